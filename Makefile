@@ -1,0 +1,67 @@
+# Two commands do everything from a fresh clone: `make attack` and `make test`. `make help` lists the rest.
+
+PYTHON ?= python3
+# On Linux the CPU build of torch is taken (200 MB instead of gigabytes of CUDA). Another index of torch builds:
+#   make TORCH_INDEX=https://download.pytorch.org/whl/cu130 setup
+# and TORCH_INDEX=none takes what pip finds by itself.
+TORCH_INDEX ?=
+ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.set-up
+SOURCES := advsearch scenes tests benchmarks
+
+export TORCH_INDEX
+
+.DEFAULT_GOAL := help
+.PHONY: help setup attack test test-slow check lint format typecheck bench reference wheel check-wheel clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup: $(STAMP) ## make .venv with everything pinned, and see to a libLLVM that works
+
+$(STAMP): constraints.txt setup.cfg pyproject.toml tools/setup.sh
+	@bash tools/setup.sh "$(PYTHON)" "$(VENV)"
+	@touch $@
+
+attack: $(STAMP) ## search the worst texture for a mug; more flags through ARGS="--epsilon 0.05"
+	@$(BIN)/advsearch attack --object mug --control texture $(ARGS)
+
+test: $(STAMP) ## run the tests; ARGS="-k name" picks some
+	@$(BIN)/python -m pytest $(ARGS)
+
+test-slow: $(STAMP) ## run the tests that take minutes
+	@$(BIN)/python -m pytest -m slow $(ARGS)
+
+check: lint typecheck test ## everything that has to pass before a commit
+
+lint: $(STAMP) ## look for mistakes and for code that is not formatted
+	@$(BIN)/ruff check $(SOURCES)
+	@$(BIN)/ruff format --check --quiet $(SOURCES) || { echo "not formatted: run make format"; exit 1; }
+
+format: $(STAMP) ## format the code and mend what can be mended
+	@$(BIN)/ruff format $(SOURCES)
+	@$(BIN)/ruff check --fix $(SOURCES)
+
+typecheck: $(STAMP) ## mypy, strict, on the package
+	@$(BIN)/mypy
+
+bench: $(STAMP) ## the benchmarks: ratios against a floor measured in the same run
+	@set -e; for file in benchmarks/*.py; do case $$file in benchmarks/_*) continue;; esac; \
+	  echo "== $$file"; $(BIN)/python $$file $(ARGS); done
+
+reference: $(STAMP) ## render, train and evaluate the bundled classifier again (hours)
+	@$(BIN)/python -m advsearch.evaluation.reference all $(ARGS)
+
+wheel: $(STAMP) ## build the wheel into dist/
+	@$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist .
+	@ls -l dist/*.whl
+
+check-wheel: $(STAMP) ## build the wheel, install it in a new environment and use it from another folder
+	@bash tools/check_wheel.sh "$(VENV)"
+
+clean: ## remove .venv, caches and what was built; runs/ stays
+	rm -rf $(VENV) build dist *.egg-info .cache .hypothesis .pytest_cache .mypy_cache .ruff_cache
+	find $(SOURCES) -name __pycache__ -prune -exec rm -rf {} +

@@ -1,0 +1,11 @@
+"""The Python interface: what `import advsearch` offers, and what the command line calls."""
+
+from __future__ import annotations
+
+from advsearch import threads as threads  # before torch: it sets how OpenMP waits
+from advsearch.api.attacking import attack, attack_from_config
+from advsearch.api.outcome import AttackResult
+from advsearch.api.scene import Scene, load_scene
+from advsearch.models import load_model
+
+__all__ = ["AttackResult", "Scene", "attack", "attack_from_config", "load_model", "load_scene"]

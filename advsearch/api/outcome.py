@@ -1,0 +1,231 @@
+"""From what an attack found to its summary (DESIGN section 6), its pictures and its files."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.api.problem import Problem
+from advsearch.api.record import Findings, Recorder, Stages
+from advsearch.attacks import Ending, SearchResult, Trial, Trials, Verification, already_wrong, count_right, typical
+from advsearch.config import AttackConfig
+from advsearch.report.page import write_report
+from advsearch.runs import images
+from advsearch.runs.directory import RunDirectory
+
+PICTURE_SPP = 64
+"""Samples a pixel of the pictures that are kept, unless verification needed more."""
+
+
+@dataclass(frozen=True, eq=False)
+class AttackResult:
+    """The answer of an attack.
+
+    Attributes:
+        summary: what `summary.json` holds (DESIGN section 6).
+        run: the run directory, or None if it was not kept.
+        u: (d,) the configuration that was verified; the start where nothing was searched.
+        clean: (H, W, 3) display-referred sRGB in [0, 1], 8-bit values: the clean configuration.
+        adversarial: the same of `u`.
+        artifacts: what the controls hand over of `u`, by name: the texture, say; (h, w, 3) sRGB in [0, 1].
+        search: the search's own log and claim.
+    """
+
+    summary: dict[str, Any]
+    run: Path | None
+    u: Tensor
+    clean: Tensor
+    adversarial: Tensor
+    artifacts: dict[str, Tensor]
+    search: SearchResult | None
+
+    @property
+    def found(self) -> bool:
+        """Whether a verified configuration was found."""
+        return bool(self.summary["ending"] == Ending.FOUND.value)
+
+
+def summarise(
+    config: AttackConfig, problem: Problem, findings: Findings, recorder: Recorder, stages: Stages, said: Sequence[str]
+) -> AttackResult:
+    """Put the result together and, if there is a run directory, write its files."""
+    search = findings.search
+    start = problem.domain.start
+    u = start if search is None else problem.domain.project(search.best_u)
+    spp = max(PICTURE_SPP, findings.sample_count.spp if findings.sample_count else 0)
+    noise = seeds.stream(config.seed, "pictures")
+    clean, adversarial = problem.picture(start, noise, spp), problem.picture(u, noise, spp)
+    artifacts = problem.space.artifacts(u)
+    answers = _answers(config, problem, findings, clean, adversarial)
+    run = recorder.run
+    costs = _costs(findings, stages)
+    where = {"run": None if run is None else str(run.path)}
+    summary = {"schema": 1, "command": "attack", **where, **answers, **costs, "seed": config.seed}
+    summary |= {"warnings": [*said, *_remarks(findings, problem)], "command_line": config.command_line()}
+    if run is not None:
+        _write_pictures(run, problem, findings, u, noise, spp, clean, adversarial)
+        _write_artifacts(run, artifacts)
+        summary["seconds"]["total"] = stages.total
+        run.write_summary(summary)
+        write_report(run.path)
+    return AttackResult(summary, None if run is None else run.path, u, clean, adversarial, artifacts, search)
+
+
+# ---- the summary ----------------------------------------------------------------------------------------------------
+
+
+def _answers(
+    config: AttackConfig, problem: Problem, findings: Findings, clean: Tensor, adversarial: Tensor
+) -> dict[str, Any]:
+    verification, labels = findings.verification, problem.model.labels
+    clean_trial = typical(findings.clean) if findings.clean else _look(problem, clean)
+    found = typical(verification.adversarial_trials) if verification else _look(problem, adversarial)
+    control = count_right(findings.clean, findings.spp) if findings.clean else None
+    budgets = [bound.budget for bound in problem.space.controls]
+    summary: dict[str, Any] = {
+        "object": config.object,
+        "model": problem.model.name,
+        "environment": config.environment,
+        "controls": [bound.name for bound in problem.space.controls],
+        "policy": config.policy,
+        "objective": config.objective,
+        "epsilon": budgets[0].epsilon
+        if len(budgets) == 1
+        else {b.name: b.budget.epsilon for b in problem.space.controls},
+        "norm": budgets[0].norm if len(budgets) == 1 else {b.name: b.budget.norm for b in problem.space.controls},
+        "label_set": list(problem.labels.names),
+        "ending": _ending(findings).value,
+        "image_formation": problem.renderer.formation.summary(),
+        "clean": {
+            **_named(clean_trial, labels),
+            "correct": clean_trial.predicted in problem.labels.indices,
+            "control": control.to_control_dict() if control else None,
+        },
+        "adversarial": _named(found, labels) if findings.search else None,
+        "verified": _verified(verification, labels),
+    }
+    if findings.baseline is not None:
+        summary["baseline"] = {
+            "policy": "random",
+            "renders": findings.baseline.renders,
+            "verified": _verified(findings.baseline_verification, labels),
+        }
+    if findings.sample_count is not None:
+        summary["sample_count"] = {"spp": findings.sample_count.spp, "converged": findings.sample_count.converged}
+    if findings.search is not None:
+        summary["claimed"] = {
+            "objective": findings.search.claimed_objective,
+            "re_evaluated": findings.search.best_objective,
+            "success_rate": findings.search.success_rate,
+        }
+        summary["configuration"] = problem.space.describe(problem.domain.project(findings.search.best_u))
+    return summary
+
+
+def _ending(findings: Findings) -> Ending:
+    if findings.interrupted:
+        return Ending.INTERRUPTED
+    if findings.verification is not None:
+        return findings.verification.ending
+    if findings.clean and already_wrong(count_right(findings.clean, findings.spp)):
+        return Ending.ALREADY_WRONG
+    return Ending.INTERRUPTED
+
+
+def _look(problem: Problem, picture: Tensor) -> Trial:
+    """What the model says of a finished picture."""
+    with torch.no_grad():
+        probabilities = problem.model(picture)[0].softmax(dim=0)
+    predicted = int(probabilities.argmax())
+    return Trial(float("nan"), predicted, float(probabilities[predicted]))
+
+
+def _named(trial: Trial, labels: Sequence[str]) -> dict[str, Any]:
+    return {"label": labels[trial.predicted], "index": trial.predicted, "probability": trial.probability}
+
+
+def _verified(verification: Verification | None, labels: Sequence[str]) -> dict[str, Any] | None:
+    """Rates and what the model answered in the trials that it got wrong."""
+    if verification is None:
+        return None
+    trials: Trials = verification.adversarial
+    answers = Counter(labels[trial.predicted] for trial in verification.adversarial_trials if trial.wrong)
+    return {**trials.to_dict(), "labels": dict(answers.most_common()), "margin": _mean_margin(verification)}
+
+
+def _mean_margin(verification: Verification) -> float:
+    margins = [trial.margin for trial in verification.adversarial_trials]
+    return sum(margins) / len(margins)
+
+
+def _costs(findings: Findings, stages: Stages) -> dict[str, Any]:
+    search, baseline = findings.search, findings.baseline
+    return {
+        "renders": {
+            "search": search.renders if search else 0,
+            "gradient": search.gradients if search else 0,
+            "baseline": baseline.renders if baseline else 0,
+            "verification": findings.verification_renders + len(findings.first_look),
+        },
+        "steps": len(search.history) if search else 0,
+        "non_finite": {
+            "objectives": search.non_finite_objectives if search else 0,
+            "gradient_elements": search.non_finite_elements if search else 0,
+        },
+        "seconds": {**stages.seconds, "total": stages.total},
+    }
+
+
+def _remarks(findings: Findings, problem: Problem) -> list[str]:
+    """What a reader has to know beside the numbers."""
+    said = []
+    count = findings.sample_count
+    if count is not None and count.table and not count.converged:
+        said.append(
+            f"The margin still moved with the sample count at {count.spp} samples a pixel, the most that was tried: "
+            "noise may take part in the verdict."
+        )
+    if problem.renderer.non_finite:
+        said.append(f"{problem.renderer.non_finite} values of pictures or gradients were not finite and were set to 0.")
+    return said
+
+
+# ---- the files ------------------------------------------------------------------------------------------------------
+
+
+def _write_pictures(
+    run: RunDirectory,
+    problem: Problem,
+    findings: Findings,
+    u: Tensor,
+    noise: int,
+    spp: int,
+    clean: Tensor,
+    adversarial: Tensor,
+) -> None:
+    gain = problem.renderer.formation.gain
+    for name, picture, at in (("clean", clean, problem.domain.start), ("adversarial", adversarial, u)):
+        run.save_image(name, picture)
+        with torch.no_grad():
+            run.save_exr(name, problem.renderer.radiance(at, seed=noise, spp=spp) * gain)
+    run.save_image("difference", images.difference(clean, adversarial))
+    if findings.verification is not None:
+        for number in range(min(4, len(findings.verification.adversarial_trials))):
+            seed = seeds.stream(problem.seed, "verification", number)
+            run.save_image(f"verification-{number:02d}", problem.picture(findings.verification.u, seed, findings.spp))
+    if findings.frames:
+        run.save_animation("search", [*findings.frames, adversarial.numpy()])
+
+
+def _write_artifacts(run: RunDirectory, artifacts: dict[str, Tensor]) -> None:
+    """Keep what the controls hand over: an 8-bit PNG, and an EXR of the same display-referred values in float32."""
+    for name, picture in artifacts.items():
+        run.save_image(name, picture, folder="artifacts")
+        run.save_exr(name, picture, folder="artifacts")

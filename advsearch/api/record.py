@@ -1,0 +1,144 @@
+"""What an attack knows so far, how long each stage took, and the rows it leaves in the run's store."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.api.problem import Problem
+from advsearch.attacks import Evaluation, SampleCount, SearchResult, StepRecord, Trial, Verification
+from advsearch.progress import Progress
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.store import Row
+
+
+@dataclass
+class Findings:
+    """What is known so far; whatever is still None or empty was not reached.
+
+    Attributes:
+        first_look: a few renders of the clean configuration at the search's sample count.
+        search: what the policy claims.
+        baseline: what the random search claims.
+        sample_count: how the sample count of the verification was chosen.
+        clean: the control group's trials.
+        verification: of the policy's answer.
+        baseline_verification: of the random search's.
+        frames: pictures of the search as 8-bit values in [0, 1], for the animation.
+        interrupted: somebody pressed Ctrl-C.
+        verification_renders: renders spent on choosing the sample count and on trials.
+    """
+
+    first_look: tuple[Trial, ...] = ()
+    search: SearchResult | None = None
+    baseline: SearchResult | None = None
+    sample_count: SampleCount | None = None
+    clean: tuple[Trial, ...] = ()
+    verification: Verification | None = None
+    baseline_verification: Verification | None = None
+    frames: list[Any] = field(default_factory=list)
+    interrupted: bool = False
+    verification_renders: int = 0
+
+    @property
+    def spp(self) -> int:
+        """Samples a pixel of the verification.
+
+        Raises:
+            RuntimeError: it has not been chosen yet.
+        """
+        if self.sample_count is None:
+            raise RuntimeError("the sample count of the verification has not been chosen yet")
+        return self.sample_count.spp
+
+
+class Stages:
+    """Tells a watcher which stage runs, and keeps the time of each.
+
+    Attributes:
+        progress: the watcher.
+        seconds: time of each stage by name, in seconds.
+        started: when the first began, by `time.perf_counter`.
+    """
+
+    def __init__(self, progress: Progress, started: float | None = None) -> None:
+        self.progress = progress
+        self.started = time.perf_counter() if started is None else started
+        self.seconds: dict[str, float] = {}
+        self._name = ""
+        self._begun = self.started
+
+    def begin(self, name: str, title: str, total: int | None = None) -> None:
+        """End the stage before and begin another; a name that comes twice adds up."""
+        self.end()
+        self._name, self._begun = name, time.perf_counter()
+        self.progress.stage(title, total)
+
+    def end(self) -> None:
+        """End the stage that runs, if one does."""
+        if self._name:
+            self.seconds[self._name] = self.seconds.get(self._name, 0.0) + time.perf_counter() - self._begun
+            self._name = ""
+
+    @property
+    def total(self) -> float:
+        """Seconds since the first stage began."""
+        return time.perf_counter() - self.started
+
+
+class Recorder:
+    """Writes what is evaluated to the run's store; without a run directory it does nothing.
+
+    Args:
+        run: the open run directory, or None.
+        problem: names labels and describes configurations.
+    """
+
+    def __init__(self, run: RunDirectory | None, problem: Problem) -> None:
+        self.run = run
+        self._problem = problem
+
+    def step(self, kind: str, record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
+        """Keep one evaluation of a search."""
+        if self.run is None:
+            return
+        problem = self._problem
+        probabilities = evaluation.logits.softmax(dim=0)
+        predicted = int(probabilities.argmax())
+        self.run.record(
+            Row(
+                kind=kind,
+                step=record.step,
+                seed=seeds.stream(problem.seed, kind, record.index),
+                spp=problem.spp,
+                objective=record.objective,
+                success=record.success,
+                label=problem.model.labels[predicted],
+                label_index=predicted,
+                probability=float(probabilities[predicted]),
+                values=problem.space.describe(u),
+                seconds=record.seconds,
+            )
+        )
+
+    def trial(self, kind: str, number: int, spp: int, trial: Trial) -> None:
+        """Keep one trial of a verification."""
+        if self.run is None:
+            return
+        self.run.record(
+            Row(
+                kind=kind,
+                step=number,
+                seed=seeds.stream(self._problem.seed, "verification", number),
+                spp=spp,
+                objective=trial.margin,
+                success=trial.wrong,
+                label=self._problem.model.labels[trial.predicted],
+                label_index=trial.predicted,
+                probability=trial.probability,
+            )
+        )

@@ -1,0 +1,73 @@
+"""The few best configurations of a search, and which of them is best once luck is taken out.
+
+The largest of many noisy values is mostly a lucky one (the winner's curse): with noise of one logit, the best of 40
+equal configurations looks two logits better than it is. So a search keeps several candidates, renders each again with
+seeds it has not used, the same seeds for all, and believes only those renders.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from torch import Tensor
+
+SAME = 1e-4
+"""Configurations that differ by less than this in every element are one candidate (an 8-bit level is 4e-3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A configuration worth a second look.
+
+    Attributes:
+        u: (d,) the configuration.
+        objective: its raw objective in the search, biased upwards.
+        success: whether that render was a success.
+        again: objectives of its new renders; -inf for one that was not finite.
+        successes: how many of these were a success.
+    """
+
+    u: Tensor
+    objective: float
+    success: bool
+    again: tuple[float, ...] = ()
+    successes: int = 0
+
+    @property
+    def believed(self) -> float:
+        """Mean objective of the new renders; the raw one if there are none."""
+        return math.fsum(self.again) / len(self.again) if self.again else self.objective
+
+    @property
+    def rate(self) -> float:
+        """Fraction of new renders that are a success; of the raw one if there are none."""
+        return self.successes / len(self.again) if self.again else float(self.success)
+
+
+def admit(pool: tuple[Candidate, ...], new: Candidate, size: int) -> tuple[Candidate, ...]:
+    """Return the pool with `new` in it if it belongs to the best `size` distinct ones, best first.
+
+    A success beats what is none, then the objective counts; of two that are the same configuration the better stays.
+    """
+    if len(pool) >= size and _raw(new) <= _raw(pool[-1]):
+        return pool
+    for old in pool:
+        if float((old.u - new.u).abs().amax()) < SAME:
+            if _raw(new) <= _raw(old):
+                return pool
+            pool = tuple(c for c in pool if c is not old)
+            break
+    return tuple(sorted((*pool, new), key=_raw, reverse=True)[:size])
+
+
+def best(pool: tuple[Candidate, ...]) -> Candidate:
+    """Return the winner: by success rate, then by objective, of the new renders where every candidate has had its
+    own."""
+    if all(c.again for c in pool):
+        return max(pool, key=lambda c: (c.rate, c.believed))
+    return pool[0]
+
+
+def _raw(candidate: Candidate) -> tuple[bool, float]:
+    return candidate.success, candidate.objective

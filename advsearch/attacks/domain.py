@@ -1,0 +1,244 @@
+"""Where a search may look: a start, norm budgets around it, and bounds. All in the unit box (DESIGN 4.5)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import torch
+from torch import Tensor
+
+from advsearch.attacks.projections import project_l2_box
+from advsearch.errors import InputError
+
+Norm = Literal["linf", "l2", "box"]
+NORMS: tuple[str, ...] = get_args(Norm)
+
+TOLERANCE = 2e-6
+"""How far outside its budget float32 rounding may put a configuration, absolute in u and relative to the radius."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """One contiguous slice of u and how far it may go.
+
+    Attributes:
+        size: number of elements, at least 1.
+        norm: "linf" or "l2" for a ball around the start cut by the bounds; "box" for the bounds alone.
+        epsilon: radius of the ball in units of u, over 0 and finite; None for "box". For "l2" it is the norm of the
+            whole block, not a norm per element, so a sensible value grows with the square root of the size.
+        low, high: bounds, 0 <= low < high <= 1.
+        periodic: whether `high` and `low` are the same place (an angle): projecting wraps around. Only for "box".
+        name: for messages, e.g. "texture".
+        flag: the command-line flag that sets epsilon, for messages.
+
+    Raises:
+        InputError: a value is outside what is said here.
+    """
+
+    size: int
+    norm: Norm = "box"
+    epsilon: float | None = None
+    low: float = 0.0
+    high: float = 1.0
+    periodic: bool = False
+    name: str = ""
+    flag: str = "--epsilon"
+
+    def __post_init__(self) -> None:
+        where = f" of {self.name!r}" if self.name else ""
+        if self.size < 1:
+            raise InputError(f"block{where}: expected a size of at least 1, got {self.size}")
+        if self.norm not in NORMS:
+            raise InputError(f"--norm{where}: expected one of {', '.join(NORMS)}, got {self.norm!r}")
+        if not 0.0 <= self.low < self.high <= 1.0:
+            raise InputError(f"bounds{where}: expected 0 <= low < high <= 1, got [{self.low}, {self.high}]")
+        if self.norm == "box":
+            if self.epsilon is not None:
+                raise InputError(f"{self.flag}{where}: has bounds and no norm budget; leave {self.flag} out")
+        elif self.epsilon is None or not (math.isfinite(self.epsilon) and self.epsilon > 0.0):
+            raise InputError(
+                f"{self.flag}{where}: expected a finite number over 0 (the {self.norm} radius, in units where the "
+                f"parameter's whole range is 1), got {self.epsilon}; try {self.flag} 0.1"
+            )
+        if self.periodic and self.norm != "box":
+            raise InputError(f"block{where}: a periodic block cannot have a norm budget; use norm 'box'")
+
+    @property
+    def radius(self) -> float:
+        """The length of one whole step, in the block's own norm: epsilon, or half the diagonal of the bounds.
+
+        Never more than the bounds let the start move.
+        """
+        width = self.high - self.low
+        if self.norm == "box":
+            return 0.5 * width * math.sqrt(self.size)
+        reach = width if self.norm == "linf" else width * math.sqrt(self.size)
+        return min(float(self.epsilon or 0.0), reach)
+
+
+@dataclass(frozen=True, eq=False)
+class Domain:
+    """The set of configurations a search may propose: the product of its blocks.
+
+    Attributes:
+        start: (d,) float32, the clean configuration, inside every block's bounds. A copy is kept.
+        blocks: consecutive slices of u that add up to d.
+        lower, upper: (d,) float32 bounds; those of an l-infinity ball are cut into them already.
+
+    Raises:
+        InputError: sizes do not add up, or the start is not finite or outside the bounds.
+    """
+
+    start: Tensor
+    blocks: tuple[Block, ...]
+    lower: Tensor = field(init=False, repr=False)
+    upper: Tensor = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        start = self.start.detach().to(torch.float32, copy=True)
+        total = sum(block.size for block in self.blocks)
+        if start.ndim != 1 or start.numel() != total:
+            raise InputError(f"start: expected shape ({total},), the sum of the blocks, got {tuple(start.shape)}")
+        if not bool(torch.isfinite(start).all()):
+            raise InputError("start: found NaN or infinite values; a start must be a configuration")
+        lower, upper = torch.empty_like(start), torch.empty_like(start)
+        object.__setattr__(self, "start", start)
+        object.__setattr__(self, "blocks", tuple(self.blocks))
+        object.__setattr__(self, "lower", lower)
+        object.__setattr__(self, "upper", upper)
+        for block, part in self._parts():
+            lower[part], upper[part] = block.low, block.high
+            if not bool(((start[part] >= lower[part]) & (start[part] <= upper[part])).all()):
+                low, high = float(start[part].min()), float(start[part].max())
+                raise InputError(
+                    f"start{f' of {block.name!r}' if block.name else ''}: expected values in "
+                    f"[{block.low}, {block.high}], got {low:.6g} to {high:.6g}"
+                )
+            if block.norm == "linf" and block.epsilon is not None:
+                lower[part].clamp_(min=start[part] - block.epsilon)
+                upper[part].clamp_(max=start[part] + block.epsilon)
+
+    @property
+    def dim(self) -> int:
+        """Number of elements of u."""
+        return self.start.numel()
+
+    def _parts(self) -> list[tuple[Block, slice]]:
+        """Every block with its slice of u."""
+        parts, begin = [], 0
+        for block in self.blocks:
+            parts.append((block, slice(begin, begin + block.size)))
+            begin += block.size
+        return parts
+
+    def project(self, u: Tensor) -> Tensor:
+        """Return the nearest configuration of the domain, block by block (Euclidean; periodic blocks wrap instead).
+
+        An l-infinity ball cut by bounds is itself a box, so clipping is exact; for an l2 ball see `project_l2_box`.
+
+        Args:
+            u: (d,) float32, finite.
+
+        Returns:
+            (d,) float32. Configurations inside come back bit for bit.
+        """
+        u = u.detach()
+        projected = torch.clamp(u, self.lower, self.upper)
+        for block, part in self._parts():
+            if block.norm == "l2" and block.epsilon is not None:
+                projected[part] = project_l2_box(u[part], self.start[part], block.epsilon, block.low, block.high)
+            elif block.periodic:
+                wrapped = block.low + torch.remainder(u[part] - block.low, block.high - block.low)
+                wrapped.clamp_(block.low, block.high)
+                projected[part] = torch.where(u[part] == projected[part], projected[part], wrapped)
+        return projected
+
+    def violation(self, u: Tensor) -> float:
+        """Return how far u lies outside: 0 inside, infinity where u has NaN or infinite elements.
+
+        The largest of the distances past a bound, and of the excess of an l2 norm over its radius (divided by the
+        radius where that is over 1).
+        """
+        excess = float(torch.maximum(self.lower - u, u - self.upper).amax())
+        for block, part in self._parts():
+            if block.norm == "l2" and block.epsilon is not None:
+                norm = math.sqrt(float((u[part] - self.start[part]).square_().sum()))
+                excess = max(excess, (norm - block.epsilon) / max(1.0, block.epsilon))
+        return math.inf if math.isnan(excess) else max(0.0, excess)
+
+    def contains(self, u: Tensor, tolerance: float = TOLERANCE) -> bool:
+        """Return whether u is a configuration of the domain, but for rounding."""
+        return u.shape == self.start.shape and self.violation(u) <= tolerance
+
+    def sample(self, generator: torch.Generator, n: int = 1, *, extreme: bool = False) -> Tensor:
+        """Draw configurations at random within the budget.
+
+        - "linf" and "box": uniform in the box that the bounds (and the ball) leave.
+        - "l2": uniform in the ball, then projected onto the bounds; not uniform where the bounds cut the ball.
+        - with `extreme`, a norm ball is sampled where random search is strongest: an l-infinity ball at random
+          corners, an l2 ball at its surface in a direction of random signs. A "box" has no such place (the corners of
+          a range of poses are no worse than its middle) and is sampled as before.
+
+        Args:
+            generator: source of randomness; advances.
+            n: number of configurations.
+            extreme: sample the norm balls at their extremes.
+
+        Returns:
+            (n, d) float32, all inside.
+        """
+        return torch.stack([self._draw(generator, extreme) for _ in range(n)])
+
+    def _draw(self, generator: torch.Generator, extreme: bool) -> Tensor:
+        """One sample of `sample`."""
+        u = torch.empty_like(self.start)
+        for block, part in self._parts():
+            noise = torch.rand(block.size, generator=generator)
+            if block.norm == "l2" and block.epsilon is not None:
+                u[part] = self.start[part] + _l2_offset(noise, block.epsilon, generator, extreme)
+                continue
+            if extreme and block.norm == "linf":
+                noise.round_()
+            u[part] = torch.lerp(self.lower[part], self.upper[part], noise)
+        return self.project(u)
+
+    def steepest(self, u: Tensor, gradient: Tensor) -> Tensor:
+        """Return one whole step uphill: the displacement that a linear objective likes most, in each block's norm.
+
+        - "linf": radius * sign(gradient);
+        - "l2": radius * gradient / ||gradient||;
+        - "box": the same, without the elements that point out of a bound at which u already lies (the free part of
+          the gradient, as in projected-gradient methods for bounds), so that they do not use up the step.
+
+        Args:
+            u: (d,) float32, the configuration to step from.
+            gradient: (d,) float32, finite.
+
+        Returns:
+            (d,) float32; zero for a block whose gradient is zero. Add a multiple of it to u and project.
+        """
+        step = torch.empty_like(gradient)
+        for block, part in self._parts():
+            slope = gradient[part]
+            if block.norm == "linf":
+                torch.sign(slope, out=step[part])
+                step[part] *= block.radius
+                continue
+            if block.norm == "box" and not block.periodic:
+                out = ((u[part] >= block.high) & (slope > 0)) | ((u[part] <= block.low) & (slope < 0))
+                slope = slope.masked_fill(out, 0.0)
+            slope = slope / slope.abs().amax().clamp_min(torch.finfo(slope.dtype).tiny)
+            step[part] = slope * (block.radius / max(float(torch.linalg.vector_norm(slope)), 1.0))
+        return step
+
+
+def _l2_offset(noise: Tensor, radius: float, generator: torch.Generator, extreme: bool) -> Tensor:
+    """An offset uniform in the l2 ball (Muller 1959), or far beyond it in a direction of random signs."""
+    size = noise.numel()
+    if extreme:
+        return (noise.round_() * 2.0 - 1.0) * (2.0 * max(radius, math.sqrt(size)))
+    direction = torch.randn(size, generator=generator)
+    length = radius * math.pow(float(noise[0]), 1.0 / size)
+    return direction * (length / max(float(torch.linalg.vector_norm(direction)), 1e-30))

@@ -1,0 +1,86 @@
+"""What one render of one configuration tells a search: the only thing that passes from a scene to a policy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """One configuration, rendered once and classified.
+
+    Attributes:
+        objective: what is maximised; a noisy number, because a render is.
+        gradient: (d,) float32 derivative of the objective with respect to u, or None where it was not asked for.
+        logits: (C,) float32 output of the model.
+        success: the model's answer lies outside the label set. Never derived from the objective.
+        non_finite: gradient elements that were NaN or infinite and were set to zero where they arose.
+    """
+
+    objective: float
+    gradient: Tensor | None
+    logits: Tensor
+    success: bool
+    non_finite: int = 0
+
+    @property
+    def finite(self) -> bool:
+        """Whether the objective is a number that can be compared."""
+        return math.isfinite(self.objective)
+
+
+class Evaluate(Protocol):
+    """Renders a configuration and classifies it; supplied by whoever owns the scene."""
+
+    def __call__(self, u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        """Evaluate u.
+
+        Args:
+            u: (d,) float32 in [0, 1]; must not be written to.
+            index: which of the search's seeds to render with. Equal indices mean equal seeds, others independent
+                ones.
+            gradient: whether the derivative is wanted.
+        """
+        ...
+
+
+StopWhen = Callable[[Evaluation], bool]
+
+
+def usable(evaluation: Evaluation) -> Evaluation:
+    """Return the evaluation as policies may see it: every number in it can be computed with.
+
+    The rule, the same for every policy:
+
+    - gradient elements that are NaN or infinite become zero and are added to `non_finite`;
+    - an objective that is NaN or infinite becomes -inf ("the worst there is"), its gradient zero and its success
+      false.
+
+    Args:
+        evaluation: as it came from the renderer and the model.
+
+    Returns:
+        The same object where nothing was wrong.
+    """
+    gradient, bad = evaluation.gradient, 0
+    if gradient is not None and not math.isfinite(float(gradient.sum(dtype=torch.float64))):
+        bad = int((~torch.isfinite(gradient)).sum())
+        gradient = torch.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0)
+    if not evaluation.finite:
+        zero = None if gradient is None else torch.zeros_like(gradient)
+        return replace(
+            evaluation,
+            objective=-math.inf,
+            gradient=zero,
+            success=False,
+            non_finite=evaluation.non_finite + bad,
+        )
+    if bad:
+        return replace(evaluation, gradient=gradient, non_finite=evaluation.non_finite + bad)
+    return evaluation

@@ -1,0 +1,219 @@
+"""Projected gradient ascent with momentum and a step size that halves when the objective stalls."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from advsearch.attacks.domain import Domain
+from advsearch.attacks.evaluation import Evaluation
+from advsearch.attacks.policies.base import Policy, Proposal, draw_seed, seeded
+from advsearch.errors import InputError
+
+FIRST_WINDOW, SHORTEN, SHORTEST = 0.22, 0.03, 0.06
+"""Length of the first window, how much each next one is shorter, and the shortest, as fractions of the steps (Auto-
+PGD)."""
+
+FEWEST = 3
+"""No window is shorter than this: two noisy values say nothing about a trend."""
+
+IMPROVING = 0.75
+"""Fraction of a window's steps that must improve the objective for the step size to be kept (Auto-PGD's rho)."""
+
+PATIENCE = 5
+"""Evaluations in a row without any gradient after which there is nothing to follow."""
+
+
+@dataclass(frozen=True, eq=False)
+class Peak:
+    """The best evaluation so far by its raw objective, and the direction in which the search stood to go on there."""
+
+    objective: float
+    u: Tensor
+    direction: Tensor
+
+
+@dataclass(frozen=True)
+class Window:
+    """The objectives since the last checkpoint, and what was true there.
+
+    Attributes:
+        length: evaluations until the next checkpoint.
+        values: objectives since the last one.
+        before: the objective just before `values`; NaN at the start.
+        improved: how many of `values` exceed their predecessor.
+        best: best objective at the last checkpoint.
+        halved: whether the step size was halved there.
+    """
+
+    length: int
+    values: tuple[float, ...] = ()
+    before: float = math.nan
+    improved: int = 0
+    best: float = -math.inf
+    halved: bool = True
+
+    def add(self, value: float) -> Window:
+        """Return the window with one more objective."""
+        last = self.values[-1] if self.values else self.before
+        return replace(self, values=(*self.values, value), improved=self.improved + (value > last))
+
+    def stalled(self, best: float) -> bool:
+        """Return whether the step size is due for halving; `best` is the best objective by now.
+
+        Either too few steps improved the objective, or the best has not moved since the last checkpoint although the
+        step size was kept there (conditions 1 and 2 of Auto-PGD).
+        """
+        return self.improved < IMPROVING * len(self.values) or (not self.halved and best <= self.best)
+
+    def lags(self, best: float) -> bool:
+        """Return whether `best` beats this window by more than noise explains: by two of its standard deviations."""
+        mean = sum(self.values) / len(self.values)
+        spread = math.sqrt(sum((v - mean) ** 2 for v in self.values) / max(1, len(self.values) - 1))
+        return best > mean + 2.0 * spread
+
+    def next(self, steps: int, best: float, halved: bool) -> Window:
+        """Return the window that follows a checkpoint."""
+        shorter = self.length - max(1, round(SHORTEN * steps))
+        length = max(FEWEST, round(SHORTEST * steps), shorter)
+        return Window(length, (), self.values[-1], 0, best, halved)
+
+
+@dataclass(frozen=True, eq=False)
+class PGDState:
+    """Where an ascent stands.
+
+    Attributes:
+        u: (d,) what to propose next.
+        direction: (d,) accumulated gradient.
+        step_size: in units of each block's radius.
+        flat: evaluations in a row whose gradient was zero.
+        count: evaluations so far.
+    """
+
+    domain: Domain
+    steps: int
+    seed: int
+    u: Tensor
+    direction: Tensor
+    step_size: float
+    peak: Peak | None
+    window: Window
+    flat: int = 0
+    count: int = 0
+
+
+@dataclass(frozen=True)
+class PGD(Policy[PGDState]):
+    """Projected gradient ascent (Madry et al. 2018) for a noisy objective.
+
+    One step, with P the projection onto the domain and `steepest` the sign of a vector in an l-infinity block and the
+    vector over its norm in an l2 or box block, scaled by the block's radius:
+
+        m <- momentum * m + g / mean|g|                (MI-FGSM, Dong et al. 2018, eq. 6)
+        u <- P(u + step_size * steepest(m))
+
+    Accumulating gradients before the sign is taken matters here: each comes from another seed, and the sign of one
+    noisy gradient is a coin toss wherever the noise exceeds it.
+
+    The step size is halved at checkpoints when the objective stalls, by the two conditions of Auto-PGD (Croce and
+    Hein 2020, section 3.1; see `Window.stalled`). There we depart from Auto-PGD: it always goes on from the best
+    configuration after halving; a noisy best is often only a lucky one, so we go back only if the last window lags
+    behind it by two of the window's standard deviations.
+
+    An evaluation with the objective -inf sends the search back to its best configuration, which is evaluated again
+    and left with half the step size. A gradient of zero leaves the accumulated one in charge; if that is zero too, the
+    step goes in a random direction; and after `PATIENCE` zero gradients in a row there is nothing more to propose.
+
+    Attributes:
+        step_size: the first step in units of each block's radius (epsilon; half the diagonal for a box), over 0, at
+            most 2.
+        momentum: weight of the past, in [0, 1).
+        random_start: start from a uniform sample of the domain, not from its start.
+
+    Raises:
+        InputError: a value is outside what is said here.
+    """
+
+    step_size: float = 1.0
+    momentum: float = 0.75
+    random_start: bool = False
+
+    name: ClassVar[str] = "pgd"
+    uses_gradient: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.step_size <= 2.0:
+            raise InputError(
+                f"--step-size: expected a number in (0, 2], a fraction of epsilon, got {self.step_size}; try 0.25"
+            )
+        if not 0.0 <= self.momentum < 1.0:
+            raise InputError(f"momentum: expected a number in [0, 1), got {self.momentum}; try 0.75")
+
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> PGDState:
+        seed = draw_seed(generator)
+        u = domain.sample(seeded(seed, 0))[0] if self.random_start else domain.start
+        window = Window(max(FEWEST, round(FIRST_WINDOW * steps)))
+        return PGDState(domain, steps, seed, u, torch.zeros_like(u), self.step_size, None, window)
+
+    def propose(self, state: PGDState) -> tuple[Proposal | None, PGDState]:
+        if state.flat >= PATIENCE:
+            return None, state
+        return Proposal(state.u, gradient=True, step_size=state.step_size), state
+
+    def update(self, state: PGDState, u: Tensor, evaluation: Evaluation) -> PGDState:
+        state = replace(state, count=state.count + 1)
+        if not evaluation.finite:
+            return _retreat(state)
+        state = _accumulate(state, evaluation.gradient, self.momentum)
+        if state.peak is None or evaluation.objective > state.peak.objective:
+            state = replace(state, peak=Peak(evaluation.objective, u, state.direction))
+        state = replace(state, window=state.window.add(evaluation.objective))
+        if len(state.window.values) < state.window.length:
+            return _step(state, u, state.direction)
+        return _checkpoint(state, u)
+
+
+def _retreat(state: PGDState) -> PGDState:
+    """Return to the best configuration itself with half the step size; if there is none, leave the start at random."""
+    state = replace(state, step_size=state.step_size / 2)
+    if state.peak is None:
+        return _step(state, state.domain.start, torch.zeros_like(state.u))
+    return replace(state, u=state.peak.u, direction=state.peak.direction)
+
+
+def _accumulate(state: PGDState, gradient: Tensor | None, momentum: float) -> PGDState:
+    """Add a gradient, divided by the mean of its absolute values, to the accumulated ones."""
+    largest = 0.0 if gradient is None else float(gradient.abs().amax())
+    if gradient is None or largest == 0.0:
+        return replace(state, flat=state.flat + 1)
+    scaled = gradient / largest  # so that sums of huge or tiny elements neither overflow nor vanish
+    direction = (state.direction * momentum).add_(scaled, alpha=1.0 / float(scaled.abs().mean()))
+    return replace(state, direction=direction, flat=0)
+
+
+def _checkpoint(state: PGDState, u: Tensor) -> PGDState:
+    """Halve the step size if the window has stalled, and go on from the best configuration if it lags behind that."""
+    window, peak = state.window, state.peak
+    best = peak.objective if peak else -math.inf
+    stalled = window.stalled(best)
+    direction = state.direction
+    if peak is not None and stalled and window.lags(best):
+        u, direction = peak.u, peak.direction
+    step_size = state.step_size / 2 if stalled else state.step_size
+    window = window.next(state.steps, best, stalled)
+    state = replace(state, step_size=step_size, direction=direction, window=window)
+    return _step(state, u, direction)
+
+
+def _step(state: PGDState, u: Tensor, direction: Tensor) -> PGDState:
+    """Move from u along the direction, or at random where there is none."""
+    uphill = direction
+    if not bool(direction.any()):
+        uphill = torch.randn(u.numel(), generator=seeded(state.seed, state.count))
+    move = torch.add(u, state.domain.steepest(u, uphill), alpha=state.step_size)
+    return replace(state, u=state.domain.project(move), direction=direction)

@@ -1,0 +1,283 @@
+"""The one search loop: it owns the budget, stopping, the best so far and the log. Policies only propose."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from advsearch.attacks.candidates import Candidate, admit, best
+from advsearch.attacks.domain import TOLERANCE, Domain
+from advsearch.attacks.ending import Ending
+from advsearch.attacks.evaluation import Evaluate, Evaluation, StopWhen, usable
+from advsearch.attacks.policies.base import Policy, Proposal
+from advsearch.errors import InputError
+from advsearch.seeds import stream
+
+NON_FINITE_LIMIT = 3
+"""Non-finite objectives in a row after which a search gives up."""
+
+Phase = Literal["search", "ranking"]
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """One evaluation, without its tensors.
+
+    Attributes:
+        step: number of the evaluation, from 0; ranking goes on counting.
+        index: the seed index it was rendered with.
+        phase: "search", or "ranking" for a candidate rendered again at the end.
+        objective: raw objective; NaN where it was not finite.
+        best: best raw objective of the search so far; NaN before there is one. Biased upwards.
+        success: whether the model was wrong on this render.
+        step_size: the policy's, in units of each block's radius; NaN where it has none.
+        gradient_norm: l2 norm of the gradient after cleaning; NaN without one.
+        non_finite: gradient elements that had to be set to zero.
+        seconds: time the evaluation took.
+    """
+
+    step: int
+    index: int
+    phase: Phase
+    objective: float
+    best: float
+    success: bool
+    step_size: float
+    gradient_norm: float
+    non_finite: int
+    seconds: float
+
+
+OnStep = Callable[[StepRecord, Tensor, Evaluation], None]
+"""Called after every evaluation, ranking included, with its record, u, and the (usable) evaluation."""
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """What a search claims. Only `verify` turns a claim into a finding (DESIGN 4.1).
+
+    Attributes:
+        best_u: (d,) float32, the answer; the start if nothing could be evaluated.
+        best_objective: mean objective of the answer in its new renders; its raw one if it had none. NaN if nothing
+            could be evaluated, or one of these renders was not finite.
+        claimed_objective: the answer's raw objective in the search, biased upwards.
+        success_rate: fraction of the answer's new renders (else of its one raw render) that the model got wrong.
+        ending: FOUND if that fraction is at least a half; else why the search stopped. INTERRUPTED takes precedence.
+        stopped: why the loop stopped, whatever it had found.
+        history: one record per evaluation of the search itself.
+        ranking: one record per new render of a candidate.
+        renders: evaluations in all: len(history) + len(ranking).
+        gradients: how many of them included a gradient.
+        non_finite_objectives: evaluations whose objective was NaN or infinite.
+        non_finite_elements: gradient elements that were set to zero, over all evaluations.
+        seconds: total time, evaluations included.
+    """
+
+    best_u: Tensor
+    best_objective: float
+    claimed_objective: float
+    success_rate: float
+    ending: Ending
+    stopped: Ending
+    history: tuple[StepRecord, ...]
+    ranking: tuple[StepRecord, ...]
+    renders: int
+    gradients: int
+    non_finite_objectives: int
+    non_finite_elements: int
+    seconds: float
+
+
+def planned_renders(steps: int, candidates: int = 4, repeats: int = 2) -> int:
+    """Return how many evaluations `search` makes at most with these arguments."""
+    return steps + candidates * repeats
+
+
+def search(
+    evaluate: Evaluate,
+    domain: Domain,
+    policy: Policy[Any],
+    *,
+    steps: int,
+    seed: int,
+    candidates: int = 4,
+    repeats: int = 2,
+    stop_when: StopWhen | None = None,
+    on_step: OnStep | None = None,
+) -> SearchResult:
+    """Run one policy on one domain and return the worst configuration it found.
+
+    1. For each step: the policy proposes; the proposal is checked against the domain; it is evaluated with the seed
+       index of its step (a new one every time, DESIGN 4.4); the policy is told. The last evaluation needs no gradient
+       and asks for none.
+    2. The `candidates` best distinct configurations are each evaluated `repeats` times more, with new seed indices
+       that are the same for all, without gradient. The best by these renders is the answer (see `candidates`). With
+       `candidates=0`, for an objective without noise, the raw best is the answer.
+
+    A non-finite objective is counted, is never best, and reaches the policy as -inf; `NON_FINITE_LIMIT` in a row end
+    the search. KeyboardInterrupt, wherever it strikes, ends it with what there is. Every other exception passes
+    through.
+
+    Args:
+        evaluate: renders and classifies one configuration.
+        domain: where to search.
+        policy: what proposes.
+        steps: evaluations of the search, at least 1. By default all are spent: the worst case is wanted, not the
+            first.
+        seed: root seed of this search's own randomness (not of the renders), at least 0.
+        candidates, repeats: see above; together they cost `candidates * repeats` renders on top of `steps`.
+        stop_when: ends step 1 early where it returns true, e.g. `stop_at_margin(1.0, labels)`.
+        on_step: called after every evaluation.
+
+    Raises:
+        InputError: steps, candidates or repeats out of range.
+        RuntimeError: the policy left the domain or `evaluate` broke its contract; a bug.
+    """
+    if steps < 1:
+        raise InputError(f"--steps: expected at least 1, got {steps}")
+    if candidates < 0 or repeats < 1:
+        raise InputError(f"candidates and repeats: expected at least 0 and 1, got {candidates} and {repeats}")
+    begun = time.perf_counter()
+    log = _Log(evaluate, domain, on_step, max(1, candidates))
+    try:
+        stopped = _explore(log, policy, steps, seed, stop_when)
+        if candidates:
+            _rank(log, steps, repeats)
+    except KeyboardInterrupt:
+        stopped = Ending.INTERRUPTED
+    return _result(log, stopped, time.perf_counter() - begun)
+
+
+@dataclass(eq=False)
+class _Log:
+    """Evaluates, checks, counts and remembers; the only thing in a search that changes."""
+
+    evaluate: Evaluate
+    domain: Domain
+    on_step: OnStep | None
+    size: int
+    pool: tuple[Candidate, ...] = ()
+    best: float = math.nan
+    records: list[StepRecord] = field(default_factory=list)
+    gradients: int = 0
+    non_finite: int = 0
+
+    def render(self, proposal: Proposal, index: int, phase: Phase) -> Evaluation:
+        """Evaluate one proposal and take note of it."""
+        begun = time.perf_counter()
+        raw = self.evaluate(proposal.u, index=index, gradient=proposal.gradient)
+        seconds = time.perf_counter() - begun
+        _check_gradient(raw, proposal)
+        evaluation = usable(raw)
+        self.gradients += proposal.gradient
+        if not evaluation.finite:
+            self.non_finite += 1
+        elif phase == "search":
+            self.best = max(evaluation.objective, self.best) if self.best == self.best else evaluation.objective
+            found = Candidate(proposal.u, evaluation.objective, evaluation.success)
+            self.pool = admit(self.pool, found, self.size)
+        record = StepRecord(
+            step=len(self.records),
+            index=index,
+            phase=phase,
+            objective=evaluation.objective if evaluation.finite else math.nan,
+            best=self.best,
+            success=evaluation.success,
+            step_size=proposal.step_size,
+            gradient_norm=math.nan if evaluation.gradient is None else float(evaluation.gradient.norm()),
+            non_finite=evaluation.non_finite,
+            seconds=seconds,
+        )
+        self.records.append(record)
+        if self.on_step is not None:
+            self.on_step(record, proposal.u, evaluation)
+        return evaluation
+
+
+def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, stop_when: StopWhen | None) -> Ending:
+    """Let the policy propose until the budget is spent or something ends it sooner; return what."""
+    generator = torch.Generator().manual_seed(stream(seed, "search"))
+    state = policy.start(log.domain, generator, steps)
+    in_a_row = 0
+    for step in range(steps):
+        proposal, state = policy.propose(state)
+        if proposal is None:
+            return Ending.STALLED
+        _check_inside(proposal.u, log.domain, policy.name)
+        last = step == steps - 1
+        evaluation = log.render(replace(proposal, gradient=proposal.gradient and not last), step, "search")
+        in_a_row = 0 if evaluation.finite else in_a_row + 1
+        if in_a_row == NON_FINITE_LIMIT:
+            return Ending.NON_FINITE
+        if evaluation.finite and stop_when is not None and stop_when(evaluation):
+            return Ending.FOUND
+        if not last:
+            state = policy.update(state, proposal.u, evaluation)
+    return Ending.BUDGET_SPENT
+
+
+def _rank(log: _Log, first_index: int, repeats: int) -> None:
+    """Render every candidate again, all with the same new seeds."""
+    for candidate in log.pool:
+        evaluations = [log.render(Proposal(candidate.u), first_index + r, "ranking") for r in range(repeats)]
+        again = tuple(e.objective for e in evaluations)
+        ranked = replace(candidate, again=again, successes=sum(e.success for e in evaluations))
+        log.pool = tuple(ranked if c is candidate else c for c in log.pool)
+
+
+def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
+    """Put together what the log holds."""
+    nothing = Candidate(log.domain.start, math.nan, False)
+    answer = best(log.pool) if log.pool else nothing
+    found = answer.rate >= 0.5 and stopped is not Ending.INTERRUPTED
+    if stopped is Ending.FOUND and not found:
+        ending = Ending.BUDGET_SPENT
+    else:
+        ending = Ending.FOUND if found else stopped
+    return SearchResult(
+        best_u=answer.u,
+        best_objective=answer.believed if math.isfinite(answer.believed) else math.nan,
+        claimed_objective=answer.objective,
+        success_rate=answer.rate,
+        ending=ending,
+        stopped=stopped,
+        history=tuple(r for r in log.records if r.phase == "search"),
+        ranking=tuple(r for r in log.records if r.phase == "ranking"),
+        renders=len(log.records),
+        gradients=log.gradients,
+        non_finite_objectives=log.non_finite,
+        non_finite_elements=sum(r.non_finite for r in log.records),
+        seconds=seconds,
+    )
+
+
+def _check_inside(u: Tensor, domain: Domain, name: str) -> None:
+    """Raise RuntimeError unless u is a configuration of the domain; a policy that leaves it has a bug."""
+    if u.shape != domain.start.shape or u.dtype != torch.float32:
+        raise RuntimeError(
+            f"policy {name!r} proposed {u.dtype} of shape {tuple(u.shape)}; expected torch.float32 of shape "
+            f"{tuple(domain.start.shape)}"
+        )
+    outside = domain.violation(u)
+    if not outside <= TOLERANCE:
+        raise RuntimeError(f"policy {name!r} left its budget by {outside:.3g}; it must project what it proposes")
+
+
+def _check_gradient(evaluation: Evaluation, proposal: Proposal) -> None:
+    """Raise RuntimeError unless a gradient came exactly as it was asked for."""
+    gradient = evaluation.gradient
+    if not proposal.gradient:
+        return
+    if gradient is None:
+        raise RuntimeError("evaluate returned no gradient although one was asked for")
+    if gradient.shape != proposal.u.shape or gradient.dtype != proposal.u.dtype:
+        raise RuntimeError(
+            f"evaluate returned a gradient of {gradient.dtype}, shape {tuple(gradient.shape)}; expected "
+            f"{proposal.u.dtype}, shape {tuple(proposal.u.shape)}"
+        )

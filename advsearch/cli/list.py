@@ -1,0 +1,65 @@
+"""`advsearch list`: the names of objects, environments, controls, policies, objectives and models."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+from advsearch.cli import output
+
+HELP = "list the objects, environments, controls, policies, objectives and models that have names"
+
+REGISTRIES = {
+    "objects": "advsearch.scene.library:list_objects",
+    "environments": "advsearch.scene.library:list_environments",
+    "controls": "advsearch.controls:CONTROLS",
+    "policies": "advsearch.attacks:POLICIES",
+    "objectives": "advsearch.attacks:OBJECTIVES",
+    "models": "advsearch.cli.list:MODELS",
+}
+"""Where the names of each kind are: a mapping from them, or a function that returns them."""
+
+MODELS = {"reference": "the bundled classifier of household objects; models of your own are given as files"}
+
+
+def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser("list", help=HELP, description=HELP[0].upper() + HELP[1:] + ".", allow_abbrev=False)
+    parser.add_argument("kind", nargs="?", default="all", choices=[*REGISTRIES, "all"], help="default: all")
+    output.add_flags(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the names of one kind, or of all."""
+    kinds = list(REGISTRIES) if args.kind == "all" else [args.kind]
+    with output.output_kept_clean():
+        found = {kind: names(kind) for kind in kinds}
+    if args.json:
+        output.print_json({"schema": 1, **{kind: list(entries) for kind, entries in found.items()}})
+        return 0
+    for number, (kind, entries) in enumerate(found.items()):
+        if args.kind == "all":
+            print(("\n" if number else "") + f"{kind}:")
+        print(output.columns([[name, text] for name, text in entries.items()]))
+    return 0
+
+
+def names(kind: str) -> dict[str, str]:
+    """Return the names of one kind, each with one line about it where its registry has one."""
+    module, _, attribute = REGISTRIES[kind].partition(":")
+    registry = getattr(importlib.import_module(module), attribute)
+    entries = registry() if callable(registry) else registry
+    if isinstance(entries, Mapping):
+        return {str(name): first_line(entry) for name, entry in entries.items()}
+    return {str(name): "" for name in entries}
+
+
+def first_line(entry: Any) -> str:
+    """Return the first line of what an entry of a registry says of itself; empty for plain values."""
+    documented = entry if inspect.isroutine(entry) or inspect.isclass(entry) else type(entry)
+    if documented.__module__ == "builtins":
+        return str(entry) if isinstance(entry, str) else ""
+    return (inspect.getdoc(documented) or "").partition("\n")[0]

@@ -1,0 +1,130 @@
+"""`advsearch`: find the command, run it, and turn what goes wrong into a message and an exit status.
+
+A command is a module with `HELP` (one line), `add_parser(subparsers)` and `run(args) -> int`. It imports what is heavy
+inside `run`, so that `advsearch --help` answers at once.
+
+Exit status: 0 the command did its work, 1 a bug, 2 bad input, 3 a check that fell short, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import re
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+from types import ModuleType
+from typing import NoReturn
+
+from advsearch import __version__
+from advsearch.errors import AdvsearchError, InputError, UnknownNameError
+
+COMMANDS = {
+    "attack": "advsearch.cli.attack",
+    "run": "advsearch.cli.run",
+    "list": "advsearch.cli.list",
+    "show": "advsearch.cli.show",
+    "doctor": "advsearch.cli.doctor_command",
+}
+"""Each command and its module, in the order in which the help shows them."""
+
+OK, BAD_INPUT, INTERRUPTED = 0, 2, 130
+
+_EXAMPLES = """examples:
+  advsearch attack --object mug --control texture
+  advsearch attack --object mug.obj --environment room.hdr --model model.pt2 --labels labels.json --label "mug,cup"
+  advsearch run runs/mug-texture-001/run.yaml steps=80
+  advsearch show runs/mug-texture-001
+"""
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse, but what is wrong with the arguments is an `InputError`."""
+
+    def error(self, message: str) -> NoReturn:
+        """Raise the message as an `InputError` that says where help is."""
+        raise InputError(f"{message}; see {self.prog} --help")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status. An exception that is a bug of ours passes through."""
+    given = list(sys.argv[1:] if argv is None else argv)
+    try:
+        status = _run(given)
+        sys.stdout.flush()
+        return status
+    except AdvsearchError as error:
+        print(f"advsearch: error: {error}", file=sys.stderr)
+        return BAD_INPUT
+    except KeyboardInterrupt:
+        print("advsearch: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        _close_output()
+        return OK
+
+
+def _run(given: list[str]) -> int:
+    command = given[0] if given and not given[0].startswith("-") else None
+    if command is not None and command not in COMMANDS:
+        raise UnknownNameError("command", command, COMMANDS, "See advsearch --help.")
+    try:
+        args = _parse(given, command)
+    except SystemExit as stop:  # --help and --version have printed their text
+        return int(stop.code or 0)
+    return int(_module(COMMANDS[args.command]).run(args))
+
+
+def _parse(given: list[str], command: str | None) -> argparse.Namespace:
+    """Return the arguments of a known command.
+
+    Raises:
+        InputError: an argument is unknown, misses its value, or is missing.
+        SystemExit: help or the version was asked for and printed.
+    """
+    parser = Parser(
+        prog="advsearch",
+        description="Find the scene that a vision model gets wrong most badly.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"advsearch {__version__}")
+    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands", parser_class=Parser)
+    for name, path in COMMANDS.items():
+        module = _module(path)
+        if name == command:
+            module.add_parser(subparsers)
+        else:
+            subparsers.add_parser(name, help=module.HELP)
+    args, unknown = parser.parse_known_args(given)
+    if unknown:
+        raise _unknown_argument(unknown[0], subparsers.choices[args.command] if args.command else parser)
+    if args.command is None:
+        parser.print_help()
+        parser.exit()
+    return args
+
+
+def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputError:
+    name = argument.partition("=")[0]
+    if not name.startswith("--"):
+        return InputError(f"expected flags, got {argument!r}; see {parser.prog} --help")
+    known = re.findall(r"(?<!\S)--[a-z][a-z-]*", parser.format_help())
+    return UnknownNameError("flag", name, set(known))
+
+
+def _module(path: str) -> ModuleType:
+    return importlib.import_module(path)
+
+
+def _close_output() -> None:
+    """Point standard output at nothing, so that the interpreter's own flush at exit doesn't complain."""
+    with suppress(OSError, ValueError, AttributeError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

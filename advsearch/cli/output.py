@@ -1,0 +1,68 @@
+"""What every command prints with: JSON alone on standard output, messages on standard error."""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import json
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout, suppress
+from typing import Any
+
+
+def add_flags(parser: argparse.ArgumentParser, *, quiet: bool = False) -> None:
+    """Add ``--json`` and, for commands that take their time, ``--quiet``."""
+    parser.add_argument("--json", action="store_true", help="print one JSON value on standard output")
+    if quiet:
+        parser.add_argument("--quiet", action="store_true", help="no progress and no messages on standard error")
+
+
+def print_json(value: Any) -> None:
+    """Print `value` as JSON on standard output; NaN and infinity become null."""
+    from advsearch.runs.summary import plain
+
+    print(json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False))
+
+
+@contextmanager
+def output_kept_clean() -> Iterator[None]:
+    """Send whatever is printed inside the block to standard error, be it by Python or by a native library.
+
+    So one JSON value, printed afterwards, is all that standard output holds.
+    """
+    sys.stdout.flush()
+    with redirect_stdout(sys.stderr), _descriptor_redirected(1, 2):
+        yield
+
+
+def columns(rows: Sequence[Sequence[str]], indent: str = "  ", gap: str = "   ") -> str:
+    """Return lines with the cells of `rows` in aligned columns."""
+    wide = [max(len(row[i]) for row in rows if i < len(row)) for i in range(max(map(len, rows), default=0))]
+    return "\n".join(
+        (indent + gap.join(cell.ljust(width) for cell, width in zip(row, wide, strict=False))).rstrip() for row in rows
+    )
+
+
+@contextmanager
+def _descriptor_redirected(source: int, target: int) -> Iterator[None]:
+    """Let file descriptor `source` stand for `target` inside the block; do nothing where one of them is closed."""
+    try:
+        kept = os.dup(source)
+        os.dup2(target, source)
+    except OSError:
+        yield
+        return
+    try:
+        yield
+    finally:
+        _flush_c()
+        os.dup2(kept, source)
+        os.close(kept)
+
+
+def _flush_c() -> None:
+    """Write out what the C library holds back, before its descriptor changes."""
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).fflush(None)

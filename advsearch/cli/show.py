@@ -1,0 +1,92 @@
+"""`advsearch show`: what a run found, or what a control can vary."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from advsearch.cli import output
+from advsearch.errors import InputError, UnknownNameError
+
+HELP = "show what a run found, or the parameters of a control"
+
+
+def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        "show",
+        usage="advsearch show [--json] RUN | control NAME",
+        help=HELP,
+        description=HELP[0].upper() + HELP[1:] + ".",
+    )
+    parser.add_argument("what", nargs="+", metavar="WHAT", help="a run's name or folder; or: control NAME")
+    output.add_flags(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the answer of a run, or a control's parameters."""
+    match args.what:
+        case ["control", name]:
+            return _show_control(name, args.json)
+        case [name]:
+            return _show_run(name, args.json)
+    raise InputError(f"expected the name of a run, or: control NAME, got {' '.join(args.what)!r}")
+
+
+def _show_run(name: str, as_json: bool) -> int:
+    from advsearch.cli.table import answer
+    from advsearch.runs.directory import find_run
+    from advsearch.runs.summary import read_summary
+
+    summary = read_summary(find_run(name))
+    if as_json:
+        output.print_json(summary)
+    else:
+        print(answer(summary))
+    return 0
+
+
+def _show_control(name: str, as_json: bool) -> int:
+    with output.output_kept_clean():
+        from advsearch.cli.list import first_line
+        from advsearch.controls import CONTROLS
+
+    if name not in CONTROLS:
+        raise UnknownNameError("control", name, CONTROLS)
+    control = CONTROLS[name]
+    parameters, choices = ([facts(one) for one in getattr(control, part, ())] for part in ("parameters", "choices"))
+    if as_json:
+        output.print_json({"schema": 1, "control": name, "parameters": parameters, "choices": choices})
+        return 0
+    print(f"{name}: {first_line(control)}")
+    for heading, declared in (("parameters, searched or fixed", parameters), ("settings, chosen", choices)):
+        if declared:
+            print(f"\n{heading}:\n{_table(declared)}")
+    return 0
+
+
+def facts(parameter: Any) -> dict[str, Any]:
+    """Return what a control declares of one of its parameters as JSON values.
+
+    Args:
+        parameter: a dataclass or a mapping.
+    """
+    from advsearch.runs.summary import plain
+
+    return dict(plain(parameter))
+
+
+def _table(declared: Sequence[Mapping[str, Any]]) -> str:
+    """Return what was declared as a table, the description last."""
+    heads = sorted(dict.fromkeys(head for one in declared for head in one), key="description".__eq__)
+    rows = [[_cell(one.get(head)) for head in heads] for one in declared]
+    return output.columns([[head.replace("_", " ") for head in heads], *rows])
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list):
+        return "[" + ", ".join("any" if one is None else _cell(one) for one in value) + "]"
+    return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)

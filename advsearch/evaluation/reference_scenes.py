@@ -1,0 +1,131 @@
+"""The scenes that the reference model is trained and tested on: this pipeline's own, with everything randomised.
+
+Varied are the instance (proportions, texture, material), pose, camera, exposure, ground, environment, its rotation,
+tint and one added soft light. Training and test differ in the instances (disjoint seeds) and in the environments (the
+library's
+"train" and "heldout" halves), not in the ranges.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from advsearch.bundled.objects import OBJECTS
+from advsearch.scene import library
+from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.formation import ImageFormation
+from advsearch.scene.mitsuba_scene import MitsubaScene
+from advsearch.scene.renderer import Renderer
+from advsearch.scene.settings import resolve
+
+CLASSES = tuple(sorted(OBJECTS))
+"""Object names in the order of the class indices."""
+SPLITS = {"train": 0, "validation": 1, "heldout": 2}
+"""Which seeds a split draws its instances from; validation shares the training environments."""
+SIZE = (128, 128)
+SPP = 8
+RAW_SHARE = 0.25
+"""Part of the pictures that stays undenoised, so that the model has seen noise."""
+
+Picture = np.ndarray[tuple[int, ...], np.dtype[np.uint8]]
+
+
+def labels() -> tuple[str, ...]:
+    """Return the class names in index order."""
+    return tuple(name.replace("-", " ") for name in CLASSES)
+
+
+def class_of(index: int) -> int:
+    """Return the class index of a split's picture `index`; classes take turns."""
+    return index % len(CLASSES)
+
+
+def picture(split: str, index: int, seed: int = 0) -> Picture:
+    """Render picture `index` of a split: (128, 128, 3) uint8, display-referred sRGB; repeatable."""
+    rng = np.random.default_rng([seed, SPLITS[split], index])
+    description = random_scene(CLASSES[class_of(index)], "heldout" if split == "heldout" else "train", rng)
+    denoiser = "none" if rng.random() < RAW_SHARE else "oidn"
+    formation = ImageFormation(denoiser=denoiser, resolution=SIZE, gain=description.gain)
+    renderer = Renderer(MitsubaScene(description, SIZE, freeze=False), _Nothing(), formation, root_seed=seed)
+    with torch.no_grad():
+        display = renderer(torch.zeros(0), seed=index, spp=SPP * (2 if denoiser == "none" else 1))
+    return (display * 255.0).round().to(torch.uint8).numpy()
+
+
+class _Nothing:
+    """The space without controls."""
+
+    start = torch.zeros(0)
+
+    def inputs(self, u: torch.Tensor) -> dict[str, torch.Tensor]:
+        return {}
+
+
+def random_scene(name: str, environments: str, rng: np.random.Generator) -> SceneDescription:
+    """Draw a scene with an object of a class, lit by an environment of one half of the library."""
+    asset = _recoloured(OBJECTS[name].generate(rng), rng)
+    names = library.list_environments(environments)
+    environment = _varied(library.load_environment(names[int(rng.integers(len(names)))]), rng)
+    ground = rng.uniform(0.1, 0.9) + rng.normal(0.0, 0.08, 3)
+    given = {
+        "camera.azimuth": rng.uniform(0.0, 360.0),
+        "camera.elevation": rng.uniform(8.0, 55.0),
+        "camera.roll": rng.normal(0.0, 4.0),
+        "camera.fov": rng.uniform(22.0, 50.0),
+        "camera.exposure": rng.uniform(-0.8, 0.5),
+        "pose.scale": rng.uniform(0.72, 1.06),
+        "pose.pitch": rng.normal(0.0, 2.0),
+        "pose.roll": rng.normal(0.0, 2.0),
+        "pose.x": rng.normal(0.0, 0.03),
+        "pose.y": rng.normal(0.0, 0.03),
+        "environment.rotation": rng.uniform(0.0, 360.0),
+        "ground.size": 0.0 if rng.random() < 0.08 else rng.uniform(2.0, 7.0),
+        **dict(zip(("ground.red", "ground.green", "ground.blue"), np.clip(ground, 0.02, 0.98), strict=True)),
+    }
+    return SceneDescription(asset, environment, resolve({key: float(value) for key, value in given.items()}))
+
+
+def _recoloured(asset: ObjectAsset, rng: np.random.Generator) -> ObjectAsset:
+    """Sometimes shift the texture's colours or add smooth blotches, so that colour alone does not tell the class."""
+    color = asset.base_color
+    if rng.random() < 0.5:
+        color = color * rng.uniform(0.75, 1.2, 3).astype(np.float32)
+    if rng.random() < 0.4:
+        color = color + rng.uniform(0.02, 0.12) * _blotches(color.shape[:2], rng)
+    return replace(asset, base_color=np.clip(color, 0.0, 1.0).astype(np.float32))
+
+
+def _blotches(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
+    """Smooth colour noise with values around -1 to 1, from a coarse grid."""
+    cells = int(rng.integers(3, 24))
+    coarse = torch.from_numpy(rng.uniform(-1.0, 1.0, (1, 3, cells, cells)).astype(np.float32))
+    fine = torch.nn.functional.interpolate(coarse, size=tuple(shape), mode="bilinear", align_corners=False)
+    return np.ascontiguousarray(fine[0].permute(1, 2, 0).numpy())
+
+
+def _varied(environment: EnvironmentAsset, rng: np.random.Generator) -> EnvironmentAsset:
+    """Mirror, tint, change the contrast of, and add one soft light to an environment."""
+    radiance = environment.radiance[:, ::-1] if rng.random() < 0.5 else environment.radiance
+    radiance = radiance * np.exp(rng.normal(0.0, 0.1, 3)).astype(np.float32)
+    mean = float(radiance.mean()) + 1e-6
+    radiance = mean * (radiance / mean) ** np.float32(rng.uniform(0.8, 1.15))
+    if rng.random() < 0.5:
+        radiance = radiance + mean * _soft_light(radiance.shape[:2], rng)
+    return replace(environment, radiance=np.ascontiguousarray(radiance, dtype=np.float32))
+
+
+def _soft_light(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
+    """A broad lobe from a random direction above the horizon, in units of the map's mean; (H, W, 1)."""
+    height, width = shape
+    theta = (np.arange(height) + 0.5)[:, None] * math.pi / height
+    phi = (np.arange(width) + 0.5)[None, :] * 2.0 * math.pi / width
+    tilt, turn = rng.uniform(0.1, 1.3), rng.uniform(0.0, 2.0 * math.pi)
+    cosine = np.cos(theta) * math.cos(tilt) + np.sin(theta) * math.sin(tilt) * np.cos(phi - turn)
+    sharpness = rng.uniform(20.0, 150.0)
+    lobe = rng.uniform(2.0, 12.0) * np.exp(sharpness * (cosine - 1.0))
+    return np.asarray(lobe[..., None], dtype=np.float32)

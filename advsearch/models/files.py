@@ -1,0 +1,207 @@
+"""Models in files: `torch.export` archives (.pt2) and TorchScript, told apart by content, not by name.
+
+No Python object is ever unpickled: archives that need it are refused. A model file is a program all the same; open only
+files whose makers you trust.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import logging
+import os
+import warnings
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from advsearch.errors import FileFormatError, ModelError
+from advsearch.models.probe import first_line
+from advsearch.models.source import Source, source_of
+
+#: Suffixes that make a name a file even if there is no such file.
+SUFFIXES = (".pt2", ".pt", ".pth", ".ts", ".torchscript", ".bin", ".pkl", ".pickle", ".ckpt", ".safetensors", ".onnx")
+
+EXPORT_HINT = (
+    "Export the network instead: torch.export.save(torch.export.export(net.eval(), (example,)), 'net.pt2'); or pass "
+    "the nn.Module through the Python API; or store its state dict as safetensors and name what builds it: "
+    "'package.module:callable@weights.safetensors'"
+)
+
+#: The largest batch sent to a program whose batch dimension is free.
+LARGEST_BATCH = 64
+
+
+def load_file(path: Path) -> Source:
+    """Return the model in a file.
+
+    Raises:
+        FileFormatError: missing, empty, truncated, damaged, a pickle, or of another kind; the message names the file.
+        ModelError: a program that does not take one floating-point image.
+    """
+    kind = _kind(path)
+    if kind == "torchscript":
+        return _load_torchscript(path)
+    return _load_exported(path)
+
+
+def _kind(path: Path) -> str:
+    """Return ``"exported"`` or ``"torchscript"``; raise for everything else."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(16)
+    except FileNotFoundError:
+        raise FileFormatError(f"model file {path}: no such file.{_near_files(path)}") from None
+    except OSError as error:
+        raise FileFormatError(f"model file {path}: cannot be read ({error.strerror or error})") from None
+    if not head:
+        raise FileFormatError(f"model file {path}: expected a model, got an empty file")
+    if head[:2] != b"PK":
+        raise FileFormatError(f"model file {path}: {_not_an_archive(path, head)}")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+    except (zipfile.BadZipFile, OSError, ValueError) as error:
+        raise FileFormatError(f"model file {path}: truncated or damaged archive ({first_line(error)})") from None
+    return _kind_of_archive(path, names)
+
+
+def _kind_of_archive(path: Path, names: list[str]) -> str:
+    inner = {name.partition("/")[2] for name in names} | set(names)
+    if any(name.startswith("models/") and name.endswith(".json") for name in inner):
+        refused = [
+            n
+            for n in inner
+            if n.startswith("data/aotinductor/") or Path(n).name.startswith(("opaque_obj", "custom_obj"))
+        ]
+        if refused:
+            raise FileFormatError(
+                f"model file {path}: holds {min(refused)!r}, which is a pickled object or compiled code and is never "
+                "loaded. Export a plain network with torch.export.save"
+            )
+        return "exported"
+    if "serialized_exported_program.json" in inner:
+        return "exported"
+    if "constants.pkl" in inner and any(name.startswith("code/") for name in inner):
+        return "torchscript"
+    if "data.pkl" in inner:
+        raise FileFormatError(
+            f"model file {path}: is a pickle (made by torch.save), which is never opened. {EXPORT_HINT}"
+        )
+    raise FileFormatError(f"model file {path}: a zip archive, but neither torch.export nor TorchScript. {EXPORT_HINT}")
+
+
+def _not_an_archive(path: Path, head: bytes) -> str:
+    """Return what a file that is not a zip archive seems to be, and what to do."""
+    if head[8:9] == b"{" and int.from_bytes(head[:8], "little") < 1 << 30:
+        return (
+            "safetensors hold weights but no network; name what builds it: "
+            "'package.module:callable@weights.safetensors' or 'torchvision:NAME@weights.safetensors'"
+        )
+    if head[:1] == b"\x80" or path.suffix.lower() in (".pkl", ".pickle", ".pth", ".ckpt", ".bin"):
+        return f"is a pickle, or something like it, which is never opened. {EXPORT_HINT}"
+    return f"expected a torch.export archive (.pt2) or TorchScript, got other bytes. {EXPORT_HINT}"
+
+
+def _near_files(path: Path) -> str:
+    if not path.parent.is_dir():
+        return f" The folder {path.parent} does not exist either"
+    near = difflib.get_close_matches(path.name, [item.name for item in path.parent.iterdir()], n=3, cutoff=0.6)
+    return f" Did you mean {' or '.join(repr(str(path.parent / name)) for name in near)}?" if near else ""
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# TorchScript
+
+
+def _load_torchscript(path: Path) -> Source:
+    with warnings.catch_warnings(), _damaged(path, "TorchScript"):
+        warnings.filterwarnings("ignore", message=r".*torch\.jit\.\w+.* is deprecated", category=DeprecationWarning)
+        module = torch.jit.load(str(path), map_location="cpu")  # type: ignore[no-untyped-call]
+    return source_of(module, path.stem)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# torch.export
+
+
+def _load_exported(path: Path) -> Source:
+    with _damaged(path, "torch.export"), _no_unpickling(), _quiet_export(), path.open("rb") as file:
+        program = torch.export.load(file)
+        module = program.module()
+    return source_of(module, path.stem, **_signature(program, path.stem))
+
+
+def _signature(program: torch.export.ExportedProgram, name: str) -> dict[str, Any]:
+    """Return the fields of `Source` that the program's signature tells: input size, layout, batch limits, dtype."""
+    inputs = program.graph_signature.user_inputs
+    nodes = {node.name: node for node in program.graph.nodes if node.op == "placeholder"}
+    values = [nodes[key].meta.get("val") for key in inputs if key in nodes]
+    if len(values) != 1 or not isinstance(values[0], torch.Tensor) or values[0].dim() != 4:
+        raise ModelError(f"model {name}: expected a program with one input, a batch of images of 4 dimensions")
+    value = values[0]
+    if not value.is_floating_point():
+        raise ModelError(f"model {name}: expected a floating-point image as input, the program takes {value.dtype}")
+    fields: dict[str, Any] = {"dtype": value.dtype, "batch_limits": _batch_limits(program, value.shape[0])}
+    fields["layout"] = "NHWC" if value.shape[3] == 3 and value.shape[1] != 3 else "NCHW"
+    height, width = value.shape[1:3] if fields["layout"] == "NHWC" else value.shape[2:4]
+    if isinstance(height, int) and isinstance(width, int):
+        fields["input_size"] = (height, width)
+    return fields
+
+
+def _batch_limits(program: torch.export.ExportedProgram, batch: int | torch.SymInt) -> tuple[int, int]:
+    if isinstance(batch, int):
+        return batch, batch
+    allowed = program.range_constraints.get(batch.node.expr)
+    if allowed is None:
+        return 1, LARGEST_BATCH
+    low = max(int(allowed.lower), 1)
+    return low, max(low, int(min(allowed.upper, LARGEST_BATCH)))
+
+
+@contextlib.contextmanager
+def _damaged(path: Path, kind: str) -> Iterator[None]:
+    """Turn whatever a loader raises into a FileFormatError that names the file."""
+    try:
+        yield
+    except Exception as error:  # loaders raise nearly every type on damaged files
+        raise FileFormatError(
+            f"model file {path}: cannot be read as {kind} with torch {torch.__version__}; damaged, made by another "
+            f"version, or in need of unpickling, which is never done ({first_line(error)})"
+        ) from error
+
+
+@contextlib.contextmanager
+def _no_unpickling() -> Iterator[None]:
+    """Hold `torch.load` to tensors and plain containers: `torch.export.load` else falls back to full unpickling."""
+    changed = {"TORCH_FORCE_WEIGHTS_ONLY_LOAD": "1", "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": None}
+    before = {key: os.environ.get(key) for key in changed}
+    _set_environment(changed)
+    try:
+        yield
+    finally:
+        _set_environment(before)
+
+
+def _set_environment(values: dict[str, str | None]) -> None:
+    for key, value in values.items():
+        if value is None:
+            os.environ.pop(key, None)
+        else:
+            os.environ[key] = value
+
+
+@contextlib.contextmanager
+def _quiet_export() -> Iterator[None]:
+    """Silence the log of `torch.export`, which prints a traceback for files that are refused with a message anyway."""
+    logger = logging.getLogger("torch.export")
+    before = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)

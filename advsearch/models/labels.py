@@ -1,0 +1,201 @@
+"""Label names and label sets: which classes count as right."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from advsearch.errors import FileFormatError, InputError
+
+
+@dataclass(frozen=True)
+class LabelSet:
+    """The classes that count as right for one object ("coffee mug" and "cup" may both be).
+
+    Args:
+        names: the model's full label names, in the order in which they were asked for.
+        indices: the class indices, distinct, in the same order.
+    """
+
+    names: tuple[str, ...]
+    indices: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(self.indices)
+
+    def __contains__(self, index: object) -> bool:
+        return index in self.indices
+
+
+def find_label_set(text: str | int | Sequence[str | int], labels: Sequence[str], *, named: bool = True) -> LabelSet:
+    """Return the classes named by `text`.
+
+    Terms are separated by commas. A term matches a class, whatever its case, if it equals the class's label name or one
+    of the comma-separated synonyms in it ("tench, Tinca tinca"). ``"#504"`` is always a class index; a bare ``"504"``
+    is one unless a label is called that.
+
+    Args:
+        text: the terms, e.g. ``"coffee mug,cup"``, or a sequence of terms and indices.
+        labels: the model's label names in index order.
+        named: False if the names are placeholders, so that messages can say so.
+
+    Raises:
+        InputError: no term, an unknown name (with near matches), a name of several classes (with their indices), an
+            index that the model does not have.
+    """
+    terms = [str(text)] if isinstance(text, (str, int)) else [str(term) for term in text]
+    terms = [term.strip() for joined in terms for term in joined.split(",") if term.strip()]
+    if not terms:
+        raise InputError(f"label: expected at least one label name or class index, got {text!r}")
+    table = _name_table(labels)
+    indices = tuple(dict.fromkeys(_find(term, table, labels, named) for term in terms))
+    return LabelSet(tuple(labels[index] for index in indices), indices)
+
+
+def _find(term: str, table: dict[str, list[int]], labels: Sequence[str], named: bool) -> int:
+    """Return the one class index that `term` stands for."""
+    explicit = re.fullmatch(r"#\s*(-?\d+)", term)
+    if explicit:
+        return _checked_index(int(explicit[1]), labels)
+    found = table.get(_key(term), [])
+    if not found and re.fullmatch(r"-?\d+", term):
+        return _checked_index(int(term), labels)
+    if not found:
+        raise InputError(_unknown(term, table, labels, named))
+    if len(found) > 1:
+        listed = ", ".join(f"#{index} ({labels[index]})" for index in found)
+        raise InputError(f"label {term!r} names {len(found)} classes: {listed}. Give the index, e.g. '#{found[0]}'")
+    return found[0]
+
+
+def _checked_index(index: int, labels: Sequence[str]) -> int:
+    if not 0 <= index < len(labels):
+        raise InputError(f"label: expected a class index from 0 to {len(labels) - 1}, got {index}")
+    return index
+
+
+def _unknown(term: str, table: dict[str, list[int]], labels: Sequence[str], named: bool) -> str:
+    message = f"the model has no label {term!r}."
+    if not named:
+        return (
+            f"{message} Its {len(labels)} classes have no names: give a label file (--labels), or an index such as '#0'"
+        )
+    near = difflib.get_close_matches(_key(term), table, n=4, cutoff=0.6)
+    if near:
+        options = [f"{name!r} (#{table[name][0]})" for name in near]
+        return f"{message} Did you mean {' or '.join(options)}?"
+    shown = ", ".join(labels[:20]) + (", ..." if len(labels) > 20 else "")
+    return f"{message} Its {len(labels)} labels: {shown}"
+
+
+def _key(name: str) -> str:
+    """Return what is compared: folded case, single spaces."""
+    return " ".join(name.casefold().split())
+
+
+def _name_table(labels: Sequence[str]) -> dict[str, list[int]]:
+    """Return, for every full name and every synonym, the class indices that carry it, ascending."""
+    table: dict[str, list[int]] = {}
+    for index, label in enumerate(labels):
+        for name in dict.fromkeys(_key(part) for part in (label, *label.split(","))):
+            if name:
+                table.setdefault(name, []).append(index)
+    return table
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# label files
+
+
+def read_labels(source: str | Path | Sequence[str]) -> tuple[str, ...]:
+    """Return label names in index order.
+
+    Args:
+        source: the names themselves, or a path to a JSON list of names, a JSON object from index to name (every index
+            from 0 on, once), or a text file with one name per line (UTF-8).
+
+    Raises:
+        FileFormatError: the file is missing, empty or something else; the message names it.
+        InputError: `source` is a sequence that holds something other than non-empty strings.
+    """
+    if isinstance(source, (str, Path)):
+        return _read_file(Path(source))
+    if not isinstance(source, Sequence):
+        raise InputError(f"labels: expected a path or a list of names, got {type(source).__name__}")
+    problem = _problem(source)
+    if problem:
+        raise InputError(f"labels: {problem}")
+    return tuple(name.strip() for name in source)
+
+
+def fitting_labels(classes: int, labels: tuple[str, ...] | None, source: str, model: str) -> tuple[str, ...]:
+    """Return the labels, or placeholders for None; InputError (FileFormatError, for a file) if their number is wrong.
+
+    Args:
+        classes: how many the model has.
+        labels: the names.
+        source: where they came from, e.g. ``"label file x.json"``.
+        model: the model's name.
+    """
+    if labels is None:
+        return tuple(f"class {index}" for index in range(classes))
+    if len(labels) == classes:
+        return labels
+    message = (
+        f"{source}: {len(labels)} labels, but model {model} has {classes} classes; give one per class, in index order"
+    )
+    raise FileFormatError(message) if source.startswith("label file") else InputError(message)
+
+
+def _read_file(path: Path) -> tuple[str, ...]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise FileFormatError(f"label file {path}: expected UTF-8 text or JSON, got other bytes") from None
+    except OSError as error:
+        raise FileFormatError(f"label file {path}: cannot be read ({error.strerror or error})") from None
+    if not text.strip():
+        raise FileFormatError(f"label file {path}: expected label names, got an empty file")
+    if path.suffix.lower() == ".json" or text.lstrip()[0] in "[{":
+        names = _from_json(path, text)
+    else:
+        names = [line.strip() for line in text.strip("\r\n").splitlines()]
+    problem = _problem(names)
+    if problem:
+        raise FileFormatError(f"label file {path}: {problem}")
+    return tuple(name.strip() for name in names)
+
+
+def _from_json(path: Path, text: str) -> list[Any]:
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise FileFormatError(f"label file {path}: not valid JSON (line {error.lineno}: {error.msg})") from None
+    if isinstance(data, list):
+        return data
+    if not isinstance(data, dict):
+        raise FileFormatError(f"label file {path}: expected a list of names or an object from index to name")
+    expected = [str(index) for index in range(len(data))]
+    if set(data) != set(expected):
+        raise FileFormatError(
+            f"label file {path}: expected the {len(data)} keys to be the indices 0 to {len(data) - 1}, each once"
+        )
+    return [data[key] for key in expected]
+
+
+def _problem(names: Sequence[Any]) -> str:
+    """Return what is wrong with a list of names, or nothing."""
+    if not names:
+        return "expected label names, got an empty list"
+    for index, name in enumerate(names):
+        if not isinstance(name, str) or not name.strip():
+            return f"expected a name (non-empty text) for class {index}, got {name!r}"
+    return ""

@@ -1,0 +1,170 @@
+"""`load_model`: from what a user names to a `Model`."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.models import files, imported, reference
+from advsearch.models import preprocessing as pre
+from advsearch.models.labels import fitting_labels, read_labels
+from advsearch.models.model import Model
+from advsearch.models.preprocessing import Preprocessing
+from advsearch.models.probe import probe
+from advsearch.models.source import Source, source_of
+
+#: Size of the input where neither the model nor the caller says.
+DEFAULT_INPUT_SIZE = (224, 224)
+
+FORMS = (
+    "A model is 'reference', a file (.pt2 or TorchScript), 'package.module:callable', "
+    "'torchvision:NAME@weights.safetensors', or in Python an nn.Module"
+)
+
+
+def load_model(
+    spec: str | os.PathLike[str] | nn.Module | Model,
+    *,
+    labels: str | os.PathLike[str] | Sequence[str] | None = None,
+    name: str | None = None,
+    input_size: int | Sequence[int] | str | None = None,
+    mean: float | Sequence[float] | str | None = None,
+    std: float | Sequence[float] | str | None = None,
+    value_range: Sequence[float] | str | None = None,
+    layout: str | None = None,
+    channels: str | None = None,
+    max_batch: int | None = None,
+) -> Model:
+    """Load a model, look at its answers once, and return it as a function from images to logits.
+
+    Options left at None take what the model says of itself, else the defaults named here.
+
+    Args:
+        spec: ``"reference"`` (the bundled classifier); a path to a `torch.export` archive (.pt2) or to TorchScript;
+            ``"package.module:callable"``, which returns an `nn.Module` or a `Model`, with ``"@weights.safetensors"`` if
+            wanted; ``"torchvision:NAME@weights.safetensors"``; an `nn.Module` (copied, its weights shared); a `Model`.
+        labels: the label names in index order, or a label file (see `read_labels`). Default "class 0", "class 1", ...
+        name: what to call it in messages and results.
+        input_size: (height, width) in pixels, or one number; default 224.
+        mean: one number, three, or ``"imagenet"``, ``"half"``, ``"clip"``, in units of `value_range`; default 0.
+        std: likewise; default 1. A preset given for one of `mean` and `std` sets both.
+        value_range: (low, high) that black and white are sent to; default (0, 1).
+        layout: ``"NCHW"`` (default) or ``"NHWC"``.
+        channels: ``"RGB"`` (default) or ``"BGR"``.
+        max_batch: the most images at once; default 64, or what the program allows.
+
+    Raises:
+        UnknownNameError: `spec` is a name that means nothing; near matches are given.
+        FileFormatError: a model or label file is missing, empty, truncated, a pickle, or of another kind.
+        InputError: an option is out of range, or the number of labels is not the number of classes.
+        ModelError: the model cannot be built or run, or does not answer with finite logits (N, classes).
+
+    Warns:
+        ModelWarning: see `advsearch.models.probe.probe`.
+    """
+    options = {
+        "input_size": input_size,
+        "mean": mean,
+        "std": std,
+        "value_range": value_range,
+        "layout": layout,
+        "channels": channels,
+        "max_batch": max_batch,
+    }
+    given = {key: value for key, value in options.items() if value is not None}
+    found = _find(spec)
+    if isinstance(found, Model):
+        return _relabelled(found, labels, name, given)
+    changes = _preprocessing(found, given)
+    low, high = found.batch_limits
+    bare = Model(
+        module=found.module,
+        name=name or found.name,
+        labels=(),
+        preprocessing=changes,
+        batch_limits=(low, max(low, min(high, _positive("max_batch", max_batch, high)))),
+        dtype=found.dtype,
+        device=found.device,
+    )
+    return probe(bare, *_labels(labels, found.labels))
+
+
+def _find(spec: object) -> Source | Model:
+    """Return what `spec` names."""
+    if isinstance(spec, Model):
+        return spec
+    if isinstance(spec, nn.Module):
+        return source_of(spec, type(spec).__name__)
+    if isinstance(spec, os.PathLike):
+        return files.load_file(Path(spec))
+    if not isinstance(spec, str):
+        raise InputError(f"model: expected a name, a path, an nn.Module or a Model, got {_described(spec)}. {FORMS}")
+    text = spec.strip()
+    if text == "reference":
+        return reference.load()
+    if text.lower().startswith("torchvision:"):
+        return imported.load_torchvision(text)
+    if re.fullmatch(r"[\w.-]+\.py:[\w.]+", text):
+        raise InputError(f"model {text!r}: write {text.replace('.py:', ':')!r}, without the '.py'")
+    if re.fullmatch(r"[^\W\d][\w.]*:[^\W\d][\w.]*(@.+)?", text):
+        return imported.load_callable(text)
+    if Path(text).suffix.lower() in files.SUFFIXES or "/" in text or os.sep in text or Path(text).exists():
+        return files.load_file(Path(text))
+    raise UnknownNameError("model", text, ["reference", "torchvision:NAME"], FORMS)
+
+
+def _described(spec: object) -> str:
+    return f"the class {spec.__name__} (pass an instance)" if isinstance(spec, type) else type(spec).__name__
+
+
+def _preprocessing(found: Source, given: dict[str, Any]) -> Preprocessing:
+    """Return the source's own preprocessing with the caller's options on top."""
+    fields: dict[str, Any] = {"input_size": found.input_size or DEFAULT_INPUT_SIZE}
+    fields.update({key: getattr(found, key) for key in ("mean", "std", "layout") if getattr(found, key) is not None})
+    fields.update(pre.parse_normalisation(given.get("mean"), given.get("std")))
+    if "input_size" in given:
+        fields["input_size"] = pre.parse_input_size(given["input_size"])
+    if "value_range" in given:
+        fields["value_range"] = pre.parse_value_range(given["value_range"])
+    if "layout" in given:
+        fields["layout"] = pre.parse_choice("layout", given["layout"], pre.LAYOUTS)
+    if "channels" in given:
+        fields["channels"] = pre.parse_choice("channels", given["channels"], pre.CHANNELS)
+    return Preprocessing(**fields)
+
+
+def _labels(given: Any, own: tuple[str, ...] | None) -> tuple[tuple[str, ...] | None, str]:
+    """Return the labels (None for placeholders) and where they came from."""
+    if given is None:
+        return own, "labels of the model"
+    if isinstance(given, (str, os.PathLike)):
+        return read_labels(Path(given)), f"label file {os.fspath(given)}"
+    return read_labels(given), "labels"
+
+
+def _relabelled(model: Model, labels: Any, name: str | None, given: dict[str, Any]) -> Model:
+    """Return a model that was complete already, with other labels or another name at most."""
+    if given:
+        raise InputError(
+            f"model {model.name} brings its own preprocessing: leave out {', '.join(given)}, or load its network anew"
+        )
+    name = name or model.name
+    if labels is None:
+        return dataclasses.replace(model, name=name)
+    names, source = _labels(labels, None)
+    return dataclasses.replace(model, name=name, labels=fitting_labels(model.classes, names, source, name), named=True)
+
+
+def _positive(key: str, value: int | None, default: int) -> int:
+    if value is None:
+        return default
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise InputError(f"{key}: expected a whole number of at least 1, got {value!r}")
+    return value

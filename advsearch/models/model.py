@@ -1,0 +1,158 @@
+"""The model: any network, seen as a differentiable function from display-referred images to logits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, final
+
+import torch
+from torch import Tensor
+
+from advsearch.errors import InputError, ModelError
+from advsearch.models.labels import LabelSet, find_label_set
+from advsearch.models.preprocessing import Preprocessing
+
+CPU = torch.device("cpu")
+
+#: Probabilities below this count as this before the logarithm is taken (its derivative stays finite in float32).
+SMALLEST_PROBABILITY = 1e-30
+
+#: How far outside [0, 1] a pixel may lie (finite differences overshoot a little) before the image is refused.
+RANGE_TOLERANCE = 0.01
+
+
+class ModelWarning(UserWarning):
+    """A model that works, but not as an attack would like it to (probabilities, randomness, no gradient)."""
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A network with everything that is needed to show it an image and read its answer. Made by `load_model`.
+
+    Args:
+        module: the network. It takes what `preprocessing` returns and answers as `logits_of` describes.
+        name: what to call it in messages and results.
+        labels: one name per class, in index order.
+        preprocessing: what happens to an image first.
+        batch_limits: (fewest, most) images that the network takes at once. Larger batches are cut, smaller ones padded.
+        probabilities: the network answers with probabilities; their logarithm is returned: differences are log-odds.
+        differentiable: a gradient of the logits reaches the image.
+        named: False if `labels` are placeholders.
+        dtype: the type of the network's floating-point input.
+        device: where the network lives. Images go there, logits come back.
+    """
+
+    module: Callable[[Tensor], Any] = field(repr=False)
+    name: str
+    labels: tuple[str, ...] = field(repr=False)
+    preprocessing: Preprocessing
+    batch_limits: tuple[int, int] = (1, 64)
+    probabilities: bool = False
+    differentiable: bool = True
+    named: bool = True
+    dtype: torch.dtype = torch.float32
+    device: torch.device = CPU
+
+    @property
+    def input_size(self) -> tuple[int, int]:
+        """(height, width) in pixels of the images that the network takes; others are resized."""
+        return self.preprocessing.input_size
+
+    @property
+    def classes(self) -> int:
+        """The number of classes."""
+        return len(self.labels)
+
+    def __call__(self, images: Tensor) -> Tensor:
+        """Return the logits of one image or a batch; differentiable with respect to the images.
+
+        Args:
+            images: (H, W, 3) or (N, H, W, 3), floating, display-referred sRGB in [0, 1]. Non-finite values pass
+                through: they are the search's to handle.
+
+        Returns:
+            Logits (N, classes), float32, on the device of the images; N is 1 for a single image. Of a network that
+            answers with probabilities p, log p.
+
+        Raises:
+            InputError: not an image, or values that are clearly not in [0, 1].
+            ModelError: the network's answer is not (N, classes).
+        """
+        images = checked_images(images)
+        low, high = self.batch_limits
+        parts = [self._logits(part, low) for part in torch.split(images, high)]
+        logits = parts[0] if len(parts) == 1 else torch.cat(parts)
+        return logits.to(images.device)
+
+    def label_set(self, text: str | int | Sequence[str | int]) -> LabelSet:
+        """Return the classes that `text` names, e.g. ``"coffee mug,cup"`` or ``"#504"``; see `find_label_set`."""
+        return find_label_set(text, self.labels, named=self.named)
+
+    def _logits(self, images: Tensor, fewest: int) -> Tensor:
+        """Return the logits of a batch that is at most as large as the network takes."""
+        count = len(images)
+        if count < fewest:
+            images = torch.cat([images, images[-1:].expand(fewest - count, -1, -1, -1)])
+        x = self.preprocessing(images.to(device=self.device, dtype=torch.float32)).to(self.dtype)
+        logits = logits_of(self.module(x), len(images), self.classes, self.name)[:count]
+        return logits.clamp_min(SMALLEST_PROBABILITY).log() if self.probabilities else logits
+
+
+def checked_images(images: Tensor) -> Tensor:
+    """Return images as (N, H, W, 3); InputError for what is not an image in [0, 1]."""
+    expected = "images: expected a floating-point tensor (H, W, 3) or (N, H, W, 3) in [0, 1]"
+    if not isinstance(images, Tensor):
+        raise InputError(f"{expected}, got {type(images).__name__}; convert it with torch.from_numpy")
+    if images.dim() not in (3, 4) or images.shape[-1] != 3 or 0 in images.shape:
+        raise InputError(f"{expected}, got the shape {tuple(images.shape)}; channels come last")
+    if not images.is_floating_point():
+        raise InputError(f"{expected}, got {images.dtype}; divide 8-bit values by 255")
+    low, high = (float(end) for end in images.detach().aminmax())
+    if -float("inf") < low < -RANGE_TOLERANCE or 1 + RANGE_TOLERANCE < high < float("inf"):
+        raise InputError(
+            f"{expected}, got values from {low:.4g} to {high:.4g}; `value_range` is for the network's side"
+        )
+    return images if images.dim() == 4 else images.unsqueeze(0)
+
+
+def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor:
+    """Return the logits (count, classes) float32 in what a network answered.
+
+    Accepted are a tensor, an object with a tensor `logits`, a mapping with a tensor ``"logits"``, and a tuple or list
+    whose first element is a tensor.
+
+    Raises:
+        ModelError: there is no such tensor, or its shape or type is not that of logits.
+    """
+    tensor = _tensor_in(output)
+    expected = f"model {name}: expected logits of shape ({count}, {classes or 'classes'})"
+    if tensor is None:
+        raise ModelError(f"{expected}, got {type(output).__name__}; wrap the network so that it returns one tensor")
+    got = tuple(tensor.shape)
+    if len(got) != 2 or got[0] != count or got[1] < 2 or (classes is not None and got[1] != classes):
+        raise ModelError(f"{expected}, got {got}; {_advice(got)}")
+    if not tensor.is_floating_point():
+        raise ModelError(f"{expected} and floating type, got {tensor.dtype}; return scores, not the predicted class")
+    return tensor.float()
+
+
+def _tensor_in(output: Any) -> Tensor | None:
+    if isinstance(output, Mapping):
+        output = output.get("logits")
+    elif not isinstance(output, Tensor) and hasattr(output, "logits"):
+        output = output.logits
+    elif isinstance(output, (tuple, list)) and output:
+        output = output[0]
+    return output if isinstance(output, Tensor) else None
+
+
+def _advice(got: tuple[int, ...]) -> str:
+    if len(got) > 2:
+        return "these look like feature maps: pass a classifier, or wrap the network to pool its output"
+    if len(got) == 2 and got[1] == 1:
+        return "one score is not enough: wrap the network to return a score for each of the two classes"
+    if len(got) == 1:
+        return "the network dropped its batch dimension: wrap it to keep it"
+    return "wrap the network so that it returns one row of scores per image"

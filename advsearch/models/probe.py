@@ -1,0 +1,147 @@
+"""Look at a network once, before anyone trusts its answers: two images, a repetition, a pair, a gradient."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch.errors import ModelError
+from advsearch.models.labels import fitting_labels
+from advsearch.models.model import Model, ModelWarning, logits_of
+
+#: Rows that are non-negative and sum to 1 within this are taken for probabilities.
+PROBABILITY_TOLERANCE = 1e-3
+
+#: Two answers are the same if they differ by less than this times the largest logit (float32 kernels differ by 1e-6).
+REPEAT_TOLERANCE = 1e-3
+
+
+def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> Model:
+    """Return the model with `labels`, `probabilities`, `differentiable` and `batch_limits` set from what it does.
+
+    It is shown a grey image and one of uniform noise. The idea of looking for probabilities, randomness and missing
+    gradients before an attack is AutoAttack's (Croce and Hein 2020, the flags of its reference implementation).
+
+    Args:
+        model: a model whose `labels` are not yet known; they are ignored.
+        labels: one name per class, or None for placeholders ("class 0").
+        labels_source: where the labels came from, for the message when their number is wrong.
+
+    Raises:
+        ModelError: it cannot be run on such an image, answers something other than logits, or with NaN or infinity.
+        InputError: the number of labels is not the number of classes.
+
+    Warns:
+        ModelWarning: it answers with probabilities, differently every time, differently in a batch, or no gradient
+            reaches the image.
+    """
+    grey, noise = _test_images(model)
+    with torch.no_grad():
+        rows = torch.cat([_run(model, grey), _run(model, noise)])
+        again = _run(model, grey)
+    if not bool(torch.isfinite(rows).all()):
+        which = "grey" if not bool(torch.isfinite(rows[0]).all()) else "noise"
+        raise ModelError(
+            f"model {model.name}: expected finite logits, got NaN or infinity for a {which} image; "
+            "check its weights and the value range and normalisation that it expects"
+        )
+    found = fitting_labels(rows.shape[1], labels, labels_source, model.name)
+    fields: dict[str, Any] = {"labels": found, "named": labels is not None, "probabilities": _probabilities(rows)}
+    if fields["probabilities"]:
+        _warn(
+            f"model {model.name} answers with probabilities. Their logarithm is used, so that margins are log-odds, "
+            "but gradients vanish where a probability rounds to 0 or 1: remove the final softmax if you can"
+        )
+    repeatable = _same(rows[:1], again)
+    if not repeatable:
+        _warn(f"model {model.name} answers the same image differently each time: results hold for single draws only")
+    fields["batch_limits"] = _batch_limits(model, torch.cat([grey, noise]), rows if repeatable else None)
+    fields["differentiable"] = _gradient_reaches(model, noise)
+    return dataclasses.replace(model, **fields)
+
+
+def _test_images(model: Model) -> tuple[Tensor, Tensor]:
+    """Return a grey and a noise image, each (1, H, W, 3) in [0, 1]."""
+    shape = (1, *model.input_size, 3)
+    return torch.full(shape, 0.5), torch.rand(shape, generator=torch.Generator().manual_seed(0))
+
+
+def _run(model: Model, images: Tensor) -> Tensor:
+    """Return the raw answer of the network for images (N, H, W, 3) as (N, classes) float32 on the CPU."""
+    padded = torch.cat([images, images[-1:].expand(max(model.batch_limits[0] - len(images), 0), -1, -1, -1)])
+    x = model.preprocessing(padded.to(model.device)).to(model.dtype)
+    output = _guarded(model, lambda: model.module(x))
+    return logits_of(output, len(padded), None, model.name)[: len(images)].cpu()
+
+
+def _guarded(model: Model, call: Callable[[], Any]) -> Any:
+    """Return what the foreign network returns; whatever it raises becomes a ModelError with advice."""
+    try:
+        return call()
+    except Exception as error:  # any network may raise anything
+        height, width = model.input_size
+        preprocessing = model.preprocessing
+        raise ModelError(
+            f"model {model.name}: cannot be run on a {preprocessing.channels} image of {height} x {width} pixels in "
+            f"layout {preprocessing.layout} ({first_line(error)}). Give the `input_size` and "
+            "`layout` that it was made for"
+        ) from error
+
+
+def _probabilities(rows: Tensor) -> bool:
+    sums = rows.sum(dim=1)
+    return bool((rows >= 0).all()) and bool(((sums - 1).abs() < PROBABILITY_TOLERANCE).all())
+
+
+def _same(a: Tensor, b: Tensor) -> bool:
+    return bool((a - b).abs().amax() <= REPEAT_TOLERANCE * a.abs().amax().clamp_min(1e-6))
+
+
+def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int, int]:
+    """Return the batch limits, lowered to one image at a time if the network does not take two."""
+    low, high = model.batch_limits
+    if high < 2:
+        return low, high
+    try:
+        with torch.no_grad():
+            together = _run(model, pair)
+    except ModelError:
+        return 1, 1
+    if rows is not None and not _same(rows, together):
+        _warn(
+            f"model {model.name} answers an image differently in a batch: was it exported in training mode? "
+            "Call .eval() before exporting"
+        )
+    return low, high
+
+
+def _gradient_reaches(model: Model, images: Tensor) -> bool:
+    """Return whether a gradient of the logits reaches the image; warn if not."""
+    leaf = images.clone().requires_grad_()
+    try:
+        with torch.enable_grad():
+            logits = _run(model, leaf)
+            weights = torch.linspace(-1.0, 1.0, logits.shape[1])
+            gradient = torch.autograd.grad((logits * weights).sum(), leaf)[0]
+        reaches, why = bool((gradient != 0).any()), "it is zero everywhere"
+    except (RuntimeError, ModelError) as error:
+        reaches, why = False, first_line(error)
+    if not reaches:
+        _warn(f"no gradient of model {model.name} reaches its image ({why}): use a policy without gradients")
+    return reaches
+
+
+def first_line(error: BaseException) -> str:
+    """Return a foreign error as one short line."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    text = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
+    return text if len(text) <= 300 else text[:297] + "..."
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, ModelWarning, stacklevel=4)

@@ -1,0 +1,197 @@
+"""The bundled reference classifier: a small residual network for images of 128 x 128 pixels.
+
+Plain on purpose: it is the victim, not the method. 1.2 million parameters, 4.7 MB in float32, about 65 million
+multiply-adds an image. SiLU instead of ReLU keeps the logits smooth in the image, so that gradients mean something.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors import torch as safetensors
+from torch import Tensor, nn
+from torch.nn.utils import fuse_conv_bn_eval
+
+from advsearch.errors import ModelError
+from advsearch.models.model import Model
+from advsearch.models.preprocessing import Preprocessing
+from advsearch.models.probe import probe
+from advsearch.models.source import source_of
+
+INPUT_SIZE = (128, 128)
+STEM = 24
+WIDTHS = (32, 64, 128, 192)
+DEPTHS = (1, 1, 2, 1)
+
+#: Mean and standard deviation of display-referred values; one pair for all channels is enough.
+MEAN, STD = 0.45, 0.25
+
+WEIGHTS, RECORD = "reference.safetensors", "reference.json"
+REMEDY = "run `make reference` to train it, or install a release, which contains it"
+
+
+class ReferenceNet(nn.Module):
+    """A residual network: stem of stride 2, four stages of strides 4 to 32, average pooling, dropout, a linear layer.
+
+    Args:
+        classes: number of classes, at least 2.
+        dropout: probability that a pooled feature is dropped in training.
+    """
+
+    def __init__(self, classes: int, *, dropout: float = 0.1) -> None:
+        super().__init__()
+        layers: list[nn.Module] = [_Convolution(3, STEM, 5, stride=2), nn.SiLU()]
+        width = STEM
+        for wider, depth in zip(WIDTHS, DEPTHS, strict=True):
+            for position in range(depth):
+                layers.append(_Residual(width, wider, stride=2 if position == 0 else 1))
+                width = wider
+        self.features = nn.Sequential(*layers)
+        self.dropout = nn.Dropout(dropout)
+        self.head = nn.Linear(width, classes)
+        self._initialise()
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Return logits (N, classes) of images (N, 3, H, W), display-referred sRGB in [0, 1]; H and W at least 32."""
+        x = ((images - MEAN) * (1.0 / STD)).contiguous(memory_format=torch.channels_last)
+        features: Tensor = self.features(x).mean(dim=(2, 3))
+        logits: Tensor = self.head(self.dropout(features))
+        return logits
+
+    def _initialise(self) -> None:
+        """He initialisation; every residual branch starts at zero, so that the network starts shallow."""
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+            elif isinstance(module, _Residual):
+                nn.init.constant_(module.second.normalise.get_parameter("weight"), 0.0)
+        nn.init.normal_(self.head.weight, std=0.01)
+        nn.init.zeros_(self.head.bias)
+
+
+class _Convolution(nn.Module):
+    """A convolution without bias, then batch normalisation."""
+
+    def __init__(self, inputs: int, outputs: int, size: int, *, stride: int = 1) -> None:
+        super().__init__()
+        self.convolve = nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False)
+        self.normalise: nn.BatchNorm2d | nn.Identity = nn.BatchNorm2d(outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        result: Tensor = self.normalise(self.convolve(x))
+        return result
+
+    def fold(self) -> None:
+        """Merge the normalisation into the convolution (inference only)."""
+        if isinstance(self.normalise, nn.BatchNorm2d):
+            self.convolve = fuse_conv_bn_eval(self.convolve, self.normalise)
+            self.normalise = nn.Identity()
+
+
+class _Residual(nn.Module):
+    """Two 3 x 3 convolutions beside a shortcut, which is average-pooled and projected where the shape changes."""
+
+    def __init__(self, inputs: int, outputs: int, *, stride: int) -> None:
+        super().__init__()
+        self.first = _Convolution(inputs, outputs, 3, stride=stride)
+        self.second = _Convolution(outputs, outputs, 3)
+        shortcut: list[nn.Module] = [nn.AvgPool2d(stride)] if stride > 1 else []
+        if inputs != outputs:
+            shortcut.append(_Convolution(inputs, outputs, 1))
+        self.shortcut = nn.Sequential(*shortcut)
+        self.activation = nn.SiLU()
+
+    def forward(self, x: Tensor) -> Tensor:
+        branch = self.second(self.activation(self.first(x)))
+        result: Tensor = self.activation(branch + self.shortcut(x))
+        return result
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# making, folding, storing, loading
+
+
+def build(classes: int, *, dropout: float = 0.1) -> ReferenceNet:
+    """Return an untrained network in channels-last memory format; weights come from torch's current random state."""
+    if classes < 2:
+        raise ModelError(f"reference network: expected at least 2 classes, got {classes}")
+    return ReferenceNet(classes, dropout=dropout).to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
+
+
+def folded(net: ReferenceNet) -> ReferenceNet:
+    """Return a copy for inference: evaluation mode, normalisation merged into the convolutions, parameters frozen."""
+    copied = copy.deepcopy(net).eval().requires_grad_(False)
+    for module in copied.modules():
+        if isinstance(module, _Convolution):
+            module.fold()
+    return copied.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
+
+
+def with_temperature(state: Mapping[str, Tensor], temperature: float) -> dict[str, Tensor]:
+    """Return the state dict whose logits are those of `state` divided by the temperature (greater than 0)."""
+    if not (math.isfinite(temperature) and temperature > 0):
+        raise ModelError(f"temperature: expected a finite number greater than 0, got {temperature}")
+    scaled = ("head.weight", "head.bias")
+    return {key: value / temperature if key in scaled else value for key, value in state.items()}
+
+
+def save(
+    folder: Path, state: Mapping[str, Tensor], labels: Sequence[str], figures: Mapping[str, Any] | None = None
+) -> tuple[Path, Path]:
+    """Write ``reference.safetensors`` and ``reference.json`` to a folder and return the two paths.
+
+    Args:
+        folder: an existing folder; that of the package is `data_folder()`.
+        state: the state dict of a `ReferenceNet` for ``len(labels)`` classes.
+        labels: the label names in index order.
+        figures: what is known of it (accuracy, calibration, seed, ...), kept in the record as it is.
+    """
+    net = build(len(labels))
+    net.load_state_dict(dict(state))
+    weights, record = folder / WEIGHTS, folder / RECORD
+    tensors = {key: value.contiguous() for key, value in net.state_dict().items()}
+    weights.write_bytes(safetensors.save(tensors))
+    content = {"schema": 1, "labels": list(labels), "input_size": list(INPUT_SIZE), "figures": dict(figures or {})}
+    record.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    return weights, record
+
+
+def data_folder() -> Path:
+    """Return the folder of the installed package that holds the weights."""
+    return Path(str(resources.files("advsearch.models").joinpath("data")))
+
+
+def load(folder: Path | None = None) -> Model:
+    """Return the model "reference" with its labels.
+
+    Args:
+        folder: where the two files are; default the package's own.
+
+    Raises:
+        ModelError: they are missing, damaged, or do not fit this version's network.
+    """
+    folder = folder or data_folder()
+    try:
+        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        labels = tuple(str(label) for label in record["labels"])
+        state = safetensors.load((folder / WEIGHTS).read_bytes())
+    except FileNotFoundError as error:
+        raise ModelError(f"the reference model is not there ({error.filename}); {REMEDY}") from None
+    except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
+        raise ModelError(f"the reference model in {folder} cannot be read ({error}); {REMEDY}") from None
+    net = build(len(labels))
+    try:
+        net.load_state_dict(state)
+    except RuntimeError as error:
+        raise ModelError(f"the weights in {folder / WEIGHTS} are of another network; {REMEDY}") from error
+    source = source_of(folded(net), "reference")
+    bare = Model(source.module, source.name, (), Preprocessing(INPUT_SIZE))
+    return probe(bare, labels, "labels of the reference model")

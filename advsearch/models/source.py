@@ -1,0 +1,128 @@
+"""What a loader hands over: a network that is ready to be asked, and what its file or maker says about it."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import nn
+
+from advsearch.errors import FileFormatError, ModelError
+from advsearch.models.model import CPU, ModelWarning
+from advsearch.models.preprocessing import Triple
+from advsearch.models.probe import first_line
+
+
+@dataclass(frozen=True)
+class Source:
+    """A frozen network and its own defaults, which the caller's options override.
+
+    Args:
+        module: the network, in evaluation mode, its parameters without gradients.
+        name: what to call it.
+        input_size, mean, std, layout, labels: as in `load_model`; None where the source does not say.
+        batch_limits: (fewest, most) images at once.
+        dtype: floating type of the input.
+        device: where its weights are.
+    """
+
+    module: Callable[[torch.Tensor], Any]
+    name: str
+    input_size: tuple[int, int] | None = None
+    mean: Triple | None = None
+    std: Triple | None = None
+    layout: str | None = None
+    labels: tuple[str, ...] | None = None
+    batch_limits: tuple[int, int] = (1, 64)
+    dtype: torch.dtype = torch.float32
+    device: torch.device = CPU
+
+
+def source_of(module: nn.Module, name: str, **fields: Any) -> Source:
+    """Return a source with the module frozen, its type and device read off its parameters; `fields` go to `Source`."""
+    placed = next((p for p in (*module.parameters(), *module.buffers()) if p.is_floating_point()), None)
+    if placed is not None:
+        fields = {"dtype": placed.dtype, "device": placed.device, **fields}
+    return Source(frozen(module, name), name, **fields)
+
+
+def frozen(module: nn.Module, name: str) -> nn.Module:
+    """Return the module in evaluation mode, with parameters that collect no gradient.
+
+    An ordinary module is copied, except for its weights, which the copy shares: the caller may go on training the
+    original, and the copy sees the new weights as long as they are changed in place (as optimisers do). Exported and
+    scripted programs, and modules that cannot be copied (with a warning), are frozen themselves.
+    """
+    if not isinstance(module, (torch.fx.GraphModule, torch.jit.ScriptModule)):
+        try:
+            module = _sharing_copy(module)
+        except (
+            TypeError,
+            AttributeError,
+            RuntimeError,
+            pickle.PickleError,
+            copy.Error,
+        ) as error:  # locks, files, handles
+            warnings.warn(
+                f"model {name} cannot be copied ({first_line(error)}): the module itself is set to evaluation mode and "
+                "its parameters are frozen",
+                ModelWarning,
+                stacklevel=3,
+            )
+    try:
+        module.eval()
+    except NotImplementedError:  # programs of torch.export have no modes
+        pass
+    for parameter in module.parameters():
+        parameter.requires_grad_(False)
+    return module
+
+
+def _sharing_copy(module: nn.Module) -> nn.Module:
+    memo: dict[int, Any] = {id(p): nn.Parameter(p.detach(), requires_grad=False) for p in module.parameters()}
+    memo.update({id(buffer): buffer for buffer in module.buffers()})
+    return copy.deepcopy(module, memo)
+
+
+def load_weights(module: nn.Module, path: Path, name: str) -> None:
+    """Load a safetensors file into the module; its keys and shapes must be the module's own.
+
+    Raises:
+        FileFormatError: the file is missing or is not safetensors.
+        ModelError: keys or shapes do not fit.
+    """
+    if not path.is_file():
+        raise FileFormatError(f"weights {path} of model {name}: no such file")
+    try:
+        state = load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise FileFormatError(
+            f"weights {path} of model {name}: expected a complete safetensors file ({first_line(error)}); "
+            "make one with safetensors.torch.save_file(module.state_dict(), path)"
+        ) from None
+    own = module.state_dict()
+    missing = [key for key in own if key not in state and not key.endswith("num_batches_tracked")]
+    unexpected = [key for key in state if key not in own]
+    shapes = [
+        f"{key} is {tuple(state[key].shape)} in the file and {tuple(own[key].shape)} in the network"
+        for key in own
+        if key in state and state[key].shape != own[key].shape
+    ]
+    problems = [*_some("missing", missing), *_some("not in the network", unexpected), *shapes[:2]]
+    if problems:
+        raise ModelError(f"weights {path} do not fit model {name}: {'; '.join(problems)}")
+    module.load_state_dict(state, strict=False)
+
+
+def _some(what: str, keys: list[str]) -> list[str]:
+    if not keys:
+        return []
+    return [f"{len(keys)} {what} ({', '.join(keys[:3])}{', ...' if len(keys) > 3 else ''})"]

@@ -1,0 +1,283 @@
+"""`report.html`: one self-contained page about one run. No scripts, no links to elsewhere."""
+
+from __future__ import annotations
+
+import base64
+import re
+import shlex
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from advsearch import __version__
+from advsearch.report import wording
+from advsearch.report.charts import Curve, interval_bar, objective_chart
+from advsearch.report.markup import Html, element, join
+from advsearch.report.style import CSS
+from advsearch.runs import directory, images, store
+from advsearch.runs.files import write_text
+from advsearch.runs.summary import read_summary
+
+LARGE_PICTURE = 1_000_000
+"""Bytes above which a PNG is put into the page at a smaller size; the file itself stays as it is."""
+
+SMALLER_SIDE = 640
+"""Longest side in pixels of such a smaller picture."""
+
+MOST_TRIALS = 24
+"""Pictures of the verification that the page shows."""
+
+_KINDS = {".png": "image/png", ".gif": "image/gif"}
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+
+
+@dataclass(frozen=True)
+class RunData:
+    """What a run left behind, as far as the page shows it.
+
+    Attributes:
+        path: the run directory.
+        summary: of `summary.json`.
+        recipe: the text of `run.yaml`; empty when there is none.
+        pictures: path inside the run directory to a data URL, sorted.
+        curves: kind of evaluation to its objectives in order.
+    """
+
+    path: Path
+    summary: Mapping[str, Any]
+    recipe: str
+    pictures: Mapping[str, str]
+    curves: Mapping[str, list[float | None]]
+
+
+def write_report(run: str | Path) -> Path:
+    """Write `report.html` into the directory of a run that has its summary, and return its path.
+
+    Raises:
+        FileFormatError: there is no summary, or the results are damaged.
+        StorageError: the page cannot be written.
+    """
+    data = read_run(Path(run))
+    return write_text(data.path / directory.REPORT, page(data), durable=False)
+
+
+def read_run(path: Path) -> RunData:
+    """Return what the run in `path` left behind; errors as for `write_report`."""
+    recipe = path / directory.CONFIG
+    return RunData(
+        path=path,
+        summary=read_summary(path),
+        recipe=recipe.read_text(encoding="utf-8", errors="replace") if recipe.is_file() else "",
+        pictures=_read_pictures(path),
+        curves=_read_curves(path / store.NAME),
+    )
+
+
+def page(data: RunData) -> str:
+    """Return the page as HTML."""
+    summary = data.summary
+    head = element(
+        "head",
+        element("meta", charset="utf-8"),
+        element("meta", http_equiv="Content-Security-Policy", content=_POLICY),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("meta", name="color-scheme", content="light dark"),
+        element("title", f"{wording.title(summary)} - advsearch"),
+        element("style", Html(CSS)),
+    )
+    main = element(
+        "main",
+        _pictures(data),
+        _textures(data),
+        _rates(summary),
+        _curve(data),
+        _cost(summary),
+        _repeat(data),
+    )
+    footer = element("footer", f"advsearch {__version__}, run {data.path.name}. This page needs no other file.")
+    body = Html(re.sub(r"(\d) %", r"\1&nbsp;%", element("body", _header(summary), main, footer)))
+    return "<!doctype html>\n" + element("html", head, body, lang="en") + "\n"
+
+
+def _header(summary: Mapping[str, Any]) -> Html:
+    remarks = [element("li", text) for text in wording.remarks(summary)]
+    model, environment = (wording.short_name(summary.get(name)) for name in ("model", "environment"))
+    what = f"{wording.budget_text(summary)}; object {wording.noun(summary)}, environment {environment}, model {model}"
+    return element(
+        "header",
+        element("p", what, class_="eyebrow"),
+        element("h1", wording.verdict(summary)),
+        element("ul", *remarks, class_="remarks") if remarks else None,
+    )
+
+
+def _pictures(data: RunData) -> Html:
+    clean, adversarial = data.summary.get("clean"), data.summary.get("adversarial")
+    gain = f"{images.DIFFERENCE_GAIN:g} times magnified, grey where nothing changed"
+    shown = [
+        _figure(data, "images/clean.png", "Clean", _answer(clean)),
+        _figure(data, "images/adversarial.png", "Adversarial", _answer(adversarial)),
+        _figure(data, "images/difference.png", "Difference", gain),
+    ]
+    trials = [name for name in data.pictures if name.startswith("images/verification")][:MOST_TRIALS]
+    animation = _figure(data, "images/search.gif", "", "from the first step to the last")
+    return join(
+        _section("What the model sees", shown),
+        _details("Pictures of the verification", [_figure(data, name, "", _trial(name)) for name in trials], "small"),
+        _details("The search as an animation", [animation], "single"),
+    )
+
+
+def _textures(data: RunData) -> Html:
+    original = _figure(data, "artifacts/texture-original.png", "Original", "texture as it was")
+    changed = _figure(data, "artifacts/texture.png", "Adversarial", "texture that was found; artifacts/texture.png")
+    return _section("The texture", [original, changed], "pair")
+
+
+def _rates(summary: Mapping[str, Any]) -> Html:
+    control = dict((summary.get("clean") or {}).get("control") or {})
+    baseline = summary.get("baseline") or {}
+    rows = [
+        ("Clean scene (control group)", "right", control, control.get("correct")),
+        ("Adversarial", "wrong", summary.get("verified") or {}, None),
+        (f"{str(baseline.get('policy', 'random')).capitalize()} search", "wrong", baseline.get("verified") or {}, None),
+    ]
+    lines = [
+        element(
+            "tr",
+            element("th", name, scope="row"),
+            element("td", what),
+            element(
+                "td", f"{rated.get('successes') if right is None else right} of {rated['trials']}", class_="number"
+            ),
+            element("td", wording.interval_text(rated), class_="number"),
+            element("td", interval_bar(rated), class_="hide-small"),
+        )
+        for name, what, rated, right in rows
+        if rated.get("trials")
+    ]
+    if not lines:
+        return Html("")
+    heads = ("Configuration", "Model is", "Renders", "95 % interval")
+    head = element("tr", *(element("th", text, scope="col") for text in heads), element("th", "", class_="hide-small"))
+    spp = (summary.get("verified") or {}).get("spp")
+    note = "Fresh seeds, pictures rounded to 8 bits, Clopper-Pearson intervals"
+    return join(
+        element("h2", "Verified rates"),
+        element("div", element("table", element("thead", head), element("tbody", *lines)), class_="scroll"),
+        element("p", note + (f", {spp} samples per pixel." if spp else "."), class_="soft"),
+    )
+
+
+def _curve(data: RunData) -> Html:
+    known = (("search", str(data.summary.get("policy", "search"))), ("baseline", "random"))
+    curves = [
+        Curve(name, kind, data.curves[kind])
+        for kind, name in known
+        if any(value is not None for value in data.curves.get(kind, ()))
+    ]
+    if not curves:
+        return Html("")
+    objective = str(data.summary.get("objective", "objective"))
+    chart = objective_chart(curves, objective, "above: wrong" if objective == "margin" else "")
+    note = "Lines: the best so far. Dots: each evaluation. These are the search's claims; the table above is verified."
+    return join(
+        element("h2", "The search"),
+        element("div", chart, class_="scroll", tabindex="0", role="region", aria_label="Chart of the search"),
+        element("p", note, class_="soft"),
+    )
+
+
+def _cost(summary: Mapping[str, Any]) -> Html:
+    seconds = summary.get("seconds") or {}
+    parts = ", ".join(f"{name} {wording.seconds_text(value)}" for name, value in seconds.items() if name != "total")
+    total = wording.seconds_text(seconds.get("total"))
+    facts = {
+        "Ending": summary.get("ending"),
+        "Policy": f"{summary.get('policy')}, {wording.count(summary.get('steps'), 'step')}",
+        "Budget": wording.budget_text(summary),
+        "Renders": wording.renders_text(summary),
+        "Time": f"{total} ({parts})" if parts else total,
+        "Image formation": wording.formation_text(summary),
+        "Object": summary.get("object"),
+        "Environment": summary.get("environment"),
+        "Model": summary.get("model"),
+        "Seed": summary.get("seed"),
+    }
+    return join(element("h2", "Cost and conditions"), _table_of_facts(facts))
+
+
+def _repeat(data: RunData) -> Html:
+    commands = [shlex.join(["advsearch", "run", f"{data.summary.get('run') or data.path}/{directory.CONFIG}"])]
+    if data.summary.get("command_line"):
+        commands.append(str(data.summary["command_line"]))
+    recipe = (
+        element("details", element("summary", "All settings"), element("pre", data.recipe)) if data.recipe else None
+    )
+    return join(element("h2", "Do it again"), *(element("pre", text, class_="wrap") for text in commands), recipe)
+
+
+def _section(heading: str, figures: Iterable[Html | None], css: str = "") -> Html:
+    shown = [figure for figure in figures if figure is not None]
+    if not shown:
+        return Html("")
+    return join(element("h2", heading), element("div", *shown, class_=f"pictures {css}".strip()))
+
+
+def _details(heading: str, figures: Iterable[Html | None], css: str = "") -> Html:
+    shown = [figure for figure in figures if figure is not None]
+    if not shown:
+        return Html("")
+    pictures = element("div", *shown, class_=f"pictures {css}".strip())
+    return element("details", element("summary", heading), pictures)
+
+
+def _figure(data: RunData, name: str, heading: str, caption: str) -> Html | None:
+    if name not in data.pictures:
+        return None
+    picture = element("img", src=data.pictures[name], alt=": ".join(filter(None, (heading, caption))))
+    label = element("strong", heading) if heading else None
+    return element("figure", picture, element("figcaption", label, ": " if heading else None, caption))
+
+
+def _answer(answer: Any) -> str:
+    if not answer or answer.get("label") is None:
+        return "no answer recorded"
+    return f"{answer['label']}, {wording.percent(answer.get('probability'))}"
+
+
+def _trial(name: str) -> str:
+    return "trial " + Path(name).stem.removeprefix("verification").strip("-_")
+
+
+def _table_of_facts(facts: Mapping[str, Any]) -> Html:
+    lines = [
+        element("tr", element("th", name, scope="row"), element("td", str(value)))
+        for name, value in facts.items()
+        if value not in (None, "")
+    ]
+    return element("table", element("tbody", *lines), class_="facts")
+
+
+def _read_pictures(path: Path) -> dict[str, str]:
+    """Return a data URL for each picture of the run."""
+    found = sorted(
+        file for folder in (directory.IMAGES, directory.ARTIFACTS) for file in (path / folder).glob("*.*")
+        if file.suffix in _KINDS and file.is_file()
+    )  # fmt: skip
+    return {file.relative_to(path).as_posix(): _data_url(file) for file in found}
+
+
+def _data_url(file: Path) -> str:
+    data = file.read_bytes()
+    if len(data) > LARGE_PICTURE and file.suffix == ".png":
+        data = images.smaller_png(data, SMALLER_SIDE)
+    return f"data:{_KINDS[file.suffix]};base64,{base64.b64encode(data).decode('ascii')}"
+
+
+def _read_curves(path: Path) -> dict[str, list[float | None]]:
+    if not path.is_file():
+        return {}
+    with store.Store(path, read_only=True) as results:
+        return {kind: [value for _, value in results.curve(kind)] for kind in ("search", "baseline")}

@@ -1,0 +1,187 @@
+"""The sentences and numbers of a summary (DESIGN 6) in plain words, for the final table and the report alike."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import PurePath
+from typing import Any
+
+Summary = Mapping[str, Any]
+
+NO_INTERVAL = "no interval"
+
+_REASONS = {
+    "budget spent": "The budget is spent.",
+    "stalled": "The policy had nothing more to propose.",
+    "non-finite objective": "The objective was not a number several times in a row.",
+}
+"""Why a search ended without an answer, where the name of the ending doesn't say it."""
+
+
+def verdict(summary: Summary) -> str:
+    """Return what the run found, in one sentence that holds on its own."""
+    ending = str(summary.get("ending") or "the run ended")
+    thing = f"this {noun(summary)}"
+    verified = summary.get("verified") or {}
+    if ending == "already wrong":
+        wrong = _called(summary.get("clean"))
+        return f"The model already calls {thing} {wrong}: nothing was changed and nothing counts as found."
+    if not verified.get("trials"):
+        return f"{ending[:1].upper()}{ending[1:]} after {count(summary.get('steps'), 'step')}; nothing is verified."
+    rate = rate_text(verified)
+    if ending == "found":
+        return f"{_how_it_errs(summary, verified, thing)} in {rate}."
+    if ending == "interrupted":
+        return f"Interrupted; so far the model is wrong about {thing} in {rate}."
+    if ending == "not verified":
+        return f"The search claims an answer that is not confirmed: the model is wrong about {thing} in {rate}."
+    why = _REASONS.get(ending, f"The search ended: {ending}.")
+    return f"No {_changes(summary)} was found that makes the model miss {thing}: it is wrong in {rate}. {why}"
+
+
+def remarks(summary: Summary) -> list[str]:
+    """Return what has to be known beside the verdict: the control group, the random search, the run's warnings."""
+    said = []
+    control = (summary.get("clean") or {}).get("control") or {}
+    missed = (control.get("trials") or 0) - (control.get("correct") or 0)
+    if missed and summary.get("ending") != "already wrong":
+        said.append(f"The clean scene itself fails {missed} of its {control['trials']} trials.")
+    said += _against_random(summary)
+    return said + [str(text) for text in summary.get("warnings") or ()]
+
+
+def noun(summary: Summary) -> str:
+    """Return what the object is called: ``wine glass`` for ``wine-glass`` and ``mug`` for ``data/mug.obj``."""
+    return PurePath(str(summary.get("object") or "object")).stem.replace("-", " ").replace("_", " ")
+
+
+def title(summary: Summary) -> str:
+    """Return a short name for the run: ``mug, texture``."""
+    return ", ".join([noun(summary), *controls(summary)])
+
+
+def controls(summary: Summary) -> list[str]:
+    """Return the names of the controls."""
+    return [str(name) for name in summary.get("controls") or ()]
+
+
+def short_name(value: Any) -> str:
+    """Return the last part of a path, and a name as it is."""
+    return PurePath(str(value)).name or str(value)
+
+
+def with_article(name: str) -> str:
+    """Return ``a mug``, ``an iron``."""
+    return f"{'an' if name[:1].lower() in 'aeiou' else 'a'} {name}"
+
+
+def percent(share: Any) -> str:
+    """Return ``83 %`` for 0.83. 100 and 0 are said only of exactly 1 and 0."""
+    if share is None:
+        return "unknown"
+    return f"{_percent_number(float(share))} %"
+
+
+def interval_text(rated: Mapping[str, Any]) -> str:
+    """Return ``83-100 %`` for the interval of a rate."""
+    ends = rated.get("interval")
+    return f"{_percent_number(ends[0])}-{_percent_number(ends[1])} %" if ends else NO_INTERVAL
+
+
+def tally(rated: Mapping[str, Any], key: str = "successes") -> str:
+    """Return ``20 of 20``."""
+    return f"{rated.get(key, 0)} of {rated.get('trials', 0)}"
+
+
+def rate_text(rated: Mapping[str, Any]) -> str:
+    """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``."""
+    return f"{tally(rated)} fresh renders (95 % interval {interval_text(rated)})"
+
+
+def seconds_text(seconds: Any) -> str:
+    """Return ``14.6 s``, ``3 min 5 s`` or ``2 h 10 min``."""
+    if seconds is None:
+        return "unknown"
+    whole = round(float(seconds))
+    if whole < 100:
+        return f"{float(seconds):.1f} s"
+    return f"{whole // 60} min {whole % 60} s" if whole < 6000 else f"{whole // 3600} h {whole % 3600 // 60} min"
+
+
+def count(number: Any, thing: str) -> str:
+    """Return ``1 step``, ``40 steps``."""
+    return f"{number or 0} {thing}{'' if number == 1 else 's'}"
+
+
+def budget_text(summary: Summary) -> str:
+    """Return what could change and how far: ``texture within 0.1 (linf)``, as far as the summary says."""
+    names = " and ".join(controls(summary)) or "nothing"
+    epsilon = summary.get("epsilon")
+    if not isinstance(epsilon, (int, float)):
+        return names
+    norm = summary.get("norm")
+    return f"{names} within {epsilon:g}" + (f" ({norm})" if norm else "")
+
+
+def renders_text(summary: Summary) -> str:
+    """Return ``40 of the search, 40 gradients, 21 of the verification``."""
+    renders = summary.get("renders") or {}
+    known = {"search": "of the search", "gradient": "gradients", "verification": "of the verification"}
+    known["baseline"] = "of the random search"
+    return ", ".join(f"{number} {known.get(name, f'of {name}')}" for name, number in renders.items()) or "unknown"
+
+
+def formation_text(summary: Summary) -> str:
+    """Return the image formation: ``128 x 128 pixels, box filter, denoised (oidn), exposure 0 stops``."""
+    formation = summary.get("image_formation") or {}
+    said = []
+    if formation.get("resolution"):
+        said.append(" x ".join(str(side) for side in formation["resolution"]) + " pixels")
+    if formation.get("filter"):
+        said.append(f"{formation['filter']} filter")
+    denoiser = formation.get("denoiser")
+    if denoiser:
+        said.append("not denoised" if denoiser == "none" else f"denoised ({denoiser})")
+    if formation.get("exposure") is not None:
+        said.append(f"exposure {formation['exposure']:g} stops")
+    known = ("resolution", "filter", "denoiser", "exposure")
+    return ", ".join(said + [f"{name} {value}" for name, value in formation.items() if name not in known])
+
+
+def _how_it_errs(summary: Summary, verified: Mapping[str, Any], thing: str) -> str:
+    """Return "The model calls this mug a vase" where that is known of every trial, a weaker clause otherwise."""
+    answers = verified.get("labels") or {}
+    if len(answers) == 1:
+        return f"The model calls {thing} {with_article(next(iter(answers)))}"
+    if answers:
+        most = max(answers, key=lambda label: answers[label])
+        return f"The model is wrong about {thing}, most often calling it {with_article(most)},"
+    return f"The model takes {thing} for something else ({_called(summary.get('adversarial'))})"
+
+
+def _against_random(summary: Summary) -> list[str]:
+    verified, baseline = summary.get("verified") or {}, summary.get("baseline") or {}
+    random = baseline.get("verified") or {}
+    if not (verified.get("trials") and random.get("trials")):
+        return []
+    ours, theirs = (one["successes"] / one["trials"] for one in (verified, random))
+    if theirs > ours:
+        return [f"Random search with as many renders does better: {tally(random)}."]
+    if theirs == ours and ours > 0:
+        return [f"Random search with as many renders does as well: {tally(random)}. The policy adds nothing here."]
+    return []
+
+
+def _called(answer: Any) -> str:
+    label = (answer or {}).get("label")
+    return with_article(str(label)) if label else "something else"
+
+
+def _changes(summary: Summary) -> str:
+    return budget_text(summary) if controls(summary) else "configuration"
+
+
+def _percent_number(share: float) -> str:
+    value = 100.0 * share
+    near_end = (99.0 < value < 100.0 and round(value) == 100) or (0.0 < value < 1.0 and round(value) == 0)
+    return f"{min(max(value, 0.1), 99.9):.1f}" if near_end else f"{value:.0f}"

@@ -1,0 +1,292 @@
+"""The run directory: all that a run leaves behind (DESIGN 6), made, locked and filled here."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, final
+
+from advsearch.errors import InputError, RunExistsError, UnknownNameError
+from advsearch.runs import images, lock, store, summary
+from advsearch.runs.files import PART, replacing, storage_errors, write_text
+
+if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+
+    from advsearch.config import AttackConfig
+
+HOME = Path("runs")
+"""Where runs live that are called by name, in the current directory."""
+
+CONFIG = "run.yaml"
+REPORT = "report.html"
+IMAGES = "images"
+ARTIFACTS = "artifacts"
+
+CONTENTS = (
+    CONFIG,
+    store.NAME,
+    f"{store.NAME}-wal",
+    f"{store.NAME}-shm",
+    f"{store.NAME}-journal",
+    summary.NAME,
+    REPORT,
+    IMAGES,
+    ARTIFACTS,
+)
+"""All that a run writes. `overwrite` removes these and nothing else."""
+
+
+@final
+class RunDirectory:
+    """The directory of one run, locked against other processes until `close`. Make one with `create`.
+
+    Used in a `with` block it is closed at the end; when the block raises before there is any result, the directory is
+    removed again, so that bad input leaves nothing behind.
+
+    Attributes:
+        path: the directory.
+        store: its open results.
+    """
+
+    def __init__(self, path: Path, held: lock.RunLock) -> None:
+        self.path = path
+        self._lock = held
+        self.store = store.Store(path / store.NAME)
+
+    @classmethod
+    def create(cls, run: str | Path | None = None, *, overwrite: bool = False, default: str = "attack") -> RunDirectory:
+        """Make the directory of a new run and lock it.
+
+        Args:
+            run: a name (kept in ``runs/``), a path, or None for ``runs/<default>-NNN`` with the next free number.
+            overwrite: replace the run that is there. Only a directory that advsearch wrote is touched, and in it only
+                what advsearch writes.
+            default: see `run`; `default_name` makes one.
+
+        Raises:
+            RunExistsError: there is something already.
+            InputError: another process works on this run.
+            StorageError: the directory cannot be made or written.
+        """
+        path = _numbered(default) if run is None else run_path(run)
+        check_free(path, overwrite=overwrite)
+        with storage_errors(path):
+            path.mkdir(parents=True, exist_ok=True)
+        try:
+            return cls._in_place(path, overwrite)
+        except InputError:  # it is another's
+            raise
+        except BaseException:
+            _remove_if_bare(path)
+            raise
+
+    @classmethod
+    def _in_place(cls, path: Path, overwrite: bool) -> RunDirectory:
+        """Lock the directory, empty it if it may be, and start the run; leave none of it when that fails."""
+        held = lock.RunLock(path)
+        try:
+            check_free(path, overwrite=overwrite)
+            with storage_errors(path):
+                _clear(path)
+            try:
+                return cls(path, held)
+            except BaseException:
+                with suppress(OSError):
+                    _clear(path)
+                raise
+        except BaseException:
+            held.release()
+            raise
+
+    @classmethod
+    def create_for(cls, config: AttackConfig) -> RunDirectory:
+        """Make the directory that `config` asks for, with its `run.yaml`; errors as for `create`."""
+        default = default_name(config.object, config.controls)
+        run = cls.create(config.run, overwrite=config.overwrite, default=default)
+        try:
+            run.write_config(config)
+        except BaseException:
+            run.discard()
+            raise
+        return run
+
+    def write_config(self, config: AttackConfig) -> Path:
+        """Write `run.yaml`, from which `advsearch run` repeats the run, and return its path."""
+        return write_text(self.path / CONFIG, config.recipe().to_yaml())
+
+    def record(self, *rows: store.Row) -> None:
+        """Add evaluated configurations to the results; they survive a kill when this returns (see `store`).
+
+        Raises:
+            StorageError: the disk is full or cannot be written; none of these rows is kept.
+        """
+        self.store.append(rows)
+
+    def save_image(self, name: str, image: Any, folder: str = IMAGES) -> Path:
+        """Write ``<folder>/<name>.png`` and return its path.
+
+        Args:
+            name: without suffix.
+            image: (H, W, 3) or (H, W), display-referred sRGB in [0, 1], numpy or torch.
+            folder: ``"images"`` or ``"artifacts"``.
+
+        Raises:
+            StorageError: it could not be written.
+        """
+        return images.write_png(self.path / folder / f"{name}.png", image)
+
+    def save_exr(self, name: str, image: Any, folder: str = IMAGES) -> Path:
+        """Write ``<folder>/<name>.exr`` with the float32 values as given (linear, by convention) and return its path.
+
+        Raises:
+            StorageError: it could not be written.
+        """
+        return images.write_exr(self.path / folder / f"{name}.exr", image)
+
+    def save_animation(self, name: str, frames: Sequence[Any]) -> Path:
+        """Write ``images/<name>.gif`` of display-referred pictures, at most 3 MB, and return its path.
+
+        Raises:
+            StorageError: it could not be written.
+        """
+        return images.write_animation(self.path / IMAGES / f"{name}.gif", frames)
+
+    def replacing(self, name: str) -> AbstractContextManager[Path]:
+        """Return `files.replacing` of a file of this run: ``with run.replacing("artifacts/mesh.obj") as path: ...``."""
+        return replacing(self.path / name)
+
+    def write_summary(self, answer: Mapping[str, Any]) -> Path:
+        """Write `summary.json` and return its path; numbers of numpy and torch are converted, NaN becomes null.
+
+        Raises:
+            StorageError: it could not be written.
+        """
+        return summary.write_summary(self.path, answer)
+
+    def close(self) -> None:
+        """Close the results and give up the lock; a second call does nothing."""
+        self.store.close()
+        self._lock.release()
+
+    def discard(self) -> None:
+        """Remove what this run wrote, and the directory if that leaves it empty."""
+        self.store.close()
+        with suppress(OSError):
+            _clear(self.path)
+            _remove_if_bare(self.path)
+        self._lock.release()
+
+    def __enter__(self) -> RunDirectory:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is not None and not (self.path / summary.NAME).exists() and self.store.count() == 0:
+            self.discard()
+        else:
+            self.close()
+
+
+def default_name(object_name: str, controls: Iterable[str]) -> str:
+    """Return ``mug-texture`` for the object ``mug`` or ``data/mug.obj`` and the control ``texture``: a safe name."""
+    words = [Path(object_name).stem, *controls]
+    return re.sub(r"[^a-z0-9]+", "-", "-".join(words).lower()).strip("-")[:80] or "attack"
+
+
+def run_path(run: str | Path) -> Path:
+    """Return where `run` is kept: a bare name in ``runs/``, a path as it is."""
+    path = Path(run)
+    is_name = isinstance(run, str) and os.sep not in run and run not in (".", "..")
+    return HOME / path if is_name else path.expanduser()
+
+
+def find_run(run: str | Path) -> Path:
+    """Return the directory of an existing run, called by name or by path (of the directory, or of its run.yaml).
+
+    Raises:
+        UnknownNameError: there is none; the message lists the runs here.
+    """
+    for path in (Path(run).expanduser(), run_path(run)):
+        folder = path.parent if path.name in CONTENTS and path.is_file() else path
+        if is_run(folder):
+            return folder
+    known = (path.name for path in HOME.glob("*") if is_run(path))
+    raise UnknownNameError("run", str(run), known, "Give a name in runs/ or the path of a run's folder.")
+
+
+def is_run(path: Path) -> bool:
+    """Return whether advsearch wrote the directory: by the header of its `run.yaml` or of its `results.sqlite`."""
+    if store.is_ours(path / store.NAME):
+        return True
+    from advsearch.config import HEADER
+
+    try:
+        with (path / CONFIG).open("rb") as file:
+            return file.read(len(HEADER)) == HEADER.encode()
+    except OSError:
+        return False
+
+
+def check_free(run: str | Path, *, overwrite: bool = False) -> None:
+    """Check that a run may be put at `run`; call it before any long work.
+
+    Raises:
+        RunExistsError: there is something, and `overwrite` is not given or does not apply.
+    """
+    path = run_path(run)
+    if path.exists() and not path.is_dir():
+        raise RunExistsError(f"{path}: expected a folder for the run, got a file; choose another name with --run")
+    with storage_errors(path):
+        bare = not path.exists() or all(_is_leftover(found) for found in path.iterdir())
+    if bare:
+        return
+    if not is_run(path):
+        raise RunExistsError(f"{path}: the folder is not empty and not a run; choose another name with --run")
+    if not overwrite:
+        raise RunExistsError(f"{path}: the run exists already; add --overwrite or choose another name with --run")
+
+
+def _numbered(default: str) -> Path:
+    """Make ``runs/<default>-NNN`` with the next free number and return it; two processes never get the same."""
+    pattern = re.compile(re.escape(default) + r"-(\d{3,})")
+    with storage_errors(HOME):
+        HOME.mkdir(parents=True, exist_ok=True)
+        taken = [int(found[1]) for path in HOME.iterdir() if (found := pattern.fullmatch(path.name))]
+        for number in itertools.count(max(taken, default=0) + 1):
+            path = HOME / f"{default}-{number:03d}"
+            try:
+                path.mkdir()
+            except FileExistsError:
+                continue
+            return path
+    raise InputError(f"{HOME}: no number is free for {default}")
+
+
+def _clear(path: Path) -> None:
+    """Remove what a run writes from the directory, and nothing else."""
+    for found in list(path.iterdir()):
+        if found.name in CONTENTS or found.name.startswith(PART):
+            if found.is_dir() and not found.is_symlink():
+                shutil.rmtree(found)
+            else:
+                found.unlink()
+
+
+def _is_leftover(path: Path) -> bool:
+    return path.name == lock.NAME or path.name.startswith(PART)
+
+
+def _remove_if_bare(path: Path) -> None:
+    """Remove the directory if it holds nothing but the lock."""
+    with suppress(OSError):
+        if all(_is_leftover(found) for found in path.iterdir()):
+            (path / lock.NAME).unlink(missing_ok=True)
+            path.rmdir()

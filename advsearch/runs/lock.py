@@ -1,0 +1,53 @@
+"""One process to a run: an advisory lock that the kernel drops when the process ends, however it ends."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+from pathlib import Path
+
+from advsearch.errors import InputError, StorageError
+from advsearch.runs.files import storage_errors
+
+NAME = ".lock"
+
+
+class RunLock:
+    """The lock on a run directory, held from construction until `release` or the end of the process.
+
+    Raises:
+        InputError: another process works on this run; the message names it.
+        StorageError: the lock file cannot be written, or the file system has no locks.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / NAME
+        with storage_errors(self._path):
+            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.truncate(self._descriptor, 0)
+            os.write(self._descriptor, str(os.getpid()).encode())
+        except OSError as error:
+            message = _refusal(error, folder, self._owner())
+            self.release()
+            raise message from None
+
+    def release(self) -> None:
+        """Give the lock up; a second call does nothing."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def _owner(self) -> str:
+        pid = os.pread(self._descriptor, 32, 0).decode(errors="replace")
+        return f"process {pid}" if pid.isdigit() else "another process"
+
+
+def _refusal(error: OSError, folder: Path, owner: str) -> Exception:
+    if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
+        return InputError(f"{folder}: {owner} is working on this run; wait for it or choose another name with --run")
+    if error.errno in (errno.ENOLCK, errno.EOPNOTSUPP):
+        return StorageError(f"{folder}: the file system has no locks; choose a local disk with --run")
+    return StorageError(f"cannot lock {folder}: {error.strerror}; choose another place with --run")

@@ -1,0 +1,241 @@
+"""`results.sqlite`: every evaluated configuration of a run.
+
+What survives: when `Store.append` returns, its rows are handed to the operating system (write-ahead log), so that
+killing the process loses nothing. A power cut loses at most the rows written within a second after the last one known
+to be on the disk, and never damages the file: `append` forces the log to the disk when the last time is a second ago
+(on a slow disk, so long ago that this takes 2 % of the time).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sqlite3
+import time
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from types import TracebackType
+from typing import Any, final
+
+from advsearch.errors import FileFormatError
+from advsearch.runs.files import storage_errors
+from advsearch.runs.summary import plain
+
+NAME = "results.sqlite"
+
+APPLICATION_ID = 0x41445653
+"""In the header of every results.sqlite that is ours: "ADVS"."""
+
+SYNC_INTERVAL = 1.0
+"""Least seconds between two forced writes to the disk; what a power cut may cost."""
+
+SYNC_SHARE = 0.02
+"""Largest share of the time that forced writes may take."""
+
+MIGRATIONS = (
+    """
+    -- How this file came to be; times are UTC. PRAGMA user_version is the number of migrations it has been through.
+    CREATE TABLE meta (
+        key   TEXT PRIMARY KEY,
+        value TEXT NOT NULL
+    ) WITHOUT ROWID;
+    INSERT INTO meta VALUES ('created', strftime('%Y-%m-%dT%H:%M:%SZ', 'now'));
+
+    -- One row for each evaluated configuration, in the order in which they were evaluated.
+    CREATE TABLE evaluations (
+        id          INTEGER PRIMARY KEY, -- grows by one
+        kind        TEXT    NOT NULL,    -- what it was for: search, baseline, verification, control, ...
+        step        INTEGER NOT NULL,    -- step or trial within its kind, from 0
+        seed        INTEGER,             -- of the render
+        spp         INTEGER,             -- samples per pixel of the render
+        objective   REAL,                -- what was maximised; NULL when it was not a number
+        success     INTEGER,             -- 1 when the model was wrong, 0 when right, NULL when not judged
+        label       TEXT,                -- the class that the model answered
+        label_index INTEGER,             -- its number
+        probability REAL,                -- the model's probability for it, in [0, 1]
+        values_json TEXT    NOT NULL,    -- {"camera.azimuth": {"value": 130.0, "unit": "degrees"}, ...}
+        seconds     REAL,                -- that the evaluation took
+        time        REAL    NOT NULL     -- when the row was written, seconds since 1970 (UTC)
+    );
+    CREATE INDEX evaluations_kind ON evaluations (kind, step);
+    """,
+)
+"""What turns a file of version n into one of version n + 1. Never change one that was released; add another."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One evaluated configuration.
+
+    Attributes:
+        kind: what it was evaluated for: ``"search"``, ``"baseline"``, ``"verification"``, ``"control"``.
+        step: step of the search or number of the trial, from 0.
+        seed: of the render.
+        spp: samples per pixel of the render.
+        objective: what was maximised; stored as None when it is not a number.
+        success: whether the model was wrong; None when that was not judged.
+        label: the class that the model answered.
+        label_index: its number.
+        probability: the model's probability for it, in [0, 1].
+        values: parameter to ``{"value": ..., "unit": ...}``.
+        seconds: that the evaluation took.
+        time: when it was written, seconds since 1970; set by the store.
+        id: place in the file; set by the store.
+    """
+
+    kind: str
+    step: int
+    seed: int | None = None
+    spp: int | None = None
+    objective: float | None = None
+    success: bool | None = None
+    label: str | None = None
+    label_index: int | None = None
+    probability: float | None = None
+    values: Mapping[str, Any] = field(default_factory=dict)
+    seconds: float | None = None
+    time: float | None = None
+    id: int | None = None
+
+
+_COLUMNS = tuple("values_json" if one.name == "values" else one.name for one in fields(Row))
+_INSERT = f"INSERT INTO evaluations ({', '.join(_COLUMNS[:-1])}) VALUES ({', '.join('?' * (len(_COLUMNS) - 1))})"
+
+
+@final
+class Store:
+    """The open `results.sqlite` of a run. Close it, or use it in a `with` block.
+
+    Args:
+        path: the file; made when it is not there, unless `read_only`.
+        read_only: open for reading beside a process that writes.
+
+    Raises:
+        FileFormatError: the file is missing (`read_only`), is not a results.sqlite, or is of a newer advsearch.
+        StorageError: it cannot be written.
+    """
+
+    def __init__(self, path: Path, *, read_only: bool = False) -> None:
+        self.path = path
+        self._next_sync = -math.inf
+        try:
+            self._db = _connect_to_read(path) if read_only else _connect_to_write(path)
+            _check_version(self._db, path)
+        except sqlite3.DatabaseError as error:
+            raise FileFormatError(f"{path}: expected a results.sqlite of advsearch, got {error}") from error
+
+    def append(self, rows: Iterable[Row]) -> None:
+        """Add rows in one transaction; they survive a kill of the process when this returns.
+
+        Raises:
+            StorageError: the disk is full or can't be written; none of these rows is kept.
+        """
+        began, stamp = time.monotonic(), time.time()
+        force = began >= self._next_sync
+        with storage_errors(self.path):
+            self._db.execute(f"PRAGMA synchronous = {'FULL' if force else 'NORMAL'}")
+            with self._db:
+                self._db.executemany(_INSERT, (_encode(row, stamp) for row in rows))
+        if force:
+            ended = time.monotonic()
+            self._next_sync = ended + max(SYNC_INTERVAL, (ended - began) / SYNC_SHARE)
+
+    def rows(self, kind: str | None = None) -> Iterator[Row]:
+        """Yield the rows, or those of one kind, in the order in which they were written."""
+        where, given = ("", ()) if kind is None else (" WHERE kind = ?", (kind,))
+        for values in self._db.execute(f"SELECT {', '.join(_COLUMNS)} FROM evaluations{where} ORDER BY id", given):
+            yield _decode(values)
+
+    def count(self, kind: str | None = None) -> int:
+        """Return how many rows there are, or how many of one kind."""
+        where, given = ("", ()) if kind is None else (" WHERE kind = ?", (kind,))
+        return int(self._db.execute(f"SELECT count(*) FROM evaluations{where}", given).fetchone()[0])
+
+    def curve(self, kind: str) -> list[tuple[int, float | None]]:
+        """Return (step, objective) of every row of one kind, in the order in which they were written."""
+        return self._db.execute(
+            "SELECT step, objective FROM evaluations WHERE kind = ? ORDER BY id", (kind,)
+        ).fetchall()
+
+    def close(self) -> None:
+        """Close the file; a second call does nothing."""
+        self._db.close()
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def is_ours(path: Path) -> bool:
+    """Return whether the file at `path` starts like a results.sqlite of advsearch."""
+    try:
+        with path.open("rb") as file:
+            header = file.read(72)
+    except OSError:
+        return False
+    return header[:15] == b"SQLite format 3" and header[68:72] == APPLICATION_ID.to_bytes(4, "big")
+
+
+def _connect_to_write(path: Path) -> sqlite3.Connection:
+    """Open or make the file and bring it up to date."""
+    with storage_errors(path):
+        db = sqlite3.connect(path)
+        version = _version(db)
+        if version == 0:
+            _make(db)
+        for number, script in enumerate(MIGRATIONS[version:], start=version + 1):
+            db.executescript(f"BEGIN; {script} PRAGMA user_version = {number}; COMMIT;")
+    return db
+
+
+def _make(db: sqlite3.Connection) -> None:
+    """Start an empty file. There is nothing in it to lose yet, so the disk isn't waited for."""
+    db.execute("PRAGMA synchronous = OFF")
+    db.execute(f"PRAGMA application_id = {APPLICATION_ID}")  # before the log, so that the file itself has it
+    db.execute("PRAGMA journal_mode = WAL")
+
+
+def _connect_to_read(path: Path) -> sqlite3.Connection:
+    """Open the file for reading; where the log's index can't be made (a read-only disk), as one that never changes."""
+    if not path.is_file():
+        raise FileFormatError(f"{path}: expected the results of a run, got no such file; check the name of the run")
+    address = path.resolve().as_uri()
+    db = sqlite3.connect(f"{address}?mode=ro", uri=True)
+    try:
+        _version(db)
+    except sqlite3.OperationalError:
+        db.close()
+        db = sqlite3.connect(f"{address}?immutable=1", uri=True)
+    return db
+
+
+def _version(db: sqlite3.Connection) -> int:
+    return int(db.execute("PRAGMA user_version").fetchone()[0])
+
+
+def _check_version(db: sqlite3.Connection, path: Path) -> None:
+    version = _version(db)
+    if version != len(MIGRATIONS):
+        db.close()
+        advice = "use a newer advsearch" if version > len(MIGRATIONS) else "it is not a finished results.sqlite"
+        raise FileFormatError(f"{path}: expected version {len(MIGRATIONS)} of the results, got {version}; {advice}")
+
+
+def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
+    """Return the row's columns but the id. Numbers of numpy and torch become Python's."""
+    values = {one.name: plain(getattr(row, one.name)) for one in fields(Row) if one.name != "id"}
+    values["values"] = json.dumps(values["values"], allow_nan=False)
+    values["time"] = stamp
+    return tuple(values.values())
+
+
+def _decode(values: tuple[Any, ...]) -> Row:
+    given = dict(zip((one.name for one in fields(Row)), values, strict=True))
+    given["values"] = json.loads(given["values"])
+    given["success"] = None if given["success"] is None else bool(given["success"])
+    return Row(**given)

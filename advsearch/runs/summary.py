@@ -1,0 +1,99 @@
+"""`summary.json`: the answer of a run as plain JSON (DESIGN 6)."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from advsearch.errors import FileFormatError
+from advsearch.runs.files import write_text
+
+NAME = "summary.json"
+
+SCHEMA = 1
+
+_ORDER = (
+    "schema",
+    "command",
+    "run",
+    "object",
+    "model",
+    "environment",
+    "controls",
+    "policy",
+    "ending",
+    "image_formation",
+    "clean",
+    "adversarial",
+    "verified",
+    "baseline",
+    "renders",
+    "steps",
+    "seconds",
+    "seed",
+)
+"""The fields of DESIGN 6 in its order; others follow in the order in which they were given."""
+
+
+def plain(value: Any) -> Any:
+    """Return `value` made of what JSON has: numbers of numpy and torch become Python's, NaN and infinity become None.
+
+    Raises:
+        TypeError: there is something in it that has no JSON form.
+    """
+    if isinstance(value, enum.Enum):
+        return plain(value.value)
+    if value is None or isinstance(value, (str, bool, int)):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(name): plain(inner) for name, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(inner) for inner in value]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {one.name: plain(getattr(value, one.name)) for one in dataclasses.fields(value)}
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    raise TypeError(f"expected something that JSON can hold, got {type(value).__name__}")
+
+
+def to_json(summary: Mapping[str, Any]) -> str:
+    """Return the summary as text: ``schema`` first, then the fields in the order of DESIGN 6, then all others."""
+    given = {"schema": SCHEMA, **summary}
+    names = [name for name in _ORDER if name in given] + [name for name in given if name not in _ORDER]
+    return json.dumps({name: plain(given[name]) for name in names}, indent=2, allow_nan=False, ensure_ascii=False)
+
+
+def write_summary(folder: Path, summary: Mapping[str, Any]) -> Path:
+    """Write ``summary.json`` into the run directory, whole or not at all, and return its path.
+
+    Raises:
+        StorageError: it could not be written.
+    """
+    return write_text(folder / NAME, to_json(summary) + "\n")
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """Return the summary of the run in `folder`.
+
+    Raises:
+        FileFormatError: there is none (the run did not end yet), or it is not JSON.
+    """
+    path = folder / NAME
+    try:
+        summary = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise FileFormatError(f"{path}: expected the summary of a run, got no such file; did the run end?") from None
+    except (OSError, ValueError) as error:
+        raise FileFormatError(f"{path}: expected the summary of a run, got {error}") from None
+    if not isinstance(summary, dict):
+        raise FileFormatError(f"{path}: expected the summary of a run, got {type(summary).__name__}")
+    return summary

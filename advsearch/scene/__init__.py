@@ -1,0 +1,1 @@
+"""Scenes: assets, loading, importing, rendering. Importing this package imports neither Mitsuba nor torch."""

@@ -1,0 +1,111 @@
+"""What a scene is made of before Mitsuba sees it: meshes, materials, environments, as plain numpy arrays.
+
+This module imports numpy only, so that the scripts in `scenes/` and the importers can share it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.errors import InputError
+
+Floats = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh with one UV chart set.
+
+    Attributes:
+        vertices: (V, 3) float32 positions, z up, in the author's units.
+        faces: (F, 3) uint32 vertex indices, counter-clockwise seen from outside.
+        normals: (V, 3) float32 unit shading normals, pointing outwards.
+        uvs: (V, 2) float32 in [0, 1]; v = 0 is the BOTTOM row of the texture image (the OBJ convention).
+    """
+
+    vertices: Floats
+    faces: npt.NDArray[np.uint32]
+    normals: Floats
+    uvs: Floats
+
+    def __post_init__(self) -> None:
+        count = len(self.vertices)
+        for name, array, width in (("vertices", self.vertices, 3), ("normals", self.normals, 3), ("uvs", self.uvs, 2)):
+            if array.shape != (count, width):
+                raise InputError(f"mesh {name}: expected shape ({count}, {width}), got {array.shape}")
+            if not np.isfinite(array).all():
+                raise InputError(f"mesh {name}: found NaN or infinite values; repair the mesh")
+        if self.faces.ndim != 2 or self.faces.shape[1] != 3 or len(self.faces) == 0:
+            raise InputError(f"mesh faces: expected shape (F, 3) with F > 0, got {self.faces.shape}; export triangles")
+        if int(self.faces.max()) >= count:
+            raise InputError(f"mesh faces: index {int(self.faces.max())} is past the last vertex {count - 1}")
+
+
+@dataclass(frozen=True)
+class Material:
+    """Parameters of the principled BSDF other than base colour; all in [0, 1] (Burley 2012, Disney principled)."""
+
+    roughness: float = 0.5
+    metallic: float = 0.0
+    specular: float = 0.5
+    clearcoat: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class ObjectAsset:
+    """The object a model should recognise.
+
+    Attributes:
+        name: short name, used in paths.
+        mesh: geometry.
+        base_color: (H, W, 3) float32 display-referred sRGB in [0, 1]; row 0 is the top of the image.
+        material: the remaining surface parameters.
+        label: name of the class it belongs to in the reference model, or None when unknown.
+        source: where it came from, for messages and logs.
+        warnings: what the importer had to repair or leave out, one sentence each.
+    """
+
+    name: str
+    mesh: Mesh
+    base_color: Floats
+    material: Material = field(default_factory=Material)
+    label: str | None = None
+    source: str = ""
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class EnvironmentAsset:
+    """A light from everywhere: an equirectangular map.
+
+    Attributes:
+        name: short name, used in paths.
+        radiance: (H, W, 3) float32 linear radiance, finite and at least 0; row 0 looks straight up, and columns run as
+        in
+            a photograph (a file's own order).
+        source: where it came from.
+        warnings: what the importer had to repair or leave out, one sentence each.
+    """
+
+    name: str
+    radiance: Floats
+    source: str = ""
+    warnings: tuple[str, ...] = ()
+
+
+def normalised(mesh: Mesh) -> Mesh:
+    """Return the mesh scaled so that its largest extent is 1, standing on z = 0 and centred in x and y.
+
+    Raises:
+        InputError: all vertices coincide, so there is no size to normalise.
+    """
+    vertices = mesh.vertices.astype(np.float64)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    size = float((high - low).max())
+    if not size > 0.0:
+        raise InputError("mesh has no extent: all its vertices coincide; export the mesh again")
+    origin = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
+    return replace(mesh, vertices=((vertices - origin) / size).astype(np.float32))

@@ -1,0 +1,166 @@
+"""A scene as data: an object, an environment and the settings, before Mitsuba is asked for anything.
+
+Conventions: z up, right-handed, lengths in object sizes (the object's largest extent is 1 before `pose.scale`), angles
+in degrees. The camera at azimuth 0 and elevation 0 looks from +x towards the object.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.errors import InputError
+from advsearch.scene import environments, importing, library, settings
+from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
+
+Doubles = npt.NDArray[np.float64]
+
+DEFAULT_ENVIRONMENT = "studio"
+FRAME_FILL = 0.86
+"""Share of the picture's half-width that the object's outline may reach when the distance is worked out."""
+METERED_WHITE = 0.9
+"""Linear display value that a diffuse white surface (albedo 0.8) gets in the direction of the strongest light."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneDescription:
+    """Everything that fixes a scene except what a control varies.
+
+    Attributes:
+        object: the thing to recognise.
+        environment: what lights it.
+        values: every setting of `advsearch.scene.settings` by name; None where the scene works the value out.
+    """
+
+    object: ObjectAsset
+    environment: EnvironmentAsset
+    values: Mapping[str, float | None] = field(default_factory=dict)
+
+    def number(self, name: str) -> float:
+        """Return a setting that always has a value."""
+        value = self.values[name]
+        if value is None:
+            raise KeyError(name)
+        return value
+
+    @property
+    def material(self) -> Material:
+        """The object's material with the `material.*` settings over it."""
+        own = self.object.material
+        names = ("roughness", "metallic", "specular", "clearcoat")
+        given = {name: self.values.get(f"material.{name}") for name in names}
+        return Material(**{name: getattr(own, name) if value is None else value for name, value in given.items()})
+
+    @property
+    def gain(self) -> float:
+        """Factor from scene radiance to display-linear values: the metered exposure times `camera.exposure`."""
+        stops = self.number("camera.exposure")
+        return metered_gain(self.environment) * math.pow(2.0, stops)
+
+
+def describe(
+    object_spec: str | Path | ObjectAsset,
+    environment_spec: str | Path | EnvironmentAsset | None = None,
+    *,
+    given: Mapping[str, float] | None = None,
+    up: str | None = None,
+) -> SceneDescription:
+    """Find and read an object and an environment, bundled or from a file.
+
+    Args:
+        object_spec: a bundled name, a path to a mesh, or an asset.
+        environment_spec: a bundled name, a path to an .hdr or .exr file, an asset, or None for the default.
+        given: settings to fix, by name.
+        up: "y" or "z", the up axis of a mesh file; None takes the format's habit.
+
+    Raises:
+        InputError: a name is unknown, a file cannot be used, or a setting is out of range.
+    """
+    values = settings.resolve(given or {})
+    return SceneDescription(_object(object_spec, up), _environment(environment_spec or DEFAULT_ENVIRONMENT), values)
+
+
+def _object(spec: str | Path | ObjectAsset, up: str | None) -> ObjectAsset:
+    if isinstance(spec, ObjectAsset):
+        return spec
+    if _is_path(spec):
+        return importing.import_object(Path(spec), up="y" if up == "y" else "z" if up == "z" else None)
+    if up is not None:
+        raise InputError(
+            f"--up: bundled objects stand upright already; leave --up out, or give a file instead of {spec!r}"
+        )
+    return library.load_object(str(spec))
+
+
+def _environment(spec: str | Path | EnvironmentAsset) -> EnvironmentAsset:
+    if isinstance(spec, EnvironmentAsset):
+        return spec
+    if _is_path(spec):
+        return environments.import_environment(Path(spec))
+    return library.load_environment(str(spec))
+
+
+def _is_path(spec: str | Path) -> bool:
+    """A spec with a folder or a file ending is a path; a bare word is a bundled name."""
+    return isinstance(spec, Path) or "/" in spec or "\\" in spec or Path(spec).suffix != ""
+
+
+def metered_gain(environment: EnvironmentAsset) -> float:
+    """Exposure that a photographer's incident-light meter would choose, as a factor on radiance.
+
+    The irradiance `E(n)` of the environment is computed for 64 directions of the upper hemisphere; a white diffuse
+    surface (albedo 0.8) facing the strongest light then reaches `METERED_WHITE`. A black environment gets a gain of 1.
+    """
+    normals = _fibonacci_hemisphere(64)
+    strongest = float(irradiance(_coarse(environment.radiance), normals).max())
+    return METERED_WHITE * math.pi / (0.8 * strongest) if strongest > 0.0 else 1.0
+
+
+def _coarse(radiance: npt.NDArray[np.float32], rows: int = 64) -> npt.NDArray[np.float32]:
+    """Average blocks of pixels down to about `rows` rows: irradiance varies slowly, and this is much less work."""
+    step = radiance.shape[0] // rows
+    if step < 2 or radiance.shape[0] % step or radiance.shape[1] % step:
+        return radiance
+    height, width = radiance.shape[0] // step, radiance.shape[1] // step
+    return np.asarray(radiance.reshape(height, step, width, step, 3).mean(axis=(1, 3)))
+
+
+def irradiance(radiance: npt.NDArray[np.float32], normals: Doubles) -> Doubles:
+    """Mean-channel irradiance on surfaces with the given normals, from the part of the map above the ground plane.
+
+    Args:
+        radiance: (H, W, 3) linear radiance, row 0 up.
+        normals: (N, 3) unit vectors.
+
+    Returns:
+        (N,) irradiance, in the unit of radiance times steradian.
+    """
+    height, width = radiance.shape[:2]
+    theta = (np.arange(height) + 0.5) * math.pi / height
+    phi = (np.arange(width) + 0.5) * 2.0 * math.pi / width
+    directions = np.stack(
+        [
+            np.sin(theta)[:, None] * np.cos(phi)[None, :],
+            np.sin(theta)[:, None] * np.sin(phi)[None, :],
+            np.broadcast_to(np.cos(theta)[:, None], (height, width)),
+        ],
+        axis=-1,
+    )
+    solid_angle = np.sin(theta)[:, None] * (math.pi / height) * (2.0 * math.pi / width)
+    power = radiance.mean(axis=-1).astype(np.float64) * solid_angle
+    upper = height // 2
+    cosines = np.maximum(directions[:upper].reshape(-1, 3) @ normals.T, 0.0)
+    return np.asarray(power[:upper].reshape(-1) @ cosines)
+
+
+def _fibonacci_hemisphere(count: int) -> Doubles:
+    index = np.arange(count) + 0.5
+    z = 1.0 - index / count
+    radius = np.sqrt(1.0 - z * z)
+    angle = index * math.pi * (3.0 - math.sqrt(5.0))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)

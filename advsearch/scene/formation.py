@@ -1,0 +1,83 @@
+"""Image formation: from linear radiance to the display-referred picture that the model sees.
+
+    display = sRGB(clip(gain * denoised(radiance), 0, 1))          (IEC 61966-2-1 transfer)
+
+It is part of a run, named and stored, and the same in search and verification (DESIGN 5.2). Verification then rounds to
+8 bits, as a file would.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from advsearch.errors import InputError
+
+DENOISERS = ("oidn", "none")
+FILTERS = ("box", "gaussian")
+
+
+@dataclass(frozen=True)
+class ImageFormation:
+    """How a picture is formed.
+
+    Attributes:
+        denoiser: "oidn" (Intel Open Image Denoise with albedo and normals as guides) or "none".
+        filter: reconstruction filter, "box" or "gaussian"; a gaussian correlates pixels, so the denoiser refuses it.
+        exposure: stops over the metered exposure; kept for the record, `gain` is what is applied.
+        resolution: (height, width) in pixels.
+        gain: factor from radiance to display-linear values.
+    """
+
+    denoiser: str = "oidn"
+    filter: str = "box"
+    exposure: float = 0.0
+    resolution: tuple[int, int] = (128, 128)
+    gain: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.denoiser not in DENOISERS:
+            raise InputError(f"--denoise: expected one of {', '.join(DENOISERS)}, got {self.denoiser!r}")
+        if self.filter not in FILTERS:
+            raise InputError(f"reconstruction filter: expected one of {', '.join(FILTERS)}, got {self.filter!r}")
+        if self.denoiser == "oidn" and self.filter != "box":
+            raise InputError(
+                "the denoiser needs the box filter: any other correlates pixels; use --denoise none with it"
+            )
+        if min(self.resolution) < 8 or max(self.resolution) > 4096:
+            raise InputError(f"--resolution: expected 8 to 4096 pixels, got {self.resolution}")
+
+    def display(self, radiance: Tensor) -> Tensor:
+        """Map linear radiance (..., 3) to display-referred sRGB in [0, 1]; differentiable, flat where clipped."""
+        return linear_to_srgb(radiance * self.gain)
+
+    def summary(self) -> dict[str, object]:
+        """The `image_formation` entry of a run's summary."""
+        height, width = self.resolution
+        return {
+            "denoiser": self.denoiser,
+            "filter": self.filter,
+            "exposure": self.exposure,
+            "resolution": [height, width],
+            "gain": self.gain,
+        }
+
+
+def linear_to_srgb(linear: Tensor) -> Tensor:
+    """Encode linear values as display-referred sRGB, clipped to [0, 1]; any shape; differentiable everywhere."""
+    clipped = linear.clamp(0.0, 1.0)
+    curve = 1.055 * clipped.clamp_min(0.0031308).pow(1.0 / 2.4) - 0.055
+    return torch.where(clipped <= 0.0031308, clipped * 12.92, curve)
+
+
+def srgb_to_linear(display: Tensor) -> Tensor:
+    """Decode display-referred sRGB in [0, 1] to linear values; any shape; differentiable everywhere."""
+    curve = ((display.clamp_min(0.04045) + 0.055) / 1.055).pow(2.4)
+    return torch.where(display <= 0.04045, display / 12.92, curve)
+
+
+def to_8_bit(display: Tensor) -> Tensor:
+    """Round to the 256 levels of an 8-bit file and return the values in [0, 1]; not differentiable."""
+    return (display.detach() * 255.0).round() / 255.0

@@ -1,0 +1,97 @@
+"""What every importer asks of a file before it is parsed: is it there, is it readable, what does it look like."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+
+from advsearch.errors import FileFormatError
+
+_KINDS = (
+    (b"\x89PNG", "a PNG picture"),
+    (b"\xff\xd8\xff", "a JPEG picture"),
+    (b"GIF8", "a GIF picture"),
+    (b"#?R", "a Radiance picture (.hdr)"),
+    (b"\x76\x2f\x31\x01", "an OpenEXR picture (.exr)"),
+    (b"glTF", "a binary glTF model (.glb)"),
+    (b"ply\n", "a PLY mesh (.ply)"),
+    (b"ply\r", "a PLY mesh (.ply)"),
+    (b"Kaydara FBX", "an FBX model"),
+    (b"BLENDER", "a Blender scene"),
+    (b"PK\x03\x04", "a ZIP archive"),
+    (b"\x1f\x8b", "a gzip archive"),
+    (b"%PDF", "a PDF document"),
+    (b"<!DOCTYPE", "a web page"),
+    (b"<html", "a web page"),
+    (b"version https://git-lfs", "a Git LFS pointer instead of the file itself"),
+)
+
+
+def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
+    """Return the content of an input file.
+
+    Args:
+        path: the file.
+        what: what it should hold, for messages: ``"object"`` or ``"environment"``.
+        suffixes: the supported endings, lower case with dot.
+
+    Raises:
+        FileFormatError: an unsupported ending, or a file that is missing, a directory, unreadable or empty.
+    """
+    try:
+        if path.is_dir():
+            raise FileFormatError(f"{path}: expected a file with an {what}, got a directory; name a file inside it")
+        if path.suffix.lower() not in suffixes:
+            got = f"got {path.suffix!r}" if path.suffix else "got a name without ending"
+            raise FileFormatError(
+                f"{path}: expected an {what} file ending in {', '.join(suffixes)}, {got}; convert it to one of these"
+            )
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise FileFormatError(f"{path}: no such {what} file.{_near(path, suffixes)} Check the path") from error
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise FileFormatError(f"{path}: the {what} file cannot be read ({reason}); check its permissions") from error
+    if not data:
+        raise FileFormatError(f"{path}: the {what} file is empty; export or download it again")
+    return data
+
+
+def damaged(path: Path, expected: str, got: str) -> FileFormatError:
+    """Return the error for a file whose content is not what its name says."""
+    return FileFormatError(f"{path}: expected {expected}, got {got}; export or download the file again")
+
+
+def looks_like(data: bytes) -> str:
+    """Name the kind of file that `data` begins like, in words that fit after "got"."""
+    for magic, kind in _KINDS:
+        if data.startswith(magic):
+            return kind
+    return "binary data of another kind" if b"\x00" in data else "text of another kind"
+
+
+def text_of(data: bytes) -> str:
+    """Decode text that is UTF-8 or, failing that, Latin-1; a byte order mark is dropped."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
+def safe_name(path: Path) -> str:
+    """Return the file's name without ending, with everything but letters, digits, '.', '_' and '-' made a '-'."""
+    kept = "".join(c if c.isascii() and (c.isalnum() or c in "._-") else "-" for c in path.stem)
+    return kept.strip(".-") or "imported"
+
+
+def _near(path: Path, suffixes: Sequence[str]) -> str:
+    """Return a sentence with similar file names in the same folder, or about the folder when that is missing too."""
+    if not path.parent.is_dir():
+        return f" The folder {path.parent} does not exist either."
+    try:
+        names = {entry.name.lower(): entry.name for entry in path.parent.iterdir() if entry.suffix.lower() in suffixes}
+    except OSError:
+        return ""
+    near = difflib.get_close_matches(path.name.lower(), sorted(names), n=3, cutoff=0.5)
+    return f" Did you mean {' or '.join(repr(names[name]) for name in near)}?" if near else ""

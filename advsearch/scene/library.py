@@ -1,0 +1,117 @@
+"""The bundled scene library: reads what `scenes/` has built; makes nothing itself.
+
+The files travel inside the package (`advsearch.bundled`, its `data` folder) and are read through `importlib.resources`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from importlib import resources
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.errors import FileFormatError, UnknownNameError
+from advsearch.scene.assets import EnvironmentAsset, Material, Mesh, ObjectAsset
+
+if TYPE_CHECKING:
+    from importlib.abc import Traversable
+
+Floats = npt.NDArray[np.float32]
+_MAP_HINT = "A path to an .hdr or .exr file works too."
+_OBJECT_HINT = "A path to an .obj, .ply or .glb file works too."
+
+
+def _data() -> Traversable:
+    return resources.files("advsearch.bundled") / "data"
+
+
+def list_objects() -> tuple[str, ...]:
+    """Return the names of the bundled objects, sorted."""
+    return tuple(sorted(p.name for p in (_data() / "objects").iterdir() if (p / "mesh.ply").is_file()))
+
+
+def list_environments(split: str | None = None) -> tuple[str, ...]:
+    """Return the names of the bundled environments, sorted.
+
+    Args:
+        split: "train" or "heldout" to list only that half; None for all.
+    """
+    facts = json.loads((_data() / "environments" / "environments.json").read_text("utf-8"))["environments"]
+    return tuple(sorted(name for name, fact in facts.items() if split is None or fact["split"] == split))
+
+
+def load_object(name: str) -> ObjectAsset:
+    """Return a bundled object, its largest extent 1, standing on z = 0.
+
+    Raises:
+        UnknownNameError: there is no such object.
+        FileFormatError: the installation is damaged.
+    """
+    known = list_objects()
+    if name not in known:
+        raise UnknownNameError("object", name, known, _OBJECT_HINT)
+    folder = _data() / "objects" / name
+    try:
+        facts = json.loads((folder / "object.json").read_text("utf-8"))
+        return ObjectAsset(
+            name=name,
+            mesh=_mesh((folder / "mesh.ply").read_bytes()),
+            base_color=_image((folder / "base_color.png").read_bytes()),
+            material=Material(**facts["material"]),
+            label=facts["label"],
+            source=f"bundled object, made by {facts['source']}",
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise FileFormatError(f"bundled object {name!r} cannot be read ({error}); reinstall advsearch") from error
+
+
+def load_environment(name: str) -> EnvironmentAsset:
+    """Return a bundled environment.
+
+    Raises:
+        UnknownNameError: there is no such environment.
+        FileFormatError: the installation is damaged.
+    """
+    known = list_environments()
+    if name not in known:
+        raise UnknownNameError("environment", name, known, _MAP_HINT)
+    try:
+        radiance = _exr((_data() / "environments" / f"{name}.exr").read_bytes())
+    except (OSError, ValueError, KeyError, RuntimeError) as error:
+        raise FileFormatError(f"bundled environment {name!r} cannot be read ({error}); reinstall advsearch") from error
+    return EnvironmentAsset(name, radiance, source="bundled environment")
+
+
+def _mesh(content: bytes) -> Mesh:
+    """Decode a PLY with normals and texture coordinates s, t, its vertices neither merged nor reordered."""
+    import trimesh
+
+    loaded: Any = trimesh.load(io.BytesIO(content), file_type="ply", process=False)
+    columns = loaded.metadata["_ply_raw"]["vertex"]["data"]
+    return Mesh(
+        vertices=np.asarray(loaded.vertices, dtype=np.float32),
+        faces=np.asarray(loaded.faces, dtype=np.uint32),
+        normals=np.stack([columns[axis] for axis in ("nx", "ny", "nz")], axis=1).astype(np.float32),
+        uvs=np.stack([columns["s"], columns["t"]], axis=1).astype(np.float32),
+    )
+
+
+def _image(content: bytes) -> Floats:
+    """Decode a PNG to (H, W, 3) display-referred sRGB in [0, 1]."""
+    import imageio.v3 as iio
+
+    levels = np.asarray(iio.imread(content, extension=".png"))[..., :3]
+    display: Floats = levels.astype(np.float32) / np.float32(255.0)
+    return display
+
+
+def _exr(content: bytes) -> Floats:
+    """Decode an RGB EXR to (H, W, 3) float32."""
+    import OpenEXR
+
+    with OpenEXR.File(io.BytesIO(content)) as file:
+        pixels: Floats = np.ascontiguousarray(file.channels()["RGB"].pixels[..., :3], dtype=np.float32)
+    return pixels

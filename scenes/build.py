@@ -1,0 +1,92 @@
+"""Writes scenes/data from the generators, or checks that it is what they make.
+
+``python -m advsearch.bundled.build`` rewrites every file; ``--check`` writes nothing, names the
+files that differ and exits 3.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+
+from advsearch.bundled.environments import ENVIRONMENTS, EnvironmentFamily
+from advsearch.bundled.files import exr, ply, png
+from advsearch.bundled.objects import OBJECTS, ObjectFamily
+
+DATA = Path(__file__).resolve().parent / "data"
+
+
+def object_files(family: ObjectFamily) -> dict[str, bytes]:
+    """Return the files of a family's canonical instance, by path below the data folder."""
+    asset = family.generate(None)
+    facts = {
+        "schema": 1,
+        "name": asset.name,
+        "label": asset.label,
+        "material": asdict(asset.material),
+        "source": asset.source,
+        "triangles": len(asset.mesh.faces),
+    }
+    folder = f"objects/{family.name}"
+    return {
+        f"{folder}/mesh.ply": ply(asset.mesh),
+        f"{folder}/base_color.png": png(asset.base_color),
+        f"{folder}/object.json": (json.dumps(facts, indent=1) + "\n").encode(),
+    }
+
+
+def environment_files(family: EnvironmentFamily) -> dict[str, bytes]:
+    """Return an environment's file, by path below the data folder."""
+    return {f"environments/{family.name}.exr": exr(family.make().radiance)}
+
+
+def everything() -> Iterator[tuple[str, bytes]]:
+    """Yield every file of the data folder: relative path, content."""
+    for thing in OBJECTS.values():
+        yield from object_files(thing).items()
+    for light in ENVIRONMENTS.values():
+        yield from environment_files(light).items()
+    facts = {name: {"split": family.split, "source": family.script} for name, family in ENVIRONMENTS.items()}
+    yield "environments/environments.json", (json.dumps({"schema": 1, "environments": facts}, indent=1) + "\n").encode()
+
+
+def differing() -> list[str]:
+    """Return the files that are missing, left over, or not byte for byte what the generators make."""
+    made = dict(everything())
+    there = {p.relative_to(DATA).as_posix() for p in DATA.rglob("*") if p.is_file()} if DATA.is_dir() else set()
+    return sorted(
+        name
+        for name in made.keys() | there
+        if name not in made or name not in there or (DATA / name).read_bytes() != made[name]
+    )
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    parser = argparse.ArgumentParser(
+        prog="python -m advsearch.bundled.build", description="Rebuild the bundled scenes."
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="write nothing; exit 3 if a file is not what would be written"
+    )
+    if parser.parse_args(arguments).check:
+        wrong = differing()
+        for name in wrong:
+            print(f"differs: scenes/data/{name}", file=sys.stderr)
+        return 3 if wrong else 0
+    total = 0
+    for name, content in everything():
+        path = DATA / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+        total += len(content)
+    print(f"{DATA}: {total / 2**20:.2f} MiB")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

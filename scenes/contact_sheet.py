@@ -1,0 +1,167 @@
+"""Draws docs/images/objects.png and docs/images/environments.png: all objects and environments, to be looked at.
+
+Run as ``python -m advsearch.bundled.contact_sheet [--out docs/images] [--size 256] [--spp 64]``. It takes some minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.bundled.environments import ENVIRONMENTS
+from advsearch.bundled.objects import OBJECTS
+from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
+
+Floats = npt.NDArray[np.float32]
+VARIANTS = 3
+
+
+def _texture(mi: Any, display: Floats) -> dict[str, Any]:
+    """A bitmap texture; Mitsuba puts row 0 at v = 0, so the image is turned upside down."""
+    return {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.ascontiguousarray(srgb_to_linear(display)[::-1]))}
+
+
+def _mesh(mi: Any, asset: ObjectAsset) -> Any:
+    props = mi.Properties()
+    props["material"] = mi.load_dict(
+        {
+            "type": "principled",
+            "base_color": _texture(mi, asset.base_color),
+            "roughness": asset.material.roughness,
+            "metallic": asset.material.metallic,
+            "specular": asset.material.specular,
+            "clearcoat": asset.material.clearcoat,
+        }
+    )
+    source = asset.mesh
+    mesh = mi.Mesh(
+        asset.name,
+        len(source.vertices),
+        len(source.faces),
+        props=props,
+        has_vertex_normals=True,
+        has_vertex_texcoords=True,
+    )
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = source.vertices.ravel()
+    params["vertex_normals"] = source.normals.ravel()
+    params["vertex_texcoords"] = source.uvs.ravel()
+    params["faces"] = source.faces.ravel()
+    params.update()
+    return mesh
+
+
+def picture(
+    asset: ObjectAsset,
+    light: EnvironmentAsset,
+    size: int,
+    spp: int,
+    azimuth: float = 40.0,
+    elevation: float = 25.0,
+    zoom: float = 1.0,
+) -> Floats:
+    """Render an object on a brown ground plane; (size, size, 3) display-referred sRGB. Angles in degrees."""
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        mi.set_variant("llvm_ad_rgb")
+    transform = mi.ScalarTransform4f
+    low, high = asset.mesh.vertices.min(axis=0), asset.mesh.vertices.max(axis=0)
+    middle = (low + high) / 2
+    radius = 0.5 * float(np.linalg.norm(high - low)) / zoom
+    a, e = np.radians(azimuth), np.radians(elevation)
+    away = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    fov = 35.0
+    eye = middle + away * radius * 1.02 / np.sin(np.radians(fov / 2))
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": 6},
+            "sensor": {
+                "type": "perspective",
+                "fov": fov,
+                "to_world": transform().look_at(origin=eye.tolist(), target=middle.tolist(), up=[0, 0, 1]),
+                "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "gaussian"}},
+            },
+            "light": {
+                "type": "envmap",
+                "bitmap": mi.Bitmap(light.radiance),
+                "to_world": transform().rotate([1, 0, 0], 90),
+            },
+            "ground": {
+                "type": "rectangle",
+                "to_world": transform().scale([1.5, 1.5, 1]),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.13, 0.08]}},
+            },
+            "object": _mesh(mi, asset),
+        }
+    )
+    return linear_to_srgb(np.array(mi.render(scene, spp=spp, seed=1)).astype(np.float32))
+
+
+def _save(path: Path, image: Floats) -> None:
+    from PIL import Image
+
+    full = Image.fromarray((image * 255 + 0.5).astype(np.uint8))
+    full.convert("P", palette=Image.Palette.ADAPTIVE, colors=256, dither=Image.Dither.FLOYDSTEINBERG).save(
+        path, optimize=True
+    )
+    print(f"{path}: {path.stat().st_size // 1024} KiB")
+
+
+def objects(size: int, spp: int, names: list[str]) -> Floats:
+    """One cell per class: the canonical instance above, three drawn ones below, seven classes in a row."""
+    light = ENVIRONMENTS["studio"].make()
+    cells = []
+    for name in names:
+        family = OBJECTS[name]
+        big = picture(family.generate(None), light, size, spp)
+        small = [
+            picture(family.generate(np.random.default_rng(seed)), light, size // 2, spp) for seed in range(2 * VARIANTS)
+        ]
+        rows = [np.concatenate(small[i : i + 2], axis=1) for i in range(0, 2 * VARIANTS, 2)]
+        cells.append(np.concatenate([big, *rows], axis=0))
+    width = min(7, len(cells))
+    cells += [np.ones_like(cells[0])] * (-len(cells) % width)
+    return np.concatenate([np.concatenate(cells[i : i + width], axis=1) for i in range(0, len(cells), width)], axis=0)
+
+
+def environments(size: int, spp: int) -> Floats:
+    """For every environment its map and the mug under it, two in a row."""
+    from PIL import Image
+
+    mug = OBJECTS["mug"].generate(None)
+    cells = []
+    for family in ENVIRONMENTS.values():
+        light = family.make()
+        chart = linear_to_srgb(light.radiance)
+        wide = Image.fromarray((chart * 255 + 0.5).astype(np.uint8)).resize((2 * size, size), Image.Resampling.BICUBIC)
+        cells.append(np.concatenate([np.asarray(wide, dtype=np.float32) / 255, picture(mug, light, size, spp)], axis=1))
+    cells += [np.ones_like(cells[0])] * (-len(cells) % 2)
+    return np.concatenate([np.concatenate(cells[i : i + 2], axis=1) for i in range(0, len(cells), 2)], axis=0)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--out", type=Path, default=Path("docs/images"))
+    parser.add_argument("--size", type=int, default=256, help="pixels across one picture")
+    parser.add_argument("--spp", type=int, default=64, help="samples per pixel")
+    parser.add_argument("--only", nargs="*", default=list(OBJECTS), help="names of objects")
+    parser.add_argument("--no-environments", action="store_true")
+    parser.add_argument("--no-objects", action="store_true")
+    args = parser.parse_args()
+    os.makedirs(args.out, exist_ok=True)
+    if not args.no_objects:
+        _save(args.out / "objects.png", objects(args.size, args.spp, args.only))
+    if not args.no_environments:
+        _save(args.out / "environments.png", environments(args.size, args.spp))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,123 @@
+"""From patches and paints to one mesh with one texture: packs the charts, paints them, joins the pieces.
+
+Charts get rectangles of one square atlas at one common scale, so that texels are equally large all over the object,
+with `GUTTER` texels of their own colour around them, so that filtering and halving the resolution do not bleed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.bundled.objects.shapes import Array, Patch
+from advsearch.bundled.objects.textures import Paint, Texels
+from advsearch.scene.assets import Mesh
+
+SIZE = 256  # texels along the atlas
+GUTTER = 2  # texels around each chart, on every side
+DECIMALS = 6  # coordinates are rounded to this: machines differ in the last bits of a sine
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Where a chart lies: left, bottom, width and height in texels (gutters included); turned by 90 degrees or not."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+    turned: bool
+
+
+def _shelves(sizes: Sequence[tuple[float, float]], scale: float) -> list[Slot] | None:
+    """Pack rectangles on shelves, tallest first; None where they do not fit. `sizes` are (w, h) with w >= h."""
+    cells = [(int(np.ceil(w * scale)) + 2 * GUTTER, int(np.ceil(h * scale)) + 2 * GUTTER) for w, h in sizes]
+    order = sorted(range(len(cells)), key=lambda i: (-cells[i][1], -cells[i][0], i))
+    slots: list[Slot | None] = [None] * len(cells)
+    shelves: list[list[int]] = []  # bottom, height, filled width
+    top = 0
+    for i in order:
+        width, height = cells[i]
+        if width > SIZE:
+            return None
+        shelf = next((s for s in shelves if s[2] + width <= SIZE), None)
+        if shelf is None:
+            if top + height > SIZE:
+                return None
+            shelf = [top, height, 0]
+            shelves.append(shelf)
+            top += height
+        slots[i] = Slot(shelf[2], shelf[0], width, height, False)
+        shelf[2] += width
+    return [slot for slot in slots if slot is not None]
+
+
+def pack(sizes: Sequence[tuple[float, float]]) -> list[Slot]:
+    """Return a slot for every chart of size (width, height), at the largest common scale that was found to fit."""
+    exact = [(round(w, DECIMALS), round(h, DECIMALS)) for w, h in sizes]
+    wide = [(max(s), min(s)) for s in exact]
+    low, high = 0.0, SIZE / max(w for w, _ in wide)
+    best = _shelves(wide, low)
+    for _ in range(12):
+        middle = (low + high) / 2
+        slots = _shelves(wide, middle)
+        if slots is None:
+            high = middle
+        else:
+            low, best = middle, slots
+    if best is None:
+        raise ValueError(f"{len(sizes)} charts do not fit an atlas of {SIZE} texels; use fewer patches")
+    return [Slot(slot.x, slot.y, slot.width, slot.height, h > w) for slot, (w, h) in zip(best, exact, strict=True)]
+
+
+def _chart(slot: Slot) -> tuple[Array, Array]:
+    """Chart coordinates (u, v) of every texel of a slot, row by row from the bottom, clamped in the gutter."""
+    a = np.clip((np.arange(slot.width) + 0.5 - GUTTER) / (slot.width - 2 * GUTTER), 0.0, 1.0)
+    b = np.clip((np.arange(slot.height) + 0.5 - GUTTER) / (slot.height - 2 * GUTTER), 0.0, 1.0)
+    a, b = np.broadcast_to(a, (slot.height, slot.width)).ravel(), np.repeat(b, slot.width)
+    return (b, 1.0 - a) if slot.turned else (a, b)
+
+
+def _in_atlas(slot: Slot, uvs: Array) -> Array:
+    """Atlas coordinates in [0, 1] of chart coordinates (V, 2)."""
+    local = np.stack([1.0 - uvs[:, 1], uvs[:, 0]], axis=1) if slot.turned else uvs
+    inner = np.array([slot.width - 2 * GUTTER, slot.height - 2 * GUTTER])
+    return (np.array([slot.x, slot.y]) + GUTTER + local * inner) / SIZE
+
+
+def painted(patches: Sequence[Patch], slots: Sequence[Slot], paints: Mapping[str, Paint]) -> npt.NDArray[np.float32]:
+    """Return the (SIZE, SIZE, 3) texture, display-referred sRGB, multiples of 1/255, row 0 at the top."""
+    image = np.zeros((SIZE, SIZE, 3))
+    used = np.zeros((SIZE, SIZE), dtype=bool)
+    for patch, slot in zip(patches, slots, strict=True):
+        u, v = _chart(slot)
+        colour = paints[patch.tag](Texels(patch.rest(u, v), u, v, patch.size))
+        area = np.s_[slot.y : slot.y + slot.height, slot.x : slot.x + slot.width]
+        image[area] = np.broadcast_to(colour, (len(u), 3)).reshape(slot.height, slot.width, 3)
+        used[area] = True
+    image[~used] = np.round(image[used].mean(axis=0), 2)
+    levels = np.clip(np.round(image[::-1] * 255.0, 4) + 0.5, 0.5, 255.5).astype(np.uint8)
+    return levels.astype(np.float32) / np.float32(255.0)
+
+
+def joined(patches: Sequence[Patch], slots: Sequence[Slot]) -> Mesh:
+    """Return one mesh, largest extent 1, standing on z = 0 and centred, every number rounded to `DECIMALS`."""
+    starts = np.cumsum([0] + [len(p.vertices) for p in patches[:-1]])
+    vertices = np.concatenate([p.vertices for p in patches])
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    origin = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]])
+    vertices = (vertices - origin) / float((high - low).max())
+    normals = np.concatenate([p.normals for p in patches])
+    uvs = np.concatenate([_in_atlas(slot, p.uvs) for p, slot in zip(patches, slots, strict=True)])
+    faces = np.concatenate([p.faces + start for p, start in zip(patches, starts, strict=True)])
+    used = np.unique(faces)  # poles leave vertices behind that no triangle needs
+    renumbered = np.searchsorted(used, faces).astype(np.uint32)
+    return Mesh(_exact(vertices[used]), renumbered, _exact(normals[used]), _exact(np.clip(uvs[used], 0.0, 1.0)))
+
+
+def _exact(values: Array) -> npt.NDArray[np.float32]:
+    """Round to `DECIMALS`, without negative zeros."""
+    return (np.round(values, DECIMALS) + 0.0).astype(np.float32)

@@ -1,0 +1,92 @@
+"""What a family of objects is, and how one of its instances is put together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from advsearch.bundled.objects.atlas import joined, pack, painted
+from advsearch.bundled.objects.draw import Draw
+from advsearch.bundled.objects.shapes import Patch
+from advsearch.bundled.objects.textures import Paint
+from advsearch.scene.assets import Material, ObjectAsset
+
+
+@dataclass(frozen=True)
+class Instance:
+    """One member of a family before its texture is baked.
+
+    Attributes:
+        patches: the surface.
+        paints: a paint for every tag of the patches.
+        material: the other surface parameters.
+        detail: texels along an edge relative to the rest of the object, by tag, for parts that are hardly seen.
+    """
+
+    patches: Sequence[Patch]
+    paints: Mapping[str, Paint]
+    material: Material
+    detail: Mapping[str, float] = field(default_factory=dict)
+
+    def charts(self) -> list[tuple[float, float]]:
+        """Return the width and height that every patch asks of the atlas."""
+        return [
+            (patch.size[0] * self.detail.get(patch.tag, 1.0), patch.size[1] * self.detail.get(patch.tag, 1.0))
+            for patch in self.patches
+        ]
+
+
+@dataclass(frozen=True)
+class ObjectFamily:
+    """A class of objects whose members differ in proportions, texture and material.
+
+    Attributes:
+        name: the class, usable on the command line.
+        make: builds an instance from a `Draw`.
+    """
+
+    name: str
+    make: Callable[[Draw], Instance]
+
+    @property
+    def label(self) -> str:
+        """The class in words: the name with spaces for hyphens."""
+        return self.name.replace("-", " ")
+
+    @property
+    def script(self) -> str:
+        """The file that makes it, within this repository."""
+        return f"scenes/objects/{self.make.__module__.rsplit('.', 1)[-1]}.py"
+
+    def generate(self, rng: np.random.Generator | None) -> ObjectAsset:
+        """Return the canonical instance (None), or one with drawn proportions, texture and material.
+
+        The mesh has largest extent 1 and rests on z = 0. The same state of the generator gives the same asset.
+        """
+        instance = self.make(Draw(rng))
+        slots = pack(instance.charts())
+        return ObjectAsset(
+            name=self.name,
+            mesh=joined(instance.patches, slots),
+            base_color=painted(instance.patches, slots, instance.paints),
+            material=instance.material,
+            label=self.label,
+            source=self.script,
+        )
+
+
+def finish(
+    draw: Draw, roughness: float, clearcoat: float = 0.0, metallic: float = 0.0, spread: float = 0.2
+) -> Material:
+    """Return a material near the given one: roughness within `spread`, and now and then another coat."""
+    rough = min(max(draw(roughness, roughness - spread, roughness + spread), 0.12), 0.95)
+    coat = draw(clearcoat, 0.0, 1.0) if draw.chance(0.3) else clearcoat
+    metal = draw(metallic, 0.3, 0.8) if draw.chance(0.06) else metallic
+    return Material(
+        roughness=round(rough, 4),
+        metallic=round(metal, 4),
+        specular=round(draw(0.5, 0.3, 0.7), 4),
+        clearcoat=round(coat, 4),
+    )

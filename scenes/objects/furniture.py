@@ -1,0 +1,289 @@
+"""Chair and table lamp. Units are centimetres."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from advsearch.bundled.objects.draw import Draw
+from advsearch.bundled.objects.family import Instance, ObjectFamily, finish
+from advsearch.bundled.objects.shapes import (
+    Array,
+    Patch,
+    ball,
+    box,
+    dense,
+    ellipse,
+    lathe,
+    placed,
+    rectangle,
+    rotation,
+    rounded,
+    spline,
+    sweep,
+)
+from advsearch.bundled.objects.textures import (
+    Paint,
+    between,
+    checks,
+    colour,
+    dots,
+    gradient,
+    hexed,
+    mottled,
+    natural,
+    over,
+    rings,
+    shade,
+    solid,
+    stripes,
+    wood,
+)
+
+# ------------------------------------------------------------------------------------------------------- chair
+
+
+def _post(
+    tag: str,
+    low: tuple[float, float, float],
+    high: tuple[float, float, float],
+    section: Array,
+    ends: tuple[float, float],
+) -> list[Patch]:
+    """A straight post between two points, scaled from the first to the second end value."""
+    t = np.array([0.0, 0.02, 0.5, 0.98, 1.0])
+    path = np.array(low) + t[:, None] * (np.array(high) - np.array(low))
+    scale = (ends[0] + (ends[1] - ends[0]) * t) * np.array([0.9, 1.0, 1.0, 1.0, 0.9])
+    lying = abs(high[0] - low[0]) > abs(high[2] - low[2])
+    return sweep(tag, path, section, scale, first=(0.0, 0.0, 1.0) if lying else (1.0, 0.0, 0.0), caps=True)
+
+
+def _chair(draw: Draw) -> Instance:
+    """Faces +x; the back stands at -x."""
+    wide, deep = draw(43.0, 36.0, 50.0), draw(42.0, 36.0, 48.0)
+    seat, total = draw(45.0, 40.0, 50.0), draw(92.0, 78.0, 108.0)
+    thick = draw(3.6, 2.4, 5.5)
+    leg = draw(2.1, 1.5, 3.0)
+    splay = draw(1.5, 0.0, 6.0)
+    lean = draw(5.0, 1.0, 11.0)
+    square = draw.chance(0.5, True)
+    section = rectangle(2.0, 2.0, 0.5, 2) if square else ellipse(1.0, 1.0, 16)
+    taper = (leg * draw(0.75, 0.55, 1.0), leg)
+    x, y = deep / 2 - leg - 0.4, wide / 2 - leg - 0.4
+    patches: list[Patch] = []
+    for sx in (-1.0, 1.0):
+        for sy in (-1.0, 1.0):
+            patches += _post(
+                "up", (sx * (x + splay), sy * (y + splay), 0.0), (sx * x, sy * y, seat - thick + 0.5), section, taper
+            )
+    patches += box("seat", (0.0, 0.0, seat - thick / 2), (deep, wide, thick), 0.45 * thick, steps=3, cells=2)
+    cushion = draw.chance(0.35)
+    if cushion:
+        patches += box("cushion", (0.5, 0.0, seat + 1.4), (deep - 4.0, wide - 4.0, 4.4), 2.1, steps=3, cells=2)
+    if draw.chance(0.55, True):
+        low = seat * draw(0.36, 0.25, 0.6)
+        spread = 1.0 - low / seat
+        for sy in (-1.0, 1.0):
+            patches += _post(
+                "along",
+                (-x - splay * spread, sy * (y + splay * spread), low),
+                (x + splay * spread, sy * (y + splay * spread), low),
+                section,
+                (0.55 * leg, 0.55 * leg),
+            )
+        patches += _post(
+            "cross", (0.0, -y - splay * spread, low), (0.0, y + splay * spread, low), section, (0.5 * leg, 0.5 * leg)
+        )
+    patches += _chair_back(draw, x, y, seat, total, lean, leg, section)
+    turned = placed(patches, rotation("z", draw(8.0, -25.0, 25.0)))
+
+    offset = draw.offset()
+    timber = colour(draw, "a86f3d", "c79a63", "6b4226", "3a2418", "d8bc92", wild=0.0)
+    paint_color = colour(draw, "f0ede4", "2f5d7c", "b5442e", "3d6b4a", "22262b", "e0b040")
+    painted = draw.chance(0.4)
+    size = total
+    wild = natural(draw, size, solid(paint_color), 0.5)
+
+    def grain(axis: int) -> Paint:
+        return wild if painted else wood(timber, 3.2, offset, axis=axis, contrast=0.36)
+
+    fabric = colour(draw, "8a2f2a", "2f4f6f", "566b3f", "c9b48a", "4a4a4f")
+    cover = draw.pick(
+        mottled(fabric, shade(fabric, 0.8), 1.5, offset),
+        stripes(fabric, shade(fabric, 1.5), 6.0),
+        checks(fabric, hexed("efe6d4"), 4.0),
+        dots(solid(fabric), hexed("f4efe4"), 6.0),
+    )
+    seat_paint = cover if draw.chance(0.25) else grain(0)
+    paints = {"up": grain(2), "along": grain(0), "cross": grain(1), "seat": seat_paint, "cushion": cover}
+    return Instance(turned, paints, finish(draw, 0.45, 0.2))
+
+
+def _chair_back(
+    draw: Draw, x: float, y: float, seat: float, total: float, lean: float, leg: float, section: Array
+) -> list[Patch]:
+    """Two leaning posts with slats between them."""
+    style = draw.pick("slats", "ladder", "panel", "arch")
+    patches: list[Patch] = []
+    foot = seat - 2.0
+
+    def at(z: float) -> float:
+        return -x - lean * (z - seat) / (total - seat)
+
+    for sy in (-1.0, 1.0):
+        patches += _post("up", (at(foot), sy * y, foot), (at(total), sy * y, total), section, (leg, 0.85 * leg))
+    tilt = rotation("y", -float(np.degrees(np.arctan2(lean, total - seat))))
+    depth = draw(1.6, 1.2, 2.4)
+
+    def slat(tag: str, z: float, width: float, height: float, shift: float = 0.0) -> list[Patch]:
+        return placed(box(tag, (0.0, 0.0, 0.0), (depth, width, height), 0.5), tilt, (at(z), shift, z))
+
+    inner = 2 * (y - 0.3 * leg)
+    high = total - seat
+    if style in ("slats", "arch"):
+        patches += slat("cross", total - 0.09 * high, inner, 0.14 * high)
+        if style == "slats":
+            patches += slat("cross", seat + 0.2 * high, inner, 0.09 * high)
+        count = int(draw.pick(5, 3, 4, 6))
+        low = seat + 0.22 * high if style == "slats" else seat - 1.0
+        for i in range(count):
+            shift = inner * ((i + 1) / (count + 1) - 0.5)
+            top = total - 0.15 * high
+            patches += slat("up", (low + top) / 2, inner * draw(0.075, 0.05, 0.11), top - low + 1.0, shift)
+    elif style == "ladder":
+        count = int(draw.pick(3, 2, 4))
+        for i in range(count):
+            patches += slat(
+                "cross", seat + high * (0.28 + 0.66 * i / max(1, count - 1)), inner, high * draw(0.15, 0.1, 0.2)
+            )
+    else:
+        tall = draw(0.6, 0.35, 0.75) * high
+        patches += slat("cushion" if draw.chance(0.3) else "up", total - tall / 2 - 0.04 * high, inner, tall)
+    return patches
+
+
+# -------------------------------------------------------------------------------------------------------- lamp
+
+
+def _shade(draw: Draw, low: float, high: float, wide: float, narrow: float) -> list[Patch]:
+    """An open lampshade with a thin wall, standing free from `low` to `high`."""
+    wall = 0.25
+    belly = draw(0.0, -0.1, 0.12) * wide
+    outer = spline(np.array([(wide, low), ((wide + narrow) / 2 + belly, (low + high) / 2), (narrow, high)]), 14)
+    inner = (outer - np.array([wall, 0.0]))[::-1]
+    return lathe(
+        [
+            ("shade", dense(outer, 2.0)),
+            ("rim", np.array([outer[-1], inner[0]])),
+            ("lining", inner),
+            ("rim", np.array([inner[-1], outer[0]])),
+        ],
+        56,
+    )
+
+
+def _lamp_base(draw: Draw, style: str, low: float, radius: float, stem: float) -> list[Patch]:
+    """The foot and the stem, up to the height `low`."""
+    under = np.array([[0.0, 0.0], [radius - 0.4, 0.0]])
+    if style == "disc":
+        top = draw(2.0, 1.2, 3.2)
+        side = rounded(
+            [
+                (radius - 0.4, 0.0),
+                (radius, 0.4),
+                (radius * 0.96, top),
+                (stem * 2.0, top * 1.4),
+                (stem, top * 2.2),
+                (stem, low),
+            ],
+            [0.3, 0.5, 1.0, 1.2],
+            5,
+        )
+        return lathe([("base", under), ("base", dense(side, 1.6)), ("base", np.array([[stem, low], [0.0, low]]))], 44)
+    belly = radius * draw(1.12, 0.95, 1.4)
+    at = draw(0.38, 0.28, 0.6) * low
+    knots = [
+        (radius * 0.96, 1.2),
+        (radius * 0.8, 2.4),
+        (belly, at),
+        (0.45 * belly, 0.72 * low),
+        (stem * 1.5, 0.86 * low),
+        (stem, 0.93 * low),
+    ]
+    if style == "gourd":
+        knots[3:4] = [(0.55 * belly, 0.6 * low), (0.72 * belly, 0.73 * low)]
+    body = spline(np.array(knots), 34)
+    ring = rounded([(radius - 0.4, 0.0), (radius, 0.2), (radius, 1.2), (radius * 0.96, 1.2)], [0.15, 0.3], 3)
+    return lathe(
+        [
+            ("base", under),
+            ("foot", ring),
+            ("body", body),
+            ("base", np.array([[stem, 0.93 * low], [stem, low]])),
+            ("base", np.array([[stem, low], [0.0, low]])),
+        ],
+        44,
+    )
+
+
+def _lamp(draw: Draw) -> Instance:
+    total = draw(48.0, 42.0, 58.0)
+    tall = draw(20.0, 14.0, 24.0)
+    wide = draw(16.5, 12.0, 19.0)
+    narrow = wide * draw(0.6, 0.35, 1.0)
+    low = total - tall
+    radius, stem = draw(7.4, 6.0, 9.5), draw(0.8, 0.6, 1.3)
+    style = draw.pick("body", "disc", "gourd")
+    base = _lamp_base(draw, style, low + 0.25 * tall, radius, stem)
+    patches = base + _shade(draw, low, total, wide, narrow)
+    patches += ball("bulb", min(3.0, 0.4 * narrow), (0.0, 0.0, low + 0.42 * tall), 12, 20)
+    ring_z = total - 0.12 * tall
+    inside = narrow + (wide - narrow) * 0.12
+    for angle in (20.0, 140.0, 260.0):
+        spoke = sweep("base", np.array([[0.0, 0.0, ring_z], [inside, 0.0, ring_z]]), ellipse(0.22, 0.22, 8))
+        patches += placed(spoke, rotation("z", angle))
+    patches += sweep(
+        "base",
+        np.array([[0, 0, low + 0.2 * tall], [0, 0, ring_z], [0, 0, ring_z + 0.8], [0, 0, ring_z + 1.0]], dtype=float),
+        ellipse(0.35, 0.35, 10),
+        np.array([1.0, 1.0, 1.6, 0.0]),
+        first=(1.0, 0.0, 0.0),
+    )
+    offset = draw.offset()
+    linen = colour(draw, "f1e3c4", "f4f1e8", "c9b48a", "b5442e", "2f5d7c", "3d6b4a", "20242a", wild=0.25)
+    weave = mottled(linen, shade(linen, 0.93), 1.2, offset)
+    kind = draw.pick("plain", "band", "stripes", "dots", "rings", "gradient")
+    accent = colour(draw, "b08d3c", "7a1f2b", "23395d", "efe6cf")
+    if kind == "band":
+        weave = over(
+            over(weave, between(0.0, low + 1.4), solid(accent)), between(total - 1.4, 2 * total), solid(accent)
+        )
+    elif kind == "stripes":
+        weave = stripes(linen, accent, draw(5.0, 3.0, 9.0), draw(0.4, 0.2, 0.6))
+    elif kind == "dots":
+        weave = dots(weave, accent, draw(6.0, 4.0, 9.0))
+    elif kind == "rings":
+        weave = rings(linen, accent, draw(6.0, 3.0, 10.0))
+    elif kind == "gradient":
+        weave = gradient(linen, shade(linen, 0.6), low, total)
+    else:
+        weave = over(
+            weave, lambda t: between(0.0, low + 0.5)(t) + between(total - 0.5, 2 * total)(t), solid(shade(linen, 0.75))
+        )
+    cloth = natural(draw, total, weave, 0.3)
+    clay = colour(draw, "2f6f6a", "23408f", "b5442e", "f2f1ea", "22262b", "8a5a32", "c9a24b")
+    body = natural(draw, total, mottled(clay, shade(clay, 1.3), 4.0, offset), 0.35)
+    metal = colour(draw, "b08d3c", "2b2d30", "b4b8bd", "8a5a32", wild=0.15)
+    paints = {
+        "shade": cloth,
+        "rim": solid(shade(linen, 0.8)),
+        "lining": solid(hexed("f4f0e4")),
+        "bulb": solid(hexed("fbf6e6")),
+        "body": body,
+        "foot": solid(metal),
+        "base": body if style == "disc" and draw.chance(0.5) else solid(metal),
+    }
+    return Instance(patches, paints, finish(draw, 0.4, 0.3), {"lining": 0.6})
+
+
+CHAIR = ObjectFamily("chair", _chair)
+LAMP = ObjectFamily("lamp", _lamp)

@@ -1,0 +1,508 @@
+"""Primitives of the bundled objects: patches of surface that carry their own chart of the texture.
+
+A `Patch` is a piece of mesh with local texture coordinates in [0, 1]^2 and a function that says which point of the
+surface a texture coordinate is, so that textures are painted in object coordinates and meet without seams. Everything
+is float64 and z up; lengths are in whatever unit the object was written in (centimetres, mostly). Faces are
+counter-clockwise seen from outside, and the charts are not mirrored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+Rest = Callable[[Array, Array], Array]
+
+HARD_ANGLE = 40.0  # degrees; where two parts of a profile meet at more than this, the edge stays hard
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """A piece of surface with one chart.
+
+    Attributes:
+        tag: which paint it gets; any string.
+        vertices: (V, 3) positions.
+        normals: (V, 3) unit normals, outwards.
+        uvs: (V, 2) chart coordinates in [0, 1].
+        faces: (F, 3) vertex indices.
+        size: width and height of the chart, in object units; its share of the atlas follows from it.
+        rest: maps (N,) u and (N,) v to the (N, 3) surface points as they were before `placed`.
+    """
+
+    tag: str
+    vertices: Array
+    normals: Array
+    uvs: Array
+    faces: Indices
+    size: tuple[float, float]
+    rest: Rest
+
+
+def unit(vectors: Array) -> Array:
+    """Return vectors (..., 3) or (..., 2) scaled to length one; zero vectors stay zero."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(length > 0.0, length, 1.0)
+
+
+def placed(
+    patches: Iterable[Patch], rotation: Array | None = None, offset: Sequence[float] = (0.0, 0.0, 0.0)
+) -> list[Patch]:
+    """Rotate patches by a (3, 3) rotation, then move them. What is painted on them moves along."""
+    turn = np.eye(3) if rotation is None else rotation
+    return [
+        replace(p, vertices=p.vertices @ turn.T + np.asarray(offset, dtype=np.float64), normals=p.normals @ turn.T)
+        for p in patches
+    ]
+
+
+def rotation(axis: str, degrees: float) -> Array:
+    """Return the (3, 3) right-handed rotation about the axis "x", "y" or "z" by an angle in degrees."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    turn = np.eye(3)
+    turn[i, i] = turn[j, j] = c
+    turn[i, j], turn[j, i] = -s, s
+    return turn
+
+
+# ---------------------------------------------------------------------------------------------------- curves
+
+
+def spline(points: Sequence[Sequence[float]] | Array, count: int) -> Array:
+    """Return `count` points of the Catmull-Rom curve (chord-length knots) through (K, D) points, ends included."""
+    knots = np.asarray(points, dtype=np.float64)
+    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
+    slope = np.gradient(knots, at, axis=0)
+    t = np.linspace(0.0, at[-1], count)
+    i = np.clip(np.searchsorted(at, t, side="right") - 1, 0, len(knots) - 2)
+    span = (at[i + 1] - at[i])[:, None]
+    x = (t - at[i])[:, None] / span
+    start, end = knots[i], knots[i + 1]
+    first, last = slope[i] * span, slope[i + 1] * span
+    turn = 2 * start - 2 * end + first + last
+    curve: Array = ((turn * x + (3 * end - 3 * start - 2 * first - last)) * x + first) * x + start
+    return curve
+
+
+def rounded(corners: Sequence[Sequence[float]] | Array, radius: float | Sequence[float], steps: int = 5) -> Array:
+    """Return the open polyline (K, D) with its inner corners rounded off.
+
+    Args:
+        corners: the polyline.
+        radius: how far from each inner corner the rounding starts, one number or K - 2 of them; at most half an edge.
+        steps: edges per rounding.
+    """
+    points = np.asarray(corners, dtype=np.float64)
+    radii = np.broadcast_to(np.asarray(radius, dtype=np.float64), (max(len(points) - 2, 0),))
+    out = [points[0]]
+    for before, corner, after, wanted in zip(points, points[1:], points[2:], radii, strict=False):
+        a, b = before - corner, after - corner
+        reach = min(float(wanted), 0.499 * float(np.linalg.norm(a)), 0.499 * float(np.linalg.norm(b)))
+        if reach <= 1e-9:
+            out.append(corner)
+            continue
+        p, q = corner + unit(a) * reach, corner + unit(b) * reach
+        t = np.linspace(0.0, 1.0, steps + 1)[:, None]
+        out.extend((1 - t) ** 2 * p + 2 * t * (1 - t) * corner + t**2 * q)
+    out.append(points[-1])
+    return np.array(out)
+
+
+def dense(curve: Array, longest: float) -> Array:
+    """Return the polyline with edges longer than `longest` cut into equal pieces."""
+    out = [curve[:1]]
+    for a, b in pairwise(curve):
+        pieces = max(1, int(np.ceil(round(float(np.linalg.norm(b - a)) / longest, 6))))
+        out.append(a + (b - a) * (np.arange(1, pieces + 1) / pieces)[:, None])
+    return np.concatenate(out)
+
+
+def polygon(sides: int, bevel: float = 0.12, steps: int = 2) -> Array:
+    """Return a regular polygon of circumradius 1, a flat side down, corners rounded: a closed section (M, 2)."""
+    angle = 2 * np.pi * (np.arange(sides + 2) - 0.5) / sides - np.pi / 2
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return rounded(ring, bevel, steps)[1:-1]
+
+
+def rectangle(width: float, height: float, bevel: float, steps: int = 3) -> Array:
+    """Return a rounded rectangle, centred, counter-clockwise, as a closed section (M, 2)."""
+    w, h = width / 2, height / 2
+    corners = [(w, -h), (w, h), (-w, h), (-w, -h), (w, -h), (w, h)]
+    return rounded(corners, bevel, steps)[1:-1]
+
+
+def ellipse(width: float, height: float, count: int = 20) -> Array:
+    """Return an ellipse with the given half-axes, counter-clockwise, as a closed section (count, 2)."""
+    t = 2 * np.pi * np.arange(count) / count
+    return np.stack([width * np.cos(t), height * np.sin(t)], axis=1)
+
+
+# ------------------------------------------------------------------------------------------------ grid patches
+
+
+def _grid_faces(rows: int, columns: int) -> Indices:
+    """Two triangles for every cell of a (rows, columns) grid of vertices in row-major order."""
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)[None]).reshape(-1)
+    lower = np.stack([corner, corner + 1, corner + columns + 1], axis=1)
+    upper = np.stack([corner, corner + columns + 1, corner + columns], axis=1)
+    return np.stack([lower, upper], axis=1).reshape(-1, 3).astype(np.int64)
+
+
+def _without_slivers(vertices: Array, faces: Indices) -> Indices:
+    """Drop triangles whose area is nothing beside the patch's (they arise where a row shrinks to a point)."""
+    a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return faces[area > 1e-6 * float(np.median(area[area > 0.0]))]
+
+
+def grid(tag: str, points: Array, normals: Array, size: tuple[float, float], down: Array, across: Array) -> Patch:
+    """Return the patch over a grid of points: u runs along columns, v along rows, du x dv points outwards.
+
+    Args:
+        tag: which paint it gets.
+        points: (R, C, 3) positions.
+        normals: (R, C, 3) unit normals.
+        size: chart width and height.
+        down: (R,) increasing v of the rows, 0 to 1.
+        across: (C,) increasing u of the columns, 0 to 1.
+    """
+    rows, columns = points.shape[:2]
+    u, v = np.broadcast_to(across, (rows, columns)), np.broadcast_to(down[:, None], (rows, columns))
+
+    def rest(at_u: Array, at_v: Array) -> Array:
+        i = np.clip(np.searchsorted(down, at_v, side="right") - 1, 0, rows - 2)
+        j = np.clip(np.searchsorted(across, at_u, side="right") - 1, 0, columns - 2)
+        s = ((at_v - down[i]) / (down[i + 1] - down[i]))[:, None]
+        t = ((at_u - across[j]) / (across[j + 1] - across[j]))[:, None]
+        low = points[i, j] * (1 - t) + points[i, j + 1] * t
+        high = points[i + 1, j] * (1 - t) + points[i + 1, j + 1] * t
+        return low * (1 - s) + high * s
+
+    flat = points.reshape(-1, 3)
+    faces = _without_slivers(flat, _grid_faces(rows, columns))
+    uvs = np.stack([u, v], axis=-1).reshape(-1, 2)
+    return Patch(tag, flat, normals.reshape(-1, 3), uvs, faces, size, rest)
+
+
+def _along(curve: Array) -> tuple[Array, float]:
+    """Return (K,) normalised arc lengths of a polyline, and its length."""
+    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
+    return at / at[-1], float(at[-1])
+
+
+# ----------------------------------------------------------------------------------------- surfaces of revolution
+
+
+def _profile_normals(parts: Sequence[Array]) -> list[Array]:
+    """Unit normals (dz, -dr) of consecutive (r, z) polylines, shared where they meet smoothly or on the axis."""
+    directions = []
+    for part in parts:
+        step = np.diff(part, axis=0)
+        direction = np.concatenate([step[:1], part[2:] - part[:-2], step[-1:]])
+        for end, row in ((0, 0), (-1, -1)):
+            if part[end, 0] < 1e-9:
+                direction[row] = (step[row][0], 0.0)
+        directions.append(unit(direction))
+    for before, after, p, q in zip(directions, directions[1:], parts, parts[1:], strict=False):
+        meets = float(np.linalg.norm(p[-1] - q[0])) < 1e-9
+        if meets and float(before[-1] @ after[0]) > np.cos(np.radians(HARD_ANGLE)):
+            before[-1] = after[0] = unit(before[-1] + after[0])
+    return [np.stack([d[:, 1], -d[:, 0]], axis=1) for d in directions]
+
+
+def _disc(tag: str, profile: Array, normals: Array, columns: int) -> Patch:
+    """A piece of a surface of revolution that starts or ends on the axis, charted by its distance from the pole."""
+    inwards = profile[-1, 0] < 1e-9
+    curve, normal = (profile[::-1], normals[::-1]) if inwards else (profile, normals)
+    at, length = _along(curve)
+    theta = 2 * np.pi * np.arange(columns) / columns
+    c, s = np.cos(theta), np.sin(theta)
+    side = (
+        1.0 if inwards else -1.0
+    )  # a profile that ends on the axis faces up: seen from above the chart is not mirrored
+
+    def around(radial: Array, axial: Array) -> Array:
+        return np.stack(
+            [radial[:, None] * c, radial[:, None] * s, np.broadcast_to(axial[:, None], (len(axial), columns))], -1
+        )
+
+    ring = around(curve[1:, 0], curve[1:, 1]).reshape(-1, 3)
+    ring_normal = around(normal[1:, 0], normal[1:, 1]).reshape(-1, 3)
+    ring_uv = np.stack([0.5 + 0.5 * side * at[1:, None] * c, 0.5 + 0.5 * at[1:, None] * s], axis=-1).reshape(-1, 2)
+    vertices = np.concatenate([[[0.0, 0.0, curve[0, 1]]], ring])
+    vertex_normals = np.concatenate([[[0.0, 0.0, normal[0, 1]]], ring_normal])
+    uvs = np.concatenate([[[0.5, 0.5]], ring_uv])
+
+    j = np.arange(columns)
+    k = (j + 1) % columns
+    faces = [np.stack([np.zeros_like(j), 1 + j, 1 + k], axis=1)]
+    for row in range(len(curve) - 2):
+        a, b = 1 + row * columns, 1 + (row + 1) * columns
+        faces += [np.stack([a + j, b + j, b + k], axis=1), np.stack([a + j, b + k, a + k], axis=1)]
+    triangles = np.concatenate(faces).astype(np.int64)
+    if not inwards:
+        triangles = triangles[:, ::-1]
+
+    def rest(u: Array, v: Array) -> Array:
+        x, y = (2 * u - 1) * side, 2 * v - 1
+        rho = np.minimum(np.hypot(x, y), 1.0)
+        radius, angle = np.interp(rho, at, curve[:, 0]), np.arctan2(y, x)
+        return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.interp(rho, at, curve[:, 1])], axis=-1)
+
+    return Patch(tag, vertices, vertex_normals, uvs, triangles, (2 * length, 2 * length), rest)
+
+
+def _wall(tag: str, profile: Array, normals: Array, columns: int) -> list[Patch]:
+    """A piece of a surface of revolution charted as an unrolled band, cut in 2 or 4 where it would be a long strip."""
+    theta = 2 * np.pi * np.arange(columns + 1) / columns
+    theta[-1] = 0.0  # the seam's two columns are the same points, to the bit
+    c, s = np.cos(theta), np.sin(theta)
+    shape = (len(profile), columns + 1)
+    points = np.stack([profile[:, :1] * c, profile[:, :1] * s, np.broadcast_to(profile[:, 1:], shape)], axis=-1)
+    normal = np.stack([normals[:, :1] * c, normals[:, :1] * s, np.broadcast_to(normals[:, 1:], shape)], axis=-1)
+    down, length = _along(profile)
+    width = 2 * np.pi * float(np.quantile(profile[:, 0], 0.75))
+    pieces = 1 if width <= 3 * length else 2 if width <= 6 * length or columns % 4 else 4
+    each = columns // pieces
+    return [
+        grid(
+            tag,
+            points[:, at : at + each + 1],
+            normal[:, at : at + each + 1],
+            (width / pieces, length),
+            down,
+            np.arange(each + 1) / each,
+        )
+        for at in range(0, each * pieces, each)
+    ]
+
+
+def lathe(profile: Sequence[tuple[str, Array]], columns: int = 56) -> list[Patch]:
+    """Turn a profile about the z axis.
+
+    Args:
+        profile: consecutive pieces (tag, (K, 2) points (r, z)), walked with the material on the left: along the bottom
+            away from the axis, up the outside, over the lip, down the inside. A piece becomes a disc where it is mostly
+            flat and touches the axis, a band otherwise.
+        columns: faces around.
+    """
+    curves = [np.asarray(curve, dtype=np.float64) for _, curve in profile]
+    patches = []
+    for (tag, _), curve, normals in zip(profile, curves, _profile_normals(curves), strict=True):
+        touches = min(curve[0, 0], curve[-1, 0]) < 1e-9 <= max(curve[0, 0], curve[-1, 0])
+        flat = abs(curve[-1, 0] - curve[0, 0]) > 0.5 * _along(curve)[1]
+        patches += [_disc(tag, curve, normals, columns)] if touches and flat else _wall(tag, curve, normals, columns)
+    return patches
+
+
+def _unlooped(curve: Array, offset: Array) -> Array:
+    """Drop the points at which an offset curve runs backwards, as it does in tight bends; the last one stays."""
+    keep = np.arange(len(curve))
+    while len(keep) > 2:
+        back = (np.diff(offset[keep], axis=0) * np.diff(curve[keep], axis=0)).sum(axis=1) <= 0.0
+        if not back.any():
+            break
+        keep = np.append(keep[:-1][~back], keep[-1])
+    return offset[keep]
+
+
+def vessel(
+    outside: Array,
+    wall: float,
+    floor: float,
+    *,
+    tags: tuple[str, str, str] = ("base", "outside", "inside"),
+    columns: int = 56,
+    step: float = 0.7,
+) -> list[Patch]:
+    """An open container: an outside profile, a rounded lip, an inside at constant wall thickness, a floor, a base.
+
+    Args:
+        outside: (K, 2) profile (r, z) from the foot (z about 0, r > 0) up to the lip.
+        wall: thickness of the wall.
+        floor: height of the inside's floor.
+        tags: names of the base, the outside with the lip, and the inside.
+        columns: faces around.
+        step: longest edge along the profile.
+    """
+    normal = _profile_normals([outside])[0]
+    inner = _unlooped(outside, outside - wall * normal)[::-1]
+    half = np.pi * np.arange(1, 6) / 6
+    top, across = outside[-1] - wall / 2 * normal[-1], wall / 2 * normal[-1]
+    up = np.array([-across[1], across[0]])
+    lip = top + np.cos(half)[:, None] * across + np.sin(half)[:, None] * up
+    fillet = min(1.5 * wall, 0.3 * float(outside[:, 0].max()))
+    edge = float(np.interp(floor, inner[::-1, 1], inner[::-1, 0]))
+    inner = inner[(inner[:, 1] > floor + fillet) & (inner[:, 0] > 0.05 * float(outside[:, 0].max()))]
+    t = np.linspace(0.0, 1.0, 5)[1:, None]
+    turn = np.array([max(edge - fillet, 0.4 * edge), floor])
+    inside = np.concatenate([inner, (1 - t) ** 2 * inner[-1] + 2 * t * (1 - t) * np.array([edge, floor]) + t**2 * turn])
+    foot = outside[0]
+    inset = min(0.35 * wall, 0.3 * floor)
+    base = np.array([[0.0, inset], [0.86 * foot[0], inset], [0.9 * foot[0], foot[1]], foot])
+    return lathe(
+        [
+            (tags[0], dense(base, 3 * step)),
+            (tags[1], dense(np.concatenate([outside, lip, inner[:1]]), step)),
+            (tags[2], dense(inside, step)),
+            (tags[2], dense(np.array([turn, [0.0, floor]]), 3 * step)),
+        ],
+        columns,
+    )
+
+
+def ball(
+    tag: str, radius: float, centre: Sequence[float] = (0.0, 0.0, 0.0), rows: int = 24, columns: int = 40
+) -> list[Patch]:
+    """A sphere in three charts: two polar caps and a band."""
+    angle = np.pi * np.arange(rows + 1) / rows - np.pi / 2
+    curve = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    curve[[0, -1], 0] = 0.0
+    cut = rows // 4
+    pieces = [(tag, curve[: cut + 1]), (tag, curve[cut : rows - cut + 1]), (tag, curve[rows - cut :])]
+    return placed(lathe(pieces, columns), offset=centre)
+
+
+# --------------------------------------------------------------------------------------------- sweeps and boxes
+
+
+def frames(path: Array, first: Sequence[float]) -> tuple[Array, Array, Array]:
+    """Return unit tangents and two normals (N, 3) each along a path, turning as little as possible.
+
+    Args:
+        path: (N, 3) points.
+        first: a vector, not along the path, whose part across it is the first normal at the start.
+    """
+    tangent = unit(np.gradient(path, axis=0))
+    normal = np.empty_like(path)
+    current = np.asarray(first, dtype=np.float64)
+    for i, direction in enumerate(tangent):
+        current = unit(current - (current @ direction) * direction)
+        normal[i] = current
+    return tangent, normal, np.cross(tangent, normal)
+
+
+def _sweep_normals(points: Array, tangent: Array) -> Array:
+    """Normals of a (R, M, 3) grid closed around, from central differences; where a row is a point, the tangent."""
+    around = np.roll(points, -1, axis=1) - np.roll(points, 1, axis=1)
+    along = np.gradient(points, axis=0)
+    normal = np.cross(around, along)
+    size = np.linalg.norm(normal, axis=-1)
+    weak = size < 1e-7 * float(size.max())
+    result = unit(normal)
+    for row, side in ((0, -1.0), (-1, 1.0)):
+        result[row][weak[row]] = side * tangent[row]
+    return result
+
+
+def sweep(
+    tag: str,
+    path: Array,
+    section: Array,
+    scale: Array | float = 1.0,
+    *,
+    first: Sequence[float] = (0.0, 0.0, 1.0),
+    caps: bool = False,
+    frame: tuple[Array, Array, Array] | None = None,
+) -> list[Patch]:
+    """Move a closed section along a path.
+
+    Args:
+        tag: which paint it gets.
+        path: (N, 3) centres.
+        section: (M, 2) closed section, counter-clockwise, coordinates along the first and second normal.
+        scale: one number, (N,) or (N, 2): the section's scale at each centre; 0 closes the surface in a point.
+        first: where the section's first axis points at the start.
+        caps: close both ends with flat faces and a hard edge.
+        frame: tangents and normals to use in place of `frames(path, first)`.
+    """
+    tangent, a, b = frames(path, first) if frame is None else frame
+    scales = np.broadcast_to(
+        np.asarray(scale, dtype=np.float64).reshape(-1, 1) if np.ndim(scale) < 2 else np.asarray(scale), (len(path), 2)
+    )
+    flat = section[None] * scales[:, None]
+    points = path[:, None] + flat[..., :1] * a[:, None] + flat[..., 1:] * b[:, None]
+    normals = _sweep_normals(points, tangent)
+    ring, around = _along(np.concatenate([section, section[:1]]))
+    closed = np.concatenate([points, points[:, :1]], axis=1)
+    closed_normals = np.concatenate([normals, normals[:, :1]], axis=1)
+    middle = np.linalg.norm(np.diff(points, axis=0), axis=-1).mean(axis=1)
+    down = np.concatenate([[0.0], np.cumsum(middle)])
+    width = around * float(np.quantile(scales.mean(axis=1), 0.75))
+    patches = [grid(tag, closed, closed_normals, (width, float(down[-1])), down / down[-1], ring)]
+    if caps:
+        patches += [cap(tag, points[0][::-1], -tangent[0]), cap(tag, points[-1], tangent[-1])]
+    return patches
+
+
+def cap(tag: str, ring: Array, normal: Array) -> Patch:
+    """A flat face bounded by a convex ring (M, 3), counter-clockwise seen from outside, with the given unit normal."""
+    centre = ring.mean(axis=0)
+    x = unit(ring[0] - centre)
+    x = unit(x - (x @ normal) * normal)
+    y = np.cross(normal, x)
+    flat = np.stack([(ring - centre) @ x, (ring - centre) @ y], axis=1)
+    low, span = flat.min(axis=0), flat.max(axis=0) - flat.min(axis=0)
+    uvs = (np.concatenate([[[0.0, 0.0]], flat]) - low) / span
+    j = np.arange(len(ring))
+    faces = np.stack([np.zeros_like(j), 1 + j, 1 + (j + 1) % len(ring)], axis=1).astype(np.int64)
+    vertices = np.concatenate([centre[None], ring])
+
+    def rest(u: Array, v: Array) -> Array:
+        return centre + (u * span[0] + low[0])[:, None] * x + (v * span[1] + low[1])[:, None] * y
+
+    return Patch(tag, vertices, np.tile(normal, (len(vertices), 1)), uvs, faces, (float(span[0]), float(span[1])), rest)
+
+
+def box(
+    tag: str, centre: Sequence[float], size: Sequence[float], bevel: float, steps: int = 2, cells: int = 1
+) -> list[Patch]:
+    """A box with rounded edges and corners: six charts, smooth normals.
+
+    Args:
+        tag: which paint it gets.
+        centre: its middle.
+        size: full extent along x, y and z.
+        bevel: radius of the edges.
+        steps: cells across half an edge's rounding.
+        cells: cells across the flat part of a face, each way.
+    """
+    half = np.asarray(size, dtype=np.float64) / 2
+    bevel = min(bevel, 0.95 * float(half.min()))
+    core = half - bevel
+    patches = []
+    for axis in range(3):
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        for side in (1.0, -1.0):
+            u, v = (_box_line(half[k], bevel, steps, cells) for k in (i, j))
+            cube = np.empty((len(v), len(u), 3))
+            cube[..., axis] = half[axis]
+            cube[..., i], cube[..., j] = u[None], v[:, None]
+            inner = np.clip(cube, -core, core)
+            normal = unit(cube - inner)
+            points = inner + bevel * normal
+            if side < 0:  # half a turn about the j axis: keeps orientation
+                points, normal = points[:, ::-1].copy(), normal[:, ::-1].copy()
+                points[..., axis] *= -1.0
+                normal[..., axis] *= -1.0
+            down = (v + half[j]) / (2 * half[j])
+            across = (u + half[i]) / (2 * half[i])
+            across = across if side > 0 else 1.0 - across[::-1]
+            extent = (2 * float(half[i]), 2 * float(half[j]))
+            patches.append(grid(tag, points + np.asarray(centre, dtype=np.float64), normal, extent, down, across))
+    return patches
+
+
+def _box_line(half: float, bevel: float, steps: int, cells: int) -> Array:
+    """Grid lines across a box's face: equal angles over each rounded edge, equal cells between."""
+    angle = np.tan(np.linspace(0.0, np.pi / 4, steps + 1))
+    edge = half - bevel + bevel * angle
+    flat = np.linspace(-(half - bevel), half - bevel, cells + 1)
+    return np.concatenate([-edge[::-1][:-1], flat, edge[1:]])

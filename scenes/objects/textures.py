@@ -1,0 +1,282 @@
+"""Procedural base colours: small functions from surface points to display-referred sRGB.
+
+A `Paint` maps `Texels` to (N, 3) colours in [0, 1]. Painting in object coordinates (`xyz`) makes patterns run on across
+the edges of charts; painting in chart coordinates (`u`, `v` times `size`) suits patterns that should wrap around a
+part. Lengths are in the object's units.
+"""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from advsearch.bundled.objects.draw import Draw
+from advsearch.bundled.objects.shapes import Array, Indices
+
+Color = Array  # (3,) display-referred sRGB
+
+
+@dataclass(frozen=True, eq=False)
+class Texels:
+    """Points to colour: positions (N, 3), chart coordinates (N,) in [0, 1], and the chart's size in object units."""
+
+    xyz: Array
+    u: Array
+    v: Array
+    size: tuple[float, float]
+
+
+Paint = Callable[[Texels], Array]
+Mask = Callable[[Texels], Array]  # (N,) weights in [0, 1]
+
+
+def hexed(code: str) -> Color:
+    """Return the colour written as six hexadecimal digits, with or without '#'."""
+    code = code.lstrip("#")
+    return np.array([int(code[i : i + 2], 16) / 255.0 for i in (0, 2, 4)])
+
+
+def shade(color: Color, factor: float) -> Color:
+    """Return the colour made darker (factor below 1) or lighter (above 1), clipped to [0, 1]."""
+    return np.clip(color * factor, 0.0, 1.0)
+
+
+def colour(draw: Draw, canonical: str, *others: str, wild: float = 0.4) -> Color:
+    """Return the canonical colour; when drawing, one of those given, jittered, or with chance `wild` any colour."""
+    if draw.rng is None:
+        return hexed(canonical)
+    if draw.rng.random() < wild:
+        hue, saturation, value = draw.rng.random(), draw.rng.random() ** 0.7, draw.rng.uniform(0.15, 0.97)
+        return np.array(colorsys.hsv_to_rgb(hue, saturation, value))
+    base = hexed(str(draw.pick(canonical, *others)))
+    return np.clip(base * draw.rng.uniform(0.85, 1.12) + draw.rng.uniform(-0.05, 0.05, 3), 0.02, 0.98)
+
+
+# ------------------------------------------------------------------------------------------------------ noise
+
+_CELLS = 16
+_LATTICE = np.random.Generator(np.random.PCG64(20)).random(_CELLS**3)
+
+
+def noise(points: Array) -> Array:
+    """Value noise: (N, 3) points to (N,) values in [0, 1], smooth at a scale of 1, period 16 along each axis."""
+    cell = np.floor(points)
+    f = points - cell
+    f = f * f * (3.0 - 2.0 * f)
+    low = cell.astype(np.int64) & (_CELLS - 1)
+    high = (low + 1) & (_CELLS - 1)
+    x0, x1 = low[:, 0] * _CELLS * _CELLS, high[:, 0] * _CELLS * _CELLS
+    y0, y1 = low[:, 1] * _CELLS, high[:, 1] * _CELLS
+    z0, z1 = low[:, 2], high[:, 2]
+    fx, fy, fz = f[:, 0], f[:, 1], f[:, 2]
+
+    def line(xy: Indices) -> Array:
+        start = _LATTICE[xy + z0]
+        return start + (_LATTICE[xy + z1] - start) * fz
+
+    near = line(x0 + y0)
+    near += (line(x0 + y1) - near) * fy
+    far = line(x1 + y0)
+    far += (line(x1 + y1) - far) * fy
+    return near + (far - near) * fx
+
+
+def fbm(points: Array, octaves: int = 2) -> Array:
+    """Sum of octaves of `noise`, each half as strong and twice as fine; (N,) values in [0, 1], mean about 0.5."""
+    total, weight = np.zeros(len(points)), 0.0
+    for octave in range(octaves):
+        total += noise(points * 2.0**octave + 5.3 * octave) * 0.5**octave
+        weight += 0.5**octave
+    return total / weight
+
+
+def mix(a: Array, b: Array, weight: Array) -> Array:
+    """Blend colours (3,) or (N, 3) by (N,) weights: 0 gives a, 1 gives b."""
+    return a + (b - a) * weight[:, None]
+
+
+def within(value: Array, low: float, high: float, soft: float) -> Array:
+    """Return 1 between two values and 0 outside, with ramps `soft` wide."""
+    return step(value, low, soft) * step(-value, -high, soft)
+
+
+def step(value: Array, edge: float, soft: float) -> Array:
+    """Return 0 below the edge and 1 above it, with a ramp `soft` wide."""
+    return np.clip((value - edge) / soft + 0.5, 0.0, 1.0)
+
+
+# ------------------------------------------------------------------------------------------------------ paints
+
+
+def solid(color: Color) -> Paint:
+    """One colour."""
+    return lambda t: np.broadcast_to(color, (len(t.u), 3))
+
+
+def mottled(a: Color, b: Color, scale: float, offset: Array, contrast: float = 2.0) -> Paint:
+    """Clouds of two colours, `scale` wide."""
+
+    def paint(t: Texels) -> Array:
+        return mix(a, b, np.clip((fbm(t.xyz / scale + offset) - 0.5) * contrast + 0.5, 0.0, 1.0))
+
+    return paint
+
+
+def speckled(base: Paint, color: Color, scale: float, offset: Array, amount: float = 0.16) -> Paint:
+    """Small irregular specks on another paint; `amount` is about the share of the surface they cover."""
+    return over(base, lambda t: step(noise(t.xyz / scale + offset), 1.0 - 1.1 * amount, 0.12), solid(color))
+
+
+def gradient(a: Color, b: Color, low: float, high: float, axis: int = 2) -> Paint:
+    """From colour a at `low` to colour b at `high` along an axis."""
+    return lambda t: mix(a, b, np.clip((t.xyz[:, axis] - low) / (high - low), 0.0, 1.0))
+
+
+def wood(color: Color, scale: float, offset: Array, axis: int = 2, contrast: float = 0.45) -> Paint:
+    """Wood with its grain along an axis: wobbling growth rings and fine fibres; rings are about `scale` apart."""
+
+    def paint(t: Texels) -> Array:
+        stretch = np.full(3, 1.0 / scale)
+        stretch[axis] = 0.12 / scale
+        p = t.xyz * stretch + offset
+        across = [i for i in range(3) if i != axis]
+        ring = p[:, across[0]] + 0.6 * p[:, across[1]] + 1.6 * noise(p * 0.45)
+        rings = 0.5 + 0.5 * np.sin(2 * np.pi * ring * 0.8)
+        fibre = noise(p * np.where(np.arange(3) == axis, 1.0, 4.0))
+        return np.clip(color * (1.0 - contrast * (0.55 * rings**2 + 0.45 * fibre))[:, None] * 1.12, 0.0, 1.0)
+
+    return paint
+
+
+def rings(a: Color, b: Color, period: float, share: float = 0.5, axis: int = 2, phase: float = 0.0) -> Paint:
+    """Stripes across an axis; colour b takes `share` of every period."""
+
+    def paint(t: Texels) -> Array:
+        wave = (t.xyz[:, axis] / period + phase) % 1.0
+        return mix(a, b, step(share / 2 - np.abs(wave - 0.5), 0.0, 0.06))
+
+    return paint
+
+
+def _cells(t: Texels, cell: float) -> tuple[Array, Array]:
+    """Chart coordinates counted in cells about `cell` wide, a whole number of them across the chart."""
+    return t.u * max(1, round(t.size[0] / cell)), t.v * max(1, round(t.size[1] / cell))
+
+
+def stripes(a: Color, b: Color, cell: float, share: float = 0.5, slant: int = 0) -> Paint:
+    """Stripes up the chart, `cell` apart; `slant` cells of shift from bottom to top."""
+
+    def paint(t: Texels) -> Array:
+        across, _ = _cells(t, cell)
+        wave = (across + slant * t.v) % 1.0
+        return mix(a, b, step(share / 2 - np.abs(wave - 0.5), 0.0, 0.08))
+
+    return paint
+
+
+def checks(a: Color, b: Color, cell: float) -> Paint:
+    """A chequer board with squares `cell` wide."""
+
+    def paint(t: Texels) -> Array:
+        across, up = _cells(t, 2 * cell)
+        return mix(a, b, ((np.floor(2 * across) + np.floor(2 * up)) % 2.0))
+
+    return paint
+
+
+def dots(base: Paint, color: Color, cell: float, radius: float = 0.3) -> Paint:
+    """Round dots in staggered rows on another paint; radius in cells."""
+
+    def mask(t: Texels) -> Array:
+        across, up = _cells(t, cell)
+        across = across + 0.5 * (np.floor(up) % 2.0)
+        return step(radius - np.hypot(across % 1.0 - 0.5, up % 1.0 - 0.5), 0.0, 0.1)
+
+    return over(base, mask, solid(color))
+
+
+def zigzag(a: Color, b: Color, cell: float) -> Paint:
+    """Chevrons running around the chart, `cell` high."""
+
+    def paint(t: Texels) -> Array:
+        across, up = _cells(t, cell)
+        wave = (up + np.abs(across % 1.0 - 0.5)) % 1.0
+        return mix(a, b, step(0.25 - np.abs(wave - 0.5), 0.0, 0.1))
+
+    return paint
+
+
+def over(base: Paint, mask: Mask, top: Paint) -> Paint:
+    """One paint over another, where the mask is above 0."""
+
+    def paint(t: Texels) -> Array:
+        weight = mask(t)
+        near = np.nonzero(weight)[0]
+        color = np.array(np.broadcast_to(base(t), (len(weight), 3)))
+        if len(near):
+            part = Texels(t.xyz[near], t.u[near], t.v[near], t.size)
+            color[near] = mix(color[near], top(part), weight[near])
+        return color
+
+    return paint
+
+
+def between(low: float, high: float, axis: int = 2, soft: float = 0.02) -> Mask:
+    """1 where a coordinate lies between two values; the edges are `soft` wide, in object units."""
+
+    return lambda t: within(t.xyz[:, axis], low, high, soft)
+
+
+def facing(degrees: float, half_width: float, low: float, high: float, soft: float = 0.02) -> Mask:
+    """1 on a label: within `half_width` degrees of the azimuth `degrees` about z, and between two heights."""
+    rows = between(low, high, soft=soft)
+
+    def mask(t: Texels) -> Array:
+        weight = rows(t)
+        near = np.nonzero(weight)[0]
+        angle = np.degrees(np.arctan2(t.xyz[near, 1], t.xyz[near, 0]))
+        away = np.abs((angle - degrees + 180.0) % 360.0 - 180.0)
+        weight[near] *= step(half_width - away, 0.0, 2.0)
+        return weight
+
+    return mask
+
+
+def anything(draw: Draw, size: float) -> Paint:
+    """A paint of any kind in any colours, for instances whose texture says nothing about their class.
+
+    Args:
+        draw: must hold a generator.
+        size: about the size of the object, in its units.
+    """
+    a, b = colour(draw, "808080", wild=1.0), colour(draw, "808080", wild=1.0)
+    cell = size * draw(0.1, 0.05, 0.2)
+    at = draw.offset()
+    kind = draw.pick("solid", "rings", "stripes", "checks", "dots", "zigzag", "mottled", "speckled", "gradient", "wood")
+    if kind == "rings":
+        return rings(a, b, cell, draw(0.5, 0.2, 0.8), axis=int(draw.pick(0, 1, 2)))
+    if kind == "stripes":
+        return stripes(a, b, cell, draw(0.5, 0.2, 0.8), int(draw.pick(0, 1, 3)))
+    if kind == "checks":
+        return checks(a, b, cell)
+    if kind == "dots":
+        return dots(solid(a), b, cell, draw(0.3, 0.18, 0.42))
+    if kind == "zigzag":
+        return zigzag(a, b, cell)
+    if kind == "mottled":
+        return mottled(a, b, 1.5 * cell, at, draw(2.0, 1.0, 4.0))
+    if kind == "speckled":
+        return speckled(solid(a), b, 0.4 * cell, at, draw(0.2, 0.1, 0.4))
+    if kind == "gradient":
+        return gradient(a, b, 0.0, size, axis=int(draw.pick(0, 1, 2)))
+    if kind == "wood":
+        return wood(colour(draw, "9a6a3c", "c89b62", "5b3a22"), 0.5 * cell, at, axis=int(draw.pick(0, 1, 2)))
+    return solid(a)
+
+
+def natural(draw: Draw, size: float, paint: Paint, wild: float = 0.35) -> Paint:
+    """Return the paint, or when drawing, with chance `wild`, one of `anything` in its place."""
+    return anything(draw, size) if draw.chance(wild) else paint

@@ -1,0 +1,403 @@
+"""Policies on objectives with a known optimum, and one battery that every registered policy must pass."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.attacks import (
+    PGD,
+    POLICIES,
+    Block,
+    Domain,
+    Ending,
+    Evaluation,
+    Policy,
+    Random,
+    get_objective,
+    make_policy,
+    search,
+)
+from advsearch.attacks.objectives import OBJECTIVES
+from advsearch.attacks.policies.base import seeded
+from advsearch.attacks.policies.pgd import Window
+from advsearch.errors import InputError, UnknownNameError
+
+RATIO = 1.05  # an optimum counts as reached within this factor (STYLE, and the figure of adversarial-library)
+STEPS = 60
+DIMS = (2, 30, 1000)
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A closed-form objective, zero at the start, whose largest value on its domain is known."""
+
+    domain: Domain
+    value: Callable[[Tensor], float]
+    gradient: Callable[[Tensor], Tensor]
+    optimum: float
+
+    def evaluator(self, seed: int = 0, noise: float = 0.0) -> Callable[..., Evaluation]:
+        """Evaluate with gaussian noise: on the value, of `noise` x 5 % of the optimum; on every gradient element, of
+        `noise` x the gradient's root mean square (so with noise 1 half of the gradient's energy is noise)."""
+
+        def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+            rng = seeded(seed, index)
+            exact = self.gradient(u)
+            rough = exact + noise * exact.square().mean().sqrt() * torch.randn(exact.shape, generator=rng)
+            value = self.value(u) + noise * 0.05 * self.optimum * float(torch.randn(1, generator=rng))
+            return Evaluation(value, rough if gradient else None, torch.tensor([0.0, value]), value > 0)
+
+        return evaluate
+
+
+def domain_of(start: Tensor, norm: str) -> Domain:
+    d = start.numel()
+    epsilon = {"linf": 0.1, "l2": 0.1 * math.sqrt(d), "box": None}[norm]
+    return Domain(start, (Block(d, norm, epsilon),))  # type: ignore[arg-type]
+
+
+def linear(d: int, norm: str, seed: int) -> Problem:
+    """w.(u - start); the start is uniform in the box, so that the box cuts the ball. The optimum is a corner of a box, or
+    the point where an l2 ball's surface, cut by the box, touches a plane (the projection of a point far along w)."""
+    rng = seeded(seed, d)
+    start, w = torch.rand(d, generator=rng), torch.randn(d, generator=rng)
+    domain = domain_of(start, norm)
+    best = domain.project(start + 1e4 * w) if norm == "l2" else torch.where(w > 0, domain.upper, domain.lower)
+
+    def value(u: Tensor) -> float:
+        return float((w.double() * (u - start).double()).sum())
+
+    return Problem(domain, value, lambda u: w, value(best))
+
+
+def quadratic(d: int, norm: str, seed: int, *, inside: bool) -> Problem:
+    """A concave quadratic with curvatures from 1 to 8 and its peak inside the domain or outside. For a box the optimum is
+    the clipped peak; for an l2 ball it is found by exact projected gradient steps, run until they stand still."""
+    rng = seeded(seed, d)
+    start = torch.rand(d, generator=rng) * 0.6 + 0.2
+    domain = domain_of(start, norm)
+    curvature = torch.linspace(0.0, math.log(8.0), d).exp()
+    offset = torch.randn(d, generator=rng) * {"linf": 0.1, "l2": 0.1, "box": 0.5}[norm]
+    peak = domain.project(start + 0.5 * offset) if inside else start + 3.0 * offset
+
+    def value(u: Tensor) -> float:
+        energy = curvature.double() * ((start - peak).double().square() - (u - peak).double().square())
+        return 0.5 * float(energy.sum())
+
+    best = domain.project(peak)
+    if norm == "l2" and not inside:
+        for _ in range(500):
+            best = domain.project(best + curvature * (peak - best) / 8.0)
+    return Problem(domain, value, lambda u: curvature * (peak - u), value(best))
+
+
+def make_problem(kind: str, norm: str, d: int, seed: int) -> Problem:
+    if kind == "linear":
+        return linear(d, norm, seed)
+    return quadratic(d, norm, seed, inside=kind == "peak inside")
+
+
+KINDS = ("linear", "peak inside", "peak outside")
+NORMS = ("linf", "l2", "box")
+
+
+# ---- known optima
+
+
+@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("norm", NORMS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_pgd_reaches_the_optimum(kind: str, norm: str, d: int) -> None:
+    problem = make_problem(kind, norm, d, seed=1)
+    result = search(problem.evaluator(), problem.domain, PGD(), steps=STEPS, seed=0)
+    assert problem.value(result.best_u) <= problem.optimum * (1 + 1e-4)
+    assert problem.value(result.best_u) >= problem.optimum / RATIO
+    assert problem.domain.contains(result.best_u)
+
+
+@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("norm", NORMS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_pgd_reaches_the_optimum_through_noise(kind: str, norm: str, d: int) -> None:
+    values = []
+    for seed in range(4):
+        problem = make_problem(kind, norm, d, seed)
+        result = search(problem.evaluator(seed, noise=0.5), problem.domain, PGD(), steps=STEPS, seed=seed)
+        values.append(problem.value(result.best_u) / problem.optimum)
+    assert sum(values) / 4 >= 1 / RATIO
+
+
+@pytest.mark.parametrize("norm", ["linf", "l2"])
+def test_pgd_follows_a_gradient_that_is_nearly_all_noise(norm: str) -> None:
+    """Two gradients of a textured object's margin at 16 samples have a cosine of 0.02 (measured); here it is 0.06."""
+    problem = linear(20_000, norm, seed=3)
+    result = search(problem.evaluator(noise=4.0), problem.domain, PGD(), steps=STEPS, seed=0)
+    assert problem.value(result.best_u) >= 0.7 * problem.optimum
+
+
+def test_momentum_pays_under_noise() -> None:
+    problem = linear(5_000, "linf", seed=3)
+
+    def reached(momentum: float) -> float:
+        result = search(problem.evaluator(noise=4.0), problem.domain, PGD(momentum=momentum), steps=24, seed=0)
+        return problem.value(result.best_u)
+
+    assert reached(0.75) > 1.05 * reached(0.0)
+
+
+@pytest.mark.parametrize("d", DIMS)
+@pytest.mark.parametrize("norm", ["linf", "l2"])
+def test_random_loses_to_pgd_on_a_linear_objective(norm: str, d: int) -> None:
+    problem = linear(d, norm, seed=2)
+    ours = search(problem.evaluator(), problem.domain, PGD(), steps=STEPS, seed=0)
+    theirs = search(problem.evaluator(), problem.domain, Random(), steps=STEPS, seed=0)
+    assert problem.value(theirs.best_u) <= problem.value(ours.best_u)
+    if d > 2:
+        assert problem.value(theirs.best_u) < 0.75 * problem.optimum
+
+
+def test_random_samples_the_corners_by_turns() -> None:
+    problem = linear(200, "linf", seed=0)
+    seen: list[Tensor] = []
+    search(
+        problem.evaluator(),
+        problem.domain,
+        Random(),
+        steps=4,
+        seed=0,
+        candidates=0,
+        on_step=lambda record, u, evaluation: seen.append(u),
+    )
+    corners = [bool(((u == problem.domain.lower) | (u == problem.domain.upper)).all()) for u in seen]
+    assert corners == [True, False, True, False]
+
+
+# ---- how pgd steps
+
+
+def test_pgd_starts_at_the_start_and_steps_by_a_fraction_of_epsilon() -> None:
+    problem = linear(50, "linf", seed=0)
+    seen: list[Tensor] = []
+    search(
+        problem.evaluator(),
+        problem.domain,
+        PGD(step_size=0.25),
+        steps=2,
+        seed=0,
+        candidates=0,
+        on_step=lambda record, u, evaluation: seen.append(u),
+    )
+    assert torch.equal(seen[0], problem.domain.start)
+    assert float((seen[1] - seen[0]).abs().max()) == pytest.approx(0.025, abs=1e-6)
+
+
+def test_pgd_halves_its_step_when_the_objective_stalls_and_not_before() -> None:
+    problem = quadratic(20, "linf", seed=0, inside=True)
+    result = search(problem.evaluator(), problem.domain, PGD(), steps=STEPS, seed=0)
+    sizes = [record.step_size for record in result.history]
+    assert sizes[0] == PGD().step_size
+    assert all(b in (a, a / 2) for a, b in zip(sizes, sizes[1:], strict=False))
+    assert sizes[-1] <= sizes[0] / 8
+    climbing = Domain(torch.zeros(4), (Block(4),))
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        return Evaluation(float(index), torch.ones(4), torch.zeros(2), False)
+
+    assert search(evaluate, climbing, PGD(), steps=STEPS, seed=0).history[-1].step_size == PGD().step_size
+
+
+def test_pgd_goes_back_to_its_best_when_it_has_fallen_behind() -> None:
+    """A peak that only the first steps see; then the gradient leads away from it, downhill."""
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        return Evaluation(5.0 if index == 2 else -0.1 * index, torch.ones(2), torch.zeros(2), False)
+
+    seen: list[Tensor] = []
+    domain = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),))
+    search(
+        evaluate,
+        domain,
+        PGD(step_size=0.125, momentum=0.0),
+        steps=40,
+        seed=0,
+        candidates=0,
+        on_step=lambda record, u, evaluation: seen.append(u),
+    )
+    returned = [k for k in range(3, 40) if float(seen[k][0]) < float(seen[k - 1][0]) - 1e-6]
+    assert returned, "it never went back"
+    assert float((seen[returned[0]] - seen[2]).abs().max()) <= 0.4 * 0.125 + 1e-6
+
+
+def test_a_window_goes_back_only_for_more_than_noise() -> None:
+    window = Window(4, (1.0, 2.0, 1.0, 2.0))
+    assert not window.lags(2.5)
+    assert window.lags(3.0)
+
+
+def test_a_non_finite_objective_sends_pgd_back_with_half_the_step() -> None:
+    wall = 0.55
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        value = float(u[0]) if float(u[0]) < wall else math.nan
+        return Evaluation(value, torch.ones(1) if gradient else None, torch.zeros(2), False)
+
+    domain = Domain(torch.tensor([0.5]), (Block(1, "linf", 0.1),))
+    result = search(evaluate, domain, PGD(step_size=1.0, momentum=0.0), steps=STEPS, seed=0)
+    assert result.stopped is Ending.BUDGET_SPENT
+    assert 0 < result.non_finite_objectives < STEPS / 2
+    assert float(result.best_u[0]) > 0.54
+
+
+def test_pgd_without_any_gradient_stalls() -> None:
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        return Evaluation(-1.0, torch.zeros_like(u), torch.zeros(2), False)
+
+    domain = Domain(torch.full((5,), 0.5), (Block(5, "linf", 0.1),))
+    result = search(evaluate, domain, PGD(), steps=STEPS, seed=0)
+    assert result.ending is Ending.STALLED
+    assert len(result.history) == 5
+
+
+def test_pgd_leaves_a_flat_start_at_random() -> None:
+    """The gradient is zero at the start only, as under a saturated softmax."""
+    problem = linear(20, "linf", seed=0)
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        evaluation = problem.evaluator()(u, index=index, gradient=gradient)
+        return Evaluation(0.0, torch.zeros(20), evaluation.logits, False) if index == 0 else evaluation
+
+    result = search(evaluate, problem.domain, PGD(), steps=STEPS, seed=0)
+    assert problem.value(result.best_u) >= problem.optimum / RATIO
+
+
+def test_a_random_start_is_another_place_inside() -> None:
+    problem = linear(20, "linf", seed=0)
+    starts = []
+    for seed in (0, 0, 1):
+        result = search(problem.evaluator(), problem.domain, PGD(random_start=True), steps=1, seed=seed, candidates=0)
+        starts.append(result.best_u)
+    assert torch.equal(starts[0], starts[1])
+    assert not torch.equal(starts[0], starts[2])
+    assert not torch.equal(starts[0], problem.domain.start)
+
+
+# ---- the battery: every registered policy, every objective
+
+MIXED = Domain(
+    torch.rand(18, generator=seeded(0, 0)),
+    (Block(8, "linf", 0.1, name="texture"), Block(6, "l2", 0.2), Block(4, name="pose")),
+)
+
+OPTIONS: dict[str, dict[str, object]] = {
+    "pgd": {"step_size": 0.5, "momentum": 0.9, "random_start": True},
+    "random": {},
+}
+
+
+def every_policy() -> list[Policy[object]]:
+    assert set(OPTIONS) == set(POLICIES), "a new policy needs its options in the battery"
+    return [make_policy(name) for name in POLICIES] + [make_policy(name, **OPTIONS[name]) for name in POLICIES]
+
+
+def classifier(objective: str, nan_at: int = -1) -> Callable[..., Evaluation]:
+    """A small random network of u with four classes, seen through noise, as an `evaluate`."""
+    rng = seeded(1, 1)
+    first, second = torch.randn(18, 12, generator=rng), torch.randn(12, 4, generator=rng)
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        x = u.clone().requires_grad_(gradient)
+        noise = 0.01 * torch.randn(18, generator=seeded(7, index))
+        logits = (((x + noise) @ first).tanh() @ second)[None]
+        value = get_objective(objective)(logits, torch.zeros(1, 1, 1, 3), (0, 2))[0]
+        slope = torch.autograd.grad(value, x)[0] if gradient else None
+        if slope is not None and index % 3 == 1:
+            slope[index % 18] = math.nan
+        number = math.nan if index == nan_at else float(value.detach())
+        return Evaluation(number, slope, logits[0].detach(), bool(logits.argmax() % 2))
+
+    return evaluate
+
+
+@pytest.mark.parametrize("objective", sorted(OBJECTIVES))
+@pytest.mark.parametrize("policy", every_policy(), ids=lambda p: f"{p.name}-{hash(p) % 1000}")
+def test_the_battery(policy: Policy[object], objective: str) -> None:
+    """Stays inside, keeps dtype and shape, honours the budget, survives NaN, and repeats with its seed."""
+
+    def run(seed: int) -> list[Tensor]:
+        seen: list[Tensor] = []
+
+        def look(record: object, u: Tensor, evaluation: Evaluation) -> None:
+            assert (u.dtype, u.shape) == (torch.float32, (18,))
+            assert MIXED.contains(u)
+            seen.append(u.clone())
+
+        evaluate = classifier(objective, nan_at=4)
+        result = search(evaluate, MIXED, policy, steps=15, seed=seed, candidates=2, repeats=2, on_step=look)
+        assert len(result.history) == 15
+        assert result.renders == len(seen) <= 15 + 2 * 2
+        assert (result.gradients > 0) == policy.uses_gradient
+        assert result.non_finite_objectives == 1
+        assert result.best_u.dtype == torch.float32
+        assert MIXED.contains(result.best_u)
+        assert math.isfinite(result.best_objective)
+        return seen
+
+    first, second, other = run(3), run(3), run(4)
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    if policy.name == "random" or getattr(policy, "random_start", False):
+        assert not torch.equal(first[0], other[0])
+
+
+@pytest.mark.parametrize("name", sorted(POLICIES))
+def test_states_are_passed_and_not_kept(name: str) -> None:
+    """Going back to an old state replays the same future."""
+    policy = make_policy(name)
+    evaluate = classifier("margin")
+
+    def play(state: object, steps: int, index: int) -> tuple[object, Tensor]:
+        u = MIXED.start
+        for k in range(index, index + steps):
+            proposal, state = policy.propose(state)
+            assert proposal is not None
+            u = proposal.u
+            evaluation = evaluate(u, index=3 * k, gradient=proposal.gradient)
+            state = policy.update(state, u, evaluation)
+        return state, u
+
+    middle, _ = play(policy.start(MIXED, torch.Generator().manual_seed(0), 20), 4, 0)
+    _, once = play(middle, 5, 4)
+    _, again = play(middle, 5, 4)
+    assert torch.equal(once, again)
+
+
+@pytest.mark.parametrize("name", sorted(POLICIES))
+def test_a_registered_policy_knows_its_name(name: str) -> None:
+    assert make_policy(name).name == name
+
+
+def test_unknown_policies_and_options_name_their_neighbours() -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown policy 'pdg'. Did you mean 'pgd'"):
+        make_policy("pdg")
+    with pytest.raises(UnknownNameError, match=r"unknown option of policy 'pgd': 'stepsize'. Did you mean 'step_size'"):
+        make_policy("pgd", stepsize=0.1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"step_size": 0.0}, r"--step-size: expected a number in \(0, 2\]"),
+        ({"step_size": math.nan}, "--step-size: expected a number in"),
+        ({"step_size": 3.0}, "got 3.0; try 0.25"),
+        ({"momentum": 1.0}, r"momentum: expected a number in \[0, 1\), got 1.0"),
+        ({"momentum": -0.1}, "momentum: expected a number"),
+    ],
+)
+def test_options_out_of_range_are_refused(options: dict[str, float], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        make_policy("pgd", **options)

@@ -1,0 +1,311 @@
+"""The search loop: budgets, endings, what it does with noise, NaN and interrupts. Policies here are made to order."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.attacks import (
+    PGD,
+    Block,
+    Domain,
+    Ending,
+    Evaluation,
+    Policy,
+    Proposal,
+    Random,
+    StepRecord,
+    planned_renders,
+    search,
+    stop_at_margin,
+)
+from advsearch.attacks.candidates import Candidate, admit, best
+from advsearch.errors import InputError
+
+DOMAIN = Domain(torch.full((3,), 0.5), (Block(3, "linf", 0.2),))
+
+
+@dataclass(frozen=True)
+class Script(Policy[int]):
+    """Proposes what it was told to, in order, then nothing more."""
+
+    us: tuple[Any, ...]
+    gradient: bool = False
+    name: ClassVar[str] = "script"
+    uses_gradient: ClassVar[bool] = False
+
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> int:
+        return 0
+
+    def propose(self, state: int) -> tuple[Proposal | None, int]:
+        return (Proposal(self.us[state], self.gradient) if state < len(self.us) else None), state + 1
+
+    def update(self, state: int, u: Tensor, evaluation: Evaluation) -> int:
+        assert math.isfinite(evaluation.objective) or evaluation.objective == -math.inf
+        assert evaluation.gradient is None or bool(torch.isfinite(evaluation.gradient).all())
+        return state
+
+
+def at(value: float) -> Tensor:
+    return torch.full((3,), 0.5 + value)
+
+
+def objective_is(value: Callable[[Tensor, int], float]) -> Callable[..., Evaluation]:
+    """An `evaluate` whose margin is a function of u and the seed index."""
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        v = value(u, index)
+        return Evaluation(v, torch.ones_like(u) if gradient else None, torch.tensor([0.0, v]), v > 0)
+
+    return evaluate
+
+
+RISE = objective_is(lambda u, index: float(u[0] - 0.5))
+
+
+def test_the_best_configuration_wins_and_the_budget_is_kept() -> None:
+    result = search(RISE, DOMAIN, Script((at(-0.1), at(0.1), at(0.0))), steps=3, seed=0)
+    assert torch.equal(result.best_u, at(0.1))
+    assert result.best_objective == pytest.approx(0.1)
+    assert result.ending is Ending.FOUND
+    assert result.stopped is Ending.BUDGET_SPENT
+    assert [r.phase for r in result.history] == ["search"] * 3
+    assert len(result.ranking) == 6  # three candidates, twice each
+    assert result.renders == len(result.history) + len(result.ranking) <= planned_renders(3)
+    assert [r.best for r in result.history] == pytest.approx([-0.1, 0.1, 0.1])
+    assert result.gradients == 0
+
+
+def test_without_a_success_the_ending_is_budget_spent() -> None:
+    result = search(RISE, DOMAIN, Script((at(-0.1), at(-0.05))), steps=2, seed=0)
+    assert result.ending is Ending.BUDGET_SPENT
+    assert result.success_rate == 0.0
+    assert torch.equal(result.best_u, at(-0.05))
+
+
+def test_every_evaluation_has_its_own_seed_and_ranking_shares_new_ones() -> None:
+    result = search(RISE, DOMAIN, Script((at(-0.1), at(0.1), at(0.0))), steps=3, seed=0, candidates=2, repeats=3)
+    assert [r.index for r in result.history] == [0, 1, 2]
+    assert [r.index for r in result.ranking] == [3, 4, 5, 3, 4, 5]
+
+
+def test_the_last_gradient_is_not_asked_for() -> None:
+    result = search(RISE, DOMAIN, PGD(), steps=5, seed=0)
+    assert result.gradients == 4
+    assert math.isnan(result.history[-1].gradient_norm)
+    assert result.history[0].gradient_norm == pytest.approx(math.sqrt(3))
+
+
+def test_a_policy_with_nothing_more_to_propose_has_stalled() -> None:
+    result = search(RISE, DOMAIN, Script((at(-0.1),)), steps=9, seed=0)
+    assert result.ending is Ending.STALLED
+    assert len(result.history) == 1
+
+
+def test_a_lucky_render_loses_to_a_candidate_that_keeps_its_promise() -> None:
+    """Index 0 adds two logits of luck to a bad configuration; new seeds expose it."""
+    lucky = objective_is(lambda u, index: float(u[0] - 0.5) + (2.0 if index == 0 else 0.0))
+    script = Script((at(-0.15), at(0.1), at(0.0)))
+    ranked = search(lucky, DOMAIN, script, steps=3, seed=0)
+    assert torch.equal(ranked.best_u, at(0.1))
+    assert ranked.best_objective == pytest.approx(0.1)
+    raw = search(lucky, DOMAIN, script, steps=3, seed=0, candidates=0)
+    assert torch.equal(raw.best_u, at(-0.15))
+    assert raw.best_objective == raw.claimed_objective == pytest.approx(1.85)
+
+
+def test_a_claim_that_ranking_refutes_is_no_find() -> None:
+    lucky = objective_is(lambda u, index: 1.0 if index == 0 else -1.0)
+    result = search(lucky, DOMAIN, Script((at(0.1), at(0.0))), steps=2, seed=0)
+    assert result.claimed_objective == 1.0
+    assert result.best_objective == -1.0
+    assert result.ending is Ending.BUDGET_SPENT
+
+
+def test_ranking_takes_the_winners_curse_out() -> None:
+    """Forty equal configurations with one logit of noise: the raw best is biased by two logits, the answer is not."""
+    claimed, believed = [], []
+    for seed in range(20):
+        noise = torch.randn(200, generator=torch.Generator().manual_seed(seed)).tolist()
+        result = search(
+            objective_is(lambda u, index, noise=noise: noise[index] - 5.0), DOMAIN, Random(), steps=40, seed=seed
+        )
+        claimed.append(result.claimed_objective + 5.0)
+        believed.append(result.best_objective + 5.0)
+    assert sum(claimed) / 20 > 1.5
+    assert abs(sum(believed) / 20) < 0.5
+
+
+# ---- stopping early
+
+
+def test_stop_when_ends_the_search_at_its_first_hit() -> None:
+    us = tuple(at(v) for v in (-0.1, 0.05, 0.15, 0.2))
+    result = search(RISE, DOMAIN, Script(us), steps=4, seed=0, stop_when=stop_at_margin(0.1, (0,)))
+    assert len(result.history) == 3
+    assert result.ending is Ending.FOUND
+
+
+# ---- non-finite numbers
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_non_finite_objective_is_counted_and_never_best(bad: float) -> None:
+    evaluate = objective_is(lambda u, index: bad if index == 1 else float(u[0] - 0.5))
+    result = search(evaluate, DOMAIN, Script((at(0.05), at(0.2), at(0.1))), steps=3, seed=0)
+    assert torch.equal(result.best_u, at(0.1))
+    assert result.non_finite_objectives == 1
+    assert math.isnan(result.history[1].objective)
+    assert not result.history[1].success
+    assert result.history[1].best == pytest.approx(0.05)
+
+
+def test_three_in_a_row_end_the_search() -> None:
+    bad = {1, 3, 4, 5}
+    evaluate = objective_is(lambda u, index: math.nan if index in bad else -1.0)
+    result = search(evaluate, DOMAIN, Script((at(0.0),) * 9), steps=9, seed=0)
+    assert result.ending is Ending.NON_FINITE
+    assert len(result.history) == 6
+    assert result.non_finite_objectives == 4
+
+
+def test_nothing_but_nan_returns_the_start() -> None:
+    result = search(objective_is(lambda u, index: math.nan), DOMAIN, PGD(), steps=9, seed=0)
+    assert result.ending is Ending.NON_FINITE
+    assert torch.equal(result.best_u, DOMAIN.start)
+    assert math.isnan(result.best_objective)
+    assert result.renders == 3
+
+
+def test_a_candidate_that_turns_nan_when_ranked_is_not_the_answer() -> None:
+    evaluate = objective_is(lambda u, index: math.nan if index >= 2 and float(u[0]) > 0.55 else float(u[0] - 0.5))
+    result = search(evaluate, DOMAIN, Script((at(0.1), at(0.02))), steps=2, seed=0)
+    assert torch.equal(result.best_u, at(0.02))
+    assert result.non_finite_objectives == 2
+
+
+def test_non_finite_gradient_elements_become_zero_and_are_counted() -> None:
+    gradients = []
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        value = torch.tensor([math.nan, 1.0, -math.inf]) if gradient else None
+        return Evaluation(0.5, value, torch.zeros(2), True, non_finite=1)
+
+    result = search(
+        evaluate,
+        DOMAIN,
+        Script((at(0.0), at(0.1)), gradient=True),
+        steps=2,
+        seed=0,
+        on_step=lambda record, u, evaluation: gradients.append(evaluation.gradient),
+    )
+    assert gradients[0].tolist() == [0.0, 1.0, 0.0]
+    assert result.history[0].non_finite == 3  # two here and one that the renderer had found
+    assert result.non_finite_elements == 3 + 1 + 4  # the last step and four ranking renders report one each
+    assert result.history[0].gradient_norm == 1.0
+
+
+# ---- interrupts
+
+
+def interrupt_at(number: int) -> Callable[..., Evaluation]:
+    def value(u: Tensor, index: int) -> float:
+        calls.append(index)
+        if len(calls) == number:
+            raise KeyboardInterrupt
+        return float(u[0] - 0.5)
+
+    calls: list[int] = []
+    return objective_is(value)
+
+
+@pytest.mark.parametrize(("number", "expected"), [(1, 0.0), (3, 0.1), (5, 0.15), (6, 0.15)])
+def test_an_interrupt_keeps_the_best_so_far(number: int, expected: float) -> None:
+    """In the first render, in the middle, and twice while candidates are ranked."""
+    script = Script((at(-0.1), at(0.1), at(0.15)))
+    result = search(interrupt_at(number), DOMAIN, script, steps=3, seed=0)
+    assert result.ending is Ending.INTERRUPTED
+    assert torch.equal(result.best_u, at(expected))
+    assert result.renders == number - 1
+
+
+def test_an_interrupt_in_the_callback_keeps_that_very_step() -> None:
+    def stop(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
+        raise KeyboardInterrupt
+
+    result = search(RISE, DOMAIN, Script((at(0.1),)), steps=1, seed=0, on_step=stop)
+    assert result.ending is Ending.INTERRUPTED
+    assert torch.equal(result.best_u, at(0.1))
+
+
+def test_other_exceptions_pass_through() -> None:
+    def broken(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        raise ZeroDivisionError("in the renderer")
+
+    with pytest.raises(ZeroDivisionError, match="in the renderer"):
+        search(broken, DOMAIN, PGD(), steps=2, seed=0)
+
+
+# ---- bugs and bad input
+
+
+@pytest.mark.parametrize(
+    ("u", "message"),
+    [
+        (at(0.21), "policy 'script' left its budget by 0.01"),
+        (at(math.nan), "policy 'script' left its budget by inf"),
+        (torch.full((4,), 0.5), r"of shape \(4,\); expected torch.float32 of shape \(3,\)"),
+        (torch.full((3,), 0.5, dtype=torch.float64), "proposed torch.float64"),
+    ],
+)
+def test_a_policy_that_leaves_the_domain_is_a_bug(u: Tensor, message: str) -> None:
+    with pytest.raises(RuntimeError, match=message):
+        search(RISE, DOMAIN, Script((u,)), steps=1, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("gradient", "message"),
+    [(None, "no gradient although one was asked for"), (torch.ones(2), r"shape \(2,\); expected torch.float32")],
+)
+def test_a_gradient_that_is_missing_or_misshapen_is_a_bug(gradient: Tensor | None, message: str) -> None:
+    def evaluate(u: Tensor, *, index: int, gradient: bool, answer: Tensor | None = gradient) -> Evaluation:
+        return Evaluation(0.0, answer, torch.zeros(2), False)
+
+    with pytest.raises(RuntimeError, match=message):
+        search(evaluate, DOMAIN, PGD(), steps=2, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"steps": 0}, "--steps: expected at least 1, got 0"),
+        ({"steps": 1, "candidates": -1}, "candidates and repeats"),
+        ({"steps": 1, "repeats": 0}, "candidates and repeats"),
+    ],
+)
+def test_impossible_budgets_are_refused(options: dict[str, int], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        search(RISE, DOMAIN, PGD(), seed=0, **options)  # type: ignore[arg-type]
+
+
+# ---- candidates
+
+
+def test_the_pool_holds_the_best_distinct_ones_and_puts_success_first() -> None:
+    pool: tuple[Candidate, ...] = ()
+    for value, objective, success in ((0.0, 3.0, False), (0.1, 1.0, True), (0.00001, 4.0, False), (0.2, 0.5, False)):
+        pool = admit(pool, Candidate(at(value), objective, success), 2)
+    assert [(round(float(c.u[0]) - 0.5, 5), c.objective) for c in pool] == [(0.1, 1.0), (0.00001, 4.0)]
+    assert admit(pool, Candidate(at(0.00002), 3.9, False), 2) == pool
+
+
+def test_half_ranked_pools_fall_back_to_the_raw_order() -> None:
+    first, second = Candidate(at(0.1), 2.0, True), Candidate(at(0.0), 1.0, True, again=(9.0,), successes=1)
+    assert best((first, second)) is first
+    assert best((Candidate(at(0.1), 2.0, True, again=(-1.0,)), second)) is second

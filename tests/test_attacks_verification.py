@@ -1,0 +1,323 @@
+"""Intervals, sample counts and verdicts. No renderer: margins are numbers with stated noise."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from advsearch.attacks import (
+    Block,
+    Domain,
+    Ending,
+    Evaluation,
+    Random,
+    Trial,
+    Trials,
+    choose_spp,
+    clopper_pearson,
+    needed,
+    run_trials,
+    search,
+    typical,
+    verdict,
+    verify,
+)
+from advsearch.errors import InputError
+
+DOMAIN = Domain(torch.full((4,), 0.5), (Block(4, "linf", 0.1),))
+WORST = DOMAIN.start + 0.1
+
+
+def noisy(clean: float, adversarial: float, noise: float) -> Callable[[torch.Tensor, int, int], Trial]:
+    """Margins that move linearly from the start (`clean`) to WORST (`adversarial`), with gaussian noise."""
+
+    def render(u: torch.Tensor, seed: int, spp: int) -> Trial:
+        way = float((u - DOMAIN.start).mean()) / 0.1
+        margin = clean + way * (adversarial - clean) + noise * float(np.random.default_rng(seed).normal())
+        return Trial(margin, 7 if margin > 0 else 0, 0.9)
+
+    return render
+
+
+# ---- intervals
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    [  # tables of exact binomial limits
+        (0, 10, 0.0, 0.3085),
+        (1, 10, 0.0025, 0.4450),
+        (5, 10, 0.1871, 0.8129),
+        (10, 20, 0.2720, 0.7280),
+        (19, 20, 0.7513, 0.9987),
+        (20, 20, 0.8316, 1.0),
+        (0, 1, 0.0, 0.975),
+    ],
+)
+def test_clopper_pearson_agrees_with_tables(successes: int, trials: int, low: float, high: float) -> None:
+    assert clopper_pearson(successes, trials) == pytest.approx((low, high), abs=6e-5)
+
+
+def test_clopper_pearson_agrees_with_scipy_and_is_exact_at_the_ends() -> None:
+    for successes in range(18):
+        ours = clopper_pearson(successes, 17, 0.9)
+        theirs = stats.binomtest(successes, 17).proportion_ci(0.9, method="exact")
+        assert ours == pytest.approx((theirs.low, theirs.high), abs=1e-9)
+    assert clopper_pearson(0, 5)[0] == 0.0
+    assert clopper_pearson(5, 5)[1] == 1.0
+
+
+@pytest.mark.parametrize("rate", [0.02, 0.3, 0.5, 0.95])
+def test_clopper_pearson_covers_at_least_as_often_as_it_says(rate: float) -> None:
+    covered = sum(
+        float(stats.binom.pmf(k, 20, rate))
+        for k in range(21)
+        if clopper_pearson(k, 20)[0] <= rate <= clopper_pearson(k, 20)[1]
+    )
+    assert covered >= 0.95
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((1, 0), "--trials: expected at least 1, got 0"),
+        ((3, 2), "successes: expected a number from 0 to 2, got 3"),
+        ((1, 2, 1.0), "confidence: expected a number between 0 and 1, got 1.0"),
+    ],
+)
+def test_impossible_counts_are_refused(arguments: tuple[float, ...], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        clopper_pearson(*arguments)  # type: ignore[arg-type]
+
+
+def test_trials_become_the_json_of_the_summary() -> None:
+    trials = Trials(20, 20, 64)
+    verified = json.loads(json.dumps(trials.to_dict()))
+    assert list(verified) == ["successes", "trials", "rate", "interval", "spp"]
+    assert verified["interval"] == pytest.approx([0.8316, 1.0], abs=1e-4)
+    control = json.loads(json.dumps(trials.to_control_dict()))
+    assert list(control) == ["correct", "trials", "rate", "interval"]
+    assert (control["correct"], control["rate"]) == (20, 1.0)
+
+
+# ---- sample counts
+
+
+def drifting(limit: float, bias: float, noise: float) -> Callable[[int, int], float]:
+    """A margin as Monte Carlo noise makes it: bias and variance fall with the sample count."""
+
+    def margin_of(spp: int, seed: int) -> float:
+        return limit - bias * 16 / spp + noise * math.sqrt(16 / spp) * float(np.random.default_rng(seed).normal())
+
+    return margin_of
+
+
+def test_margins_that_do_not_drift_settle_at_the_second_rung() -> None:
+    choice = choose_spp({"clean": drifting(-3.0, 0.0, 0.1), "adversarial": drifting(2.0, 0.0, 0.1)}, seed=0)
+    assert (choice.spp, choice.converged, choice.renders) == (64, True, 16)
+    assert [(r.name, r.spp) for r in choice.table] == [
+        ("clean", 16),
+        ("adversarial", 16),
+        ("clean", 64),
+        ("adversarial", 64),
+    ]
+    assert math.isnan(choice.table[0].drift)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_drifting_margin_climbs_until_it_stands(seed: int) -> None:
+    choice = choose_spp({"clean": drifting(-3.0, 0, 0.1), "adversarial": drifting(3.0, 4.0, 0.5)}, seed=seed)
+    assert choice.spp >= 256
+    assert choice.converged
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_noise_alone_is_no_proof_that_nothing_drifts(seed: int) -> None:
+    """A drift below its own uncertainty must not pass: at 16 and 64 samples these margins say nothing."""
+    choice = choose_spp({"clean": drifting(-3.0, 0, 0.0), "adversarial": drifting(1.0, 1.0, 2.0)}, seed=seed)
+    assert choice.spp >= 256
+
+
+def test_a_margin_at_zero_never_settles_and_says_so() -> None:
+    choice = choose_spp({"adversarial": drifting(0.0, 0.0, 0.3)}, seed=0, ladder=(16, 64, 256))
+    assert (choice.spp, choice.converged, choice.renders) == (256, False, 12)
+
+
+def test_every_render_of_a_sample_count_has_its_own_seed_and_both_groups_share_them() -> None:
+    seen: dict[str, list[int]] = {"a": [], "b": []}
+
+    def record(name: str) -> Callable[[int, int], float]:
+        return lambda spp, seed: seen[name].append(seed) or 0.0
+
+    choose_spp({name: record(name) for name in seen}, seed=3, ladder=(4, 8, 16), drift=0.5)
+    assert seen["a"] == seen["b"]
+    assert len(set(seen["a"])) == len(seen["a"]) > 4
+
+
+def test_a_nan_margin_never_settles() -> None:
+    choice = choose_spp({"adversarial": lambda spp, seed: math.nan}, seed=0, ladder=(4, 8))
+    assert not choice.converged
+
+
+def test_a_single_rung_is_taken_unmeasured() -> None:
+    choice = choose_spp({"clean": drifting(1.0, 0.0, 0.0)}, seed=0, ladder=(32,))
+    assert (choice.spp, choice.converged, choice.renders) == (32, False, 0)
+
+
+@pytest.mark.parametrize("ladder", [(), (0, 4), (16, 16), (64, 16)])
+def test_a_bad_ladder_is_refused(ladder: tuple[int, ...]) -> None:
+    with pytest.raises(InputError, match="--verify-spp: expected rising sample counts"):
+        choose_spp({}, seed=0, ladder=ladder)
+
+
+# ---- verdicts
+
+
+def test_nineteen_of_twenty_are_needed() -> None:
+    assert [needed(n) for n in (1, 10, 19, 20, 21, 40, 100, 200)] == [1, 10, 19, 19, 20, 38, 95, 190]
+
+
+@pytest.mark.parametrize(
+    ("search_ending", "clean", "adversarial", "expected"),
+    [
+        (Ending.FOUND, 20, 20, Ending.FOUND),
+        (Ending.FOUND, 19, 19, Ending.FOUND),
+        (Ending.FOUND, 20, 18, Ending.NOT_VERIFIED),
+        (Ending.FOUND, 18, 18, Ending.NOT_VERIFIED),
+        (Ending.BUDGET_SPENT, 20, 19, Ending.FOUND),
+        (Ending.BUDGET_SPENT, 20, 18, Ending.BUDGET_SPENT),
+        (Ending.STALLED, 20, 0, Ending.STALLED),
+        (Ending.NON_FINITE, 20, 0, Ending.NON_FINITE),
+        (Ending.FOUND, 9, 9, Ending.ALREADY_WRONG),
+        (Ending.BUDGET_SPENT, 0, 0, Ending.ALREADY_WRONG),
+        (Ending.INTERRUPTED, 20, 20, Ending.INTERRUPTED),
+    ],
+)
+def test_the_verdict(search_ending: Ending, clean: int, adversarial: int, expected: Ending) -> None:
+    assert verdict(search_ending, Trials(clean, 20, 64), Trials(adversarial, 20, 64)) is expected
+
+
+def test_a_real_success_is_verified() -> None:
+    result = verify(noisy(-3.0, 3.0, 0.3), DOMAIN, WORST, claim=Ending.FOUND, spp=64, seed=0)
+    assert result.ending is Ending.FOUND
+    assert (result.clean.successes, result.adversarial.successes, result.renders) == (20, 20, 40)
+    assert result.adversarial.spp == 64
+    assert "Wrong in 20 of 20 trials, clean right in 20 of 20; 19 of each are needed." in result.reason
+
+
+def test_a_success_counts_only_where_the_clean_one_is_right() -> None:
+    """The clean margin is noise around zero: whatever the answer does, half of its trials prove nothing."""
+    result = verify(noisy(-0.1, 5.0, 1.0), DOMAIN, WORST, claim=Ending.FOUND, spp=64, seed=0)
+    assert all(trial.wrong for trial in result.adversarial_trials)
+    assert result.adversarial.successes == result.clean.successes < 19
+    assert result.ending in (Ending.NOT_VERIFIED, Ending.ALREADY_WRONG)
+
+
+def test_a_start_that_is_wrong_already_is_no_find() -> None:
+    result = verify(noisy(2.0, 5.0, 0.1), DOMAIN, WORST, claim=Ending.FOUND, spp=64, seed=0)
+    assert result.ending is Ending.ALREADY_WRONG
+    assert result.adversarial.successes == 0
+    assert result.ending.explanation in result.reason
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_lucky_claim_is_not_verified(seed: int) -> None:
+    """The winner's curse: nothing in the budget beats margin -1, one logit of noise makes 60 renders look otherwise."""
+    render = noisy(-1.2, -1.0, 1.0)
+
+    def evaluate(u: torch.Tensor, *, index: int, gradient: bool) -> Evaluation:
+        margin = render(u, 1_000_003 * (seed + 1) + index, 16).margin
+        return Evaluation(margin, None, torch.tensor([0.0, margin]), margin > 0)
+
+    claim = search(evaluate, DOMAIN, Random(), steps=60, seed=seed)
+    assert claim.claimed_objective > 0.2  # the raw claim: a success, 1.2 logits over anything there is
+    result = verify(render, DOMAIN, claim.best_u, claim=Ending.FOUND, spp=64, seed=seed)
+    assert result.ending is Ending.NOT_VERIFIED
+    assert result.adversarial.interval[1] < 0.9
+
+
+def test_the_answer_is_projected_again() -> None:
+    result = verify(noisy(-3.0, 3.0, 0.1), DOMAIN, DOMAIN.start + 0.4, claim=Ending.FOUND, spp=1, seed=0)
+    assert torch.equal(result.u, DOMAIN.upper)
+    beyond = verify(noisy(-3.0, -1.0, 0.0), DOMAIN, DOMAIN.start + 0.4, claim=Ending.FOUND, spp=1, seed=0)
+    assert beyond.ending is Ending.NOT_VERIFIED
+
+
+def test_both_groups_get_the_same_fresh_seeds_and_the_control_can_be_shared() -> None:
+    seeds: list[int] = []
+
+    def render(u: torch.Tensor, seed: int, spp: int) -> Trial:
+        seeds.append(seed)
+        return Trial(-1.0 if torch.equal(u, DOMAIN.start) else 1.0, 0, 0.5)
+
+    clean = run_trials(render, DOMAIN.start, spp=8, seed=5, trials=6, group="clean")
+    shared = verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=8, seed=5, trials=6, clean=clean)
+    assert seeds[:6] == seeds[6:]
+    assert len(set(seeds[:6])) == 6
+    assert (shared.renders, shared.ending) == (6, Ending.FOUND)
+    with pytest.raises(InputError, match="clean trials: expected 20, as many as --trials, got 6"):
+        verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=8, seed=5, clean=clean)
+
+
+def test_trials_are_reported_as_they_come() -> None:
+    seen: list[tuple[str, int]] = []
+    verify(
+        noisy(-1.0, 1.0, 0.0),
+        DOMAIN,
+        WORST,
+        claim=Ending.FOUND,
+        spp=1,
+        seed=0,
+        trials=2,
+        on_trial=lambda group, number, trial: seen.append((group, number)),
+    )
+    assert seen == [("clean", 0), ("clean", 1), ("adversarial", 0), ("adversarial", 1)]
+
+
+def test_a_nan_margin_is_neither_right_nor_wrong() -> None:
+    result = verify(
+        lambda u, seed, spp: Trial(math.nan, 0, math.nan), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=4
+    )
+    assert (result.clean.successes, result.adversarial.successes) == (0, 0)
+    assert result.ending is not Ending.FOUND
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"trials": 0}, "--trials: expected at least 1, got 0"),
+        ({"spp": 0}, "--verify-spp: expected at least 1, got 0"),
+    ],
+)
+def test_bad_trial_counts_are_refused(options: dict[str, int], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        verify(noisy(-1, 1, 0), DOMAIN, WORST, claim=Ending.FOUND, seed=0, **({"spp": 4} | options))  # type: ignore[arg-type]
+
+
+def test_the_typical_answer_is_the_most_frequent_one() -> None:
+    trials = (Trial(1.0, 7, 0.5), Trial(3.0, 7, 0.7), Trial(2.0, 3, 0.99))
+    answer = typical(trials)
+    assert answer.predicted == 7
+    assert (answer.margin, answer.probability) == pytest.approx((2.0, 0.6))
+    assert typical((Trial(1.0, 9, 0.1), Trial(1.0, 2, 0.3))).predicted == 2
+
+
+def test_every_ending_has_a_value_for_json_and_a_sentence() -> None:
+    values = {ending.value for ending in Ending}
+    assert values >= {
+        "found",
+        "budget spent",
+        "not verified",
+        "stalled",
+        "non-finite objective",
+        "interrupted",
+        "already wrong",
+    }
+    for ending in Ending:
+        assert ending.explanation.endswith(".")

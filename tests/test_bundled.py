@@ -1,0 +1,224 @@
+"""The bundled objects and environments: sound meshes of every family; what is shipped is what the scripts make."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+
+from advsearch.bundled import build
+from advsearch.bundled.environments import ENVIRONMENTS
+from advsearch.bundled.environments.panorama import HEIGHT, LEVEL, WIDTH, brightness, directions, irradiance
+from advsearch.bundled.objects import OBJECTS
+from advsearch.bundled.objects.draw import Draw
+from advsearch.bundled.objects.shapes import grid
+from advsearch.errors import UnknownNameError
+from advsearch.scene import library
+from advsearch.scene.assets import Mesh, ObjectAsset, normalised
+
+SEEDS = (None, 1, 2, 3)  # None is the canonical instance
+CLASSES = {
+    "mug", "bowl", "bottle", "vase", "teapot", "wine-glass", "frying-pan",
+    "hammer", "banana", "ball", "chair", "lamp", "book", "dumbbell",
+}  # fmt: skip
+INSTANCES = [pytest.param(name, seed, id=f"{name}-{seed}") for name in sorted(OBJECTS) for seed in SEEDS]
+
+
+@functools.cache
+def instance(name: str, seed: int | None) -> ObjectAsset:
+    return OBJECTS[name].generate(None if seed is None else np.random.default_rng(seed))
+
+
+def corners(mesh: Mesh) -> np.ndarray:
+    return mesh.vertices.astype(np.float64)[mesh.faces]
+
+
+def face_normals(mesh: Mesh) -> np.ndarray:
+    a, b, c = np.moveaxis(corners(mesh), 1, 0)
+    return np.cross(b - a, c - a)
+
+
+def charts(mesh: Mesh) -> np.ndarray:
+    """Number the connected pieces of a mesh; (F,) the piece of every face."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    i, j = mesh.faces[:, [0, 1]].astype(np.int64).reshape(-1), mesh.faces[:, [1, 2]].astype(np.int64).reshape(-1)
+    size = len(mesh.vertices)
+    _, piece = connected_components(coo_matrix((np.ones(len(i)), (i, j)), shape=(size, size)), directed=False)
+    return piece[mesh.faces[:, 0]]
+
+
+# ---------------------------------------------------------------------------------------------------- objects
+
+
+def test_every_class_of_the_library_is_registered() -> None:
+    assert set(OBJECTS) == CLASSES
+    assert {family.label for family in OBJECTS.values()} == {name.replace("-", " ") for name in CLASSES}
+
+
+@pytest.mark.parametrize(("name", "seed"), INSTANCES)
+def test_a_mesh_is_sound(name: str, seed: int | None) -> None:
+    asset = instance(name, seed)
+    mesh = asset.mesh
+    assert asset.label == name.replace("-", " ")
+    assert 500 < len(mesh.faces) < 12000
+    assert all(np.isfinite(a).all() for a in (mesh.vertices, mesh.normals, mesh.uvs, asset.base_color))
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-5)
+    assert len(np.unique(mesh.faces)) == len(mesh.vertices), "vertices that no triangle uses"
+
+    normals = face_normals(mesh)
+    area = np.linalg.norm(normals, axis=1) / 2
+    assert area.min() > 1e-8, "a degenerate triangle"
+    agree = (normals * mesh.normals.astype(np.float64)[mesh.faces].mean(axis=1)).sum(axis=1)
+    assert (agree > 0.0).mean() > 0.998, "shading normals against the winding"
+
+    again = normalised(mesh)
+    assert again.vertices[:, 2].min() == 0.0
+    np.testing.assert_allclose(again.vertices, mesh.vertices, atol=2e-6)
+    volume = np.einsum("ij,ij->i", corners(mesh)[:, 0], normals).sum() / 6
+    assert volume > 0.0, "the surface is inside out"
+
+
+@pytest.mark.parametrize(("name", "seed"), INSTANCES)
+def test_charts_lie_apart_in_the_atlas(name: str, seed: int | None) -> None:
+    mesh = instance(name, seed).mesh
+    assert mesh.uvs.min() >= 0.0
+    assert mesh.uvs.max() <= 1.0
+    uv = mesh.uvs.astype(np.float64)[mesh.faces]
+    e, f = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    area = (e[:, 0] * f[:, 1] - e[:, 1] * f[:, 0]) / 2
+    assert (area > 0.0).all(), "a chart is mirrored or folded"
+    assert 0.3 < area.sum() < 1.0, "much of the atlas is empty, or charts overlap"
+
+    texels = 128  # half of the canonical size: charts must stay apart there too
+    count = np.ceil(4 * area * texels**2).astype(np.int64) + 3
+    face = np.repeat(np.arange(len(uv)), count)
+    rng = np.random.default_rng(0)
+    s, t = rng.random(len(face)), rng.random(len(face))
+    s, t = np.where(s + t > 1, 1 - s, s)[:, None], np.where(s + t > 1, 1 - t, t)[:, None]
+    cell = np.floor((uv[face, 0] + s * e[face] + t * f[face]) * texels).astype(np.int64)
+    owner = np.unique(np.stack([cell[:, 0], cell[:, 1], charts(mesh)[face]], axis=1), axis=0)
+    assert len(owner) == len(np.unique(owner[:, :2], axis=0)), "two charts share a texel"
+
+
+@pytest.mark.parametrize("name", sorted(OBJECTS))
+def test_charts_are_about_as_large_as_their_surface(name: str) -> None:
+    patches = OBJECTS[name].make(Draw(None)).patches
+    a, b, c = (np.concatenate([p.vertices[p.faces[:, i]] for p in patches]) for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    surface = np.add.reduceat(area, np.cumsum([0] + [len(p.faces) for p in patches[:-1]]))
+    ratio = np.array([p.size[0] * p.size[1] for p in patches]) / surface
+    fair = (ratio > 0.6) & (ratio < 2.2)
+    assert surface[fair].sum() > 0.9 * surface.sum(), "texels are much larger on some parts than on others"
+
+
+@pytest.mark.parametrize("name", sorted(OBJECTS))
+def test_seeds_decide_everything(name: str) -> None:
+    first, again, other = (OBJECTS[name].generate(np.random.default_rng(seed)) for seed in (7, 7, 8))
+    for part in ("vertices", "faces", "normals", "uvs"):
+        assert getattr(first.mesh, part).tobytes() == getattr(again.mesh, part).tobytes()
+    assert first.base_color.tobytes() == again.base_color.tobytes()
+    assert first.material == again.material
+    same_shape = first.mesh.vertices.shape == other.mesh.vertices.shape
+    assert not same_shape or not np.allclose(first.mesh.vertices, other.mesh.vertices, atol=1e-3)
+    assert not np.allclose(first.base_color, other.base_color, atol=0.02)
+
+
+def test_proportions_of_a_family_vary() -> None:
+    sizes = {name: np.array([np.ptp(instance(name, s).mesh.vertices, axis=0) for s in SEEDS]) for name in OBJECTS}
+    alike = [name for name, size in sizes.items() if size.std(axis=0).max() < 0.015 and name != "ball"]
+    assert not alike, f"these hardly vary: {alike}"
+
+
+def test_a_grid_patch_faces_outwards_and_maps_charts_to_points() -> None:
+    points = np.array([[[0.0, 0, 0], [2, 0, 0]], [[0, 1, 0], [2, 1, 0]]])
+    normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
+    patch = grid("x", points, normals, (2.0, 1.0), np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+    a, b, c = patch.vertices[patch.faces[0]]
+    assert np.cross(b - a, c - a)[2] > 0.0
+    np.testing.assert_allclose(patch.rest(np.array([0.5, 1.0]), np.array([0.25, 1.0])), [[1.0, 0.25, 0.0], [2, 1, 0]])
+
+
+# ----------------------------------------------------------------------------------------------- environments
+
+
+def test_half_of_the_environments_are_held_out() -> None:
+    splits = [family.split for family in ENVIRONMENTS.values()]
+    assert splits.count("train") == splits.count("heldout") >= 4
+    assert ENVIRONMENTS["studio"].split == ENVIRONMENTS["noon"].split == "train"
+    assert ENVIRONMENTS["low-sun"].split == "heldout"
+    halves = library.list_environments("train"), library.list_environments("heldout")
+    assert sorted(halves[0] + halves[1]) == sorted(ENVIRONMENTS) == list(library.list_environments())
+    assert all(ENVIRONMENTS[name].split == "train" for name in halves[0])
+
+
+@pytest.mark.parametrize("name", sorted(ENVIRONMENTS))
+def test_a_shipped_environment_is_light_of_the_common_brightness(name: str) -> None:
+    radiance = library.load_environment(name).radiance
+    assert radiance.shape == (HEIGHT, WIDTH, 3)
+    assert radiance.dtype == np.float32
+    assert np.isfinite(radiance).all()
+    assert radiance.min() >= 0.0
+    assert brightness(radiance.astype(np.float64)) == pytest.approx(LEVEL, rel=0.01)
+    up = irradiance(radiance.astype(np.float64), np.array([0.0, 0.0, 1.0]))
+    down = irradiance(radiance.astype(np.float64), np.array([0.0, 0.0, -1.0]))
+    assert up.sum() > down.sum(), "row 0 should look at the ceiling or the sky"
+
+
+def test_directions_and_irradiance_have_the_documented_conventions() -> None:
+    towards = directions(64, 128)
+    np.testing.assert_allclose(np.linalg.norm(towards, axis=-1), 1.0)
+    assert towards[0, 0, 2] > 0.99
+    assert towards[32, 0] @ np.array([0, 1, 0]) > 0.99
+    assert towards[32, 32] @ np.array([1, 0, 0]) > 0.99
+    np.testing.assert_allclose(irradiance(np.ones((64, 128, 3)), np.array([0.0, 0.0, 1.0])), np.pi, rtol=1e-3)
+
+
+# ------------------------------------------------------------------------------------------ what is shipped
+
+
+def test_the_shipped_files_are_what_the_scripts_make() -> None:
+    assert build.differing() == []
+
+
+def test_the_check_command_names_a_file_that_differs(tmp_path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(build, "DATA", tmp_path)
+    monkeypatch.setattr(build, "everything", lambda: iter([("a/b.txt", b"right"), ("c.txt", b"here")]))
+    assert build.main([]) == 0
+    assert build.main(["--check"]) == 0
+    (tmp_path / "a/b.txt").write_bytes(b"wrong")
+    (tmp_path / "c.txt").unlink()
+    (tmp_path / "left-over").write_bytes(b"")
+    assert build.main(["--check"]) == 3
+    assert capsys.readouterr().err.split() == [
+        word for name in ("a/b.txt", "c.txt", "left-over") for word in ("differs:", f"scenes/data/{name}")
+    ]
+
+
+def test_the_data_is_small() -> None:
+    assert sum(p.stat().st_size for p in build.DATA.rglob("*")) < 8 * 2**20
+
+
+@pytest.mark.parametrize("name", sorted(OBJECTS))
+def test_the_library_loads_the_canonical_instance(name: str) -> None:
+    asset, made = library.load_object(name), instance(name, None)
+    for part in ("vertices", "faces", "normals", "uvs"):
+        loaded, expected = getattr(asset.mesh, part), getattr(made.mesh, part)
+        assert loaded.dtype == expected.dtype
+        np.testing.assert_array_equal(loaded, expected)
+    np.testing.assert_array_equal(asset.base_color, made.base_color)
+    assert (asset.name, asset.label, asset.material) == (name, made.label, made.material)
+    assert asset.base_color.dtype == np.float32
+
+
+def test_the_library_lists_every_object() -> None:
+    assert list(library.list_objects()) == sorted(OBJECTS)
+
+
+def test_unknown_names_come_with_near_matches() -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown object 'teapott'\. Did you mean 'teapot'\?.*Known: ball, "):
+        library.load_object("teapott")
+    with pytest.raises(UnknownNameError, match=r"unknown environment 'studo'\. Did you mean 'studio'\?.*\.exr"):
+        library.load_environment("studo")

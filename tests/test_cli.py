@@ -1,0 +1,494 @@
+"""The command line: what it prints where, its exit statuses, and that it answers at once."""
+
+from __future__ import annotations
+
+import ctypes
+import io
+import json
+import os
+import subprocess
+import sys
+import time
+import types
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+from rich.progress import Progress as Bars
+from rich.progress import TextColumn
+from test_report import SUMMARY, changed, make_run
+
+from advsearch import __version__
+from advsearch.cli import list as listing
+from advsearch.cli.main import COMMANDS, main
+from advsearch.cli.output import columns
+from advsearch.cli.progress import BarProgress, LineProgress, watching
+from advsearch.cli.table import answer
+from advsearch.config import AttackConfig, settings
+from advsearch.errors import InputError, StorageError
+from advsearch.progress import NullProgress, Progress
+
+HEAVY = ("torch", "mitsuba", "drjit", "numpy", "scipy", "pydantic", "rich", "yaml", "PIL", "trimesh")
+
+Api = Callable[..., Any]
+
+
+@dataclass
+class Result:
+    """What the API returns, as far as the command line looks at it."""
+
+    summary: dict[str, Any]
+    run: Path = Path("runs/x")
+
+
+@pytest.fixture
+def api(monkeypatch: pytest.MonkeyPatch) -> Callable[[Api], None]:
+    """Put a stand-in in the place of `advsearch.api.attack_from_config`."""
+
+    def install(stand_in: Api) -> None:
+        module = types.ModuleType("advsearch.api")
+        module.attack_from_config = stand_in  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, "advsearch.api", module)
+
+    return install
+
+
+@pytest.fixture
+def asked(api: Callable[[Api], None]) -> list[AttackConfig]:
+    """The configurations that a successful stand-in was given."""
+    given: list[AttackConfig] = []
+
+    def attack(config: AttackConfig, *, progress: Progress) -> Result:
+        given.append(config)
+        return Result(SUMMARY)
+
+    api(attack)
+    return given
+
+
+def python(code: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    """Run a piece of Python in a process of its own."""
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, **options)
+
+
+# ---- the program ----
+
+
+def test_help_is_quick_and_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; from advsearch.cli.main import main; status = main(['--help']);"
+        f"print(sorted(set({HEAVY}) & set(sys.modules)), file=sys.stderr); sys.exit(status)"
+    )
+    seconds = []
+    for _ in range(3):
+        began = time.perf_counter()
+        done = python(code)
+        seconds.append(time.perf_counter() - began)
+    assert (done.returncode, done.stderr) == (0, "[]\n")
+    assert all(name in done.stdout for name in COMMANDS)
+    assert min(seconds) < 0.5
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_and_json(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    out, err = capsys.readouterr()
+    assert out.startswith("usage: advsearch " + command) and "--json" in out and err == ""
+
+
+def test_help_of_attack_shows_every_setting_with_range_and_default(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["attack", "--help"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for setting in settings():
+        assert f"{setting.flag} " in text
+        if not setting.is_switch:
+            assert setting.expects in text and setting.unit in text
+    assert "a whole number from 1 to 1000000 (default: 40)" in text
+    assert "in texels (default: chosen from the object's own)" in text
+
+
+def test_no_command_prints_help_and_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    assert "commands:" in capsys.readouterr().out
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"advsearch {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["atack"], "unknown command 'atack'. Did you mean 'attack'? Known: attack, doctor, list, run, show. See adv"),
+        (["--jsn"], "unknown flag '--jsn'."),
+        (["attack", "--epsilom", "1"], "unknown flag '--epsilom'. Did you mean '--epsilon'"),
+        (["attack", "--eps", "1"], "unknown flag '--eps'."),
+        (["attack", "mug"], "expected flags, got 'mug'; see advsearch attack --help"),
+        (["attack", "--steps"], "argument --steps: expected one argument; see advsearch attack --help"),
+        (["attack"], "--object: expected the name of an object or a .obj, .ply, .glb or .gltf file, got nothing"),
+        (["attack", "--object", "mug", "--epsilon", "nan"], "--epsilon: expected a number greater than 0, got nan"),
+        (["attack", "--object", "mug", "--epsilon", "-0.1"], "--epsilon: expected a number greater than 0, got -0.1"),
+        (["attack", "--object", "mug", "--control", ","], "--control: expected names of controls, or NAME="),
+        (["attack", "--object", "mug", "--set", "a"], "--set: expected NAME=VALUE such as camera.azimuth=130, got 'a'"),
+        (["attack", "--object", "mug", "--set", "a=nan"], "--set: expected PARAMETER=VALUE with a finite number"),
+        (["run"], "the following arguments are required: FILE"),
+        (["run", "no.yaml"], "no.yaml: expected a YAML file, got No such file or directory; check the path"),
+        (["show", "no-run"], "unknown run 'no-run'."),
+        (["show", "control", "a", "b"], "expected the name of a run, or: control NAME, got 'control a b'"),
+        (["list", "cups"], "argument kind: invalid choice: 'cups'"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line_and_status_2(
+    argv: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(argv) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith(f"advsearch: error: {message}") and err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_bug_keeps_its_traceback_and_ends_with_1() -> None:
+    code = (
+        "import sys, types; api = types.ModuleType('advsearch.api'); sys.modules['advsearch.api'] = api\n"
+        "def attack_from_config(config, progress): raise ValueError('a bug')\n"
+        "api.attack_from_config = attack_from_config\n"
+        "from advsearch.cli.main import main; sys.exit(main(['attack', '--object', 'mug', '--json']))"
+    )
+    done = python(code)
+    assert done.returncode == 1 and done.stdout == ""
+    assert "Traceback" in done.stderr and done.stderr.endswith("ValueError: a bug\n")
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "message"),
+    [
+        (InputError("--object: no such thing"), 2, "advsearch: error: --object: no such thing\n"),
+        (StorageError("the disk is full"), 2, "advsearch: error: the disk is full\n"),
+        (KeyboardInterrupt(), 130, "advsearch: interrupted\n"),
+    ],
+)
+def test_what_the_api_raises_becomes_a_status(
+    api: Callable[[Api], None], capsys: pytest.CaptureFixture[str], error: BaseException, status: int, message: str
+) -> None:
+    def attack(config: AttackConfig, *, progress: Progress) -> Result:
+        raise error
+
+    api(attack)
+    assert main(["attack", "--object", "mug", "--json"]) == status
+    assert capsys.readouterr() == ("", message)
+
+
+def test_a_reader_that_goes_away_is_no_error() -> None:
+    code = "import sys; from advsearch.cli.main import main; sys.stdin.read(); sys.exit(main(['--help']))"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdin and process.stdout and process.stderr
+        process.stdout.close()
+        process.stdin.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 0
+
+
+# ---- attack and run ----
+
+
+def test_attack_builds_its_configuration_from_flags(asked: list[AttackConfig]) -> None:
+    argv = (
+        "attack --object mug.obj --up y --environment room.hdr --model net.pt2 --labels l.json --label cup --norm l2"
+        " --control texture,pose --control light --set camera.azimuth=130 --set a.b=[0,1] --epsilon 0.1 --exposure -1"
+        " --texture-resolution 64 --policy random --steps 3 --step-size 0.5 --objective margin --spp 4 --verify-spp 32"
+        " --trials 7 --denoise none --resolution 64x96 --no-baseline --seed 9 --threads 1 --run x --overwrite"
+        " --deterministic --quiet"
+    )
+    assert main([*argv.split(), "--control", "patch={size: 0.3}"]) == 0
+    assert asked == [
+        AttackConfig(
+            object="mug.obj", up="y", environment="room.hdr", model="net.pt2", labels="l.json", label="cup",
+            controls={"texture": {}, "pose": {}, "light": {}, "patch": {"size": 0.3}},
+            set={"camera.azimuth": 130, "a.b": [0, 1]}, epsilon=0.1, norm="l2", texture_resolution=64, policy="random",
+            steps=3, step_size=0.5, objective="margin", spp=4, verify_spp=32, trials=7, denoise="none",
+            resolution=(64, 96), exposure=-1, baseline=False, seed=9, threads=1, run="x", overwrite=True,
+            deterministic=True,
+        )
+    ]  # fmt: skip
+
+
+def test_attack_needs_only_an_object(asked: list[AttackConfig]) -> None:
+    assert main(["attack", "--object", "mug"]) == 0
+    assert asked == [AttackConfig(object="mug")]
+    assert list(asked[0].controls) == ["texture"]
+
+
+def test_attack_prints_the_table(asked: list[AttackConfig], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["attack", "--object", "mug"]) == 0
+    out, err = capsys.readouterr()
+    assert out == answer(SUMMARY) + "\n" and err == ""
+
+
+def test_json_is_all_that_stands_on_standard_output(
+    api: Callable[[Api], None], capfd: pytest.CaptureFixture[str]
+) -> None:
+    def attack(config: AttackConfig, *, progress: Progress) -> Result:
+        print("an objective of the user prints")
+        os.write(1, b"so does a native library\n")
+        ctypes.CDLL(None).puts(b"and one that buffers")
+        progress.message("a warning")
+        return Result(changed(seed=float("nan")))
+
+    api(attack)
+    assert main(["attack", "--object", "mug", "--json"]) == 0
+    out, err = capfd.readouterr()
+    found = json.loads(out, parse_constant=lambda text: pytest.fail(f"{text} is not JSON"))
+    assert found == changed(seed=None)
+    for text in ("an objective of the user prints", "so does a native library", "and one that buffers", "a warning"):
+        assert text in err
+
+
+@pytest.mark.parametrize(
+    ("ending", "status"), [("found", 0), ("budget spent", 0), ("already wrong", 0), ("interrupted", 130)]
+)
+def test_the_status_of_an_attack(api: Callable[[Api], None], ending: str, status: int) -> None:
+    api(lambda config, progress: Result(changed(ending=ending)))
+    assert main(["attack", "--object", "mug"]) == status
+    assert main(["attack", "--object", "mug", "--json"]) == status
+
+
+def test_run_reads_a_file_and_puts_changes_over_it(asked: list[AttackConfig], tmp_path: Path) -> None:
+    path = tmp_path / "run.yaml"
+    path.write_text(AttackConfig(object="mug", steps=10, seed=4).to_yaml())
+    assert (
+        main(["run", str(path), "steps=80", "set.camera.azimuth=130", "--run", "again", "--overwrite", "--quiet"]) == 0
+    )
+    assert asked == [
+        AttackConfig(object="mug", steps=80, seed=4, set={"camera.azimuth": 130}, run="again", overwrite=True)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "change", "message"),
+    [
+        (
+            "object: mug\ncommand: atack\n",
+            [],
+            "unknown command 'atack'. Did you mean 'attack'? Known: attack. It stands in ",
+        ),
+        ("object: mug\n", ["steps"], "steps: expected NAME=VALUE such as camera.azimuth=130, got 'steps'"),
+        ("object: mug\n", ["step=3"], "unknown setting 'step'. Did you mean 'steps'"),
+        ("object: mug\n", ["steps=0"], "run.yaml: steps: expected a whole number from 1 to 1000000, got 0"),
+    ],
+)
+def test_a_bad_file_or_change_is_told(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    text: str,
+    change: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("run.yaml").write_text(text)
+    assert main(["run", "run.yaml", *change]) == 2
+    assert capsys.readouterr().err.startswith(f"advsearch: error: {message}")
+
+
+# ---- list, show, doctor ----
+
+
+@pytest.fixture
+def registries(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small registries in the place of the real ones."""
+
+    class Pgd:
+        """Projected gradient ascent.
+
+        More.
+        """
+
+    @dataclass
+    class Parameter:
+        name: str
+        unit: str
+        range: tuple[float, float]
+        periodic: bool
+
+    class Camera:
+        """Orbit around the object."""
+
+        parameters = (
+            Parameter("azimuth", "degrees", (0.0, 360.0), True),
+            Parameter("distance", "sizes", (1.0, 9.5), False),
+        )
+
+    def put(name: str, **attributes: Any) -> None:
+        module = types.ModuleType(name)
+        vars(module).update(attributes)
+        monkeypatch.setitem(sys.modules, name, module)
+
+    put("advsearch.scene.library", list_objects=lambda: ("ball", "mug"), list_environments=lambda: ("studio",))
+    put("advsearch.controls", CONTROLS={"camera": Camera()})
+    put("advsearch.attacks", POLICIES={"pgd": Pgd}, OBJECTIVES={"margin": objective_of_a_user})
+
+
+def objective_of_a_user() -> None:
+    """Largest wrong logit minus largest right one."""
+
+
+@pytest.mark.usefixtures("registries")
+def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found == {
+        "schema": 1, "objects": ["ball", "mug"], "environments": ["studio"], "controls": ["camera"],
+        "policies": ["pgd"], "objectives": ["margin"], "models": ["reference"],
+    }  # fmt: skip
+    assert main(["list"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("objects:\n  ball\n  mug\n\nenvironments:\n  studio\n")
+    assert "policies:\n  pgd   Projected gradient ascent.\n" in out
+    assert "objectives:\n  margin   Largest wrong logit minus largest right one.\n" in out
+    assert main(["list", "objects"]) == 0
+    assert capsys.readouterr().out == "  ball\n  mug\n"
+
+
+def test_the_listed_models_can_be_loaded_by_that_name() -> None:
+    assert list(listing.MODELS) == [AttackConfig(object="mug").model]
+
+
+@pytest.mark.usefixtures("registries")
+def test_show_control(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["show", "control", "camera", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["choices"] == []
+    assert found["parameters"][0] == {"name": "azimuth", "unit": "degrees", "range": [0.0, 360.0], "periodic": True}
+    assert main(["show", "control", "camera"]) == 0
+    assert capsys.readouterr().out == (
+        "camera: Orbit around the object.\n\n"
+        "parameters, searched or fixed:\n"
+        "  name       unit      range      periodic\n"
+        "  azimuth    degrees   [0, 360]   yes\n"
+        "  distance   sizes     [1, 9.5]   no\n"
+    )
+    assert main(["show", "control", "camra"]) == 2
+    assert "unknown control 'camra'. Did you mean 'camera'?" in capsys.readouterr().err
+
+
+def test_show_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    make_run(tmp_path / "runs" / "first", pictures=False, rows=False)
+    assert main(["show", "first"]) == 0
+    assert capsys.readouterr().out == answer(SUMMARY) + "\n"
+    assert main(["show", "runs/first", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {"schema": 1, **SUMMARY}
+
+
+@pytest.mark.parametrize("flag", [[], ["--json"]])
+def test_doctor_passes_its_status_on(flag: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    import advsearch.cli
+
+    asked: list[bool] = []
+    module = types.ModuleType("advsearch.cli.doctor")
+    module.run = lambda json: asked.append(json) or 3  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "advsearch.cli.doctor", module)
+    monkeypatch.setattr(advsearch.cli, "doctor", module, raising=False)
+    assert main(["doctor", *flag]) == 3
+    assert asked == [bool(flag)]
+
+
+# ---- the table ----
+
+
+def test_the_table_is_read_in_five_seconds() -> None:
+    assert answer(SUMMARY) == (
+        "The model calls this mug a vase in 20 of 20 fresh renders (95 % interval 83-100 %).\n\n"
+        "  clean           mug          98 %   right in 20 of 20   83-100 %\n"
+        "  adversarial     vase         91 %   wrong in 20 of 20   83-100 %\n"
+        "  random search   40 renders          wrong in 1 of 20    0.1-25 %\n\n"
+        "  changed    texture within 0.1 (linf)\n"
+        "  search     pgd, 40 steps: found\n"
+        "  renders    40 of the search, 40 gradients, 21 of the verification\n"
+        "  time       14.6 s\n"
+        "  pictures   runs/mug-texture-001"
+    )
+
+
+def test_the_table_says_what_matters_beside_the_verdict() -> None:
+    text = answer(changed(warnings=["A texture is missing."], baseline={"verified": SUMMARY["verified"]}))
+    assert text.endswith("adds nothing here.\n\nNote: A texture is missing.")
+
+
+def test_a_table_of_almost_nothing() -> None:
+    text = answer({"object": "mug", "ending": "already wrong", "clean": {"label": "vase", "probability": None}})
+    assert text.startswith("The model already calls this mug a vase")
+    assert "  clean   vase      not verified\n" in text
+
+
+def test_columns() -> None:
+    assert columns([["a", "bb", "c"], ["aaa", "b"]]) == "  a     bb   c\n  aaa   b"
+    assert columns([]) == ""
+
+
+# ---- progress ----
+
+
+class Clock:
+    """Seconds that pass when told."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_lines_come_at_most_every_five_seconds_and_messages_at_once() -> None:
+    stream, clock = io.StringIO(), Clock()
+    progress = LineProgress(stream, clock)
+    progress.stage("search", 40)
+    for _ in range(12):
+        clock.now += 1.0
+        progress.advance(best=0.31234)
+    progress.message("a warning")
+    progress.stage("verification")
+    clock.now += 5.0
+    progress.advance(3)
+    assert stream.getvalue().splitlines() == [
+        "advsearch: search: 5 of 40, 35 s left, best 0.312",
+        "advsearch: search: 10 of 40, 30 s left, best 0.312",
+        "advsearch: a warning",
+        "advsearch: verification: 3",
+    ]
+
+
+def test_bars_show_stages_and_the_best() -> None:
+    stream = io.StringIO()
+    console = Console(file=stream, force_terminal=True, width=100)
+    with Bars(TextColumn("{task.description} {task.completed} {task.fields[info]}"), console=console) as bars:
+        progress = BarProgress(bars)
+        progress.advance()
+        progress.stage("set-up")
+        progress.stage("search", 40)
+        progress.advance(2, best=0.5, state="[fine]")
+        progress.advance()
+        progress.message("a [bold] warning")
+        progress.stage("verification", 0)
+    assert [(task.description, task.completed, task.finished) for task in bars.tasks] == [
+        ("set-up", 1, True), ("search", 3, True), ("verification", 0, False),
+    ]  # fmt: skip
+    assert "a [bold] warning" in stream.getvalue()
+    assert bars.tasks[1].fields["info"] == "best 0.5, state [fine]"
+
+
+def test_who_watches(monkeypatch: pytest.MonkeyPatch) -> None:
+    def watcher(quiet: bool = False) -> type[Progress]:
+        with watching(quiet=quiet) as progress:
+            progress.stage("search", 3)
+            progress.advance(1, best=0.5)
+            progress.message("text")
+            return type(progress)
+
+    assert watcher() is LineProgress and watcher(quiet=True) is NullProgress
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    assert watcher() is BarProgress and watcher(quiet=True) is NullProgress

@@ -1,0 +1,233 @@
+"""The typed configuration: what every wrong value says, and that YAML, flags and Python mean the same."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import settings as examples
+from hypothesis import strategies as st
+
+from advsearch.cli import flags
+from advsearch.config import AttackConfig, flag, parse_assignment, read_yaml, settings
+from advsearch.errors import FileFormatError, InputError, UnknownNameError
+
+WRONG: dict[str, tuple[Any, str]] = {
+    "object": ("", "expected the name of an object or a .obj, .ply, .glb or .gltf file, got ''"),
+    "environment": ([], "expected the name of an environment or a .hdr or .exr file, got "),
+    "up": ("x", "expected y or z, got x"),
+    "set_": ({"camera.azimuth": math.nan}, "got camera.azimuth=nan"),
+    "exposure": (99, "expected a number from -20 to 20, got 99"),
+    "resolution": ("4x4", "expected SIDE or HEIGHTxWIDTH, each from 8 to 4096, got 4x4"),
+    "model": (
+        "a\0b",
+        "expected reference, a .pt2 (torch.export), .pt or .ts (TorchScript) file, or package.module:callable",
+    ),
+    "labels": (True, "expected a JSON or text file, got True"),
+    "label": ("  ", "expected names of classes or their numbers, such as \"coffee mug,cup\" or #504, got '  '"),
+    "controls": ({"texture": 3}, "expected names of controls, or NAME={PARAMETER: VALUE}, got texture=3"),
+    "epsilon": ("nan", "expected a number greater than 0, got nan"),
+    "norm": ("l3", "expected linf or l2, got l3"),
+    "texture_resolution": (0, "expected a whole number from 2 to 8192, got 0"),
+    "policy": (None, "expected the name of a policy, got None"),
+    "steps": (2.5, "expected a whole number from 1 to 1000000, got 2.5"),
+    "step_size": (0.0, "expected a number greater than 0, got 0.0"),
+    "objective": ({}, "expected the name of an objective, got {}"),
+    "spp": ("many", "expected a whole number from 1 to 65536, got many"),
+    "denoise": (False, "expected oidn or none, got False"),
+    "baseline": ("maybe", "expected true or false, got maybe"),
+    "verify_spp": (0, "expected a whole number from 1 to 65536, got 0"),
+    "trials": (0, "expected a whole number from 1 to 100000, got 0"),
+    "seed": (-1, "expected a whole number from 0 to 2**63 - 1, got -1"),
+    "threads": (0, "expected a whole number from 1 to 1024, got 0"),
+    "deterministic": (3, "expected true or false, got 3"),
+    "run": ("", "expected a name (kept in runs/) or the path of a folder, got ''"),
+    "overwrite": ([], "expected true or false, got []"),
+}
+
+GIVEN: dict[str, Any] = {
+    "object": "mug.obj", "environment": "room.hdr", "up": "y",
+    "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
+    "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2", "labels": "labels.json", "label": "coffee mug,cup",
+    "controls": {"texture": {}, "pose": {"yaw": [0, 90]}}, "epsilon": 0.03, "norm": "l2", "texture_resolution": 64,
+    "policy": "random", "steps": 3, "step_size": 0.5, "objective": "cross_entropy", "spp": 4, "denoise": "none",
+    "baseline": False, "verify_spp": 32, "trials": 7, "seed": 9, "threads": 1, "deterministic": True, "run": "x/y",
+    "overwrite": True,
+}  # fmt: skip
+
+
+def of_command_line(line: str) -> AttackConfig:
+    """Return the configuration of a shell command ``advsearch attack ...``."""
+    parser = argparse.ArgumentParser(allow_abbrev=False)
+    flags.add_settings(parser)
+    return flags.config_from(parser.parse_args(shlex.split(line)[2:]))
+
+
+@pytest.mark.parametrize("setting", settings(), ids=lambda setting: setting.name)
+def test_every_wrong_value_names_its_flag_and_what_was_expected(setting: Any) -> None:
+    value, message = WRONG[setting.field]
+    data = {"object": "mug", setting.field: value}
+    with pytest.raises(InputError) as as_flag:
+        AttackConfig.from_flags(data)
+    with pytest.raises(InputError) as in_python:
+        AttackConfig(**data)
+    assert str(as_flag.value).startswith(f"{setting.flag}: expected ") and message in str(as_flag.value)
+    assert str(in_python.value).startswith(f"{setting.name}: expected ")
+
+
+@pytest.mark.parametrize(
+    "value", [0, -1, -0.5, "nan", math.nan, math.inf, "inf", "-inf", True, "much", [0.1], "0.1,0.2"]
+)
+def test_epsilon_is_a_number_greater_than_zero(value: Any) -> None:
+    with pytest.raises(InputError, match=r"^--epsilon: expected a number greater than 0, got "):
+        AttackConfig.from_flags({"object": "mug", "epsilon": value})
+
+
+def test_all_problems_are_told_at_once() -> None:
+    with pytest.raises(InputError) as error:
+        AttackConfig.from_flags({"epsilon": -1, "steps": 0})
+    assert str(error.value) == (
+        "--object: expected the name of an object or a .obj, .ply, .glb or .gltf file, got nothing; "
+        "--epsilon: expected a number greater than 0, got -1; "
+        "--steps: expected a whole number from 1 to 1000000, got 0"
+    )
+
+
+def test_an_unknown_setting_has_near_matches() -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown setting 'epsilonn'\. Did you mean 'epsilon'") as error:
+        AttackConfig(object="mug", epsilonn=0.1)
+    assert error.value.near[0] == "epsilon"
+
+
+def test_a_configuration_does_not_change() -> None:
+    config = AttackConfig(object="mug")
+    with pytest.raises(ValueError, match="frozen"):
+        config.epsilon = 0.1  # type: ignore[misc]
+
+
+def test_every_setting_is_documented_and_has_a_flag_of_its_own() -> None:
+    known = settings()
+    assert {setting.field for setting in known} == set(AttackConfig.model_fields) == set(WRONG)
+    assert {setting.name for setting in known} == set(GIVEN)
+    assert len({setting.flag for setting in known}) == len(known)
+    for setting in known:
+        assert setting.description and setting.expects and setting.group in flags.GROUPS
+        assert setting.required or setting.default is not None or setting.otherwise
+    assert flag("texture_resolution") == "--texture-resolution"
+
+
+def test_yaml_round_trip_of_everything(tmp_path: Path) -> None:
+    config = AttackConfig(**GIVEN)
+    assert all(getattr(config, setting.field) == GIVEN[setting.name] for setting in settings())
+    path = tmp_path / "run.yaml"
+    path.write_text(config.to_yaml())
+    assert AttackConfig.from_yaml(path) == config
+    assert read_yaml(path)["schema"] == 1 and read_yaml(path)["command"] == "attack"
+
+
+def test_the_command_line_says_the_same() -> None:
+    config = AttackConfig(**GIVEN)
+    again = of_command_line(config.command_line())
+    assert again == config.model_copy(update={"run": None, "overwrite": False})
+    assert AttackConfig(object="mug").command_line() == "advsearch attack --object mug"
+
+
+@examples(max_examples=60, deadline=None)
+@given(
+    epsilon=st.none() | st.floats(1e-30, 1e30), exposure=st.floats(-20, 20), seed=st.integers(0, 2**63 - 1),
+    name=st.text(st.characters(codec="utf-8", exclude_categories=("Cc", "Cs")), min_size=1).filter(str.strip),
+    value=st.floats(allow_nan=False, allow_infinity=False),
+)  # fmt: skip
+def test_any_values_go_round(
+    tmp_path_factory: pytest.TempPathFactory, epsilon: float | None, exposure: float, seed: int, name: str, value: float
+) -> None:
+    config = AttackConfig(object=name, label=name, epsilon=epsilon, exposure=exposure, seed=seed, set={"a.b": value})
+    path = tmp_path_factory.getbasetemp() / "any.yaml"
+    path.write_text(config.to_yaml(), encoding="utf-8")
+    assert AttackConfig.from_yaml(path) == config
+    if not name.startswith("-"):
+        assert of_command_line(config.command_line()) == config
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, r"study\.yaml: expected a YAML file, got No such file or directory; check the path"),
+        ("", r"study\.yaml: expected settings and values such as 'object: mug', got an empty file"),
+        ("- a\n", r"study\.yaml: expected settings and values such as 'object: mug', got list"),
+        ("1: 2\n", r"study\.yaml: expected settings and values such as 'object: mug', got dict"),
+        ("a: [1,\n", r"study\.yaml: expected YAML, got .*line 2"),
+        ("schema: 7\nobject: mug\n", r"study\.yaml: expected schema 1, got 7; it is of another advsearch"),
+        ("object: mug\nepsilon: yes\n", r"study\.yaml: epsilon: expected a number greater than 0, got True"),
+        ("object: mug\nset:\n  a: .inf\n", r"study\.yaml: set: expected PARAMETER=VALUE .*, got a=inf"),
+        ("object: mug\nsteps:\n", r"study\.yaml: steps: expected a whole number from 1 to 1000000, got None"),
+        ("objekt: mug\n", r"unknown setting 'objekt'\. Did you mean 'object'"),
+    ],
+)
+def test_a_bad_file_is_named(tmp_path: Path, text: str | None, message: str) -> None:
+    path = tmp_path / "study.yaml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        AttackConfig.from_yaml(path)
+
+
+def test_a_file_that_is_not_text_is_named(tmp_path: Path) -> None:
+    (tmp_path / "x.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(FileFormatError, match=r"x\.yaml: expected a YAML file in UTF-8, got bytes that are not text"):
+        AttackConfig.from_yaml(tmp_path / "x.yaml")
+
+
+def test_yaml_as_a_person_writes_it(tmp_path: Path) -> None:
+    path = tmp_path / "study.yaml"
+    path.write_text(
+        "object: mug\nup: y\ndenoise: none\ncontrols: [texture, pose]\nlabel: [coffee mug, cup]\n"
+        "epsilon: 1e-3\nresolution: 224\nset: {camera.azimuth: 130, camera.elevation: 2e1}\n"
+    )
+    config = AttackConfig.from_yaml(path)
+    assert (config.up, config.denoise, config.label) == ("y", "none", "coffee mug,cup")
+    assert (config.epsilon, config.resolution) == (1e-3, (224, 224))
+    assert config.controls == {"texture": {}, "pose": {}}
+    assert config.set_ == {"camera.azimuth": 130.0, "camera.elevation": 20.0}
+
+
+def test_overrides_reach_inside(tmp_path: Path) -> None:
+    path = tmp_path / "study.yaml"
+    path.write_text("object: mug\nset: {camera.azimuth: 1}\ncontrols: [texture]\n")
+    changes = {"steps": 80, "set.camera.elevation": 25, "controls.texture.resolution": 64, "controls.pose.yaw": [0, 9]}
+    config = AttackConfig.from_yaml(path, changes)
+    assert config.steps == 80
+    assert config.set_ == {"camera.azimuth": 1.0, "camera.elevation": 25.0}
+    assert config.controls == {"texture": {"resolution": 64}, "pose": {"yaw": [0, 9]}}
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("camera.azimuth=130", ("camera.azimuth", 130)),
+        (" a = [1, 2.5] ", ("a", [1, 2.5])),
+        ("a=", ("a", "")),
+        ("a={b: c=d}", ("a", {"b": "c=d"})),
+        ("a=[1", ("a", "[1")),
+    ],
+)
+def test_assignments(text: str, expected: tuple[str, Any]) -> None:
+    assert parse_assignment(text, "--set") == expected
+
+
+@pytest.mark.parametrize("text", ["camera.azimuth", "=3", ""])
+def test_what_is_no_assignment(text: str) -> None:
+    with pytest.raises(InputError, match=r"^--set: expected NAME=VALUE such as camera\.azimuth=130, got '"):
+        parse_assignment(text, "--set")
+
+
+def test_the_module_stays_light() -> None:
+    code = "import sys, advsearch.config; print(sorted({'torch', 'mitsuba', 'drjit', 'numpy'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

@@ -1,0 +1,333 @@
+"""Environments from .hdr and .exr pictures: values, sizes, and every error that a file can cause."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from advsearch.errors import FileFormatError, InputError
+from advsearch.scene.environments import import_environment
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "environments"
+real_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the shared test data is not at {DATA}")
+
+HEADER = b"#?RADIANCE\n# made by hand\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=2\n\n"
+
+
+def write_exr(path: Path, channels: dict[str, np.ndarray]) -> Path:
+    """Write an OpenEXR file and return its path."""
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, channels).write(str(path))
+    return path
+
+
+def light(height: int = 8, width: int = 16) -> np.ndarray:
+    """Return random radiance, (height, width, 3) float32 in [0, 4)."""
+    return np.random.default_rng(0).random((height, width, 3), dtype=np.float32) * 4
+
+
+def rgbe(height: int, width: int) -> np.ndarray:
+    """Return random shared-exponent pixels with runs in them, (height, width, 4) uint8."""
+    pixels = np.random.default_rng(0).integers(2, 256, (height, width, 4), dtype=np.uint8)
+    pixels[:, width // 3 : width // 2] = [200, 100, 50, 129]
+    pixels[0, 0] = [9, 9, 9, 0]  # exponent 0 is black
+    pixels[:, :, 3] = np.where(pixels[:, :, 3] == 0, 0, 120 + pixels[:, :, 3] % 16)
+    pixels[0, 0, 3] = 0
+    return pixels
+
+
+def values(pixels: np.ndarray) -> np.ndarray:
+    """Return what shared-exponent pixels mean."""
+    scale = np.where(pixels[..., 3:] == 0, 0.0, 2.0 ** (pixels[..., 3:].astype(np.float64) - 136))
+    return (pixels[..., :3] * scale).astype(np.float32)
+
+
+def run_lengths(pixels: np.ndarray) -> bytes:
+    """Encode pixels line by line with the four channels apart, in runs and literal stretches."""
+    body = b""
+    for line in pixels:
+        body += bytes([2, 2, len(line) >> 8, len(line) & 255])
+        for channel in line.T:
+            at = 0
+            while at < len(channel):
+                run = 1
+                while at + run < len(channel) and run < 127 and channel[at + run] == channel[at]:
+                    run += 1
+                if run > 2:
+                    body += bytes([128 + run, channel[at]])
+                    at += run
+                else:
+                    stretch = channel[at : at + 5]
+                    body += bytes([len(stretch), *stretch])
+                    at += len(stretch)
+    return body
+
+
+def repeats(pixels: np.ndarray) -> bytes:
+    """Encode pixels in the old way: each as four bytes, repeats as (1, 1, 1, count)."""
+    body = b""
+    for line in pixels:
+        at = 0
+        while at < len(line):
+            run = 1
+            while at + run < len(line) and run < 300 and (line[at + run] == line[at]).all():
+                run += 1
+            body += bytes(line[at])
+            if run > 1:
+                low, high = (run - 1) & 255, (run - 1) >> 8
+                body += bytes([1, 1, 1, low]) + (bytes([1, 1, 1, high]) if high else b"")
+            at += run
+    return body
+
+
+def write_hdr(path: Path, pixels: np.ndarray, encode: Callable[[np.ndarray], bytes], size: bytes = b"") -> Path:
+    """Write a Radiance file and return its path."""
+    size = size or b"-Y %d +X %d\n" % pixels.shape[:2]
+    path.write_bytes(HEADER + size + encode(pixels))
+    return path
+
+
+# --- values ----------------------------------------
+
+
+@pytest.mark.parametrize("encode", [run_lengths, repeats, np.ndarray.tobytes], ids=["runs", "repeats", "plain"])
+def test_radiance_encodings(tmp_path: Path, encode: Callable[[np.ndarray], bytes]) -> None:
+    pixels = rgbe(12, 24)
+    got = import_environment(write_hdr(tmp_path / "sky.hdr", pixels, encode))
+    assert got.name == "sky" and got.source.endswith("sky.hdr") and got.warnings == ()
+    assert got.radiance.dtype == np.float32
+    assert np.array_equal(got.radiance, values(pixels))
+    assert got.radiance[0, 0].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_radiance_long_repeat(tmp_path: Path) -> None:
+    pixels = np.tile(np.array([50, 60, 70, 130], np.uint8), (200, 400, 1))
+    assert len(repeats(pixels)) <= 200 * 20
+    got = import_environment(write_hdr(tmp_path / "grey.hdr", pixels, repeats))
+    assert np.array_equal(got.radiance, values(pixels))
+
+
+@pytest.mark.parametrize(("size", "rows", "columns"), [(b"+Y 12 +X 24\n", -1, 1), (b"-Y 12 -X 24\n", 1, -1)])
+def test_radiance_orientation(tmp_path: Path, size: bytes, rows: int, columns: int) -> None:
+    pixels = rgbe(12, 24)
+    got = import_environment(write_hdr(tmp_path / "sky.hdr", pixels, run_lengths, size))
+    assert np.array_equal(got.radiance, values(pixels)[::rows, ::columns])
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32])
+@pytest.mark.parametrize("names", ["RGB", "RGBA", "RGBZ"])
+def test_exr_channels(tmp_path: Path, kind: type, names: str) -> None:
+    image = light().astype(kind)
+    channels = {name: image[:, :, min(k, 2)].copy() for k, name in enumerate(names)}
+    got = import_environment(write_exr(tmp_path / "room.exr", channels))
+    assert got.name == "room" and got.warnings == ()
+    assert got.radiance.dtype == np.float32
+    assert np.array_equal(got.radiance, image.astype(np.float32))
+
+
+def test_grey_exr(tmp_path: Path) -> None:
+    grey = light()[:, :, 0].copy()
+    got = import_environment(write_exr(tmp_path / "grey.exr", {"Y": grey}))
+    assert np.array_equal(got.radiance, np.repeat(grey[:, :, None], 3, axis=2))
+
+
+def test_largest_half_float_is_allowed(tmp_path: Path) -> None:
+    image = light().astype(np.float16)
+    image[2, 3] = 65504
+    assert import_environment(write_exr(tmp_path / "sun.exr", {"RGB": image})).radiance.max() == 65504.0
+
+
+# --- sizes ----------------------------------------
+
+
+def energy(radiance: np.ndarray) -> np.ndarray:
+    """Return the irradiance (3,) that a map sends to its centre from all sides."""
+    height, width = radiance.shape[:2]
+    edges = np.cos(np.arange(height + 1) * np.pi / height)
+    angle = (edges[:-1] - edges[1:]) * 2 * np.pi / width
+    return np.einsum("h,hwc->c", angle, radiance.astype(np.float64))
+
+
+@pytest.mark.parametrize(("height", "width"), [(1024, 2048), (700, 1400)])
+def test_large_maps_keep_their_energy(tmp_path: Path, height: int, width: int) -> None:
+    image = np.full((height, width, 3), 0.5, np.float32)
+    image[height // 20, width // 7] = [9000.0, 8000.0, 7000.0]  # a sun of one texel, near the pole
+    image[:, : width // 5] *= np.array([1.0, 2.0, 3.0], np.float32)
+    got = import_environment(write_exr(tmp_path / "sun.exr", {"RGB": image}))
+    assert got.radiance.shape == (512, 1024, 3) and got.warnings == ()
+    assert energy(got.radiance) == pytest.approx(energy(image), rel=1e-5)
+    assert got.radiance[-1, -1] == pytest.approx([0.5] * 3, rel=1e-5)
+
+
+def test_maps_up_to_the_limit_are_kept(tmp_path: Path) -> None:
+    image = light(512, 1024)
+    assert np.array_equal(import_environment(write_exr(tmp_path / "a.exr", {"RGB": image})).radiance, image)
+
+
+def test_tiny_maps_are_repeated(tmp_path: Path) -> None:
+    image = light(1, 2)
+    got = import_environment(write_exr(tmp_path / "two.exr", {"RGB": image}))
+    assert got.warnings == () and got.radiance.shape == (4, 8, 3)
+    assert np.array_equal(got.radiance, image.repeat(4, axis=0).repeat(4, axis=1))
+
+
+@pytest.mark.parametrize(("height", "width", "warned"), [(100, 201, False), (100, 204, True), (16, 16, True)])
+def test_aspect(tmp_path: Path, height: int, width: int, warned: bool) -> None:
+    got = import_environment(write_exr(tmp_path / "a.exr", {"RGB": light(height, width)}))
+    expected = f"a.exr: expected a map twice as wide as high, got {width} x {height}; it appears stretched"
+    assert got.warnings == ((expected,) if warned else ())
+
+
+def test_black_is_allowed_with_a_warning(tmp_path: Path) -> None:
+    got = import_environment(write_exr(tmp_path / "night.exr", {"RGB": np.zeros((8, 16, 3), np.float32)}))
+    assert got.warnings == ("night.exr: the environment is black everywhere; it lights nothing",)
+    assert not got.radiance.any()
+
+
+# --- bad input ----------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (-1.0, r"got 2 of 128 texels negative \(the first in row 3, column 4: 0\.\d+, -1, .*\); clamp them to 0"),
+        (
+            np.inf,
+            r"got 2 of 128 texels infinite \(the first in row 3, column 4: .*inf.*\); clamp them, or save the map in",
+        ),
+        (np.nan, r"got 2 of 128 texels NaN \(the first in row 3, column 4: .*nan.*\); paint them over"),
+    ],
+)
+def test_values_that_are_not_light(tmp_path: Path, value: float, message: str) -> None:
+    image = light() / 4
+    image[3, 4, 1] = value
+    image[6, 2] = value
+    path = write_exr(tmp_path / "bad.exr", {"RGB": image})
+    with pytest.raises(InputError, match=r"bad\.exr: expected finite radiance of at least 0, " + message):
+        import_environment(path)
+
+
+def bad_exr(channels: dict[str, np.ndarray]) -> Callable[[Path], Path]:
+    """Return a function that writes an OpenEXR file."""
+    return lambda folder: write_exr(folder / "bad.exr", channels)
+
+
+def bad_hdr(content: bytes) -> Callable[[Path], Path]:
+    """Return a function that writes a .hdr file."""
+    return raw("bad.hdr", content)
+
+
+def raw(name: str, content: bytes) -> Callable[[Path], Path]:
+    """Return a function that writes any file."""
+
+    def write(folder: Path) -> Path:
+        (folder / name).write_bytes(content)
+        return folder / name
+
+    return write
+
+
+def cut_exr(keep: float) -> Callable[[Path], Path]:
+    """Return a function that writes the first share of an OpenEXR file."""
+
+    def write(folder: Path) -> Path:
+        path = write_exr(folder / "bad.exr", {"RGB": light()})
+        data = path.read_bytes()
+        return raw("bad.exr", data[: int(keep * len(data))])(folder)
+
+    return write
+
+
+PLANE = light()[:, :, 0].copy()
+LINE = HEADER + b"-Y 8 +X 16\n"
+NOISE = np.random.default_rng(0).bytes(2000)
+BAD = {
+    "directory": (
+        lambda folder: folder,
+        r"expected a file with an environment, got a directory; name a file inside it",
+    ),
+    "missing": (lambda folder: folder / "no.hdr", r"no such environment file\. Check the path"),
+    "empty": (raw("bad.hdr", b""), r"the environment file is empty; export or download it again"),
+    "ending": (raw("bad.png", b"x"), r"expected an environment file ending in \.hdr, \.exr, got '\.png'; convert it"),
+    "png as hdr": (raw("bad.hdr", b"\x89PNG\r\n\x1a\n\0"), r"expected a Radiance \.hdr picture, got a PNG picture"),
+    "hdr as exr": (raw("bad.exr", HEADER), r"expected an OpenEXR picture, got a Radiance picture \(\.hdr\)"),
+    "noise as exr": (raw("bad.exr", NOISE), r"expected an OpenEXR picture, got binary data of another kind"),
+    "noise as hdr": (raw("bad.hdr", NOISE), r"expected a Radiance \.hdr picture, got binary data of another kind"),
+    "exr, then noise": (
+        raw("bad.exr", b"\x76\x2f\x31\x01" + NOISE),
+        r"cannot be read as OpenEXR; it is damaged or cut",
+    ),
+    "cut exr header": (cut_exr(0.1), r"cannot be read as OpenEXR; it is damaged or cut short, export it again"),
+    "cut exr": (cut_exr(0.8), r"cannot be read as OpenEXR; it is damaged or cut short, export it again"),
+    "no blue": (bad_exr({"R": PLANE, "G": PLANE}), r"expected the channels R, G and B \(or Y alone\), got G, R; save"),
+    "layers": (
+        bad_exr({f"left.{c}": PLANE for c in "RGB"}),
+        r"got left\.B, left\.G, left\.R; save the picture as plain RGB",
+    ),
+    "chroma": (
+        bad_exr({"Y": PLANE, "RY": PLANE, "BY": PLANE}),
+        r"\(or Y alone\), got BY, RY, Y; save the picture as plain",
+    ),
+    "integers": (
+        bad_exr({"R": PLANE.astype(np.uint32), "G": PLANE, "B": PLANE}),
+        r"channels of equal size in half or float, got R uint32 \(8, 16\), G float32 \(8, 16\), .*; save it again",
+    ),
+    "cut hdr header": (bad_hdr(b"#?RADIANCE\nFORMAT=32-"), r"expected a Radiance \.hdr picture, got half a header"),
+    "xyz": (bad_hdr(b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 8 +X 16\n"), r"got 32-bit_rle_xyze; convert it to RGB"),
+    "rotated": (
+        bad_hdr(HEADER + b"+X 16 -Y 8\n"),
+        r"a size like '-Y 512 \+X 1024', got '\+X 16 -Y 8'; save the picture",
+    ),
+    "no size": (bad_hdr(HEADER + b"-Y 0 +X 16\n"), r"a size like '-Y 512 \+X 1024', got '-Y 0 \+X 16'"),
+    "huge": (bad_hdr(HEADER + b"-Y 99999 +X 99999\n"), r"at most 268435456 pixels, got 99999 x 99999; scale it down"),
+    "no pixels": (bad_hdr(LINE), r"expected 8 scanlines of 16 pixels, got 0 whole ones and the start of another"),
+    "cut runs": (bad_hdr(LINE + run_lengths(rgbe(8, 16))[:-1]), r"expected 8 scanlines of 16 pixels, got 7 whole ones"),
+    "cut pixels": (
+        bad_hdr(LINE + rgbe(8, 16).tobytes()[:-9]),
+        r"got 7 whole ones and the start of another; the file is cut",
+    ),
+    "empty run": (bad_hdr(LINE + b"\2\2\0\x10\0\0"), r"got 0 whole ones"),
+    "run too long": (bad_hdr(LINE + b"\2\2\0\x10" + b"\xff\x10" * 60), r"got 0 whole ones"),
+    "repeat of nothing": (bad_hdr(LINE + b"\1\1\1\4" * 200), r"got 0 whole ones"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_files(tmp_path: Path, case: str, capfd: pytest.CaptureFixture[str]) -> None:
+    make, message = BAD[case]
+    path = make(tmp_path)
+    with pytest.raises(FileFormatError, match=message) as caught:
+        import_environment(path)
+    assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_near_matches_of_a_missing_file(tmp_path: Path) -> None:
+    for name in ("comfy_cafe_1k.hdr", "workshop.exr", "comfy_cafe.png"):
+        (tmp_path / name).write_bytes(b"x")
+    with pytest.raises(FileFormatError, match=r"no such environment file\. Did you mean 'comfy_cafe_1k\.hdr'\? Check"):
+        import_environment(tmp_path / "comfy_cafe.hdr")
+
+
+# --- environments that nobody here made ----------------------------------------
+
+
+@real_data
+@pytest.mark.parametrize("name", ["comfy_cafe_1k", "artist_workshop_1k", "abandoned_factory_canteen_01_1k"])
+def test_real_environments(name: str) -> None:
+    got = import_environment(DATA / f"{name}.hdr")
+    assert got.name == name and got.warnings == ()
+    assert got.radiance.shape == (512, 1024, 3)
+    assert got.radiance.max() > 20.0 and 0.05 < np.median(got.radiance) < 2.0
+
+
+@real_data
+def test_radiance_agrees_with_mitsuba() -> None:
+    mitsuba = pytest.importorskip("mitsuba")
+    path = DATA / "artist_workshop_1k.hdr"
+    reference = np.array(mitsuba.Bitmap(str(path)))
+    assert np.array_equal(import_environment(path).radiance, reference[:, :, :3])

@@ -1,0 +1,911 @@
+"""Objects from mesh files: geometry, normals, texture coordinates, colours, and every error that a file can cause."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from trimesh.visual.material import PBRMaterial
+
+from advsearch.errors import FileFormatError, InputError
+from advsearch.scene.assets import Material, Mesh, ObjectAsset
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
+from advsearch.scene.import_images import area_average, display_image
+from advsearch.scene.import_unwrap import sampled
+from advsearch.scene.importing import import_object
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "objects"
+real_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the shared test data is not at {DATA}")
+
+CUBE_V = "".join(f"v {x} {y} {z}\n" for z in (0, 1) for y in (0, 1) for x in (0, 1))
+CUBE_F = ("1 3 4 2", "5 6 8 7", "1 2 6 5", "3 7 8 4", "1 5 7 3", "2 4 8 6")
+CUBE = CUBE_V + "".join(f"f {face}\n" for face in CUBE_F)
+QUAD_V = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+QUAD_UV = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+QUAD = QUAD_V + QUAD_UV + "f 1/1 2/2 3/3 4/4\n"
+MTL = "newmtl paint\nKd 0.2 0.3 0.7\n"
+
+
+def written(folder: Path, name: str, content: str | bytes) -> Path:
+    """Write a file and return its path."""
+    path = folder / name
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def picture(folder: Path, name: str = "wood.png", size: int = 16) -> np.ndarray:
+    """Write a smooth RGB picture that repeats without a seam; return its values, (size, size, 3) in [0, 1]."""
+    x, y = np.meshgrid(*(2 * np.pi * (np.arange(size) + 0.5) / size,) * 2)
+    waves = np.stack([np.sin(x + 1.0), np.sin(y), np.sin(x + y + 2.0) * np.cos(y)], axis=2)
+    codes = np.round(127.5 + 120.0 * waves).astype(np.uint8)
+    Image.fromarray(codes).save(folder / name)
+    return codes.astype(np.float32) / np.float32(255.0)
+
+
+def exported(folder: Path, name: str, mesh: trimesh.Trimesh | trimesh.Scene, **options: Any) -> Path:
+    """Write a mesh with trimesh and return its path."""
+    return written(folder, name, mesh.export(file_type=Path(name).suffix[1:], **options))
+
+
+def face_normals(mesh: Mesh) -> np.ndarray:
+    """Return unit normals of the faces (F, 3), from their winding."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    vectors = np.cross(b - a, c - a)
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def volume(mesh: Mesh) -> float:
+    """Return the signed volume inside a closed mesh."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    return float((a * np.cross(b, c)).sum() / 6.0)
+
+
+def overlap(mesh: Mesh, size: int = 256) -> int:
+    """Count the texels of a size x size grid whose centres lie well inside two faces or more."""
+    hits = np.zeros((size, size), dtype=int)
+    grid = (np.arange(size) + 0.5) / size
+    for corners in mesh.uvs[mesh.faces].astype(np.float64):
+        inside = np.ones((size, size), dtype=bool)
+        turn = np.sign(np.cross(np.append(corners[1] - corners[0], 0), np.append(corners[2] - corners[0], 0))[2])
+        for k in range(3):
+            edge, start = corners[(k + 1) % 3] - corners[k], corners[k]
+            side = edge[0] * (grid[:, None] - start[1]) - edge[1] * (grid[None, :] - start[0])
+            inside &= turn * side > 1e-3 * np.linalg.norm(edge)
+        hits += inside
+    return int((hits > 1).sum())
+
+
+def color_at(asset: ObjectAsset, points: np.ndarray) -> np.ndarray:
+    """Return the base colour at the face whose centre is nearest to each of the points (N, 3)."""
+    centres = asset.mesh.vertices[asset.mesh.faces].mean(axis=1)
+    nearest = ((centres[None] - points[:, None]) ** 2).sum(axis=2).argmin(axis=1)
+    return sampled(asset.base_color, asset.mesh.uvs[asset.mesh.faces[nearest]].mean(axis=1).astype(np.float64))
+
+
+def check_sound(asset: ObjectAsset) -> None:
+    """Check what holds for every imported object."""
+    mesh = asset.mesh
+    extent = mesh.vertices.max(axis=0) - mesh.vertices.min(axis=0)
+    assert extent.max() == pytest.approx(1.0, abs=1e-6)
+    assert mesh.vertices[:, 2].min() == pytest.approx(0.0, abs=1e-6)
+    assert mesh.vertices.max(axis=0)[:2] == pytest.approx(-mesh.vertices.min(axis=0)[:2], abs=1e-6)
+    for array, kind in ((mesh.vertices, "f4"), (mesh.normals, "f4"), (mesh.uvs, "f4"), (mesh.faces, "u4")):
+        assert array.dtype == np.dtype(kind)
+    assert np.linalg.norm(mesh.normals, axis=1) == pytest.approx(1.0, abs=1e-5)
+    assert mesh.uvs.min() >= 0.0 and mesh.uvs.max() <= 1.0
+    assert ((mesh.normals[mesh.faces] * face_normals(mesh)[:, None]).sum(axis=2) > 0.0).all()
+    assert asset.base_color.dtype == np.float32 and asset.base_color.shape[2] == 3
+    assert max(asset.base_color.shape) <= 1024
+    assert asset.base_color.min() >= 0.0 and asset.base_color.max() <= 1.0
+
+
+# --- geometry ----------------------------------------
+
+
+def test_cube_without_anything(tmp_path: Path) -> None:
+    asset = import_object(written(tmp_path, "my cube.obj", CUBE))
+    check_sound(asset)
+    assert asset.name == "my-cube" and asset.source.endswith("my cube.obj") and asset.label is None
+    assert asset.warnings == () and asset.material == Material()
+    assert (asset.base_color == 0.5).all()
+    assert len(asset.mesh.faces) == 12
+    assert volume(asset.mesh) == pytest.approx(1.0, abs=1e-5)
+    corners = asset.mesh.normals[asset.mesh.faces]
+    assert corners == pytest.approx(np.repeat(face_normals(asset.mesh)[:, None], 3, axis=1), abs=1e-5)
+    assert overlap(asset.mesh) == 0
+
+
+@pytest.mark.parametrize(
+    ("suffix", "up", "turned"),
+    [
+        ("obj", None, False),
+        ("ply", None, False),
+        ("stl", None, False),
+        ("glb", None, True),
+        ("gltf", None, True),
+        ("obj", "y", True),
+        ("obj", "z", False),
+        ("glb", "z", False),
+    ],
+)
+def test_up_axis(tmp_path: Path, suffix: str, up: Any, turned: bool) -> None:
+    points = np.array([[0.0, 0, 0], [4, 0, 0], [0, 2, 0], [0, 0, 1]])
+    mesh = trimesh.Trimesh(points, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], process=False)
+    if suffix == "gltf":
+        files = mesh.export(file_type="gltf")
+        for name, content in files.items():
+            written(tmp_path, "thing.gltf" if name.endswith(".gltf") else name, content)
+        path = tmp_path / "thing.gltf"
+    else:
+        path = exported(tmp_path, f"thing.{suffix}", mesh)
+    got = import_object(path, up=up).mesh
+    expected = (np.array([[0.0, 0, 0], [4, 0, 0], [0, 0, 2], [0, -1, 0]]) if turned else points) / 4.0
+    middle = (expected.max(axis=0) + expected.min(axis=0)) / 2
+    expected -= [middle[0], middle[1], expected[:, 2].min()]
+    assert np.unique(got.vertices.round(5), axis=0) == pytest.approx(np.unique(expected.round(5), axis=0), abs=1e-5)
+    assert volume(got) > 0.0
+
+
+def test_scene_graph_is_applied_and_parts_are_joined(tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    box = trimesh.creation.box()
+    scene.add_geometry(box, transform=trimesh.transformations.scale_and_translate([2.0, 1.0, 1.0], [0.0, 0.0, 0.0]))
+    mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
+    mirror[:3, 3] = [0.0, 3.0, 0.0]
+    scene.add_geometry(trimesh.creation.cone(0.5, 1.0), transform=mirror)
+    asset = import_object(exported(tmp_path, "two.glb", scene), up="z")
+    check_sound(asset)
+    assert asset.warnings == ()
+    extent = asset.mesh.vertices.max(axis=0) - asset.mesh.vertices.min(axis=0)
+    assert extent[:2] == pytest.approx(np.array([2.0, 4.0]) / 4.0, abs=1e-4)
+    assert volume(asset.mesh) * 4.0**3 == pytest.approx(2.0 + np.pi / 12, abs=0.01)
+
+
+def test_a_mirrored_part_keeps_the_normals_of_its_file(tmp_path: Path) -> None:
+    sphere = trimesh.creation.icosphere(subdivisions=2)
+    sphere.vertex_normals = sphere.vertices
+    scene = trimesh.Scene()
+    scene.add_geometry(sphere, transform=np.diag([-1.0, 2.0, 1.0, 1.0]))
+    asset = import_object(exported(tmp_path, "egg.glb", scene, include_normals=True), up="z")
+    check_sound(asset)
+    assert asset.warnings == ()
+    points = (asset.mesh.vertices - [0.0, 0.0, 0.25]) * 4.0
+    gradient = points / np.array([1.0, 4.0, 1.0])
+    gradient /= np.linalg.norm(gradient, axis=1, keepdims=True)
+    assert asset.mesh.normals == pytest.approx(gradient, abs=1e-4)
+
+
+@pytest.mark.parametrize("suffix", ["stl", "ply", "glb"])
+def test_a_cylinder_is_smooth_with_sharp_rims(tmp_path: Path, suffix: str) -> None:
+    cylinder = trimesh.creation.cylinder(radius=0.5, height=1.0, sections=32)
+    asset = import_object(exported(tmp_path, f"tin.{suffix}", cylinder), up="z")
+    check_sound(asset)
+    mesh = asset.mesh
+    corners, faces = mesh.normals[mesh.faces], face_normals(mesh)
+    cap = np.abs(faces[:, 2]) > 0.5
+    assert corners[cap] == pytest.approx(np.repeat(faces[cap][:, None], 3, axis=1), abs=1e-5)
+    radial = mesh.vertices[mesh.faces[~cap]] * [1.0, 1.0, 0.0]
+    assert corners[~cap] == pytest.approx(radial / np.linalg.norm(radial, axis=2, keepdims=True), abs=1e-4)
+
+
+def test_almost_equal_points_are_welded(tmp_path: Path) -> None:
+    sphere = trimesh.creation.icosphere(subdivisions=2)
+    corners = sphere.vertices[sphere.faces.reshape(-1)]
+    corners += np.random.default_rng(0).uniform(-2e-7, 2e-7, corners.shape)
+    soup = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+    asset = import_object(exported(tmp_path, "ball.ply", soup))
+    check_sound(asset)
+    outward = asset.mesh.vertices - [0.0, 0.0, 0.5]
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    assert asset.mesh.normals == pytest.approx(outward, abs=0.02)
+
+
+def test_inside_out_box_is_turned_over(tmp_path: Path) -> None:
+    text = CUBE_V + "".join(f"f {' '.join(reversed(face.split()))}\n" for face in CUBE_F)
+    asset = import_object(written(tmp_path, "box.obj", text))
+    check_sound(asset)
+    assert volume(asset.mesh) == pytest.approx(1.0, abs=1e-5)
+    assert asset.warnings == ("box.obj: 12 faces were inside out and have been turned over",)
+
+
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_the_wall_of_a_hollow_faces_the_hollow(tmp_path: Path, inside_out: bool) -> None:
+    inner = trimesh.creation.box(extents=[0.5, 0.5, 0.5])
+    inner.invert()
+    hollow = trimesh.util.concatenate([trimesh.creation.box(), inner])
+    if inside_out:
+        hollow.invert()
+    asset = import_object(exported(tmp_path, "hollow.stl", hollow))
+    check_sound(asset)
+    assert volume(asset.mesh) == pytest.approx(1.0 - 0.125, abs=1e-5)
+    assert bool(asset.warnings) == inside_out
+
+
+def test_open_sheet_with_mixed_winding_becomes_consistent(tmp_path: Path) -> None:
+    lines = [f"v {x} {y} 0\n" for y in range(6) for x in range(6)]
+    number = 0
+    for y in range(5):
+        for x in range(5):
+            corners = [6 * y + x + 1, 6 * y + x + 2, 6 * y + x + 8, 6 * y + x + 7]
+            number += 1
+            lines.append("f " + " ".join(map(str, corners if number % 4 else corners[::-1])) + "\n")
+    asset = import_object(written(tmp_path, "sheet.obj", "".join(lines)))
+    check_sound(asset)
+    assert face_normals(asset.mesh) == pytest.approx(np.tile([0.0, 0.0, 1.0], (50, 1)), abs=1e-6)
+    assert asset.warnings == ("sheet.obj: 12 faces wound against their neighbours were turned over",)
+
+
+def test_one_sided_surface_is_said(tmp_path: Path) -> None:
+    count, lines, faces = 24, [], []
+    for k in range(count):
+        angle, half = 2 * np.pi * k / count, np.pi * k / count
+        for side in (-0.3, 0.3):
+            radius = 1.0 + side * np.cos(half)
+            lines.append(f"v {radius * np.cos(angle)} {radius * np.sin(angle)} {side * np.sin(half)}\n")
+        a, b = 2 * k + 1, 2 * k + 2
+        c, d = (a + 2, b + 2) if k < count - 1 else (2, 1)
+        faces.append(f"f {a} {c} {d} {b}\n")
+    asset = import_object(written(tmp_path, "band.obj", "".join(lines + faces)))
+    assert "band.obj: has a one-sided surface (a Moebius strip), so some faces show their backs" in asset.warnings
+
+
+def test_faces_without_area_are_removed(tmp_path: Path) -> None:
+    text = CUBE + "v 0.5 0 0\nf 1 9 2\nf 1 1 2\n"
+    asset = import_object(written(tmp_path, "box.obj", text))
+    check_sound(asset)
+    assert len(asset.mesh.faces) == 12
+    assert asset.warnings == ("box.obj: 2 faces without area were removed",)
+
+
+def test_file_normals_are_kept(tmp_path: Path) -> None:
+    tilted = np.array([0.6, 0.0, 0.8])
+    text = QUAD_V + f"vn {3 * tilted[0]} 0 {3 * tilted[2]}\nf 1//1 2//1 3//1 4//1\n"
+    asset = import_object(written(tmp_path, "tile.obj", text))
+    assert asset.mesh.normals == pytest.approx(np.tile(tilted, (4, 1)), abs=1e-6)
+    assert asset.warnings == ()
+
+
+@pytest.mark.parametrize("bad", ["nan 0 1", "0 0 0", "inf 0 0"])
+def test_bad_file_normals_are_computed(tmp_path: Path, bad: str) -> None:
+    asset = import_object(written(tmp_path, "tile.obj", QUAD_V + f"vn {bad}\nf 1//1 2//1 3//1 4//1\n"))
+    assert asset.mesh.normals == pytest.approx(np.tile([0.0, 0.0, 1.0], (4, 1)), abs=1e-6)
+
+
+def sphere_with(folder: Path, normals: Callable[[np.ndarray], np.ndarray]) -> ObjectAsset:
+    """Import a ball whose file gives it the normals that a function makes of the right ones."""
+    sphere = trimesh.creation.icosphere(subdivisions=2)
+    sphere.vertex_normals = normals(sphere.vertices.copy())
+    return import_object(exported(folder, "ball.glb", sphere, include_normals=True))
+
+
+def test_normals_that_all_point_inwards_are_turned_around(tmp_path: Path) -> None:
+    asset = sphere_with(tmp_path, lambda normals: -normals)
+    check_sound(asset)
+    assert asset.warnings == ("ball.glb: its normals pointed inwards and were turned around",)
+
+
+def test_contradictory_normals_are_computed_anew(tmp_path: Path) -> None:
+    asset = sphere_with(tmp_path, lambda normals: normals * np.where(np.arange(len(normals)) % 2, 1.0, -1.0)[:, None])
+    check_sound(asset)
+    assert asset.warnings == ("ball.glb: its normals contradict its faces and were computed anew",)
+
+
+def test_normals_of_an_open_sheet_decide_its_front(tmp_path: Path) -> None:
+    asset = import_object(written(tmp_path, "tile.obj", QUAD_V + "vn 0 0 -1\nf 1//1 2//1 3//1 4//1\n"))
+    check_sound(asset)
+    assert face_normals(asset.mesh)[:, 2] == pytest.approx(-1.0)
+    assert asset.warnings == ("tile.obj: 2 faces were inside out and have been turned over",)
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1e30, 0.0), (1e300, 0.0), (1e-30, 0.0), (1.0, 1e9)])
+def test_scale_and_offset_do_not_matter(tmp_path: Path, scale: float, offset: float) -> None:
+    lines = [f"v {x * scale + offset!r} {y * scale!r} {z * scale!r}\n" for z in (0, 1) for y in (0, 1) for x in (0, 1)]
+    text = "".join(lines) + "".join(f"f {face}\n" for face in CUBE_F)
+    asset = import_object(written(tmp_path, "cube.obj", text))
+    check_sound(asset)
+    assert asset.mesh.vertices == pytest.approx(import_object(written(tmp_path, "b.obj", CUBE)).mesh.vertices)
+
+
+def test_relative_indices_polygons_and_odd_text(tmp_path: Path) -> None:
+    ring = [(np.cos(a), np.sin(a)) for a in np.arange(6) * np.pi / 3]
+    text = "# caf\u00e9\n" + "".join(f"\tv\t{x} {y} 0 \\\n\n" for x, y in ring) + "f -6 -5 -4 -3 -2 -1 # a hexagon\n"
+    text += "".join(f"v {x} {y} 5\r\n" for x, y in ring) + "f -6 -5 -4 -3 -2 -1\n"
+    asset = import_object(written(tmp_path, "prism.obj", text.encode("latin-1")))
+    check_sound(asset)
+    assert len(asset.mesh.faces) == 8
+    assert set(asset.mesh.vertices[:, 2].tolist()) == {0.0, 1.0}
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "glb", "stl"])
+def test_same_file_same_bytes(tmp_path: Path, suffix: str) -> None:
+    scene = trimesh.Scene([trimesh.creation.box(), trimesh.creation.icosphere(subdivisions=2)])
+    mesh = scene if suffix == "glb" else scene.to_mesh()
+    path = exported(tmp_path, f"thing.{suffix}", mesh)
+    first, second = import_object(path), import_object(path)
+    for name in ("vertices", "faces", "normals", "uvs"):
+        assert getattr(first.mesh, name).tobytes() == getattr(second.mesh, name).tobytes()
+    assert first.base_color.tobytes() == second.base_color.tobytes()
+
+
+# --- texture coordinates and textures ----------------------------------------
+
+
+def textured_quad(folder: Path, uvs: str, *, size: int = 16) -> tuple[ObjectAsset, np.ndarray]:
+    """Import a square with a texture and the given four ``vt`` lines; return it and the texture's values."""
+    pixels = picture(folder, size=size)
+    written(folder, "quad.mtl", "newmtl paint\nKd 0.5 0.5 0.5\nmap_Kd wood.png\n")
+    text = "mtllib quad.mtl\nusemtl paint\n" + QUAD_V + uvs + "f 1/1 2/2 3/3 4/4\n"
+    return import_object(written(folder, "quad.obj", text)), pixels
+
+
+def test_file_uvs_and_texture_are_kept(tmp_path: Path) -> None:
+    asset, pixels = textured_quad(tmp_path, QUAD_UV)
+    check_sound(asset)
+    assert asset.warnings == ()
+    assert np.array_equal(asset.base_color, pixels)
+    assert asset.mesh.uvs == pytest.approx(asset.mesh.vertices[:, :2] + 0.5)  # v = 0 at y = 0: the bottom row
+
+
+def test_uvs_moved_by_whole_textures_are_moved_back(tmp_path: Path) -> None:
+    asset, pixels = textured_quad(tmp_path, "vt 3 -2\nvt 4 -2\nvt 4 -1\nvt 3 -1\n")
+    check_sound(asset)
+    assert np.array_equal(asset.base_color, pixels)
+    assert asset.mesh.uvs == pytest.approx(asset.mesh.vertices[:, :2] + 0.5)
+
+
+RESAMPLED = 0.02
+"""Error of interpolating a 64-texel wave twice."""
+
+
+def texture_error(asset: ObjectAsset, pixels: np.ndarray, low: tuple[float, float], high: tuple[float, float]) -> float:
+    """Return the largest difference of colour, over the square, from a repeated texture spanning low to high."""
+    mesh, errors = asset.mesh, []
+    for face in mesh.faces:
+        for weights in np.random.default_rng(0).dirichlet([2.0, 2.0, 2.0], 200):
+            at, uv = weights @ (mesh.vertices[face][:, :2] + 0.5), weights @ mesh.uvs[face]
+            there = np.array(low) + at * (np.array(high) - low)
+            errors.append(np.abs(sampled(asset.base_color, uv[None]) - sampled(pixels, there[None])).max())
+    return max(errors)
+
+
+def test_uvs_that_overstep_a_little_keep_their_layout(tmp_path: Path) -> None:
+    asset, pixels = textured_quad(tmp_path, "vt -0.1 0.2\nvt 0.9 0.2\nvt 0.9 1.2\nvt -0.1 1.2\n", size=64)
+    check_sound(asset)
+    assert asset.warnings == () and len(asset.mesh.vertices) == 4
+    assert texture_error(asset, pixels, (-0.1, 0.2), (0.9, 1.2)) < RESAMPLED
+
+
+def test_repeating_texture_is_unwrapped_and_resampled(tmp_path: Path) -> None:
+    asset, pixels = textured_quad(tmp_path, "vt 0 0\nvt 3 0\nvt 3 2\nvt 0 2\n", size=64)
+    check_sound(asset)
+    assert overlap(asset.mesh) == 0
+    (warning,) = asset.warnings
+    assert warning.startswith(
+        "quad.obj: its texture coordinates repeat or hardly use the texture; it was unwrapped anew"
+    )
+    assert texture_error(asset, pixels, (0.0, 0.0), (3.0, 2.0)) < RESAMPLED
+
+
+def test_uvs_squashed_to_points_become_an_atlas(tmp_path: Path) -> None:
+    Image.fromarray(np.array([[[255, 0, 0], [0, 0, 255]]], np.uint8)).save(tmp_path / "palette.png")
+    written(tmp_path, "cube.mtl", "newmtl palette\nmap_Kd palette.png\n")
+    faces = [" ".join(f"{v}/{1 + (k == 1)}" for v in face.split()) for k, face in enumerate(CUBE_F)]
+    text = "mtllib cube.mtl\nusemtl palette\n" + CUBE_V + "vt 0.25 0.5\nvt 0.75 0.5\n"
+    asset = import_object(written(tmp_path, "cube.obj", text + "".join(f"f {face}\n" for face in faces)))
+    check_sound(asset)
+    got = color_at(asset, np.array([[0.0, 0.1, 1.0], [0.0, 0.1, 0.0], [0.5, 0.1, 0.5]]))
+    assert got == pytest.approx(np.array([[0.0, 0, 1], [1, 0, 0], [1, 0, 0]]), abs=1e-6)
+
+
+def test_plain_object_with_bad_uvs_is_unwrapped(tmp_path: Path) -> None:
+    text = CUBE_V + "vt 0 0\nvt 5 0\nvt 5 5\nvt 0 5\n"
+    text += "".join("f " + " ".join(f"{v}/{k + 1}" for k, v in enumerate(f.split())) + "\n" for f in CUBE_F)
+    asset = import_object(written(tmp_path, "cube.obj", text))
+    check_sound(asset)
+    assert asset.warnings == () and asset.base_color.shape == (8, 8, 3)
+    assert overlap(asset.mesh) == 0
+
+
+def test_unwrap_of_a_curved_object_does_not_overlap(tmp_path: Path) -> None:
+    torus = trimesh.creation.torus(1.0, 0.4, major_sections=24, minor_sections=12)
+    asset = import_object(exported(tmp_path, "ring.stl", torus))
+    check_sound(asset)
+    assert overlap(asset.mesh, 128) == 0
+    a, b, c = (asset.mesh.uvs[asset.mesh.faces[:, k]] for k in range(3))
+    area = np.abs(np.cross(np.pad(b - a, ((0, 0), (0, 1))), np.pad(c - a, ((0, 0), (0, 1))))[:, 2]) / 2
+    assert (area > 0.0).all() and 0.3 < area.sum() < 1.0
+
+
+@pytest.mark.parametrize(("width", "height", "expected"), [(2048, 1024, (512, 1024)), (1500, 3000, (1024, 512))])
+def test_large_textures_are_averaged_down(tmp_path: Path, width: int, height: int, expected: tuple[int, int]) -> None:
+    stripes = np.zeros((height, width, 3), np.uint8)
+    stripes[::2] = 255
+    Image.fromarray(stripes).save(tmp_path / "wood.png", compress_level=1)
+    got = display_image(Image.open(tmp_path / "wood.png"))
+    assert got.shape == (*expected, 3)
+    # black and white lines average to half of white's light, not to half of its code
+    assert srgb_to_linear(got).mean() == pytest.approx(0.5, abs=1e-3)
+
+
+def test_area_average_is_exact() -> None:
+    image = np.random.default_rng(0).random((7, 9, 2), dtype=np.float32)
+    got = area_average(image, 3, 4)
+    assert got.mean(axis=(0, 1)) == pytest.approx(image.mean(axis=(0, 1)), rel=1e-6)
+    weights = np.array([1.0, 1.0, 1 / 3])
+    expected = np.einsum("i,ij,j->", weights, image[:3, :3, 0], np.array([1.0, 1.0, 0.25])) / (7 / 3 * 9 / 4)
+    assert got[0, 0, 0] == pytest.approx(expected, rel=1e-6)
+
+
+def test_alpha_palettes_and_depths_of_pictures() -> None:
+    rgba = np.full((2, 2, 4), 200, np.uint8)
+    rgba[..., 3] = 0
+    assert display_image(Image.fromarray(rgba)) == pytest.approx(200 / 255)
+    assert display_image(Image.fromarray(rgba[..., :3]).convert("P")) == pytest.approx(200 / 255, abs=0.02)
+    assert display_image(Image.fromarray(np.full((2, 2), 32768, np.uint16))) == pytest.approx(0.5, abs=0.003)
+    assert display_image(Image.fromarray(np.full((2, 2), 0.25, np.float32))) == pytest.approx(0.25, abs=0.003)
+    assert display_image(Image.new("L", (3, 2), 255)).shape == (2, 3, 3)
+
+
+# --- materials ----------------------------------------
+
+
+def painted_quad(folder: Path, material: str, *, head: str = "mtllib quad.mtl\nusemtl paint\n") -> ObjectAsset:
+    """Import a square whose .mtl file has the given text."""
+    written(folder, "quad.mtl", material)
+    return import_object(written(folder, "quad.obj", head + QUAD))
+
+
+def test_plain_material_color(tmp_path: Path) -> None:
+    asset = painted_quad(tmp_path, MTL)
+    assert asset.warnings == ()
+    assert asset.base_color == pytest.approx(np.broadcast_to([0.2, 0.3, 0.7], (8, 8, 3)))
+
+
+@pytest.mark.parametrize(
+    "material", ["newmtl paint\nNs 10\n", "newmtl paint\nKd # white\n", "newmtl paint\nKd nan 0 0\n"]
+)
+def test_material_without_color_is_neutral_grey(tmp_path: Path, material: str) -> None:
+    asset = painted_quad(tmp_path, material)
+    assert asset.warnings == ()
+    assert (asset.base_color == 0.5).all()
+
+
+def test_texture_stands_alone_beside_kd(tmp_path: Path) -> None:
+    pixels = picture(tmp_path)
+    assert np.array_equal(painted_quad(tmp_path, MTL + "map_Kd wood.png\n").base_color, pixels)
+
+
+@pytest.mark.parametrize("line", ["map_Kd -s 1 1 1 wood.png", "map_kd .\\wood.png", "MAP_KD C:\\somewhere\\wood.png"])
+def test_texture_names_as_exporters_write_them(tmp_path: Path, line: str) -> None:
+    pixels = picture(tmp_path)
+    asset = painted_quad(tmp_path, f"newmtl paint\n{line}\n")
+    assert asset.warnings == ()
+    assert np.array_equal(asset.base_color, pixels)
+
+
+def test_missing_texture_leaves_the_color(tmp_path: Path) -> None:
+    asset = painted_quad(tmp_path, MTL + "map_Kd gone.png\n")
+    assert asset.base_color == pytest.approx(np.broadcast_to([0.2, 0.3, 0.7], (8, 8, 3)))
+    assert asset.warnings == (
+        "quad.obj: quad.mtl names the texture 'gone.png', which is missing;"
+        " its base colour (0.20, 0.30, 0.70) is used instead",
+    )
+
+
+def test_missing_texture_of_a_white_material_leaves_grey(tmp_path: Path) -> None:
+    asset = painted_quad(tmp_path, "newmtl paint\nKd 1 1 1\nmap_Kd gone.png\n")
+    assert (asset.base_color == 0.5).all()
+    assert asset.warnings == (
+        "quad.obj: quad.mtl names the texture 'gone.png', which is missing; neutral grey is used instead",
+    )
+
+
+@pytest.mark.parametrize("content", [b"not a picture", b"", None])
+def test_unreadable_texture_leaves_the_color(tmp_path: Path, content: bytes | None) -> None:
+    picture(tmp_path, size=64)
+    whole = (tmp_path / "wood.png").read_bytes()
+    written(tmp_path, "wood.png", whole[: len(whole) // 2] if content is None else content)
+    asset = painted_quad(tmp_path, MTL + "map_Kd wood.png\n")
+    assert asset.base_color == pytest.approx(np.broadcast_to([0.2, 0.3, 0.7], (8, 8, 3)))
+    assert asset.warnings == (
+        "quad.obj: quad.mtl names the texture 'wood.png', which cannot be read as a picture;"
+        " its base colour (0.20, 0.30, 0.70) is used instead",
+    )
+
+
+def test_missing_material_file_and_missing_material(tmp_path: Path) -> None:
+    asset = painted_quad(tmp_path, MTL, head="mtllib gone.mtl\nusemtl paint\n")
+    assert (asset.base_color == 0.5).all()
+    assert asset.warnings == (
+        "quad.obj names the material file 'gone.mtl', which is missing; neutral grey is used instead",
+    )
+    asset = painted_quad(tmp_path, MTL, head="mtllib quad.mtl\nusemtl pant\n")
+    assert (asset.base_color == 0.5).all()
+    assert asset.warnings == (
+        "quad.obj uses the material 'pant', which its .mtl file lacks; neutral grey is used instead",
+    )
+
+
+def test_several_materials_are_baked_into_one_texture(tmp_path: Path) -> None:
+    pixels = picture(tmp_path, size=8)
+    written(tmp_path, "cube.mtl", "newmtl red\nKd 0.9 0.1 0.1\nnewmtl wood\nmap_Kd wood.png\nnewmtl blue\nKd 0 0 1\n")
+    text = "mtllib cube.mtl\n" + CUBE_V + QUAD_UV
+    for name, faces in (("red", CUBE_F[2:]), ("blue", CUBE_F[:1]), ("wood", CUBE_F[1:2])):
+        text += f"usemtl {name}\n"
+        for face in faces:
+            text += "f " + " ".join(f"{v}/{k + 1}" if name == "wood" else v for k, v in enumerate(face.split())) + "\n"
+    asset = import_object(written(tmp_path, "cube.obj", text))
+    check_sound(asset)
+    assert asset.warnings == ("cube.obj: the colours of its 3 parts were baked into one texture",)
+    assert overlap(asset.mesh) == 0
+    got = color_at(asset, np.array([[0.0, -0.5, 0.5], [0.0, 0.0, 0.0]]))
+    assert got == pytest.approx(np.array([[0.9, 0.1, 0.1], [0.0, 0.0, 1.0]]), abs=1e-5)
+    top = asset.mesh.vertices[asset.mesh.faces][:, :, 2].min(axis=1) > 0.99
+    for face in asset.mesh.faces[top]:  # the top's texture runs along x and y
+        at, uv = asset.mesh.vertices[face].mean(axis=0)[:2] + 0.5, asset.mesh.uvs[face].mean(axis=0)
+        expected = sampled(pixels, at[None].astype(np.float64))
+        assert sampled(asset.base_color, uv[None].astype(np.float64)) == pytest.approx(expected, abs=0.03)
+
+
+def glb(folder: Path, material: PBRMaterial | None, **attributes: np.ndarray) -> Path:
+    """Write a square with UVs as .glb."""
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    mesh = trimesh.Trimesh(points, [[0, 1, 2], [0, 2, 3]], process=False)
+    if material is not None:
+        mesh.visual = trimesh.visual.TextureVisuals(uv=points[:, :2], material=material)
+        for name, values in attributes.items():
+            mesh.visual.vertex_attributes[name] = values
+    return exported(folder, "quad.glb", mesh)
+
+
+def test_gltf_color_is_linear(tmp_path: Path) -> None:
+    asset = import_object(glb(tmp_path, PBRMaterial(baseColorFactor=[0.2, 0.5, 1.0, 0.3])))
+    expected = linear_to_srgb(np.round(np.array([0.2, 0.5, 1.0], np.float32) * 255) / 255)
+    assert asset.base_color == pytest.approx(np.broadcast_to(expected, (8, 8, 3)), abs=1e-6)
+    assert asset.material == Material() and asset.warnings == ()
+
+
+def test_gltf_texture_times_factor_with_roughness_and_metallic(tmp_path: Path) -> None:
+    pixels = picture(tmp_path)
+    image = Image.open(tmp_path / "wood.png")
+    material = PBRMaterial(
+        baseColorTexture=image, baseColorFactor=[1.0, 0.2, 1.0, 1.0], roughnessFactor=0.25, metallicFactor=0.75
+    )
+    asset = import_object(glb(tmp_path, material))
+    expected = linear_to_srgb((srgb_to_linear(pixels) * np.array([1.0, 0.2, 1.0])).astype(np.float32))
+    assert asset.base_color == pytest.approx(expected, abs=1e-5)
+    assert asset.material == Material(roughness=0.25, metallic=0.75)
+    assert asset.warnings == ()
+
+
+def test_gltf_without_material_is_neutral_grey(tmp_path: Path) -> None:
+    assert (import_object(glb(tmp_path, None)).base_color == 0.5).all()
+
+
+def test_gltf_roughness_texture_is_replaced_by_its_mean(tmp_path: Path) -> None:
+    packed = np.zeros((4, 4, 3), np.uint8)
+    packed[:2, :, 1], packed[:, :, 2] = 255, 51
+    material = PBRMaterial(metallicRoughnessTexture=Image.fromarray(packed), roughnessFactor=0.5)
+    asset = import_object(glb(tmp_path, material))
+    assert asset.material.roughness == pytest.approx(0.25) and asset.material.metallic == pytest.approx(0.2)
+    assert asset.warnings == ("quad.glb: textures of roughness and metallic are replaced by their means",)
+
+
+def test_several_roughnesses_are_replaced_by_their_mean(tmp_path: Path) -> None:
+    scene = trimesh.Scene()
+    for k, (size, roughness) in enumerate(((1.0, 0.2), (2.0, 0.7))):
+        box = trimesh.creation.box(extents=[size] * 3)
+        material = PBRMaterial(name=f"m{k}", baseColorFactor=[1.0, 0.0, 0.0, 1.0], roughnessFactor=roughness)
+        box.visual = trimesh.visual.TextureVisuals(uv=np.zeros((8, 2)), material=material)
+        scene.add_geometry(box, transform=trimesh.transformations.translation_matrix([3.0 * k, 0.0, 0.0]))
+    asset = import_object(exported(tmp_path, "boxes.glb", scene))
+    assert asset.material.roughness == pytest.approx(0.2 * 0.2 + 0.8 * 0.7)
+    assert asset.warnings == ("boxes.glb: the roughness and metallic of its materials are replaced by their means",)
+    assert asset.base_color == pytest.approx(np.broadcast_to([1.0, 0.0, 0.0], (8, 8, 3)))
+
+
+def split_gltf(folder: Path) -> Path:
+    """Write a textured square as .gltf with files beside it: buffers, and wood.png."""
+    picture(folder)
+    files = trimesh.load_scene(glb(folder, PBRMaterial(baseColorTexture=Image.open(folder / "wood.png")))).export(
+        file_type="gltf"
+    )
+    for name, content in files.items():
+        if name.endswith(".gltf"):
+            header = json.loads(content)
+            del header["images"][0]["bufferView"], header["images"][0]["mimeType"]
+            header["images"][0]["uri"] = "wood.png"
+            written(folder, "split.gltf", json.dumps(header))
+        else:
+            written(folder, name, content)
+    return folder / "split.gltf"
+
+
+def test_gltf_with_separate_files(tmp_path: Path) -> None:
+    path = split_gltf(tmp_path)
+    asset = import_object(path)
+    assert asset.warnings == () and asset.base_color.shape == (16, 16, 3)
+    (tmp_path / "wood.png").unlink()
+    asset = import_object(path)
+    assert asset.warnings == (
+        "split.gltf names the texture 'wood.png', which is missing; neutral grey is used instead",
+    )
+    (buffer, *_) = tmp_path.glob("*.bin")
+    for other in tmp_path.glob("*.bin"):
+        other.unlink()
+    with pytest.raises(
+        FileFormatError, match=rf"split\.gltf: needs '{buffer.stem[:6]}.*', which is missing; put that file"
+    ):
+        import_object(path)
+
+
+def test_vertex_colors_are_baked(tmp_path: Path) -> None:
+    box = trimesh.creation.box(extents=[1.0, 1.0, 1.0])
+    box.visual.vertex_colors = np.where(box.vertices[:, 2:] > 0.0, [[255, 0, 0, 255]], [[0, 0, 255, 255]])
+    asset = import_object(exported(tmp_path, "box.ply", box))
+    check_sound(asset)
+    assert asset.warnings == ("box.ply: its vertex or face colours were baked into a texture",)
+    got = color_at(asset, np.array([[0.0, 0.1, 1.0], [0.0, 0.1, 0.0]]))
+    assert got == pytest.approx(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), abs=1e-5)
+
+
+def test_one_vertex_color_is_a_plain_color(tmp_path: Path) -> None:
+    text = QUAD_V.replace("\n", " 0.2 0.4 0.6\n") + "f 1 2 3 4\n"
+    asset = import_object(written(tmp_path, "tile.obj", text))
+    assert asset.warnings == ()
+    assert asset.base_color == pytest.approx(np.broadcast_to([0.2, 0.4, 0.6], (8, 8, 3)), abs=2e-3)  # trimesh: 8 bits
+
+
+def test_gltf_vertex_colors_multiply_the_material(tmp_path: Path) -> None:
+    colors = np.tile(np.array([[255, 128, 0, 255]], np.uint8), (4, 1))
+    path = glb(tmp_path, PBRMaterial(baseColorFactor=[0.5, 0.5, 0.5, 1.0]), color=colors)
+    asset = import_object(path)
+    expected = linear_to_srgb(np.array([255, 128, 0], np.float32) / 255 * np.float32(128 / 255))
+    assert asset.base_color == pytest.approx(np.broadcast_to(expected, (8, 8, 3)), abs=1e-3)
+
+
+def test_ply_keeps_normals_and_uvs_together(tmp_path: Path) -> None:
+    header = "ply\nformat ascii 1.0\ncomment TextureFile wood.png\nelement vertex 4\n"
+    header += "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz", "s", "t"))
+    header += "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    corners = [(1, 1), (0, 0), (1, 0), (0, 1)]
+    rows = "".join(f"{x} {y} 0 {0.6 * x} 0 {1 - 0.2 * x} {x} {y}\n" for x, y in corners)
+    pixels = picture(tmp_path)
+    path = written(tmp_path, "tile.ply", header + rows + "3 1 2 0\n3 1 0 3\n")
+    asset = import_object(path)
+    assert asset.warnings == () and np.array_equal(asset.base_color, pixels)
+    x = asset.mesh.vertices[:, 0] + 0.5
+    assert asset.mesh.uvs == pytest.approx(asset.mesh.vertices[:, :2] + 0.5, abs=1e-6)
+    assert asset.mesh.normals[:, 0] == pytest.approx(0.6 * x, abs=1e-6)
+    (tmp_path / "wood.png").unlink()
+    assert import_object(path).warnings == (
+        "tile.ply names the texture 'wood.png', which is missing; neutral grey is used instead",
+    )
+
+
+# --- bad input ----------------------------------------
+
+
+def obj(text: str) -> Callable[[Path], Path]:
+    """Return a function that writes an OBJ file."""
+    return lambda folder: written(folder, "thing.obj", text)
+
+
+def raw(name: str, content: bytes) -> Callable[[Path], Path]:
+    """Return a function that writes any file."""
+    return lambda folder: written(folder, name, content)
+
+
+def cut(name: str, keep: float, **options: Any) -> Callable[[Path], Path]:
+    """Return a function that writes the first share of an exported box."""
+
+    def write(folder: Path) -> Path:
+        path = exported(folder, name, trimesh.creation.box(), **options)
+        data = path.read_bytes()
+        return written(folder, name, data[: int(keep * len(data))])
+
+    return write
+
+
+def png() -> bytes:
+    """Return a small PNG file."""
+    buffer = io.BytesIO()
+    Image.new("RGB", (4, 4)).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def glb_of(header: dict[str, Any]) -> bytes:
+    """Return a .glb file with a JSON chunk only."""
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text), len(text), 0x4E4F534A) + text
+
+
+NOISE = np.random.default_rng(0).bytes(3000)
+INTEGER_UVS = {
+    "asset": {"version": "2.0"},
+    "accessors": [{"componentType": 5123, "count": 3, "type": "VEC2"}],
+    "meshes": [{"primitives": [{"attributes": {"TEXCOORD_0": 0}}]}],
+}
+BAD = {
+    "directory": (lambda folder: folder, r": expected a file with an object, got a directory; name a file inside it"),
+    "missing": (lambda folder: folder / "no.obj", r"no\.obj: no such object file\. Check the path"),
+    "missing folder": (lambda f: f / "no" / "no.obj", r"no such object file\. The folder .*no does not exist either\."),
+    "empty": (raw("thing.ply", b""), r"thing\.ply: the object file is empty; export or download it again"),
+    "ending": (raw("thing.fbx", b"x"), r"ending in \.obj, \.ply, \.glb, \.gltf, \.stl, got '\.fbx'; convert it"),
+    "no ending": (raw("thing", b"x"), r"got a name without ending; convert it to one of these"),
+    "png as obj": (raw("thing.obj", png()), r"expected a Wavefront OBJ file .*, got a PNG picture; export or download"),
+    "png as ply": (raw("thing.ply", png()), r"expected a PLY file with a complete header, got a PNG picture"),
+    "png as glb": (raw("thing.glb", png()), r"expected a binary glTF file, got a PNG picture"),
+    "png as gltf": (raw("thing.gltf", png()), r"expected glTF with a JSON header, got a PNG picture"),
+    "png as stl": (raw("thing.stl", png()), r"expected an STL file .*, got a PNG picture"),
+    "noise as obj": (raw("thing.obj", NOISE), r"expected a Wavefront OBJ file .*, got binary data of another kind"),
+    "noise as ply": (raw("thing.ply", NOISE), r"expected a PLY file .*, got binary data of another kind"),
+    "noise as glb": (raw("thing.glb", NOISE), r"expected a binary glTF file, got binary data of another kind"),
+    "noise as gltf": (raw("thing.gltf", NOISE), r"expected glTF with a JSON header, got something else"),
+    "noise as stl": (raw("thing.stl", NOISE), r"expected an STL file .*, got 3000 bytes"),
+    "text as obj": (obj("hello\nworld\n"), r"expected a Wavefront OBJ file .*, got text of another kind"),
+    "other json": (raw("thing.gltf", b"{}"), r"expected glTF with an 'asset' entry, got other JSON"),
+    "points only": (obj(CUBE_V), r"expected a mesh with faces, got points or lines only; export triangles"),
+    "no nodes": (raw("t.glb", glb_of({"asset": {"version": "2.0"}})), r"expected a mesh with faces, got none"),
+    "nan": (obj(CUBE.replace("v 1 1 1", "v 1 nan 1")), r"expected finite vertices, got 1 of 8 with NaN or infinite"),
+    "infinite": (obj(CUBE.replace("v 1 1 1", "v 1 inf 1")), r"coordinates \(the first: \[1\.0, inf, 1\.0\]\); repair"),
+    "coincident": (
+        obj("v 1 2 3\n" * 3 + "f 1 2 3\n"),
+        r"an object with a size, got a mesh in which all vertices coincide",
+    ),
+    "too large": (obj("v -1e308 0 0\nv 1.7e308 1 0\nv 0 0 1\nf 1 2 3\n"), r"its extent is too large to compute with"),
+    "no area": (obj("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n"), r"expected faces with an area, got 1 without"),
+    "cut obj face": (obj(CUBE + "f 1 2"), r"3 or more corners on line 15, got 'f 1 2' \(is the file cut short\?\)"),
+    "cut obj vertex": (obj("v 0 0 0\nv 1 0"), r"3 numbers after 'v' on line 2, got '1 0' \(is the file cut short\?\)"),
+    "index past end": (obj(CUBE + "f 1 2 99\n"), r"at least 99 'v' lines, got 8, and a face on line 15 that refers to"),
+    "index zero": (obj(CUBE + "f 0 1 2\n"), r"indices that count from 1 in the face on line 15, got '0'"),
+    "index before start": (obj(CUBE + "f -9 1 2\n"), r"indices that count from 1 in the face on line 15, got '-9'"),
+    "index not a number": (obj(CUBE + "f a b c\n"), r"whole numbers in the face on line 15, got 'a'"),
+    "word in a vertex": (obj("v 0 0 x\n" + CUBE), r"is not readable OBJ \(.*\); it is damaged or cut short"),
+    "cut ply header": (cut("t.ply", 0.1), r"expected a PLY file with a complete header, got half of one"),
+    "cut ply": (cut("t.ply", 0.8), r"is not readable PLY \(PLY is unexpected length!\); it is damaged or cut short"),
+    "cut ascii ply": (
+        cut("t.ply", 0.9, encoding="ascii"),
+        r"expected 20 lines after the PLY header, got 1\d; the file is",
+    ),
+    "cut glb": (cut("t.glb", 0.8), r"expected \d+ bytes, as its header says, got \d+; the file is cut short"),
+    "cut glb header": (raw("t.glb", b"glTF\2\0"), r"expected a binary glTF file, got the first few bytes of one"),
+    "cut stl": (cut("t.stl", 0.8), r"an STL file \(in binary, 684 bytes for its number of facets\), got 547 bytes"),
+    "cut ascii stl": (
+        raw("t.stl", b"solid x\nfacet normal 0 0 1\n"),
+        r"ASCII STL file that ends in 'endsolid', got one",
+    ),
+    "compressed": (
+        raw("t.glb", glb_of({"asset": {"version": "2.0"}, "extensionsRequired": ["KHR_draco_mesh_compression"]})),
+        r"needs KHR_draco_mesh_compression, which is not supported; export it without that option",
+    ),
+    "quantized": (
+        raw("t.glb", glb_of(INTEGER_UVS)),
+        r"expected floats, got TEXCOORD_0 values that are not 32-bit floats",
+    ),
+    "old gltf": (raw("t.gltf", b'{"asset": {"version": "1.0"}}'), r"is not readable GLTF \(only GLTF 2 is supported"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_files(tmp_path: Path, case: str, capfd: pytest.CaptureFixture[str]) -> None:
+    make, message = BAD[case]
+    path = make(tmp_path)
+    with pytest.raises(InputError, match=message) as caught:
+        import_object(path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("suffix", ["obj", "ply", "glb", "stl"])
+def test_damage_anywhere_is_the_inputs_fault(tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]) -> None:
+    box = trimesh.creation.box()
+    box.visual.vertex_colors = np.arange(32, dtype=np.uint8).reshape(8, 4) * 8
+    data = exported(tmp_path, f"box.{suffix}", box).read_bytes()
+    random, refused = np.random.default_rng(0), 0
+    for _ in range(20):
+        broken = bytearray(data)
+        for position in random.integers(len(data), size=3):
+            broken[position] = random.integers(256)
+        try:
+            import_object(written(tmp_path, f"broken.{suffix}", bytes(broken)))
+        except InputError:
+            refused += 1  # anything else fails the test
+    assert refused > 0
+    assert capfd.readouterr() == ("", "")
+
+
+def test_near_matches_of_a_missing_file(tmp_path: Path) -> None:
+    for name in ("Teapot.obj", "teacup.glb", "teapot.png"):
+        written(tmp_path, name, "x")
+    with pytest.raises(
+        FileFormatError, match=r"no such object file\. Did you mean 'Teapot\.obj' or 'teacup\.glb'\? Check"
+    ):
+        import_object(tmp_path / "teapott.obj")
+
+
+def test_up_must_be_an_axis(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="up axis: expected 'y' or 'z', got 'x'"):
+        import_object(written(tmp_path, "cube.obj", CUBE), up="x")  # type: ignore[arg-type]
+
+
+def test_parts_without_faces_are_left_out(tmp_path: Path) -> None:
+    scene = trimesh.Scene([trimesh.creation.box(), trimesh.PointCloud(np.eye(3))])
+    asset = import_object(exported(tmp_path, "mixed.glb", scene))
+    assert asset.warnings == ("mixed.glb: 1 parts without faces (points, lines) are left out",)
+
+
+def test_texture_transform_is_said(tmp_path: Path) -> None:
+    data = glb(tmp_path, PBRMaterial(baseColorFactor=[1.0, 0.0, 0.0, 1.0])).read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    header = json.loads(data[20 : 20 + length]) | {"extensionsUsed": ["KHR_texture_transform"]}
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + length :]
+    path = written(
+        tmp_path,
+        "moved.glb",
+        struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest,
+    )
+    assert import_object(path).warnings == (
+        "moved.glb moves its textures with KHR_texture_transform, which is not applied",
+    )
+
+
+def test_importing_does_not_pull_in_the_renderer() -> None:
+    code = "import sys, advsearch.scene.importing, advsearch.scene.environments as e\n"
+    code += "print({'mitsuba', 'torch'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+# --- objects that nobody here made ----------------------------------------
+
+
+@real_data
+@pytest.mark.parametrize(
+    ("name", "up", "faces"),
+    [("mug.obj", None, 864), ("teapot.obj", "y", 2464), ("bowl.obj", None, 14030), ("cow.glb", None, 5856)],
+)
+def test_real_objects(name: str, up: Any, faces: int) -> None:
+    asset = import_object(DATA / name, up=up)
+    check_sound(asset)
+    assert len(asset.mesh.faces) == faces
+    missing = ("bowl.obj: model.mtl names the texture 'texture.png', which is missing; neutral grey is used instead",)
+    assert asset.warnings == (missing if name == "bowl.obj" else ())
+    if name in ("mug.obj", "teapot.obj"):
+        assert overlap(asset.mesh, 64) == 0
+    if name != "cow.glb":
+        assert (asset.base_color == 0.5).all()
+
+
+@real_data
+def test_real_banana_is_yellow_all_over() -> None:
+    asset = import_object(DATA / "banana.obj")
+    check_sound(asset)
+    assert asset.warnings == () and asset.base_color.shape == (1024, 1024, 3)
+    uvs = asset.mesh.uvs[asset.mesh.faces].mean(axis=1).astype(np.float64)
+    red, green, blue = sampled(asset.base_color, uvs).T  # an upside-down texture would show its black background
+    assert (np.minimum(red, green) > blue + 0.15).mean() > 0.95
+
+
+@real_data
+def test_real_cow_is_the_same_from_both_formats() -> None:
+    one, other = import_object(DATA / "cow.obj", up="y"), import_object(DATA / "cow.glb")
+    assert np.abs(one.base_color - other.base_color).max() < 0.01
+    assert other.material.roughness == pytest.approx(0.99)
+    points = np.random.default_rng(0).permutation(one.mesh.vertices[one.mesh.faces].mean(axis=1))[:300]
+    assert color_at(one, points) == pytest.approx(color_at(other, points), abs=0.02)
+    assert one.warnings == () and one.mesh.vertices.max() == pytest.approx(other.mesh.vertices.max(), abs=1e-5)

@@ -1,0 +1,340 @@
+"""The report page: filled, escaped, self-contained; and the words that it shares with the final table."""
+
+from __future__ import annotations
+
+import copy
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from advsearch.config import AttackConfig
+from advsearch.errors import FileFormatError
+from advsearch.report import wording
+from advsearch.report.charts import Curve, interval_bar, nice_ticks, objective_chart
+from advsearch.report.markup import Html, element, join
+from advsearch.report.page import LARGE_PICTURE, SMALLER_SIDE, write_report
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.images import read_png
+from advsearch.runs.store import Row
+
+SUMMARY: dict[str, Any] = {
+    "command": "attack", "run": "runs/mug-texture-001", "object": "mug", "model": "reference", "environment": "studio",
+    "controls": ["texture"], "epsilon": 0.1, "norm": "linf", "objective": "margin", "policy": "pgd", "ending": "found",
+    "image_formation": {"denoiser": "oidn", "filter": "box", "exposure": 0.0, "resolution": [128, 128]},
+    "clean": {"label": "mug", "index": 0, "probability": 0.98, "correct": True,
+              "control": {"correct": 20, "trials": 20, "rate": 1.0, "interval": [0.8316, 1.0]}},
+    "adversarial": {"label": "vase", "index": 7, "probability": 0.913},
+    "verified": {"successes": 20, "trials": 20, "rate": 1.0, "interval": [0.8316, 1.0], "spp": 64,
+                 "labels": {"vase": 20}},
+    "baseline": {"policy": "random", "renders": 40,
+                 "verified": {"successes": 1, "trials": 20, "rate": 0.05, "interval": [0.0013, 0.249]}},
+    "renders": {"search": 40, "gradient": 40, "verification": 21}, "steps": 40,
+    "seconds": {"setup": 3.1, "search": 9.0, "verification": 2.2, "total": 14.6}, "seed": 0,
+}  # fmt: skip
+
+VOID = {"meta", "img", "br", "hr"}
+
+
+class Page(HTMLParser):
+    """The tags, texts and attributes of a page; fails where tags do not nest."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words: list[str] = []
+        self.feed(text)
+        self.close()
+        assert not self.open, f"not closed: {self.open}"
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] != "style":
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        """All that a reader sees."""
+        return " ".join(" ".join(self.words).replace("\u00a0", " ").split())
+
+    def all(self, tag: str) -> list[dict[str, str | None]]:
+        """Return the attributes of each such tag."""
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+def make_run(path: Path, summary: dict[str, Any] = SUMMARY, *, pictures: bool = True, rows: bool = True) -> Path:
+    """Return a run directory with stand-in pictures and results."""
+    grey = np.full((8, 8, 3), 0.5)
+    with RunDirectory.create_for(AttackConfig(object=str(summary["object"]), run=str(path))) as run:
+        for name in ("clean", "adversarial", "difference", "verification-00", "verification-01") if pictures else ():
+            run.save_image(name, grey)
+        for name in ("texture", "texture-original") if pictures else ():
+            run.save_image(name, grey, folder="artifacts")
+        if pictures:
+            run.save_animation("search", [grey, grey * 0])
+        for step in range(40) if rows else ():
+            run.record(Row("search", step, objective=step / 10 - 2), Row("baseline", step, objective=-2.0 - step / 100))
+        run.write_summary(summary)
+    return path
+
+
+def page_of(run: Path) -> Page:
+    """Return the parsed report of a run."""
+    return Page(write_report(run).read_text(encoding="utf-8"))
+
+
+def changed(**fields: Any) -> dict[str, Any]:
+    """Return the summary with other fields."""
+    return {**copy.deepcopy(SUMMARY), **fields}
+
+
+# ---- the page ----
+
+
+def test_the_page_says_it_all(tmp_path: Path) -> None:
+    page = page_of(
+        make_run(tmp_path / "run", changed(warnings=["A texture is missing."], command_line="advsearch attack"))
+    )
+    for text in (
+        "The model calls this mug a vase in 20 of 20 fresh renders (95 % interval 83-100 %).",
+        "A texture is missing.",
+        "Clean : mug, 98 %",
+        "Adversarial : vase, 91 %",
+        "5 times magnified, grey where nothing changed",
+        "trial 00",
+        "Clean scene (control group) right 20 of 20 83-100 %",
+        "Adversarial wrong 20 of 20 83-100 %",
+        "Random search wrong 1 of 20 0.1-25 %",
+        "64 samples per pixel",
+        "pgd, 40 steps",
+        "texture within 0.1 (linf)",
+        "40 of the search, 40 gradients, 21 of the verification",
+        "14.6 s (setup 3.1 s, search 9.0 s, verification 2.2 s)",
+        "128 x 128 pixels, box filter, denoised (oidn), exposure 0 stops",
+        "advsearch run runs/mug-texture-001/run.yaml",
+        "advsearch attack",
+        "texture_resolution: null",
+    ):
+        assert text in page.text, text
+    assert not re.search(r"None|nan|\{|\}|\$", page.text.replace("texture: {}", "").replace("set: {}", ""))
+
+
+def test_the_page_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
+    path = write_report(make_run(tmp_path / "run"))
+    text, page = path.read_text(), Page(path.read_text())
+    assert "//" not in re.sub(r"base64,[A-Za-z0-9+/=]+", "", text)
+    assert "url(" not in text and "@import" not in text
+    assert {tag for tag, _ in page.tags}.isdisjoint({"script", "link", "iframe", "object", "a", "form"})
+    assert len(page.all("img")) == 8
+    assert all(str(image["src"]).startswith("data:image/") for image in page.all("img"))
+
+
+def test_the_page_is_accessible(tmp_path: Path) -> None:
+    page = page_of(make_run(tmp_path / "run"))
+    assert page.all("html")[0]["lang"] == "en"
+    assert len(page.all("h1")) == len(page.all("main")) == len(page.all("title")[:1]) == 1
+    assert all(image.get("alt") for image in page.all("img"))
+    assert all(head.get("scope") in ("row", "col") for head in page.all("th") if head.get("class") != "hide-small")
+    charts = [svg for svg in page.all("svg") if svg.get("aria-hidden") != "true"]
+    assert [svg["role"] for svg in charts] == ["img"]
+    assert "pgd: from -2 to 1.9" in str(charts[0]["aria-label"])
+
+
+def test_names_cannot_become_markup(tmp_path: Path) -> None:
+    evil = "\"><script>alert('x')</script>&lt;"
+    answer = {"label": evil, "probability": 0.5}
+    summary = changed(
+        object=evil, model=evil, environment=evil, controls=[evil], policy=evil, objective=evil, norm=evil,
+        warnings=[evil], adversarial=answer, run=evil, command_line=evil,
+        clean={**answer, "control": SUMMARY["clean"]["control"]},
+        verified={**SUMMARY["verified"], "labels": {evil: 20}}, baseline={**SUMMARY["baseline"], "policy": evil},
+        image_formation={evil: evil}, renders={evil: 1}, seconds={evil: 1.0, "total": 2.0}, seed=evil,
+    )  # fmt: skip
+    make_run(tmp_path / "run", summary)
+    page = page_of(tmp_path / "run")
+    assert not page.all("script")
+    assert page.text.lower().count("alert('x')") > 15
+    known = {"charset", "http-equiv", "content", "name", "lang", "class", "src", "alt", "scope", "role", "tabindex"}
+    for tag, attributes in page.tags:
+        found = {name for name in attributes if not name.startswith("aria-")}
+        assert tag in ("svg", "rect", "line", "text", "circle", "polyline", "g") or found <= known
+
+
+@pytest.mark.parametrize("ending", ["interrupted", "already wrong"])
+def test_a_run_that_has_little_still_has_a_page(tmp_path: Path, ending: str) -> None:
+    summary = {"command": "attack", "object": "mug", "ending": ending, "steps": 3}
+    page = page_of(make_run(tmp_path / "run", summary, pictures=False, rows=False))
+    assert wording.verdict(summary) in page.text
+    assert not page.all("img") and "Verified rates" not in page.text
+
+
+def test_a_large_picture_is_embedded_smaller(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run")
+    large = run / "artifacts" / "texture.png"
+    noise = np.random.default_rng(0).random((700, 700, 3))
+    from advsearch.runs.images import write_png
+
+    write_png(large, noise)
+    assert large.stat().st_size > LARGE_PICTURE
+    source = next(str(image["src"]) for image in page_of(run).all("img") if "found" in str(image["alt"]))
+    import base64
+
+    (tmp_path / "small.png").write_bytes(base64.b64decode(source.partition(",")[2]))
+    assert read_png(tmp_path / "small.png").shape == (SMALLER_SIDE, SMALLER_SIDE, 3)
+
+
+def test_without_a_summary_there_is_no_page(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match="expected the summary of a run"):
+        write_report(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+# ---- charts and markup ----
+
+
+def test_text_is_escaped_and_markup_is_not() -> None:
+    assert element("p", "<b>", Html("<i></i>"), None, class_='"') == '<p class="&quot;">&lt;b&gt;<i></i></p>'
+    assert element("img", src="&") == '<img src="&amp;">'
+    assert join("<", element("br")) == "&lt;<br>"
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        (0, 10, [0, 2, 4, 6, 8, 10]),
+        (-0.11, 0.1, [-0.1, -0.05, 0, 0.05, 0.1]),
+        (1, 1.0004, [1, 1.0001, 1.0002, 1.0003, 1.0004]),
+    ],
+)
+def test_ticks_are_round(low: float, high: float, expected: list[float]) -> None:
+    assert nice_ticks(low, high) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    "values", [[1.0], [2.0, 2.0, 2.0], [None, 1.0, None], [1e-12, 2e-12], [-1e9, 1e9], [float(i) for i in range(5000)]]
+)
+def test_a_chart_of_any_values_is_drawn_inside_its_frame(values: list[float | None]) -> None:
+    page = Page(objective_chart([Curve("a", "search", values), Curve("b", "baseline", values)], "margin", "wrong"))
+    (first, second) = page.all("polyline")
+    points = [tuple(map(float, pair.split(","))) for pair in str(first["points"]).split()]
+    assert first["points"] == second["points"] and len(points) == min(len(values), 400)
+    assert all(0 <= x <= 720 and 0 <= y <= 300 for x, y in points)
+    assert [x for x, _ in points] == sorted(x for x, _ in points)
+    heights = [float(str(text["y"])) for text in page.all("text")[-2:]]
+    assert heights[1] - heights[0] >= 16 - 0.11  # the two labels do not lie on each other
+
+
+def test_an_interval_is_drawn_only_where_there_is_one() -> None:
+    assert interval_bar({}) == ""
+    bar = Page(interval_bar({"rate": 1.0, "interval": [0.5, 1.0]})).all("rect")
+    assert (bar[1]["x"], bar[1]["width"]) == ("50.0", "48.0")
+
+
+# ---- words ----
+
+
+def rated(successes: int, low: float, high: float) -> dict[str, Any]:
+    """Return a rate over 20 trials."""
+    return {"successes": successes, "trials": 20, "rate": successes / 20, "interval": [low, high]}
+
+
+ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
+
+
+@pytest.mark.parametrize(
+    ("fields", "sentence"),
+    [
+        ({}, f"The model calls this mug a vase in {ALL}"),
+        (
+            {"verified": {**SUMMARY["verified"], "labels": {"iron": 12, "vase": 8}}},
+            f"The model is wrong about this mug, most often calling it an iron, in {ALL}",
+        ),
+        (
+            {"verified": rated(19, 0.751, 0.9987), "object": "data/wine_glass.obj"},
+            "The model takes this wine glass for something else (a vase) in 19 of 20 fresh renders"
+            " (95 % interval 75-99.9 %).",
+        ),
+        (
+            {"ending": "budget spent", "verified": rated(0, 0.0, 0.168)},
+            "No texture within 0.1 (linf) was found that makes the model miss this mug: it is wrong in 0 of 20 fresh"
+            " renders (95 % interval 0-17 %). The budget is spent.",
+        ),
+        (
+            {"ending": "not verified", "verified": rated(3, 0.032, 0.379)},
+            "The search claims an answer that is not confirmed: the model is wrong about this mug in 3 of 20 fresh"
+            " renders (95 % interval 3-38 %).",
+        ),
+        (
+            {"ending": "already wrong", "clean": {"label": "vase"}},
+            "The model already calls this mug a vase: nothing was changed and nothing counts as found.",
+        ),
+        ({"ending": "interrupted", "verified": None}, "Interrupted after 40 steps; nothing is verified."),
+        ({"ending": "interrupted", "steps": 1}, f"Interrupted; so far the model is wrong about this mug in {ALL}"),
+        ({"ending": "stalled", "verified": {}, "steps": 1}, "Stalled after 1 step; nothing is verified."),
+    ],
+)
+def test_the_verdict_says_what_is_known_and_no_more(fields: dict[str, Any], sentence: str) -> None:
+    assert wording.verdict(changed(**fields)) == sentence
+
+
+def test_every_ending_has_a_verdict() -> None:
+    from advsearch.attacks.ending import Ending
+
+    said = [wording.verdict(changed(ending=ending.value)) for ending in Ending]
+    assert len(set(said)) == len(said)
+    assert all("mug" in text for text in said)
+
+
+@pytest.mark.parametrize(
+    ("successes", "remark"),
+    [
+        (20, ["Random search with as many renders does as well: 20 of 20. The policy adds nothing here."]),
+        (19, []),
+    ],
+)
+def test_a_random_search_that_does_as_well_is_said(successes: int, remark: list[str]) -> None:
+    assert wording.remarks(changed(baseline={"verified": {"successes": successes, "trials": 20}})) == remark
+
+
+def test_a_better_random_search_and_a_failing_control_group_are_said() -> None:
+    clean, baseline = {"control": {"correct": 18, "trials": 20}}, {"verified": {"successes": 5, "trials": 20}}
+    summary = changed(verified={"successes": 3, "trials": 20}, baseline=baseline, clean=clean)
+    assert wording.remarks(summary) == [
+        "The clean scene itself fails 2 of its 20 trials.",
+        "Random search with as many renders does better: 5 of 20.",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [
+        (1.0, "100 %"),
+        (0.0, "0 %"),
+        (0.9987, "99.9 %"),
+        (0.99999, "99.9 %"),
+        (0.8316, "83 %"),
+        (0.001, "0.1 %"),
+        (None, "unknown"),
+    ],
+)
+def test_only_certainty_is_called_100_percent(share: float | None, text: str) -> None:
+    assert wording.percent(share) == text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.26, "0.3 s"), (99.4, "99.4 s"), (185, "3 min 5 s"), (7800, "2 h 10 min"), (None, "unknown")],
+)
+def test_times(seconds: float | None, text: str) -> None:
+    assert wording.seconds_text(seconds) == text

@@ -1,0 +1,581 @@
+"""The run directory: what survives, what is refused, and that files are whole or not there."""
+
+from __future__ import annotations
+
+import enum
+import errno
+import json
+import math
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from advsearch.config import AttackConfig
+from advsearch.errors import FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
+from advsearch.runs import directory, images
+from advsearch.runs.directory import RunDirectory, default_name, find_run, run_path
+from advsearch.runs.files import PART, replacing, write_bytes, write_text
+from advsearch.runs.lock import RunLock
+from advsearch.runs.store import Row, Store
+from advsearch.runs.summary import plain, read_summary, to_json
+
+WRITER = """
+import sys
+from pathlib import Path
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.store import Row
+run = RunDirectory.create(Path(sys.argv[1]))
+for step in range(100_000):
+    run.record(Row("search", step, seed=step * 7, objective=step / 3, values={"p": {"value": step, "unit": "degrees"}}))
+    print(step, flush=True)
+"""
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current directory is empty."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[RunDirectory]:
+    """A new run."""
+    with RunDirectory.create(tmp_path / "run") as made:
+        yield made
+
+
+# ---- what survives ----
+
+
+@pytest.mark.parametrize("acknowledged", [1, 20, 137])
+def test_every_acknowledged_row_survives_sigkill(tmp_path: Path, acknowledged: int) -> None:
+    path = tmp_path / "run"
+    with subprocess.Popen([sys.executable, "-c", WRITER, str(path)], stdout=subprocess.PIPE, text=True) as writer:
+        assert writer.stdout is not None
+        said = [int(writer.stdout.readline()) for _ in range(acknowledged)]
+        writer.send_signal(signal.SIGKILL)
+        said += [int(line) for line in writer.stdout if line.endswith("\n")]
+    assert writer.returncode == -signal.SIGKILL
+    with Store(path / "results.sqlite", read_only=True) as store:
+        rows = list(store.rows())
+    assert len(rows) - len(said) in (0, 1)
+    assert [row.step for row in rows] == list(range(len(rows)))
+    assert all(row.seed == row.step * 7 and row.objective == row.step / 3 for row in rows)
+    RunLock(path).release()  # the kernel dropped the lock of the killed process
+
+
+def test_a_row_comes_back_as_it_was(run: RunDirectory) -> None:
+    row = Row(
+        kind="search", step=3, seed=2**32 - 1, spp=16, objective=-1.25, success=True, label="wine glass", label_index=5,
+        probability=0.75, values={"camera.azimuth": {"value": 130.0, "unit": "degrees"}}, seconds=0.5,
+    )  # fmt: skip
+    run.record(row)
+    (found,) = run.store.rows()
+    assert found.id == 1 and found.time is not None and found.time > 1.6e9
+    assert {name: getattr(found, name) for name in vars(row) if name not in ("id", "time")} == {
+        name: getattr(row, name) for name in vars(row) if name not in ("id", "time")
+    }
+
+
+def test_rows_are_added_all_or_none(run: RunDirectory) -> None:
+    run.record(Row("search", 0))
+    broken = Row("search", 2, values={"p": object()})
+    with pytest.raises(TypeError, match="expected something that JSON can hold, got object"):
+        run.record(Row("search", 1), broken)
+    run.record(Row("search", 5))
+    assert [row.step for row in run.store.rows()] == [0, 5]
+
+
+def test_kinds_are_counted_and_read_apart(run: RunDirectory) -> None:
+    run.record(Row("search", 0, objective=1.0), Row("baseline", 0, objective=5.0), Row("search", 1, objective=math.nan))
+    assert (run.store.count(), run.store.count("search"), run.store.count("sweep")) == (3, 2, 0)
+    assert run.store.curve("search") == [(0, 1.0), (1, None)]
+    assert [row.objective for row in run.store.rows("baseline")] == [5.0]
+
+
+def test_numbers_of_numpy_are_stored_as_numbers(run: RunDirectory) -> None:
+    run.record(Row("search", np.int64(4), objective=np.float32(0.5), success=np.bool_(True), seed=np.uint32(7)))  # type: ignore[arg-type]
+    (found,) = run.store.rows()
+    assert (found.step, found.objective, found.success, found.seed) == (4, 0.5, True, 7)
+
+
+def test_the_store_is_readable_beside_the_writer(run: RunDirectory) -> None:
+    run.record(Row("search", 0))
+    with Store(run.path / "results.sqlite", read_only=True) as reader:
+        assert reader.count() == 1
+        run.record(Row("search", 1))
+        assert reader.count() == 2
+        with pytest.raises(StorageError, match=r"results\.sqlite: the file system is read-only; choose another place"):
+            reader.append([Row("search", 2)])
+
+
+def test_the_file_is_versioned_commented_and_in_wal_mode(run: RunDirectory) -> None:
+    with sqlite3.connect(run.path / "results.sqlite") as db:
+        assert db.execute("PRAGMA user_version").fetchone() == (1,)
+        assert db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+        (schema,) = db.execute("SELECT sql FROM sqlite_master WHERE name = 'evaluations'").fetchone()
+        meta = dict(db.execute("SELECT key, value FROM meta"))
+    db.close()
+    assert all("--" in line for line in schema.splitlines()[1:-1])
+    assert meta["created"].startswith("20") and meta["created"].endswith("Z")
+
+
+def test_a_closed_run_is_one_file_and_opens_again(tmp_path: Path) -> None:
+    with RunDirectory.create(tmp_path / "run") as run:
+        run.record(Row("search", 0))
+    assert not list((tmp_path / "run").glob("results.sqlite-*"))
+    with Store(tmp_path / "run" / "results.sqlite") as store:
+        store.append([Row("search", 1)])
+        assert store.count() == 2
+
+
+def test_results_of_another_advsearch_or_none_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "results.sqlite"
+    with pytest.raises(FileFormatError, match=r"expected the results of a run, got no such file; check the name"):
+        Store(path, read_only=True)
+    path.write_bytes(b"not a database, but long enough to look like a file of some kind" * 20)
+    for read_only in (True, False):
+        with pytest.raises(
+            FileFormatError, match=r"expected a results\.sqlite of advsearch, got file is not a database"
+        ):
+            Store(path, read_only=read_only)
+    path.unlink()
+    Store(path).close()
+    with sqlite3.connect(path) as db:
+        db.execute("PRAGMA user_version = 99")
+    db.close()
+    with pytest.raises(FileFormatError, match=r"expected version 1 of the results, got 99; use a newer advsearch"):
+        Store(path)
+
+
+JSON = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**53), 2**53)
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=6,
+)
+
+
+@pytest.fixture(scope="module")
+def codec(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
+    """One store for many rows."""
+    with Store(tmp_path_factory.mktemp("codec") / "results.sqlite") as store:
+        yield store
+
+
+@settings(max_examples=50, deadline=None)
+@given(values=st.dictionaries(st.text(), JSON, max_size=3), objective=st.floats(), label=st.none() | st.text())
+def test_any_values_come_back(codec: Store, values: dict[str, Any], objective: float, label: str | None) -> None:
+    label = None if label is None else label.encode("utf-8", "replace").decode()
+    codec.append([Row("search", 0, objective=objective, label=label, values=values)])
+    found = list(codec.rows())[-1]
+    assert found.values == values and found.label == label
+    assert found.objective == (objective if math.isfinite(objective) else None)
+
+
+# ---- the lock ----
+
+
+def test_a_second_process_is_refused(run: RunDirectory) -> None:
+    code = "import sys; from pathlib import Path; from advsearch.runs.lock import RunLock; RunLock(Path(sys.argv[1]))"
+    second = subprocess.run([sys.executable, "-c", code, run.path], capture_output=True, text=True)
+    assert f"process {os.getpid()} is working on this run; wait for it or choose another name" in second.stderr
+    assert second.returncode != 0
+
+
+def test_a_run_in_work_is_not_overwritten(run: RunDirectory) -> None:
+    run.record(Row("search", 0))
+    with pytest.raises(InputError, match="is working on this run"):
+        RunDirectory.create(run.path, overwrite=True)
+    assert run.store.count() == 1
+
+
+def test_a_file_system_without_locks_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fcntl.flock", _raises(errno.ENOLCK))
+    with pytest.raises(StorageError, match="the file system has no locks; choose a local disk with --run"):
+        RunLock(tmp_path)
+
+
+# ---- where a run goes ----
+
+
+def test_runs_are_numbered(home: Path) -> None:
+    paths = []
+    for _ in range(2):
+        with RunDirectory.create(default="mug-texture") as run:
+            run.record(Row("search", 0))
+            paths.append(run.path)
+    assert paths == [Path("runs/mug-texture-001"), Path("runs/mug-texture-002")]
+    Path("runs/mug-texture-0999").mkdir()
+    with RunDirectory.create(default="mug-texture") as run:
+        assert run.path == Path("runs/mug-texture-1000")
+
+
+def test_no_two_runs_get_one_number(home: Path) -> None:
+    made: list[Path] = []
+
+    def make() -> None:
+        with RunDirectory.create() as run:
+            made.append(run.path)
+
+    threads = [threading.Thread(target=make) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(set(made)) == 8
+
+
+def test_names_and_paths() -> None:
+    assert run_path("first") == Path("runs/first")
+    assert run_path("./first") == Path("./first")
+    assert run_path(Path("first")) == Path("first")
+    assert default_name("../data/My Mug.obj", ["texture", "pose"]) == "my-mug-texture-pose"
+    assert default_name("..", []) == "attack"
+
+
+def test_an_existing_run_is_refused_and_overwritten_on_request(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    with RunDirectory.create(path) as run:
+        run.record(Row("search", 0))
+        run.save_image("clean", np.zeros((4, 4, 3)))
+        run.write_summary({"ending": "found"})
+    (path / "notes.txt").write_text("mine")
+    with pytest.raises(
+        RunExistsError, match="the run exists already; add --overwrite or choose another name with --run"
+    ):
+        RunDirectory.create(path)
+    with RunDirectory.create(path, overwrite=True) as run:
+        assert run.store.count() == 0
+        assert sorted(found.name for found in path.iterdir()) == [
+            ".lock", "notes.txt", "results.sqlite", "results.sqlite-shm", "results.sqlite-wal",
+        ]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["run.yaml", "results.sqlite", "images"])
+def test_a_folder_that_is_no_run_is_never_touched(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("model: mine\n")
+    with pytest.raises(RunExistsError, match="the folder is not empty and not a run; choose another name with --run"):
+        RunDirectory.create(tmp_path, overwrite=True)
+    assert (tmp_path / name).read_text() == "model: mine\n"
+    assert not (tmp_path / ".lock").exists()
+
+
+def test_a_file_in_the_place_of_the_run_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunExistsError, match="expected a folder for the run, got a file"):
+        RunDirectory.create(tmp_path / "file", overwrite=True)
+    with pytest.raises(StorageError, match="a part of the path is a file, not a folder"):
+        RunDirectory.create(tmp_path / "file" / "run")
+
+
+def test_a_run_that_fails_before_any_result_leaves_nothing(home: Path) -> None:
+    config = AttackConfig(object="mug")
+    with pytest.raises(InputError, match="no such label"), RunDirectory.create_for(config):
+        assert Path("runs/mug-texture-001/run.yaml").is_file()
+        raise InputError("no such label")
+    assert not list(Path("runs").iterdir())
+
+
+@pytest.mark.parametrize("keep", ["row", "summary"])
+def test_a_run_that_fails_later_keeps_what_it_has(tmp_path: Path, keep: str) -> None:
+    with pytest.raises(KeyboardInterrupt), RunDirectory.create(tmp_path / "run") as run:
+        run.record(Row("search", 0)) if keep == "row" else run.write_summary({"ending": "interrupted"})
+        raise KeyboardInterrupt
+    assert (tmp_path / "run" / "results.sqlite").exists()
+    with RunDirectory.create(tmp_path / "run", overwrite=True):
+        pass
+
+
+def test_runs_are_found_by_name_and_path(home: Path) -> None:
+    with RunDirectory.create_for(AttackConfig(object="mug")) as run:
+        run.record(Row("search", 0))
+    for name in ("mug-texture-001", "runs/mug-texture-001", "runs/mug-texture-001/run.yaml"):
+        assert find_run(name) == Path("runs/mug-texture-001")
+    with pytest.raises(UnknownNameError, match=r"unknown run 'mug-textur'\. Did you mean 'mug-texture-001'\?"):
+        find_run("mug-textur")
+
+
+def test_the_recipe_repeats_the_run_elsewhere(home: Path) -> None:
+    Path("mug.obj").write_text("v 0 0 0")
+    config = AttackConfig(object="mug.obj", run="first", epsilon=0.1, set={"camera.azimuth": 130})
+    with RunDirectory.create_for(config) as run:
+        assert run.path == Path("runs/first")
+        again = AttackConfig.from_yaml(run.path / "run.yaml")
+    assert again.run is None and again.object == str(home / "mug.obj")
+    assert again.model_copy(update={"run": "first", "object": "mug.obj"}) == config
+
+
+# ---- whole or not at all ----
+
+
+def _raises(number: int) -> Any:
+    def fail(*_: Any, **__: Any) -> Any:
+        raise OSError(number, os.strerror(number))
+
+    return fail
+
+
+def test_a_file_is_replaced_only_when_all_went_well(tmp_path: Path) -> None:
+    path = write_text(tmp_path / "deep" / "summary.json", "old")
+    with pytest.raises(ValueError, match="half way"), replacing(path) as part:
+        part.write_text("ne")
+        raise ValueError("half way")
+    assert path.read_text() == "old"
+    assert os.listdir(path.parent) == ["summary.json"]
+
+
+@pytest.mark.parametrize(
+    ("number", "advice"),
+    [
+        (errno.ENOSPC, "the disk is full; free some space or choose another place with --run"),
+        (errno.EDQUOT, "the disk quota is used up; free some space or choose another place with --run"),
+        (errno.EROFS, "the file system is read-only; choose another place with --run"),
+        (errno.EACCES, "there is no permission to write there; choose another place with --run"),
+        (errno.EIO, "Input/output error; choose another place with --run"),
+    ],
+)
+def test_a_bad_disk_is_said_and_leaves_nothing(
+    run: RunDirectory, monkeypatch: pytest.MonkeyPatch, number: int, advice: str
+) -> None:
+    run.write_summary({"ending": "old"})
+    with monkeypatch.context() as broken:
+        broken.setattr("os.replace", _raises(number))
+        for write in (
+            lambda: run.save_image("clean", np.zeros((4, 4, 3))),
+            lambda: run.save_exr("clean", np.zeros((4, 4, 3))),
+            lambda: run.save_animation("search", [np.zeros((4, 4, 3))]),
+            lambda: run.write_summary({"ending": "new"}),
+        ):
+            with pytest.raises(StorageError, match=f"cannot write .*run/.*: {advice}"):
+                write()
+    assert not list((run.path / "images").iterdir())
+    assert not list(run.path.glob(PART + "*"))
+    assert read_summary(run.path)["ending"] == "old"
+
+
+@pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES, errno.ENOSPC])
+def test_a_run_cannot_be_made_on_a_bad_disk(home: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    monkeypatch.setattr("pathlib.Path.mkdir", _raises(number))
+    for name in (None, "first"):
+        with pytest.raises(StorageError, match=r"cannot write runs.*with --run"):
+            RunDirectory.create(name)
+    assert not list(home.iterdir())
+
+
+@pytest.mark.parametrize("part", ["advsearch.runs.store._check_version", "fcntl.flock"])
+def test_a_run_that_cannot_start_leaves_nothing(home: Path, monkeypatch: pytest.MonkeyPatch, part: str) -> None:
+    monkeypatch.setattr(part, _raises(errno.ENOSPC))
+    with pytest.raises((StorageError, OSError)):
+        RunDirectory.create()
+    with pytest.raises((StorageError, OSError)):
+        RunDirectory.create("first")
+    assert not list(Path("runs").iterdir())
+
+
+def test_a_full_disk_stops_the_store_and_keeps_the_rows_before(run: RunDirectory) -> None:
+    run.record(Row("search", 0))
+    run.store._db.execute("PRAGMA max_page_count = 8")
+    with pytest.raises(StorageError, match=r"cannot write .*results\.sqlite: the disk is full; free some space"):
+        run.record(*(Row("search", step, label="x" * 1000) for step in range(1, 100)))
+    assert [row.step for row in run.store.rows()] == [0]
+
+
+def test_an_exr_that_does_not_fit_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import OpenEXR
+
+    class Full:
+        def __init__(self, *_: Any) -> None: ...
+        def __enter__(self) -> Full:
+            return self
+
+        def __exit__(self, *_: Any) -> None: ...
+        def write(self, name: str) -> None:
+            Path(name).write_bytes(b"half")
+            raise RuntimeError("Failed to write pixel data. No space left on device.")
+
+    monkeypatch.setattr(OpenEXR, "File", Full)
+    with pytest.raises(StorageError, match=r"cannot write .*clean\.exr: the disk is full"):
+        images.write_exr(tmp_path / "clean.exr", np.zeros((4, 4, 3)))
+    assert not list(tmp_path.iterdir())
+
+
+# ---- pictures ----
+
+
+@given(st.lists(st.floats(-1.0, 2.0, width=32), min_size=1, max_size=30))
+@settings(max_examples=50, deadline=None)
+def test_eight_bits_round_as_verification_does(values: list[float]) -> None:
+    expected = [round(float(np.float32(min(max(value, 0.0), 1.0)) * np.float32(255.0))) for value in values]
+    assert images.to_8bit(np.array(values, dtype=np.float32)).tolist() == expected
+
+
+def test_halves_go_to_even_and_nan_to_black() -> None:
+    halves = (np.array([0.5, 1.5, 2.5, 3.5], dtype=np.float32)) / np.float32(255.0)
+    scaled = halves * np.float32(255.0)
+    assert images.to_8bit(halves).tolist() == [round(float(one)) for one in scaled]
+    assert images.to_8bit(np.array([np.nan, np.inf, -np.inf])).tolist() == [0, 255, 0]
+
+
+def test_png_round_trip_and_equal_bytes(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).random((5, 7, 3), dtype=np.float32)
+    path = images.write_png(tmp_path / "image.png", image)
+    assert path.read_bytes() == images.png_bytes(image.copy())
+    np.testing.assert_array_equal(images.to_8bit(images.read_png(path)), images.to_8bit(image))
+    assert images.read_png(images.write_png(tmp_path / "grey.png", image[..., :1])).shape == (5, 7, 3)
+    with pytest.raises(ValueError, match=r"expected a picture of shape \(H, W, 3\) or \(H, W\), got \(5, 7, 4\)"):
+        images.png_bytes(np.zeros((5, 7, 4)))
+
+
+def test_exr_round_trip_is_exact_and_equal_bytes(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).normal(scale=1e4, size=(5, 7, 3)).astype(np.float32)
+    image[0, 0] = np.inf, -0.0, np.nan
+    first, second = (images.write_exr(tmp_path / f"{name}.exr", image) for name in "ab")
+    np.testing.assert_array_equal(images.read_exr(first), image)
+    assert first.read_bytes() == second.read_bytes()
+    grey = images.write_exr(tmp_path / "grey.exr", image[..., 1])
+    np.testing.assert_array_equal(images.read_exr(grey), image[..., 1])
+
+
+@pytest.mark.parametrize("read", [images.read_exr, images.read_png])
+def test_what_is_no_picture_is_refused(tmp_path: Path, read: Any) -> None:
+    for content in (None, b"", b"no picture"):
+        if content is not None:
+            (tmp_path / "x").write_bytes(content)
+        with pytest.raises(FileFormatError, match=r"x: expected an? (EXR|PNG) picture"):
+            read(tmp_path / "x")
+
+
+def test_the_difference_is_grey_where_nothing_changed() -> None:
+    before = np.full((2, 2, 3), 0.5)
+    after = before.copy()
+    after[0, 0] = 0.54
+    found = images.difference(before, after)
+    np.testing.assert_allclose(found[0, 0], 0.5 + images.DIFFERENCE_GAIN * 0.04, rtol=1e-5)
+    assert (found[1] == 0.5).all()
+
+
+def test_an_animation_is_small_and_holds_its_last_frame(run: RunDirectory) -> None:
+    frames = [np.full((40, 50, 3), step / 99) for step in range(100)]
+    path = run.save_animation("search", frames)
+    shown = iio.imread(path)
+    assert path == run.path / "images" / "search.gif"
+    assert len(shown) <= images.ANIMATION_FRAMES
+    assert shown[0].mean() < 8 and shown[-1].mean() > 247
+    durations = [iio.immeta(path, index=number)["duration"] for number in range(len(shown))]
+    assert sum(durations) == (images.ANIMATION_FRAMES - 1) * images.FRAME_MS + images.LAST_FRAME_MS
+    assert durations[0] == images.FRAME_MS and durations[-1] >= images.LAST_FRAME_MS
+
+
+@pytest.mark.parametrize("limit", [150_000, 20_000])
+def test_noise_still_fits(monkeypatch: pytest.MonkeyPatch, limit: int) -> None:
+    noise = np.random.default_rng(0).random((24, 96, 96, 3))
+    monkeypatch.setattr(images, "ANIMATION_BYTES", limit)
+    assert limit / 4 < len(images.animation_bytes(list(noise))) <= limit
+
+
+def test_large_and_single_frames_become_animations() -> None:
+    large = iio.imread(images.animation_bytes([np.zeros((700, 900, 3))] * 2), extension=".gif")
+    assert large.shape[1:] == (233, 300, 3)
+    assert iio.imread(images.animation_bytes([np.ones((9, 9, 3))]), extension=".gif").min() == 255
+
+
+def test_an_array_that_needs_its_gradient_detached() -> None:
+    class Tensor:
+        def detach(self) -> Tensor:
+            return self
+
+        def cpu(self) -> Any:
+            return np.full((1, 1, 3), 0.25)
+
+    assert images.to_8bit(Tensor()).tolist() == [[[64, 64, 64]]]
+
+
+# ---- the summary ----
+
+
+class Colour(enum.Enum):
+    RED = "red"
+
+
+def test_the_summary_is_plain_json_in_the_order_of_the_design(run: RunDirectory) -> None:
+    answer = {
+        "seed": np.int64(3),
+        "warnings": ("one",),
+        "clean": {"probability": np.float64(0.5), "index": np.array(2)},
+        "ending": Colour.RED,
+        "run": Path("runs/x"),
+        "bad": [math.nan, math.inf, np.float32("nan")],
+        "command": "attack",
+    }
+    path = run.write_summary(answer)
+    found = json.loads(path.read_text(), parse_constant=lambda text: pytest.fail(f"{text} is not JSON"))
+    assert list(found) == ["schema", "command", "run", "ending", "clean", "seed", "warnings", "bad"]
+    assert found["clean"] == {"probability": 0.5, "index": 2}
+    assert (found["schema"], found["ending"], found["bad"]) == (1, "red", [None] * 3)
+    assert found == read_summary(run.path)
+
+
+def test_what_json_cannot_hold_is_a_bug() -> None:
+    with pytest.raises(TypeError, match="expected something that JSON can hold, got set"):
+        to_json({"x": {1}})
+    assert plain({"x": (1, Row("search", 0).kind)}) == {"x": [1, "search"]}
+
+
+def test_a_summary_that_is_not_there_or_damaged_is_said(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r"expected the summary of a run, got no such file; did the run end\?"):
+        read_summary(tmp_path)
+    for text in ("{", "[1]"):
+        write_bytes(tmp_path / "summary.json", text.encode())
+        with pytest.raises(FileFormatError, match=r"summary\.json: expected the summary of a run, got"):
+            read_summary(tmp_path)
+
+
+def test_all_that_a_run_writes_is_known_to_overwrite(home: Path) -> None:
+    with RunDirectory.create_for(AttackConfig(object="mug", run="all")) as run:
+        run.record(Row("search", 0))
+        run.save_image("clean", np.zeros((4, 4, 3)))
+        run.save_exr("texture", np.zeros((4, 4, 3)), folder="artifacts")
+        with run.replacing("artifacts/mesh.obj") as part:
+            part.write_text("v 0 0 0")
+        run.write_summary({})
+        assert {path.name for path in run.path.iterdir()} - {".lock"} <= set(directory.CONTENTS)
+
+
+def test_the_log_is_forced_to_the_disk_once_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    forced = []
+    with Store(tmp_path / "results.sqlite") as store:
+        for step, seconds in enumerate([0.0, 0.5, 0.6, 1.0, 0.9]):
+            now[0] += seconds
+            store.append([Row("search", step)])
+            forced.append(store._db.execute("PRAGMA synchronous").fetchone()[0] == 2)
+    assert forced == [True, False, True, True, False]
+
+
+def test_text_is_on_the_disk_when_it_is_written_and_pictures_do_not_wait(
+    run: RunDirectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forced: list[int] = []
+    monkeypatch.setattr("os.fsync", forced.append)
+    run.save_image("clean", np.zeros((4, 4, 3)))
+    assert len(forced) == 0
+    run.write_summary({})
+    assert len(forced) == 2  # the file and its folder

@@ -1,0 +1,36 @@
+#!/usr/bin/env bash
+# Builds the wheel, installs it in a new environment and uses it from another folder: scenes and weights travel inside.
+# Usage: tools/check_wheel.sh [VENV], from the root of the checkout; VENV (.venv) is the environment that builds.
+set -euo pipefail
+
+builder=$PWD/${1:-.venv}/bin/python
+constraints=$PWD/constraints.txt
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+
+rm -rf build
+"$builder" -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir "$work" .
+ls -l "$work"/*.whl
+"$builder" -m venv "$work/venv"
+"$work/venv/bin/python" -m pip install --quiet -c "$constraints" pip
+"$work/venv/bin/python" -m pip install --quiet -c "$constraints" "$work"/*.whl
+
+cd "$work"
+"$work/venv/bin/advsearch" --help >/dev/null
+"$work/venv/bin/advsearch" doctor
+"$work/venv/bin/python" - <<'PYTHON'
+import pathlib
+
+import advsearch
+from advsearch.models import load_model
+from advsearch.scene.library import list_environments, list_objects, load_environment, load_object
+
+assert "venv" in pathlib.Path(advsearch.__file__).parts, advsearch.__file__
+for name in list_objects():
+    load_object(name)
+for name in list_environments():
+    load_environment(name)
+model = load_model("reference")
+print(f"wheel: {len(list_objects())} objects, {len(list_environments())} environments, {len(model.labels)} labels")
+PYTHON
+echo "wheel: works from $work"
