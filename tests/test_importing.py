@@ -21,7 +21,7 @@ from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.assets import Material, Mesh, ObjectAsset
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.import_images import area_average, display_image
-from advsearch.scene.import_unwrap import sampled
+from advsearch.scene.import_texture import sampled
 from advsearch.scene.importing import import_object
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "objects"
@@ -424,6 +424,17 @@ def test_unwrap_of_a_curved_object_does_not_overlap(tmp_path: Path) -> None:
     a, b, c = (asset.mesh.uvs[asset.mesh.faces[:, k]] for k in range(3))
     area = np.abs(np.cross(np.pad(b - a, ((0, 0), (0, 1))), np.pad(c - a, ((0, 0), (0, 1))))[:, 2]) / 2
     assert (area > 0.0).all() and 0.3 < area.sum() < 1.0
+
+
+def test_unwrap_of_a_fine_smooth_object(tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=6)  # so fine that xatlas by itself crashes the process
+    mesh = import_object(exported(tmp_path, "ball.stl", ball)).mesh
+    corners = mesh.uvs[mesh.faces].astype(np.float64)
+    (ax, ay), (bx, by) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
+    area = np.abs(ax * by - ay * bx)
+    spread = np.quantile(area / area.mean(), [0.01, 0.99])
+    assert len(mesh.faces) == 81920 and 0.3 < area.sum() / 2 < 1.0
+    assert spread[0] > 0.4 and spread[1] < 1.6  # faces are of about one size, in space and on the texture
 
 
 @pytest.mark.parametrize(("width", "height", "expected"), [(2048, 1024, (512, 1024)), (1500, 3000, (1024, 512))])

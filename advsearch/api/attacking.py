@@ -38,7 +38,7 @@ from advsearch.attacks import (
 )
 from advsearch.attacks.sample_count import LADDER
 from advsearch.config import AttackConfig
-from advsearch.controls import CONTROLS, Space, make_space
+from advsearch.controls import CONTROLS, make_space
 from advsearch.errors import InputError
 from advsearch.models import LabelSet, Model, ModelWarning, load_model
 from advsearch.progress import NullProgress, Progress
@@ -173,7 +173,7 @@ def _label_set(model: Model, config: AttackConfig, label: str | None) -> LabelSe
         ) from None
 
 
-def _problem(job: _Job) -> tuple[Problem, Space]:
+def _problem(job: _Job) -> Problem:
     config, (model, _) = job.config, job.loaded
     description = job.scene.description
     labels = _label_set(model, config, description.object.label)
@@ -181,7 +181,7 @@ def _problem(job: _Job) -> tuple[Problem, Space]:
     resolution = config.resolution or (model.input_size[0], model.input_size[1])
     renderer = make_renderer(description, space, resolution, config.denoise, config.seed)
     objective = get_objective(job.objective)
-    return Problem(renderer, space, model, labels, objective, config.spp, config.seed), space
+    return Problem(renderer, space, model, labels, objective, config.spp, config.seed)
 
 
 # ---- the stages -----------------------------------------------------------------------------------------------------
@@ -190,7 +190,7 @@ def _problem(job: _Job) -> tuple[Problem, Space]:
 def _carry_out(job: _Job, progress: Progress) -> AttackResult:
     stages = Stages(progress)
     stages.begin("setup", "set-up")
-    problem, space = _problem(job)
+    problem = _problem(job)
     said = [*job.scene.description.object.warnings, *job.scene.description.environment.warnings, *job.loaded[1]]
     for text in said:
         progress.message(text)

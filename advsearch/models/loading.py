@@ -79,21 +79,21 @@ def load_model(
         "max_batch": max_batch,
     }
     given = {key: value for key, value in options.items() if value is not None}
+    names, origin = _given_labels(labels)  # first, because loading a model takes seconds
     found = _find(spec)
     if isinstance(found, Model):
-        return _relabelled(found, labels, name, given)
-    changes = _preprocessing(found, given)
+        return _relabelled(found, names, origin, name, given)
     low, high = found.batch_limits
     bare = Model(
         module=found.module,
         name=name or found.name,
         labels=(),
-        preprocessing=changes,
+        preprocessing=_preprocessing(found, given),
         batch_limits=(low, max(low, min(high, _positive("max_batch", max_batch, high)))),
         dtype=found.dtype,
         device=found.device,
     )
-    return probe(bare, *_labels(labels, found.labels))
+    return probe(bare, found.labels if names is None else names, origin)
 
 
 def _find(spec: object) -> Source | Model:
@@ -140,16 +140,18 @@ def _preprocessing(found: Source, given: dict[str, Any]) -> Preprocessing:
     return Preprocessing(**fields)
 
 
-def _labels(given: Any, own: tuple[str, ...] | None) -> tuple[tuple[str, ...] | None, str]:
-    """Return the labels (None for placeholders) and where they came from."""
+def _given_labels(given: Any) -> tuple[tuple[str, ...] | None, str]:
+    """Return the labels that the caller gave, if any, and where they came from, for messages."""
     if given is None:
-        return own, "labels of the model"
+        return None, "labels of the model"
     if isinstance(given, (str, os.PathLike)):
         return read_labels(Path(given)), f"label file {os.fspath(given)}"
     return read_labels(given), "labels"
 
 
-def _relabelled(model: Model, labels: Any, name: str | None, given: dict[str, Any]) -> Model:
+def _relabelled(
+    model: Model, labels: tuple[str, ...] | None, origin: str, name: str | None, given: dict[str, Any]
+) -> Model:
     """Return a model that was complete already, with other labels or another name at most."""
     if given:
         raise InputError(
@@ -158,8 +160,7 @@ def _relabelled(model: Model, labels: Any, name: str | None, given: dict[str, An
     name = name or model.name
     if labels is None:
         return dataclasses.replace(model, name=name)
-    names, source = _labels(labels, None)
-    return dataclasses.replace(model, name=name, labels=fitting_labels(model.classes, names, source, name), named=True)
+    return dataclasses.replace(model, name=name, labels=fitting_labels(model.classes, labels, origin, name), named=True)
 
 
 def _positive(key: str, value: int | None, default: int) -> int:

@@ -113,7 +113,7 @@ def join(parts: Sequence[Part], source: str, *, y_up: bool) -> Soup:
         what = "all vertices coincide" if size == 0.0 else "its extent is too large to compute with"
         raise InputError(f"{source}: expected an object with a size, got a mesh in which {what}; export it again")
     points, index = _welded((vertices - low) / size @ turn.T)
-    normals = _unit(np.concatenate([_corners(part.normals, part.faces, 3) for part in parts])) @ turn.T
+    normals = unit_vectors(np.concatenate([_corners(part.normals, part.faces, 3) for part in parts])) @ turn.T
     return Soup(
         points=points,
         faces=index[faces],
@@ -168,7 +168,7 @@ def assemble(soup: Soup) -> Mesh:
 
 def _wound(soup: Soup) -> tuple[Soup, list[str]]:
     """Turn faces over until neighbours agree and closed shells, and sheets with normals, face outwards."""
-    left, right, same_way = _neighbours(soup.faces)
+    left, right, same_way = neighbours(soup.faces)
     area = np.linalg.norm(soup.face_vectors(), axis=1)
     turn, shell, twisted = _agreement(area, left, right, same_way)
     notes = []
@@ -183,7 +183,7 @@ def _wound(soup: Soup) -> tuple[Soup, list[str]]:
     return soup.reversed(inside_out[shell]), notes
 
 
-def _neighbours(faces: Ints) -> tuple[Ints, Ints, Bools]:
+def neighbours(faces: Ints) -> tuple[Ints, Ints, Bools]:
     """Return, for each edge of exactly two faces, the corner in each of them at which the edge starts (3 face + k).
 
     The third array tells whether both faces run along the edge in the same direction, that is, disagree in winding.
@@ -221,7 +221,7 @@ def _agreement(area: Array, left: Ints, right: Ints, same_way: Bools) -> tuple[B
 
 def _closed(faces: Ints, shell: Ints) -> Bools:
     """Return, for each shell, whether all its edges belong to exactly two faces of it."""
-    left, _, _ = _neighbours(faces)
+    left, _, _ = neighbours(faces)
     paired = np.bincount(shell[left // 3], minlength=int(shell.max()) + 1) * 2
     return np.equal(paired, 3 * np.bincount(shell))
 
@@ -288,8 +288,8 @@ def smooth_normals(soup: Soup, crease_degrees: float = CREASE_DEGREES) -> Array:
     Returns:
         (F, 3, 3) float64 unit normals.
     """
-    unit = _unit(soup.face_vectors())
-    left, right, same_way = _neighbours(soup.faces)
+    unit = unit_vectors(soup.face_vectors())
+    left, right, same_way = neighbours(soup.faces)
     gentle = (unit[left // 3] * unit[right // 3]).sum(axis=1) >= np.cos(np.radians(crease_degrees))
     left, right = left[gentle & ~same_way], right[gentle & ~same_way]
     after = [corner - corner % 3 + (corner + 1) % 3 for corner in (left, right)]
@@ -299,7 +299,7 @@ def smooth_normals(soup: Soup, crease_degrees: float = CREASE_DEGREES) -> Array:
     groups, group = csgraph.connected_components(graph, directed=False)
     weighted = unit[:, None] * _angles(soup)[:, :, None]
     sums: Array = np.stack([np.bincount(group, weighted[:, :, k].ravel(), groups) for k in range(3)], axis=1)
-    smooth = _unit(sums)[group].reshape(-1, 3, 3)
+    smooth = unit_vectors(sums)[group].reshape(-1, 3, 3)
     sound = (smooth * unit[:, None]).sum(axis=2, keepdims=True) > 0.0  # NaN, where normals cancel, is not
     return np.where(sound, smooth, unit[:, None])
 
@@ -332,7 +332,7 @@ def _corners(values: Array | None, faces: Ints, width: int) -> Array:
     return np.full((len(faces), 3, width), np.nan) if values is None else values[faces]
 
 
-def _unit(vectors: Array) -> Array:
+def unit_vectors(vectors: Array) -> Array:
     """Scale vectors, along the last axis, to unit length; NaN where they have no direction."""
     with np.errstate(all="ignore"):
         largest = np.abs(vectors).max(axis=-1, keepdims=True)

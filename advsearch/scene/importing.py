@@ -14,7 +14,7 @@ from advsearch.scene.import_files import read_bytes, safe_name
 from advsearch.scene.import_geometry import Soup, assemble, join, repaired
 from advsearch.scene.import_parts import GLTF, read_parts
 from advsearch.scene.import_surfaces import Surface
-from advsearch.scene.import_unwrap import textured
+from advsearch.scene.import_texture import textured
 
 SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl")
 """The mesh files that can be imported."""

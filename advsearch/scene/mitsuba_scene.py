@@ -7,6 +7,8 @@ no configuration is ever applied on top of another.
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -27,6 +29,21 @@ NO_ROULETTE = 1000
 
 BASE_COLOR = "object.base_color"
 """Input: (h, w, 3) linear reflectance of the object, row 0 at v = 1 (top of the image)."""
+
+
+class _Population:
+    """Counts scenes made and destroyed in this process.
+
+    A recorded kernel refers to the objects of all scenes that lived when it was recorded; Dr.Jit says that replaying it
+    after one was added or removed is undefined, and a replayed adjoint does crash then. So every change makes every
+    recording stale.
+    """
+
+    changes: int = 0
+
+    @classmethod
+    def changed(cls) -> None:
+        cls.changes += 1
 
 
 class MitsubaScene:
@@ -61,6 +78,9 @@ class MitsubaScene:
         self._base = {name: mi.TensorXf(self._parameters[key]) for name, key in self._keys.items()}
         self._applied: dict[str, tuple[Tensor, int]] = {}
         self._recorded: dict[tuple[str, int, tuple[str, ...]], Callable[..., Any]] = {}
+        self._recorded_at = 0
+        _Population.changed()
+        weakref.finalize(self, _Population.changed)
 
     def base(self, name: str) -> Tensor:
         """Return the base value of an input, as a fresh torch tensor."""
@@ -170,6 +190,10 @@ class MitsubaScene:
         """Return the recorded function for one job at one sample count, recording it on first use."""
         import drjit as dr
 
+        if self._recorded_at != _Population.changes:
+            self._recorded.clear()
+            gc.collect()  # what is left of a scene in reference cycles must go now, not after the next recording
+            self._recorded_at = _Population.changes
         key = (what, spp, names)
         if key not in self._recorded:
             function = make()

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.bundled.objects.shapes import Array, Patch
+from advsearch.bundled.objects.curves import Array
+from advsearch.bundled.objects.shapes import Patch
 from advsearch.bundled.objects.textures import Paint, Texels
 from advsearch.scene.assets import Mesh
 

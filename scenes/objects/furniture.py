@@ -4,23 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from advsearch.bundled.objects.curves import Array, dense, ellipse, rectangle, rotation, rounded, spline
 from advsearch.bundled.objects.draw import Draw
 from advsearch.bundled.objects.family import Instance, ObjectFamily, finish
-from advsearch.bundled.objects.shapes import (
-    Array,
-    Patch,
-    ball,
-    box,
-    dense,
-    ellipse,
-    lathe,
-    placed,
-    rectangle,
-    rotation,
-    rounded,
-    spline,
-    sweep,
-)
+from advsearch.bundled.objects.shapes import Patch, ball, box, lathe, placed, sweep
 from advsearch.bundled.objects.textures import (
     Paint,
     between,

@@ -4,22 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from advsearch.bundled.objects.curves import Array, ellipse, rectangle, rotation, spline
 from advsearch.bundled.objects.draw import Draw
 from advsearch.bundled.objects.family import Instance, ObjectFamily, finish
-from advsearch.bundled.objects.shapes import (
-    Array,
-    Patch,
-    ball,
-    ellipse,
-    frames,
-    lathe,
-    placed,
-    rectangle,
-    rotation,
-    spline,
-    sweep,
-    vessel,
-)
+from advsearch.bundled.objects.shapes import Patch, ball, frames, lathe, placed, sweep, vessel
 from advsearch.bundled.objects.textures import (
     Paint,
     between,

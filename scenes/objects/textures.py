@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from advsearch.bundled.objects.curves import Array
 from advsearch.bundled.objects.draw import Draw
-from advsearch.bundled.objects.shapes import Array, Indices
+from advsearch.bundled.objects.shapes import Indices
 
 Color = Array  # (3,) display-referred sRGB
 

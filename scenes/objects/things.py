@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from advsearch.bundled.objects.curves import Array, rotation, unit
 from advsearch.bundled.objects.draw import Draw
 from advsearch.bundled.objects.family import Instance, ObjectFamily, finish
-from advsearch.bundled.objects.shapes import Array, Patch, ball, box, grid, placed, rotation, sweep, unit
+from advsearch.bundled.objects.shapes import Patch, ball, box, grid, placed, sweep
 from advsearch.bundled.objects.textures import (
     Paint,
     Texels,

@@ -4,22 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from advsearch.bundled.objects.curves import Array, dense, ellipse, polygon, rectangle, rotation, rounded
 from advsearch.bundled.objects.draw import Draw
 from advsearch.bundled.objects.family import Instance, ObjectFamily, finish
-from advsearch.bundled.objects.shapes import (
-    Array,
-    Patch,
-    ball,
-    dense,
-    ellipse,
-    lathe,
-    placed,
-    polygon,
-    rectangle,
-    rotation,
-    rounded,
-    sweep,
-)
+from advsearch.bundled.objects.shapes import Patch, ball, lathe, placed, sweep
 from advsearch.bundled.objects.textures import (
     Paint,
     between,

@@ -4,22 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from advsearch.bundled.objects.curves import Array, dense, ellipse, rectangle, rotation, rounded, spline
 from advsearch.bundled.objects.draw import Draw
 from advsearch.bundled.objects.family import Instance, ObjectFamily, finish
-from advsearch.bundled.objects.shapes import (
-    Array,
-    Patch,
-    dense,
-    ellipse,
-    lathe,
-    placed,
-    rectangle,
-    rotation,
-    rounded,
-    spline,
-    sweep,
-    vessel,
-)
+from advsearch.bundled.objects.shapes import Patch, lathe, placed, sweep, vessel
 from advsearch.bundled.objects.textures import (
     Paint,
     Texels,

@@ -139,8 +139,8 @@ class PGD(Policy[PGDState]):
         InputError: a value is outside what is said here.
     """
 
-    step_size: float = 1.0
-    momentum: float = 0.75
+    step_size: float = 0.5
+    momentum: float = 0.5
     random_start: bool = False
 
     name: ClassVar[str] = "pgd"
@@ -149,10 +149,10 @@ class PGD(Policy[PGDState]):
     def __post_init__(self) -> None:
         if not 0.0 < self.step_size <= 2.0:
             raise InputError(
-                f"--step-size: expected a number in (0, 2], a fraction of epsilon, got {self.step_size}; try 0.25"
+                f"--step-size: expected a number in (0, 2], a fraction of epsilon, got {self.step_size}; try 0.5"
             )
         if not 0.0 <= self.momentum < 1.0:
-            raise InputError(f"momentum: expected a number in [0, 1), got {self.momentum}; try 0.75")
+            raise InputError(f"momentum: expected a number in [0, 1), got {self.momentum}; try 0.5")
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> PGDState:
         seed = draw_seed(generator)

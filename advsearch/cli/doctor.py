@@ -1,0 +1,294 @@
+"""What `advsearch doctor` checks: every part that a run needs, its version, whether it works, and what to do if not.
+
+Whatever loads native code is tried in a process of its own (`advsearch.cli.doctor_probe`): a libLLVM that is too old
+takes its process down, and the rest should still be told.
+"""
+
+from __future__ import annotations
+
+import json as jsonlib
+import os
+import platform
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from importlib import metadata, resources
+from pathlib import Path
+
+from advsearch import __version__, threads
+from advsearch.errors import AdvsearchError
+
+OK, WARNING, MISSING, BROKEN = "ok", "warning", "missing", "broken"
+"""The states of a part. A warning does not keep anything from running."""
+
+FELL_SHORT = 3
+GIB = 2**30
+DISK_WANTED, MEMORY_WANTED = 1 * GIB, 3 * GIB
+"""Below these a warning: a run's pictures and the kernel cache; the peak of a search (2.5 GiB) and what else runs."""
+
+SECONDS_ALLOWED = 300
+OPTIONAL = {"imageio-ffmpeg": "animations of the search are not written"}
+"""Packages without which the rest works, and what is lost."""
+
+PROBE = (sys.executable, "-m", "advsearch.cli.doctor_probe")
+
+_SMALL_PACKAGES = ("OpenEXR", "imageio", "imageio-ffmpeg", "trimesh", "xatlas")
+_NO_FIX_NEEDED = ""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of the installation.
+
+    Attributes:
+        name: what it is.
+        version: its version; empty where there is none to tell.
+        status: ok, warning, missing or broken.
+        detail: what was tried or found.
+        fix: what to type or do; empty when nothing has to be done.
+    """
+
+    name: str
+    version: str
+    status: str
+    detail: str = ""
+    fix: str = _NO_FIX_NEEDED
+
+
+def run(json: bool = False) -> int:
+    """Check every part and print the list: a table for a person, one JSON value with `json`.
+
+    Returns:
+        0 when everything that is necessary works, 3 otherwise.
+    """
+    parts = examine()
+    good = all(part.status in (OK, WARNING) for part in parts)
+    if json:
+        answer = {"schema": 1, "command": "doctor", "ok": good, "parts": [asdict(part) for part in parts]}
+        print(jsonlib.dumps(answer, indent=2))
+    else:
+        _print_table(parts, good)
+    return 0 if good else FELL_SHORT
+
+
+def examine() -> list[Part]:
+    """Check every part, in the order in which they depend on each other."""
+    return [
+        Part("Python", platform.python_version(), OK, sys.executable),
+        Part("advsearch", __version__, OK, str(resources.files("advsearch"))),
+        *packages(probe()),
+        other_packages(),
+        llvm(),
+        bundled_scenes(),
+        reference_weights(),
+        kernel_cache(Path.home() / ".drjit"),
+        disk(Path.cwd()),
+        machine(),
+    ]
+
+
+def probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
+    """Try the parts that load native code, in another process: name to whether it worked and a detail or the error.
+
+    The part that ended the process, and those after it, are absent; under the name ``""`` stands how it ended.
+    """
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=SECONDS_ALLOWED, check=False)
+        output, errors, status = done.stdout, done.stderr, done.returncode
+    except subprocess.TimeoutExpired as expired:
+        output, errors, status = _text(expired.stdout), "", None
+    tried = {}
+    for line in output.splitlines():
+        try:
+            answer = jsonlib.loads(line)
+            tried[answer["name"]] = (bool(answer["ok"]), str(answer["detail"]))
+        except (ValueError, KeyError, TypeError):  # a library's own words
+            continue
+    tried[""] = (status == 0, _ending(status, errors))
+    return tried
+
+
+def packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Part]:
+    """The packages that were tried, with their versions; a render stands for Mitsuba and Dr.Jit together."""
+    for name in ("numpy", "torch", "mitsuba", "drjit", "render", "mitsuba-oidn", *_SMALL_PACKAGES):
+        version = "" if name == "render" else installed_version(name)
+        if version is None:
+            yield _absent(name)
+        elif name in ("mitsuba", "drjit"):
+            yield Part(name, version, OK, "tried by the render below")
+        else:
+            yield _tried(name, version, tried)
+
+
+def other_packages(requirements: Sequence[str] | None = None) -> Part:
+    """The dependencies that need no trial: present or not.
+
+    Args:
+        requirements: as in the package's metadata, e.g. ``"rich>=13"``; None reads them there.
+    """
+    wanted = (metadata.requires("advsearch") or []) if requirements is None else requirements
+    names = {re.split(r"[^\w.-]", one, maxsplit=1)[0] for one in wanted if "extra ==" not in one}
+    rest = sorted(names - {"numpy", "torch", "mitsuba", "mitsuba-oidn", *_SMALL_PACKAGES}, key=str.lower)
+    versions = {name: installed_version(name) for name in rest}
+    absent = [name for name, version in versions.items() if version is None]
+    if absent:
+        return Part("other packages", "", MISSING, f"not installed: {', '.join(absent)}", _reinstall(" ".join(absent)))
+    return Part("other packages", "", OK, ", ".join(f"{name} {version}" for name, version in versions.items()))
+
+
+def installed_version(name: str) -> str | None:
+    """The version of an installed package, or None."""
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _absent(name: str) -> Part:
+    if name in OPTIONAL:
+        return Part(name, "", WARNING, f"not installed: {OPTIONAL[name]}", _reinstall(name))
+    return Part(name, "", MISSING, "not installed", _reinstall(name))
+
+
+def _tried(name: str, version: str, tried: dict[str, tuple[bool, str]]) -> Part:
+    if name not in tried:
+        return Part(name, version, BROKEN, f"not reached: {tried[''][1]}", "see libLLVM below")
+    worked, detail = tried[name]
+    if worked:
+        return Part(name, version, OK, detail)
+    if name == "render":
+        return Part(name, version, BROKEN, detail, "see libLLVM below, then mend mitsuba and drjit: make setup")
+    status = WARNING if name in OPTIONAL else BROKEN
+    return Part(name, version, status, detail, _reinstall(name))
+
+
+def _reinstall(name: str) -> str:
+    return f"pip install --force-reinstall --no-deps {name}, or make clean setup in a checkout"
+
+
+def llvm() -> Part:
+    """The libLLVM that will be used, what else there is, and why that is not used."""
+    from advsearch.scene.llvm import VARIABLE, ensure_llvm, find, install_command
+
+    given = os.environ.get(VARIABLE, "")
+    others = find()
+    try:
+        chosen = ensure_llvm()
+    except AdvsearchError as error:
+        fix = f"unset {VARIABLE}" if given else f"{install_command()} (or name a file in {VARIABLE})"
+        return Part("libLLVM", "", BROKEN if others or given else MISSING, str(error), fix)
+    refused = [str(c) for c in others if c.refused]
+    usable = [str(c) for c in others if not c.refused and c.path != chosen.path.resolve()]
+    detail = f"chosen: {chosen.path}" + (f", named by {VARIABLE}" if given else "")
+    detail += f"; also usable: {', '.join(usable)}" if usable else ""
+    detail += f"; refused: {', '.join(refused)}" if refused else ""
+    return Part("libLLVM", ".".join(map(str, chosen.version)), OK, detail)
+
+
+def bundled_scenes() -> Part:
+    """The objects and environments that travel inside the package."""
+    name, fix = "bundled scenes", "reinstall advsearch; in a checkout: git restore scenes/data"
+    try:
+        from advsearch.scene.library import list_environments, list_objects
+
+        objects, environments = list_objects(), list_environments()
+    except (ImportError, OSError, ValueError, KeyError, AdvsearchError) as error:
+        return Part(name, "", MISSING, f"{type(error).__name__}: {error}", fix)
+    status = OK if objects and environments else MISSING
+    detail = f"{len(objects)} objects, {len(environments)} environments"
+    return Part(name, "", status, detail, _NO_FIX_NEEDED if status == OK else fix)
+
+
+def reference_weights() -> Part:
+    """The weights and labels of the bundled classifier."""
+    folder = resources.files("advsearch.models") / "data"
+    absent = [n for n in ("reference.safetensors", "reference.json") if not folder.joinpath(n).is_file()]
+    if absent:
+        fix = "reinstall advsearch; in a checkout: git restore advsearch/models/data"
+        return Part("reference model", "", MISSING, f"{' and '.join(absent)} not in {folder}", fix)
+    size = os.path.getsize(str(folder.joinpath("reference.safetensors")))
+    return Part("reference model", "", OK, f"{size / 1e6:.1f} MB of weights")
+
+
+def kernel_cache(folder: Path) -> Part:
+    """The folder in which Dr.Jit keeps compiled kernels between runs."""
+    name = "kernel cache"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        detail = f"{folder} cannot be written ({error.strerror}): every run compiles its kernels again"
+        return Part(name, "", WARNING, detail, f"make {folder} writable")
+    files = [entry.stat().st_size for entry in os.scandir(folder) if entry.is_file()]
+    return Part(name, "", OK, f"{folder}: {len(files)} files, {sum(files) / 1e6:.0f} MB")
+
+
+def disk(folder: Path) -> Part:
+    """The space left where runs are written by default."""
+    free = shutil.disk_usage(folder).free
+    if free < DISK_WANTED:
+        return Part(
+            "disk", "", WARNING, f"{free / GIB:.1f} GiB free in {folder}", "free some space, or --run elsewhere"
+        )
+    return Part("disk", "", OK, f"{free / GIB:.0f} GiB free in {folder}")
+
+
+def machine() -> Part:
+    """Cores and memory."""
+    cores = threads.cores()
+    memory = _memory()
+    detail = f"{platform.system()} {platform.machine()}, {cores} core{'s' * (cores > 1)}"
+    detail += f", {memory / GIB:.1f} GiB of memory" if memory else ""
+    if memory and memory < MEMORY_WANTED:
+        return Part("machine", "", WARNING, detail, "a search peaks at 2.5 GiB: close other programs")
+    return Part("machine", "", OK, detail)
+
+
+def _memory() -> int:
+    """Bytes of memory, or 0 where the system does not tell."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return 0
+
+
+def _ending(status: int | None, errors: str) -> str:
+    """How the other process ended, in one line."""
+    if status is None:
+        return f"the trial took longer than {SECONDS_ALLOWED} s"
+    if status == 0:
+        return ""
+    how = f"signal {signal.Signals(-status).name}" if status < 0 else f"status {status}"
+    telling = [line.strip() for line in errors.splitlines() if "ERROR" in line or "Error" in line]
+    return f"the trial ended with {how}" + (f" ({telling[0][:120]})" if telling else "")
+
+
+def _text(output: str | bytes | None) -> str:
+    return output.decode("utf-8", "replace") if isinstance(output, bytes) else output or ""
+
+
+def _print_table(parts: list[Part], good: bool) -> None:
+    """Print the parts as a table, and below it what has to be done."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    colours = {OK: "green", WARNING: "yellow", MISSING: "red", BROKEN: "red"}
+    table = Table(box=None, pad_edge=False)
+    for heading in ("part", "version", "", "detail"):
+        table.add_column(heading, overflow="fold")
+    for part in parts:
+        state = f"[{colours[part.status]}]{part.status}[/]"
+        table.add_row(escape(part.name), escape(part.version), state, escape(part.detail))
+    console = Console(highlight=False)
+    console.print(table)
+    console.print()
+    for part in (part for part in parts if part.fix):
+        console.print(f"{escape(part.name)}: {escape(part.fix)}", soft_wrap=True)
+    console.print("Everything that is necessary works." if good else "[red]Something necessary does not work.[/]")

@@ -1,0 +1,326 @@
+"""Rewrites what is made from the code, or from the reference model's record, in the pages of this folder.
+
+    python docs/make_figures.py [--check]
+
+A made part stands between two comments, `<!-- made by docs/make_figures.py: NAME -->` and `<!-- end of NAME -->`; all
+else in a page is written by hand. `--check` writes nothing, names the files that differ and exits 3. Also drawn here:
+`docs/images/reliability.svg`, once the reference model has been measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import json
+import re
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+from advsearch.cli.flags import GROUPS, help_text
+from advsearch.config import Setting, settings
+from advsearch.scene.settings import SETTINGS
+
+DOCS = Path(__file__).resolve().parent
+DIAGRAM = "images/reliability.svg"
+
+Record = Mapping[str, Any]
+"""What `advsearch.evaluation.reference` keeps in reference.json, or a part of that."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Rewrite or check every file; returns the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--check", action="store_true", help="write nothing; exit 3 if a file is not as it should be")
+    check = parser.parse_args(argv).check
+    wrong = differing()
+    for path, text in wrong.items():
+        print(f"{'differs' if check else 'written'}: {path.relative_to(DOCS.parent)}", file=sys.stderr)
+        if not check:
+            path.write_text(text, encoding="utf-8")
+    return 3 if check and wrong else 0
+
+
+def differing(record: Record | None = None) -> dict[Path, str]:
+    """Return the files whose made parts are not up to date, with the text that they should have.
+
+    Args:
+        record: of the reference model; None reads the package's own.
+    """
+    record = stored_record() if record is None else record
+    wanted: dict[Path, str] = {}
+    for (page, name), make in PARTS.items():
+        path = DOCS / page
+        wanted[path] = replaced(wanted.get(path) or path.read_text(encoding="utf-8"), name, make(record))
+    if measured(record):
+        wanted[DOCS / DIAGRAM] = reliability_diagram(record["figures"]["heldout"])
+    return {path: text for path, text in wanted.items() if not path.exists() or path.read_text("utf-8") != text}
+
+
+def replaced(page: str, name: str, content: str) -> str:
+    """Return the page with the content of one made part exchanged.
+
+    Raises:
+        ValueError: the page does not have that part exactly once.
+    """
+    begin, end = f"<!-- made by docs/make_figures.py: {name} -->\n", f"<!-- end of {name} -->"
+    if page.count(begin) != 1 or page.count(end) != 1:
+        raise ValueError(f"expected one part named {name!r} in the page")
+    before, rest = page.split(begin)
+    return f"{before}{begin}{content}{end}{rest.split(end)[1]}"
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a Markdown table; a vertical bar in a cell is escaped."""
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |\n" for line in lines)
+
+
+# ---- parts made from the code ---------------------------------------------------------------------------------------
+
+
+def flags(record: Record) -> str:
+    """Every flag of `attack` with its values and default, group by group."""
+    parts = []
+    for group, heading in GROUPS.items():
+        rows = []
+        for one in settings():
+            if one.group == group:
+                what, values, default = _flag_cells(one)
+                rows.append([f"`{one.flag}`", what, values, default])
+        parts.append(f"**{heading.capitalize()}**\n\n" + table(["flag", "what", "values", "default"], rows))
+    return "\n".join(parts)
+
+
+def _flag_cells(one: Setting) -> tuple[str, str, str]:
+    """What a flag is, its values and its default, cut from its help text."""
+    text = help_text(one).replace("%%", "%")
+    if one.is_switch:
+        return text, "no value", ""
+    what, _, rest = text.partition(": ")
+    values, marked, default = rest.partition(" (default: ")
+    return what, values, "required" if one.required else default.removesuffix(")") if marked else ""
+
+
+def scene_parameters(record: Record) -> str:
+    """Every parameter that `--set` fixes."""
+    rows = [
+        [
+            f"`{one.name}`",
+            one.unit if one.unit != "1" else "",
+            f"{one.low:g} to {one.high:g}",
+            "worked out" if one.default is None else f"{one.default:g}",
+            one.description,
+        ]
+        for one in SETTINGS.values()
+    ]
+    return table(["parameter", "unit", "range", "default", "what"], rows)
+
+
+def objects(record: Record) -> str:
+    """The bundled objects with the labels that the reference model gives them."""
+    from advsearch.bundled.objects import OBJECTS
+
+    return table(["object", "label"], [[f"`{one.name}`", one.label] for one in OBJECTS.values()])
+
+
+def environments(record: Record) -> str:
+    """The bundled environments and the half that each belongs to."""
+    from advsearch.bundled.environments import ENVIRONMENTS
+
+    half = {"train": "training", "heldout": "held out"}
+    return table(["environment", "half"], [[f"`{one.name}`", half[one.split]] for one in ENVIRONMENTS.values()])
+
+
+def control(kind: str) -> Callable[[Record], str]:
+    """The parameters and settings that a control declares."""
+
+    def make(record: Record) -> str:
+        from advsearch.controls import CONTROLS
+
+        declared = CONTROLS[kind]
+        parameters = [
+            [
+                f"`{one.name}`",
+                " x ".join("any" if side is None else str(side) for side in one.shape) or "number",
+                one.unit,
+                f"{one.low:g} to {one.high:g}",
+                str(one.default),
+                "yes" if one.differentiable else "no",
+                one.description,
+            ]
+            for one in declared.parameters
+        ]
+        heads = ["parameter", "shape", "unit", "range", "default", "differentiable", "what"]
+        choices = [[f"`{one.name}`", _shown(one.default), one.description] for one in declared.choices]
+        return table(heads, parameters) + "\n" + table(["setting", "default", "what"], choices)
+
+    return make
+
+
+def policy(name: str) -> Callable[[Record], str]:
+    """The options of a policy: the fields of its dataclass, with what its docstring says of them."""
+
+    def make(record: Record) -> str:
+        from advsearch.attacks import POLICIES
+
+        known = POLICIES[name]
+        said = inspect.getdoc(known) or ""
+        rows = []
+        for one in fields(known):  # type: ignore[arg-type]
+            entry = re.search(rf"^    {one.name}: (.+(?:\n {{8}}.+)*)", said, re.MULTILINE)
+            rows.append([f"`{one.name}`", f"`{one.default}`", " ".join(entry[1].split()) if entry else ""])
+        return table(["option", "default", "what"], rows)
+
+    return make
+
+
+def endings(record: Record) -> str:
+    """How a run can end."""
+    from advsearch.attacks import Ending
+
+    return table(["`ending`", "meaning"], [[f"`{one.value}`", one.explanation] for one in Ending])
+
+
+def _shown(value: object) -> str:
+    return "chosen" if value is None else f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
+
+
+# ---- the reference model --------------------------------------------------------------------------------------------
+
+
+def stored_record() -> dict[str, Any]:
+    """Return the record that lies beside the weights in the package; empty if the model has not been trained yet."""
+    from advsearch.models.reference import RECORD, data_folder
+
+    path = data_folder() / RECORD
+    return dict(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else {}
+
+
+def measured(record: Record) -> bool:
+    """Return whether the record holds the figures of the held-out pictures and of the default views."""
+    return {"heldout", "default_views"} <= set(record.get("figures", {}))
+
+
+def reference(record: Record) -> str:
+    """The figures of the reference model: of its training, over all held-out pictures, and for each class."""
+    if not measured(record):
+        return "The reference model has not been measured yet: run `make reference`, then this script.\n"
+    labels, figures = record["labels"], record["figures"]
+    return (
+        table(["figure", "value"], _overall(labels, figures, figures["heldout"]))
+        + f"\n![Reliability diagram: accuracy against confidence on the held-out pictures]({DIAGRAM})\n\n"
+        + table(["class", "right, held out", "most often taken for", "default view"], _classes(labels, figures))
+    )
+
+
+def _overall(labels: Sequence[str], figures: Record, heldout: Record) -> list[list[str]]:
+    from advsearch.attacks import clopper_pearson
+    from advsearch.models.reference import build
+
+    size = sum(parameter.numel() for parameter in build(len(labels)).parameters())
+    count, accuracy = heldout["count"], heldout["accuracy"]
+    low, high = clopper_pearson(round(accuracy * count), count)
+    return [
+        ["parameters", f"{size / 1e6:.2f} million ({4 * size / 1e6:.1f} MB in float32)"],
+        ["training pictures", f"{figures['pictures']:,}, seen {figures['epochs']} times, seed {figures['seed']}"],
+        ["temperature", f"{figures['temperature']:.3f}, divided into the last layer"],
+        ["held-out pictures", f"{count:,}"],
+        ["right", f"{100 * accuracy:.1f} % (95 % interval {100 * low:.1f} to {100 * high:.1f} %)"],
+        ["mean confidence", f"{100 * heldout['confidence']:.1f} %"],
+        ["expected calibration error", f"{100 * heldout['error']:.1f} %"],
+        ["log loss", f"{heldout['log_loss']:.3f} nats"],
+    ]
+
+
+def _classes(labels: Sequence[str], figures: Record) -> list[list[str]]:
+    heldout, views = figures["heldout"], figures["default_views"]
+    rows = []
+    for index, label in enumerate(labels):
+        right = heldout["per_class"][index]
+        wrong = [0 if other == index else number for other, number in enumerate(heldout["confusion"][index])]
+        most = max(wrong)
+        taken = f"{labels[wrong.index(most)]} ({most})" if most else "none"
+        view = views.get(label.replace(" ", "-"))
+        rows.append(
+            [label, "" if right is None else f"{100 * right:.1f} %", taken, "" if view is None else f"{view:.3f}"]
+        )
+    return rows
+
+
+# ---- the reliability diagram: 100 units are a probability of 1 ------------------------------------------------------
+
+SIDE, LEFT, TOP, COUNTS, GAP = 300, 56, 16, 60, 22
+INK, BAR, LINE = "#333333", "#4477aa", "#cc6677"
+
+
+def reliability_diagram(heldout: Record) -> str:
+    """Return the reliability diagram as SVG: accuracy of each confidence bin, and below how many pictures it holds.
+
+    Args:
+        heldout: a `calibration.Report` as it is stored: `bins`, `count`, `accuracy`, `error`.
+    """
+    width, height = LEFT + SIDE + 16, TOP + SIDE + GAP + COUNTS + 44
+    bottom, floor = TOP + SIDE, TOP + SIDE + GAP + COUNTS
+    most = max(one["count"] for one in heldout["bins"]) or 1
+    shapes = [f'<rect width="{width}" height="{height}" fill="#ffffff"/>']
+    for one in heldout["bins"]:
+        x, wide = LEFT + SIDE * one["low"], SIDE * (one["high"] - one["low"])
+        if one["count"]:
+            shapes.append(_bar(x, bottom, wide, SIDE * one["accuracy"]))
+            shapes.append(_bar(x, floor, wide, COUNTS * one["count"] / most))
+    shapes += [_frame(TOP, SIDE), _frame(floor - COUNTS, COUNTS)]
+    diagonal = f'<line x1="{LEFT}" y1="{bottom}" x2="{LEFT + SIDE}" y2="{TOP}"'
+    shapes.append(f'{diagonal} stroke="{LINE}" stroke-width="2" stroke-dasharray="6 4"/>')
+    for tick in (0.0, 0.25, 0.5, 0.75, 1.0):
+        shapes.append(_text(LEFT - 6, bottom - SIDE * tick + 4, f"{tick:g}", "end"))
+        shapes.append(_text(LEFT + SIDE * tick, floor + 16, f"{tick:g}", "middle"))
+    shapes += [
+        _text(LEFT - 6, floor - COUNTS + 8, f"{most:,}", "end"),
+        _text(LEFT + SIDE / 2, floor + 34, "confidence", "middle"),
+        _text(14, TOP + SIDE / 2, "accuracy", "middle", turned=True),
+        _text(14, floor - COUNTS / 2, "pictures", "middle", turned=True),
+        _text(LEFT + 8, TOP + 18, f"calibration error {100 * heldout['error']:.1f} %", "start"),
+    ]
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}"'
+    return f'{head} font-family="sans-serif" font-size="12">\n' + "\n".join(shapes) + "\n</svg>\n"
+
+
+def _bar(x: float, floor: float, wide: float, high: float) -> str:
+    return (
+        f'<rect x="{x:.2f}" y="{floor - high:.2f}" width="{wide:.2f}" height="{high:.2f}" '
+        f'fill="{BAR}" stroke="#ffffff"/>'
+    )
+
+
+def _frame(y: float, high: float) -> str:
+    return f'<rect x="{LEFT}" y="{y}" width="{SIDE}" height="{high}" fill="none" stroke="{INK}"/>'
+
+
+def _text(x: float, y: float, text: str, anchor: str, *, turned: bool = False) -> str:
+    turn = f' transform="rotate(-90 {x:.1f} {y:.1f})"' if turned else ""
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}" fill="{INK}"{turn}>{text}</text>'
+
+
+PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
+    ("command-line.md", "flags"): flags,
+    ("scenes.md", "parameters"): scene_parameters,
+    ("scenes.md", "objects"): objects,
+    ("scenes.md", "environments"): environments,
+    ("controls/texture.md", "texture"): control("texture"),
+    ("policies/pgd.md", "pgd"): policy("pgd"),
+    ("design.md", "endings"): endings,
+    ("reference-model.md", "reference"): reference,
+}
+"""What makes each part of a page: (page, name of the part)."""
+
+
+def parts_in(page: str) -> set[str]:
+    """Return the names of the made parts of a page."""
+    return set(re.findall(r"<!-- made by docs/make_figures\.py: ([a-z-]+) -->", page))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

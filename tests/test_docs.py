@@ -1,0 +1,397 @@
+"""The documentation can't drift: names, flags, tables, numbers, links and examples are held to the code."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import inspect
+import re
+import shlex
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+import torch
+from PIL import Image
+
+import advsearch
+from advsearch.api import attacking, outcome
+from advsearch.attacks import OBJECTIVES, POLICIES, clopper_pearson, needed, planned_renders, sample_count, trials
+from advsearch.attacks.policies import pgd
+from advsearch.cli.flags import config_from
+from advsearch.cli.list import REGISTRIES
+from advsearch.cli.main import COMMANDS, _parse
+from advsearch.config import AttackConfig, parse_assignment, settings
+from advsearch.controls import CONTROLS, make_control, texture
+from advsearch.models import calibration, loading
+from advsearch.scene import description, environments, formation, importing, library, mitsuba_scene
+from advsearch.scene.import_images import TEXTURE_LIMIT
+from advsearch.scene.settings import SETTINGS, resolve
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+
+
+def script(name: str) -> ModuleType:
+    """Import a script of docs/, which is no package."""
+    spec = importlib.util.spec_from_file_location(f"docs_{name}", DOCS / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def blocks(page: Path, language: str) -> Iterator[str]:
+    """Yield the fenced blocks of one language, without their indentation."""
+    for indent, body in re.findall(rf"^( *)```{language}\n(.*?)^ *```$", page.read_text("utf-8"), re.M | re.S):
+        yield re.sub(rf"^{indent}", "", body, flags=re.MULTILINE)
+
+
+# ---- everything that has a name is documented -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_a_section_with_an_example(command: str) -> None:
+    page = (DOCS / "command-line.md").read_text("utf-8")
+    section = re.search(rf"^## {command}\n(.*?)(?=^## |\Z)", page, re.M | re.S)
+    assert section is not None
+    assert f"\nadvsearch {command}" in section[1]
+
+
+def test_every_flag_of_attack_is_in_the_command_line_page() -> None:
+    page = (DOCS / "command-line.md").read_text("utf-8")
+    missing = [one.flag for one in settings() if f"| `{one.flag}` |" not in page]
+    assert not missing
+
+
+@pytest.mark.parametrize("kind", CONTROLS)
+def test_every_control_has_a_page_with_its_parameters_settings_and_an_example(kind: str) -> None:
+    page = (DOCS / "controls" / f"{kind}.md").read_text("utf-8")
+    for declared in (*CONTROLS[kind].parameters, *CONTROLS[kind].choices):
+        assert f"| `{declared.name}` |" in page
+    assert f"--control {kind}" in page
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_every_policy_has_a_page_with_an_example(name: str) -> None:
+    assert f"--policy {name}" in (DOCS / "policies" / f"{name}.md").read_text("utf-8")
+
+
+@pytest.mark.parametrize("name", OBJECTIVES)
+def test_every_objective_has_a_row_and_an_example(name: str) -> None:
+    page = (DOCS / "objectives.md").read_text("utf-8")
+    assert f"| `{name}` |" in page
+    assert f"--objective {name}" in page
+
+
+def test_everything_bundled_and_every_scene_parameter_is_in_the_page_about_scenes() -> None:
+    page = (DOCS / "scenes.md").read_text("utf-8")
+    names = [*SETTINGS, *library.list_objects(), *library.list_environments()]
+    assert not [name for name in names if f"| `{name}` |" not in page]
+    endings = (*importing.SUFFIXES, *environments.SUFFIXES)
+    assert not [ending for ending in endings if f"`{ending}`" not in page]
+
+
+def test_every_option_of_load_model_is_in_the_page_about_models() -> None:
+    page = (DOCS / "models.md").read_text("utf-8")
+    options = set(inspect.signature(loading.load_model).parameters) - {"spec", "name", "max_batch"}
+    assert not [option for option in options if f"{option}=" not in page and f"`{option}`" not in page]
+
+
+def test_every_kind_that_list_knows_is_in_the_command_line_page() -> None:
+    page = (DOCS / "command-line.md").read_text("utf-8")
+    assert not [kind for kind in REGISTRIES if f"`{kind}`" not in page]
+
+
+def test_every_make_target_is_in_the_page_about_development() -> None:
+    page = (DOCS / "development.md").read_text("utf-8")
+    targets = re.findall(r"^([a-z-]+):.*?## ", (ROOT / "Makefile").read_text("utf-8"), re.M)
+    assert len(targets) > 10
+    assert not [target for target in targets if f"`{target}`" not in page and f"make {target}" not in page]
+
+
+def test_every_field_of_a_summary_is_in_the_table() -> None:
+    page = (DOCS / "design.md").read_text("utf-8")
+    said = set(re.findall(r"`([a-z_]+)`", page.partition("### summary.json")[2].partition("\n## ")[0]))
+    written: set[str] = set()
+    for source in (outcome, trials, formation):
+        for node in ast.walk(ast.parse(inspect.getsource(source))):
+            keys = node.keys if isinstance(node, ast.Dict) else [node.slice] if isinstance(node, ast.Subscript) else []
+            written |= {k.value for k in keys if isinstance(k, ast.Constant) and isinstance(k.value, str)}
+    assert {"verified", "converged", "interval", "denoiser"} <= written
+    assert not written - said
+
+
+# ---- what is made from the code is up to date -----------------------------------------------------------------------
+
+
+def test_the_made_parts_are_up_to_date() -> None:
+    found = [path.relative_to(ROOT).as_posix() for path in script("make_figures").differing()]
+    assert not found, "run python docs/make_figures.py"
+
+
+def test_every_control_and_policy_with_options_has_a_made_part() -> None:
+    made = script("make_figures").PARTS
+    pages = [f"controls/{kind}.md" for kind in CONTROLS]
+    pages += [f"policies/{name}.md" for name in POLICIES if inspect.signature(POLICIES[name]).parameters]
+    assert not [page for page in pages if page not in {page for page, _ in made}]
+    for path in PAGES[1:]:
+        page = path.relative_to(DOCS).as_posix()
+        marked = re.findall(r"<!-- made by docs/make_figures\.py: ([a-z-]+) -->", path.read_text("utf-8"))
+        assert set(marked) == {name for known, name in made if known == page}
+
+
+MADE_BY_HAND = [
+    ("design.md", f"**First look**: {attacking.FIRST_LOOK} renders of the clean scene"),
+    ("design.md", f"That makes `steps` + {planned_renders(0)} renders"),
+    ("design.md", f"at {', '.join(map(str, sample_count.LADDER[:-1]))} and {sample_count.LADDER[-1]} samples a pixel"),
+    ("design.md", f"is at most {sample_count.DRIFT} of the margin itself"),
+    ("design.md", f"**Trials**: {AttackConfig.model_fields['trials'].default} renders"),
+    ("design.md", f"rounded up: {needed(20)} of 20"),
+    ("design.md", f"20 of 20 means a true rate of at least {100 * clopper_pearson(20, 20)[0]:.0f} %"),
+    ("design.md", f"at most {mitsuba_scene.MAX_DEPTH} segments"),
+    ("scenes.md", f"gets the linear value {description.METERED_WHITE}"),
+    ("scenes.md", f"averaged down to at most {TEXTURE_LIMIT} texels"),
+    ("scenes.md", "Maps larger than {1} x {0} are".format(*environments.LARGEST)),
+    ("controls/texture.md", f"Default {texture.DEFAULT_EPSILON}"),
+    ("controls/texture.md", "at least {} and at most {}".format(*texture.RESOLUTIONS)),
+    ("policies/pgd.md", f"the first after {100 * pgd.FIRST_WINDOW:.0f} % of the steps"),
+    ("policies/pgd.md", {0.75: "fewer than three quarters of the steps"}[pgd.IMPROVING]),
+    ("policies/pgd.md", {5: "Five in a row end the search"}[pgd.PATIENCE]),
+    ("models.md", "goes in as {} x {}, RGB".format(*loading.DEFAULT_INPUT_SIZE)),
+]
+
+
+@pytest.mark.parametrize(("page", "sentence"), MADE_BY_HAND)
+def test_numbers_in_the_text_are_those_of_the_code(page: str, sentence: str) -> None:
+    assert sentence in " ".join((DOCS / page).read_text("utf-8").split())
+
+
+# ---- links and words ------------------------------------------------------------------------------------------------
+
+
+def prose(page: Path) -> str:
+    """Return a page without its code, fenced and inline."""
+    text = re.sub(r"^ *```.*?^ *```$", "", page.read_text("utf-8"), flags=re.M | re.S)
+    return re.sub(r"`[^`\n]*`", "code", text)
+
+
+def anchors(page: Path) -> set[str]:
+    """Return what `#...` may name in a page: its headings as GitHub spells them."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text("utf-8"), re.M)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@every_page
+def test_every_relative_link_leads_somewhere(page: Path) -> None:
+    targets = re.findall(r"\]\(([^)\s]+)\)", prose(page))
+    broken = []
+    for target in targets:
+        path, _, anchor = target.partition("#")
+        if path.startswith(("http://", "https://")):
+            continue
+        found = (page.parent / path).resolve() if path else page
+        if not found.exists() or (anchor and anchor not in anchors(found)):
+            broken.append(target)
+    assert not broken
+
+
+def test_every_page_can_be_reached_from_the_readme() -> None:
+    seen, todo = set(), [PAGES[0]]
+    while todo:
+        page = todo.pop()
+        if page not in seen:
+            seen.add(page)
+            targets = re.findall(r"\]\(([^)#\s]+\.md)", prose(page))
+            todo += [(page.parent / target).resolve() for target in targets if "://" not in target]
+    assert seen == set(PAGES)
+
+
+@every_page
+def test_words_are_british_and_no_path_of_one_machine_is_left(page: Path) -> None:
+    assert not re.findall(r"\b\w*(?:color|normaliz|recogniz|gray|behavior)\w*", prose(page), re.I)
+    assert not re.findall(r"/(?:work|tmp|home|root)/|\.\./shared", page.read_text("utf-8"))
+
+
+# ---- examples -------------------------------------------------------------------------------------------------------
+
+
+def lines(page: Path) -> list[list[str]]:
+    """Return the words of every command in a page's shell blocks."""
+    joined = (line for block in blocks(page, "sh") for line in block.replace("\\\n", " ").splitlines())
+    return [words for line in joined if (words := shlex.split(line, comments=True))]
+
+
+def check_names(config: AttackConfig) -> None:
+    """Look up every name in a configuration, as `attack` would; nothing is loaded."""
+    for kind, given in config.controls.items():
+        make_control(kind, given)
+    resolve(config.set_)  # type: ignore[arg-type]
+    assert config.policy in POLICIES and config.objective in OBJECTIVES
+    assert config.object in library.list_objects() or Path(config.object).suffix in importing.SUFFIXES
+    assert config.environment in library.list_environments() or Path(config.environment).suffix in environments.SUFFIXES
+    assert config.label is not None or config.object in library.list_objects(), "a file does not bring a label"
+
+
+def check_advsearch(words: list[str], folder: Path) -> None:
+    """Parse a command with the real parser, and read its settings."""
+    args = _parse(words, words[0])
+    if args.command == "attack":
+        check_names(config_from(args))
+    if args.command == "run":
+        recipe = folder / "run.yaml"
+        recipe.write_text("object: mug\n", encoding="utf-8")
+        check_names(AttackConfig.from_yaml(recipe, dict(parse_assignment(text, text) for text in args.change)))
+
+
+def check_other(words: list[str]) -> None:
+    """Check that a make target, a module or a script exists."""
+    if words[0] == "make":
+        targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.M)
+        assert words[1] in targets
+    elif words[:2] == ["python", "-m"]:
+        assert importlib.util.find_spec(words[2]) is not None
+    elif words[0] == "python":
+        assert (ROOT / words[1]).is_file()
+    else:
+        assert words == [".", ".venv/bin/activate"], f"an example that no test can check: {shlex.join(words)}"
+
+
+@every_page
+def test_every_command_in_an_example_is_one_that_the_tools_take(page: Path, tmp_path: Path) -> None:
+    for words in lines(page):
+        command = words[0].removeprefix(".venv/bin/")
+        if command == "advsearch":
+            check_advsearch(words[1:], tmp_path)
+        else:
+            check_other([command, *words[1:]])
+
+
+@every_page
+def test_every_yaml_example_is_a_configuration(page: Path, tmp_path: Path) -> None:
+    for block in blocks(page, "yaml"):
+        path = tmp_path / "example.yaml"
+        path.write_text(block, encoding="utf-8")
+        check_names(AttackConfig.from_yaml(path))
+
+
+def parameters(call: str) -> set[str]:
+    """Return the keywords that a function of `advsearch` takes."""
+    own = set(inspect.signature(getattr(advsearch, call)).parameters)
+    return own | set(AttackConfig.model_fields) if call == "attack" else own
+
+
+@every_page
+def test_every_python_example_compiles_and_names_what_exists(page: Path) -> None:
+    for block in blocks(page, "python"):
+        tree = ast.parse(block, filename=str(page))
+        compile(tree, str(page), "exec")
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom):
+                module = importlib.import_module(node.module or "")
+                assert not [alias.name for alias in node.names if not hasattr(module, alias.name)]
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "advsearch":
+                assert node.attr in advsearch.__all__
+            if isinstance(node, ast.Call) and ast.unparse(node.func).startswith("advsearch."):
+                known = parameters(ast.unparse(node.func).partition(".")[2])
+                assert not {keyword.arg for keyword in node.keywords} - known
+
+
+@pytest.mark.slow
+def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    for block in blocks(PAGES[0], "python"):
+        exec(compile(block, "README.md", "exec"), names)
+    assert names["result"].search.renders == planned_renders(40)
+    assert float(names["u"].grad.abs().max()) > 0.0
+
+
+# ---- the scripts ----------------------------------------------------------------------------------------------------
+
+
+def made_up_record() -> dict[str, Any]:
+    """A record as `advsearch.evaluation.reference` writes it, of a model that is right nine times in ten."""
+    labels = ["ball", "mug", "wine glass"]
+    truth = [index % 3 for index in range(300)]
+    logits = torch.nn.functional.one_hot(torch.tensor(truth), 3).float() * 3.0
+    logits[::10] = logits[::10].roll(1, dims=1)
+    heldout = asdict(calibration.report(logits, truth))
+    views = {"ball": 0.91, "mug": 0.97, "wine-glass": 0.8812}
+    figures = {"pictures": 16000, "epochs": 16, "seed": 0, "temperature": 1.1, "heldout": heldout}
+    return {"schema": 1, "labels": labels, "figures": {**figures, "default_views": views}}
+
+
+def test_the_figures_of_the_reference_model_come_from_its_record() -> None:
+    figures = script("make_figures")
+    record = made_up_record()
+    part = figures.reference(record)
+    assert "| right | 90.0 % (95 % interval 86.0 to 93.2 %) |" in part
+    assert "| training pictures | 16,000, seen 16 times, seed 0 |" in part
+    assert "| wine glass | 90.0 % | ball (10) | 0.881 |" in part
+    wanted = figures.differing(record)
+    assert part in wanted[DOCS / "reference-model.md"]
+    assert wanted[DOCS / "images" / "reliability.svg"] == figures.reliability_diagram(record["figures"]["heldout"])
+
+
+def test_without_a_record_the_page_says_so_and_nothing_is_drawn() -> None:
+    figures = script("make_figures")
+    assert "not been measured" in figures.reference({})
+    assert "not been measured" in figures.reference({"labels": ["a", "b"], "figures": {"pictures": 10}})
+    assert not [path for path in figures.differing({}) if path.suffix == ".svg"]
+
+
+def test_the_reliability_diagram_is_an_svg_whose_bars_are_the_bins() -> None:
+    heldout = made_up_record()["figures"]["heldout"]
+    svg = script("make_figures").reliability_diagram(heldout)
+    root = ElementTree.fromstring(svg)
+    bars = [one for one in root.iter("{http://www.w3.org/2000/svg}rect") if one.get("fill") == "#4477aa"]
+    filled = [one for one in heldout["bins"] if one["count"]]
+    assert len(bars) == 2 * len(filled)
+    accuracy = [float(one.get("height", "nan")) / 300 for one in bars[::2]]
+    assert accuracy == pytest.approx([one["accuracy"] for one in filled], abs=1e-4)
+
+
+def test_a_part_is_exchanged_and_nothing_else() -> None:
+    replaced = script("make_figures").replaced
+    page = "a\n<!-- made by docs/make_figures.py: x -->\nold\n<!-- end of x -->\nb\n"
+    assert replaced(page, "x", "new\n") == page.replace("old", "new")
+    with pytest.raises(ValueError, match="expected one part named 'y'"):
+        replaced(page, "y", "new\n")
+
+
+def test_the_picture_and_the_answer_in_the_readme_are_made_from_a_run(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    for name, grey in (("images/clean", 40), ("images/adversarial", 120), ("artifacts/texture", 200)):
+        (run / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (16, 16), (grey, grey, grey)).save(run / f"{name}.png")
+    summary = {
+        "object": "path/to/mug.obj",
+        "controls": ["texture"],
+        "ending": "found",
+        "clean": {"label": "mug", "probability": 0.98},
+        "adversarial": {"label": "vase", "probability": 0.91},
+        "verified": {"successes": 20, "trials": 20, "interval": [0.83, 1.0], "labels": {"vase": 20}},
+    }
+    images = script("make_images")
+    sheet = images.side_by_side(run, summary)
+    centres = [sheet.getpixel((images.SIDE // 2 + number * (images.SIDE + images.GAP), 9)) for number in range(3)]
+    assert centres == [(40, 40, 40), (120, 120, 120), (200, 200, 200)]
+    readme = images.with_answer(PAGES[0].read_text("utf-8"), summary)
+    assert "The model calls this mug a vase in 20 of 20 fresh renders" in readme
+    assert "runs/mug-texture-001\n```\n<!-- end -->" in readme
+
+
+def test_the_readme_shows_an_answer() -> None:
+    shown = (
+        PAGES[0].read_text("utf-8").partition("<!-- made by docs/make_images.py -->")[2].partition("<!-- end -->")[0]
+    )
+    assert "fresh renders" in shown, "run python docs/make_images.py RUN"

@@ -1,0 +1,214 @@
+"""Finding a libLLVM: every platform's places, names and versions, in made-up folders; and the one of this machine."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from advsearch.errors import EnvironmentSetupError
+from advsearch.scene import llvm
+
+DEBIAN = "ID=debian\nVERSION_ID=12\n"
+UBUNTU = 'ID=ubuntu\nID_LIKE=debian\nVERSION_ID="24.04"\n'
+UBUNTU_22 = 'ID=ubuntu\nID_LIKE=debian\nVERSION_ID="22.04"\n'
+FEDORA = "ID=fedora\nVERSION_ID=42\n"
+
+linux_only = pytest.mark.skipif(not llvm._own_elf_header(), reason="libraries are not ELF files here")
+
+
+@pytest.fixture(autouse=True)
+def _fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each test starts without the variable and without a remembered choice."""
+    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+    monkeypatch.delenv("CONDA_PREFIX", raising=False)
+    llvm.ensure_llvm.cache_clear()
+
+
+def library(root: Path, path: str, content: bytes | None = None) -> Path:
+    """Make a file that looks like a library for this interpreter."""
+    file = root / path
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_bytes(llvm._own_elf_header() if content is None else content)
+    return file
+
+
+@pytest.mark.parametrize(
+    ("path", "version"),
+    [
+        ("usr/lib/x86_64-linux-gnu/libLLVM.so.19.1", (19, 1)),  # Debian, Ubuntu since 19
+        ("usr/lib/x86_64-linux-gnu/libLLVM-17.so.1", (17,)),  # Debian, Ubuntu before
+        ("usr/lib/llvm-18/lib/libLLVM.so.1", (18,)),
+        ("usr/lib64/libLLVM.so.20.1", (20, 1)),  # Fedora
+        ("usr/lib64/llvm19/lib/libLLVM.so", (19,)),
+        ("usr/lib/libLLVM-18.1.8.so", (18, 1, 8)),  # Arch
+        ("opt/homebrew/opt/llvm@19/lib/libLLVM.dylib", (19,)),
+        ("opt/homebrew/opt/llvm/lib/libLLVM-21.dylib", (21,)),
+        ("usr/local/opt/llvm/lib/libLLVM.22.1.dylib", (22, 1)),
+    ],
+)
+def test_finds_each_platforms_file_and_its_version(tmp_path: Path, path: str, version: tuple[int, ...]) -> None:
+    library(tmp_path, path)
+    (found,) = llvm.find(tmp_path, {})
+    assert (found.version, found.refused) == (version, "")
+
+
+def test_version_of_a_homebrew_link_is_read_from_where_it_leads(tmp_path: Path) -> None:
+    library(tmp_path, "opt/homebrew/Cellar/llvm/19.1.7/lib/libLLVM.dylib")
+    (tmp_path / "opt/homebrew/opt").mkdir()
+    (tmp_path / "opt/homebrew/opt/llvm").symlink_to(tmp_path / "opt/homebrew/Cellar/llvm/19.1.7")
+    assert [c.version for c in llvm.find(tmp_path, {})] == [(19, 1, 7)]
+
+
+def test_finds_an_active_conda_environments_file(tmp_path: Path) -> None:
+    library(tmp_path, "home/me/conda/envs/a/lib/libLLVM-19.so")
+    assert [c.version for c in llvm.find(tmp_path, {"CONDA_PREFIX": "/home/me/conda/envs/a"})] == [(19,)]
+    assert llvm.find(tmp_path, {}) == []
+
+
+def test_newest_usable_comes_first_and_old_ones_are_refused_with_the_reason(tmp_path: Path) -> None:
+    for name in ("libLLVM-14.so.1", "libLLVM-15.so.1", "libLLVM-16.so.1", "libLLVM.so.19.1", "libLLVM.so.20.1"):
+        library(tmp_path, f"usr/lib/x86_64-linux-gnu/{name}")
+    found = llvm.find(tmp_path, {})
+    assert [c.version[0] for c in found] == [20, 19, 16, 15, 14]
+    assert [bool(c.refused) for c in found] == [False, False, True, True, True]
+    assert "aborts the process" in found[2].refused
+    assert "Dr.Jit refuses" in found[4].refused
+
+
+def test_other_libraries_of_llvm_are_not_taken_for_it(tmp_path: Path) -> None:
+    for name in ("libLLVMCore.so.19", "libLLVM-19.so.1.bak.txt", "libLLVMSupport.a", "libLLVM.a"):
+        library(tmp_path, f"usr/lib/{name}")
+    assert [c.path.name for c in llvm.find(tmp_path, {})] in ([], ["libLLVM-19.so.1.bak.txt"])
+
+
+@linux_only
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"", "not a shared library"),
+        (b"INPUT(libLLVM-19.so)\n", "not a shared library"),
+        (llvm._own_elf_header()[:18] + b"\x28\x00", "another processor"),
+    ],
+)
+def test_a_file_that_is_no_library_for_this_machine_is_refused(tmp_path: Path, content: bytes, reason: str) -> None:
+    library(tmp_path, "usr/lib/libLLVM.so.19.1", content)
+    (found,) = llvm.find(tmp_path, {})
+    assert reason in found.refused
+
+
+@linux_only
+def test_a_usable_name_on_a_broken_file_is_passed_over(tmp_path: Path) -> None:
+    """The header is right and the rest is missing: the loader says so, and the next candidate is taken."""
+    library(tmp_path, "usr/lib/libLLVM.so.99.1")
+    with pytest.raises(EnvironmentSetupError, match=r"libLLVM\.so\.99\.1 \(cannot be loaded: .*Install one with"):
+        llvm._newest(llvm.find(tmp_path, {}))
+
+
+def test_message_without_any_usable_file_lists_what_is_there_and_what_to_type(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old = library(tmp_path, "usr/lib/x86_64-linux-gnu/libLLVM-15.so.1")
+    monkeypatch.setattr(llvm, "_read_os_release", lambda: DEBIAN)
+    monkeypatch.setattr(llvm.os, "geteuid", lambda: 1000, raising=False)
+    monkeypatch.setattr(llvm.sys, "platform", "linux")
+    with pytest.raises(EnvironmentSetupError) as caught:
+        llvm._newest(llvm.find(tmp_path, {}))
+    message = str(caught.value)
+    assert f"{old} (15: it aborts the process" in message
+    assert "sudo apt-get install libllvm19" in message
+    assert llvm.VARIABLE in message
+
+
+@pytest.mark.parametrize(
+    ("release", "platform", "command"),
+    [
+        (DEBIAN, "linux", "apt-get install libllvm19"),
+        (UBUNTU, "linux", "apt-get install libllvm19"),
+        (UBUNTU_22, "linux", "apt.llvm.org"),
+        (FEDORA, "linux", "dnf install llvm-libs"),
+        ("", "darwin", "brew install llvm"),
+    ],
+)
+def test_install_command_of_each_platform_is_one_line(release: str, platform: str, command: str) -> None:
+    answer = llvm.install_command(release, platform)
+    assert command in answer and "\n" not in answer
+
+
+def test_install_command_of_an_unknown_platform_lists_all() -> None:
+    answer = llvm.install_command("ID=nixos\n", "linux")
+    assert [line.split(":")[0].strip() for line in answer.splitlines()] == [
+        "Debian, Ubuntu",
+        "Fedora",
+        "Homebrew",
+        "conda",
+    ]
+
+
+def test_install_command_in_a_conda_environment_is_condas(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CONDA_PREFIX", "/somewhere")
+    assert llvm.install_command(DEBIAN, "linux").startswith("conda install")
+
+
+def test_variable_wins_over_what_would_be_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = library(tmp_path, "mine/libLLVM.so.18.1")
+    monkeypatch.setenv(llvm.VARIABLE, str(given))
+    assert llvm.ensure_llvm() == llvm.LLVM(given, (18, 1))
+    assert os.environ[llvm.VARIABLE] == str(given)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("libLLVM.so.15.0", "aborts"), ("libLLVM-14.so.1", "refuses versions below 15")]
+)
+def test_variable_that_names_an_old_file_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, text: str
+) -> None:
+    monkeypatch.setenv(llvm.VARIABLE, str(library(tmp_path, name)))
+    with pytest.raises(EnvironmentSetupError, match=rf"{llvm.VARIABLE}: expected .* version 17 or later.*{text}"):
+        llvm.ensure_llvm()
+
+
+def test_variable_that_names_no_file_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM.so.19.1")
+    with pytest.raises(EnvironmentSetupError, match=r"'/nowhere/libLLVM\.so\.19\.1', which does not exist"):
+        llvm.ensure_llvm()
+
+
+def test_a_file_without_a_version_in_its_name_is_asked_for_it(tmp_path: Path) -> None:
+    """This file cannot be loaded, so it cannot answer, and is refused for that."""
+    library(tmp_path, "usr/lib/libLLVM.so")
+    (found,) = llvm.find(tmp_path, {})
+    assert "does not tell its version" in found.refused
+
+
+def test_this_machine_has_a_usable_one_and_it_tells_the_version_of_its_name() -> None:
+    chosen = llvm.ensure_llvm()
+    assert chosen.version[0] >= llvm.MINIMUM
+    assert llvm._ask(str(chosen.path))[: len(chosen.version)] == chosen.version
+
+
+def test_command_prints_the_choice_or_fails_with_the_message(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "advsearch.scene.llvm"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "libLLVM" in done.stdout or "LLVM-C" in done.stdout
+    environ = os.environ | {llvm.VARIABLE: str(tmp_path / "none.so")}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environ)
+    assert (done.returncode, done.stdout) == (3, "")
+    assert "does not exist" in done.stderr
+
+
+def test_mitsuba_comes_with_our_variant_few_messages_and_all_threads() -> None:
+    from advsearch import threads
+    from advsearch.scene.backend import VARIANT, mitsuba
+
+    mi = mitsuba()
+    import drjit as dr
+
+    assert mi.variant() == VARIANT
+    assert dr.log_level() == dr.LogLevel.Warn
+    assert threads.configure(1) == dr.thread_count() == 1
+    assert threads.configure() == dr.thread_count() >= 1
+    assert mitsuba() is mi

@@ -1,0 +1,235 @@
+"""The function in the middle: repeatable, stateless, finite, and differentiable as it claims."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.api.scene import load_scene, make_renderer
+from advsearch.controls import TextureControl, make_space
+from advsearch.errors import InputError
+from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.description import describe, metered_gain
+from advsearch.scene.formation import ImageFormation, linear_to_srgb, srgb_to_linear, to_8_bit
+from advsearch.scene.mitsuba_scene import BASE_COLOR, MitsubaScene
+from advsearch.scene.renderer import Renderer
+
+SIZE = 32
+TEXELS = 16
+LINEAR_TOLERANCE = 0.03
+"""A path-replayed gradient against a difference with the same 256 samples: both are noisy by about one per cent."""
+
+
+@pytest.fixture(scope="module")
+def raw() -> Renderer:
+    """A mug without denoiser, whose 16 x 16 texture may vary."""
+    return load_scene("mug").renderer([TextureControl(resolution=TEXELS)], resolution=SIZE, denoise="none")
+
+
+@pytest.fixture(scope="module")
+def denoised() -> Renderer:
+    return load_scene("mug").renderer([TextureControl(resolution=TEXELS)], resolution=SIZE)
+
+
+def weights() -> Tensor:
+    """A smooth linear loss: every pixel weighs, none cancels another by chance."""
+    rows = torch.linspace(0.2, 1.0, SIZE)
+    return (rows[:, None] * rows.flip(0)[None, :])[..., None] / SIZE**2
+
+
+def loss(render: Renderer, u: Tensor, seed: int, spp: int) -> Tensor:
+    return (render(u, seed=seed, spp=spp) * weights()).sum()
+
+
+def inside(render: Renderer) -> Tensor:
+    """The start, away from the ends of the unit box."""
+    return render.start * 0.8 + 0.1
+
+
+@pytest.mark.parametrize("which", ["raw", "denoised"])
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_another_picture(
+    which: str, request: pytest.FixtureRequest
+) -> None:
+    render = request.getfixturevalue(which)
+    with torch.no_grad():
+        first, again, other = (render(render.start, seed=seed, spp=4) for seed in (3, 3, 4))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert first.shape == (SIZE, SIZE, 3) and first.dtype == torch.float32
+    assert float(first.min()) >= 0.0 and float(first.max()) <= 1.0
+
+
+def test_a_configuration_after_many_others_gives_the_bytes_of_a_fresh_renderer(raw: Renderer) -> None:
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for _ in range(20):
+            raw(torch.rand(raw.start.shape, generator=generator), seed=1, spp=1)
+        after = raw(raw.start, seed=7, spp=4)
+        fresh = load_scene("mug").renderer([TextureControl(resolution=TEXELS)], resolution=SIZE, denoise="none")
+        assert torch.equal(after, fresh(fresh.start, seed=7, spp=4))
+
+
+def test_a_gradient_leaves_the_scene_as_it_was(raw: Renderer) -> None:
+    with torch.no_grad():
+        before = raw(raw.start, seed=2, spp=4)
+    u = inside(raw).requires_grad_()
+    loss(raw, u, 0, 4).backward()
+    with torch.no_grad():
+        assert torch.equal(before, raw(raw.start, seed=2, spp=4))
+
+
+def test_inputs_that_are_not_named_have_their_base_value(raw: Renderer) -> None:
+    base = raw.scene.radiance({}, 5, 4)
+    raw.scene.radiance({BASE_COLOR: torch.zeros(TEXELS, TEXELS, 3)}, 5, 4)
+    assert torch.equal(base, raw.scene.radiance({}, 5, 4))
+
+
+def test_a_tensor_changed_in_place_is_uploaded_again(raw: Renderer) -> None:
+    texture = torch.full((TEXELS, TEXELS, 3), 0.2)
+    dark = raw.scene.radiance({BASE_COLOR: texture}, 5, 4)
+    texture += 0.5
+    assert float(raw.scene.radiance({BASE_COLOR: texture}, 5, 4).mean()) > 1.1 * float(dark.mean())
+
+
+def test_a_recorded_adjoint_survives_the_death_of_another_scene(raw: Renderer) -> None:
+    """Dr.Jit crashes the process when a recording is replayed after a scene it knew has gone."""
+
+    def gradient() -> Tensor:
+        return raw.scene.adjoint({BASE_COLOR: texture}, torch.ones(SIZE, SIZE, 3), 1, 4)[BASE_COLOR]
+
+    texture = raw.scene.base(BASE_COLOR)
+    before = gradient()
+    other = MitsubaScene(describe("ball"), (SIZE, SIZE))
+    other.adjoint({BASE_COLOR: other.base(BASE_COLOR)}, torch.ones(SIZE, SIZE, 3), 1, 4)
+    del other
+    assert torch.allclose(gradient(), before, rtol=1e-4, atol=1e-6)
+
+
+def test_recording_kernels_changes_no_byte() -> None:
+    description = describe("mug")
+    frozen = MitsubaScene(description, (SIZE, SIZE))
+    plain = MitsubaScene(description, (SIZE, SIZE), freeze=False)
+    for seed in range(4):
+        assert torch.equal(frozen.radiance({}, seed, 4), plain.radiance({}, seed, 4))
+
+
+def test_the_gradient_agrees_with_a_central_difference_of_the_same_samples(raw: Renderer) -> None:
+    u = inside(raw).requires_grad_()
+    loss(raw, u, 0, 256).backward()
+    generator = torch.Generator().manual_seed(1)
+    direction = 0.03 * torch.rand(u.shape, generator=generator)
+    with torch.no_grad():
+        difference = (loss(raw, u + direction, 0, 256) - loss(raw, u - direction, 0, 256)) / 2
+    assert u.grad is not None
+    assert float((u.grad * direction).sum()) == pytest.approx(float(difference), rel=LINEAR_TOLERANCE)
+
+
+def test_a_loss_linear_in_the_texture_changes_by_step_times_gradient() -> None:
+    """Direct light only (paths of two segments) makes radiance linear in reflectance, so the identity is exact."""
+    scene = MitsubaScene(describe("ball"), (SIZE, SIZE), max_depth=2)
+    base = scene.base(BASE_COLOR)
+    cotangent = torch.ones(SIZE, SIZE, 3)
+    gradient = scene.adjoint({BASE_COLOR: base}, cotangent, 11, 64)[BASE_COLOR]
+    step = torch.zeros_like(base)
+    step[..., 1] = 0.05
+    before, after = (scene.radiance({BASE_COLOR: base + k * step}, 11, 64).sum() for k in (0.0, 1.0))
+    assert float((gradient * step).sum()) == pytest.approx(float(after - before), rel=2e-3)
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_gradients_are_finite_at_black_and_white_texels(raw: Renderer, value: float) -> None:
+    u = torch.full_like(raw.start, value).requires_grad_()
+    loss(raw, u, 0, 4).backward()
+    assert u.grad is not None and bool(torch.isfinite(u.grad).all())
+    assert float(u.grad.abs().sum()) > 0.0
+
+
+def test_the_denoiser_is_the_identity_in_the_backward_pass(raw: Renderer, denoised: Renderer) -> None:
+    gradients = []
+    for render in (raw, denoised):
+        linear = Renderer(render.scene, render.space, replace(render.formation, gain=1e-3))  # below every clip
+        u = inside(render).requires_grad_()
+        linear.radiance(u, seed=0, spp=16).sum().backward()
+        gradients.append(u.grad)
+    assert gradients[0] is not None and torch.allclose(gradients[0], gradients[1], rtol=1e-4, atol=1e-7)
+
+
+def test_the_denoiser_brings_few_samples_close_to_many(raw: Renderer, denoised: Renderer) -> None:
+    with torch.no_grad():
+        many, noisy, clean = raw(raw.start, 0, 1024), raw(raw.start, 1, 8), denoised(denoised.start, 1, 8)
+    assert float((clean - many).pow(2).mean()) < 0.5 * float((noisy - many).pow(2).mean())
+
+
+def test_non_finite_radiance_is_counted_and_set_to_zero(raw: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = torch.full((SIZE, SIZE, 3), 0.5)
+    broken[0, 0, 0], broken[1, 1, 1] = float("nan"), float("inf")
+    monkeypatch.setattr(raw.scene, "radiance", lambda *_: broken)
+    before = raw.non_finite
+    with torch.no_grad():
+        image = raw(raw.start, seed=0, spp=1)
+    assert raw.non_finite - before == 2
+    assert bool(torch.isfinite(image).all()) and float(image[0, 0, 0]) == 0.0
+
+
+def test_what_cannot_be_rendered_is_refused(raw: Renderer) -> None:
+    with pytest.raises(InputError, match=r"expected u of shape \(768,\), got \(3,\)"):
+        raw(torch.zeros(3))
+    with pytest.raises(InputError, match=r"in \[0, 1\]; project u"):
+        raw(raw.start + 2.0)
+    with pytest.raises(InputError, match=r"in \[0, 1\]"):
+        raw(torch.full_like(raw.start, float("nan")))
+    with pytest.raises(InputError, match="--spp: expected 1 to 65536"):
+        raw(raw.start, spp=0)
+    with pytest.raises(InputError, match="the denoiser needs the box filter"):
+        ImageFormation(denoiser="oidn", filter="gaussian")
+    with pytest.raises(InputError, match="--denoise: expected one of oidn, none"):
+        ImageFormation(denoiser="median")
+    with pytest.raises(InputError, match="--resolution: expected 8 to 4096"):
+        make_renderer(describe("mug"), make_space([TextureControl()], describe("mug")), 4, "none", 0)
+
+
+# ---- image formation ------------------------------------------------------------------------------------------------
+
+
+def test_the_transfer_curve_is_its_own_inverse_and_has_the_standard_values() -> None:
+    values = torch.linspace(0.0, 1.0, 257)
+    assert torch.allclose(linear_to_srgb(srgb_to_linear(values)), values, atol=2e-6)
+    assert float(srgb_to_linear(torch.tensor(0.5))) == pytest.approx(0.21404, abs=1e-5)
+
+
+def test_the_transfer_curve_is_flat_where_it_clips_and_finite_at_black() -> None:
+    linear = torch.tensor([-0.5, 0.0, 0.5, 1.5], requires_grad=True)
+    linear_to_srgb(linear).sum().backward()
+    assert linear.grad is not None
+    assert bool(torch.isfinite(linear.grad).all())
+    assert float(linear.grad[0]) == 0.0 and float(linear.grad[3]) == 0.0 and float(linear.grad[2]) > 0.0
+
+
+def test_rounding_to_8_bits_leaves_256_levels() -> None:
+    values = to_8_bit(torch.linspace(0.0, 1.0, 10_000))
+    assert len(values.unique()) == 256
+    assert torch.equal(to_8_bit(values), values)
+
+
+def test_metering_puts_a_white_card_under_uniform_light_at_its_level() -> None:
+    """Uniform radiance L gives irradiance pi L facing up, so gain * 0.8 * L must be 0.9."""
+    sky = EnvironmentAsset("uniform", np.full((64, 128, 3), 2.5, np.float32))
+    assert metered_gain(sky) * 0.8 * 2.5 == pytest.approx(0.9, rel=0.01)
+
+
+def test_a_black_environment_meters_to_one() -> None:
+    assert metered_gain(EnvironmentAsset("night", np.zeros((8, 16, 3), np.float32))) == 1.0
+
+
+def test_recorded_adjoints_of_small_textures_replay() -> None:
+    """Dr.Jit's per-thread copies of small scatter targets corrupt the heap when a recording is replayed."""
+    frozen, plain = (MitsubaScene(describe("mug"), (SIZE, SIZE), freeze=freeze) for freeze in (True, False))
+    cotangent = torch.ones(SIZE, SIZE, 3)
+    for seed in range(6):
+        inputs = {BASE_COLOR: torch.full((4, 4, 3), 0.2 + 0.1 * seed)}
+        replayed, computed = (scene.adjoint(inputs, cotangent, seed, 4)[BASE_COLOR] for scene in (frozen, plain))
+        assert torch.allclose(replayed, computed, rtol=1e-3, atol=1e-5)

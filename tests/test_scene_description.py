@@ -1,0 +1,88 @@
+"""Settings, poses and cameras, without Mitsuba."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.description import FRAME_FILL, SceneDescription, describe
+from advsearch.scene.geometry import camera_to_world, object_to_world, rotation
+from advsearch.scene.settings import SETTINGS, resolve
+
+
+def projected(description: SceneDescription) -> np.ndarray:
+    """Vertices in units of half the picture, and their depth, by an independent pinhole projection."""
+    camera = camera_to_world(description)
+    world = (
+        description.object.mesh.vertices @ object_to_world(description)[:3, :3].T + object_to_world(description)[:3, 3]
+    )
+    local = (world - camera[:3, 3]) @ camera[:3, :3]
+    half = np.tan(np.radians(description.number("camera.fov")) / 2)
+    return np.column_stack([local[:, :2] / local[:, 2:3] / half, local[:, 2]])
+
+
+@pytest.mark.parametrize("name", ["mug", "banana", "lamp", "wine-glass"])
+@pytest.mark.parametrize("azimuth", [0.0, 40.0, 275.0])
+def test_the_default_camera_frames_the_whole_object_and_fills_the_frame(name: str, azimuth: float) -> None:
+    points = projected(describe(name, given={"camera.azimuth": azimuth}))
+    assert points[:, 2].min() > 0.0
+    assert np.abs(points[:, :2]).max() == pytest.approx(FRAME_FILL, abs=1e-3)
+
+
+def test_a_camera_at_azimuth_zero_and_no_elevation_looks_from_plus_x_with_z_up() -> None:
+    camera = camera_to_world(describe("mug", given={"camera.azimuth": 0.0, "camera.elevation": 0.0}))
+    assert np.allclose(camera[:3, 2], [-1, 0, 0]) and np.allclose(camera[:3, 1], [0, 0, 1])
+    assert camera[0, 3] > 0 and np.linalg.det(camera[:3, :3]) == pytest.approx(1.0)
+
+
+def test_a_rolled_camera_turns_the_picture_and_nothing_else() -> None:
+    plain, rolled = (camera_to_world(describe("ball", given={"camera.roll": roll})) for roll in (0.0, 90.0))
+    assert np.allclose(rolled[:3, 2], plain[:3, 2])
+    assert np.allclose(np.abs(rolled[:3, 0] @ plain[:3, 1]), 1.0)
+
+
+@pytest.mark.parametrize("pose", [{}, {"pose.pitch": 35.0}, {"pose.roll": 90.0, "pose.scale": 2.0}])
+def test_an_object_stands_on_the_ground_in_every_pose(pose: dict[str, float]) -> None:
+    description = describe("mug", given=pose)
+    matrix = object_to_world(description)
+    heights = description.object.mesh.vertices @ matrix[2, :3] + matrix[2, 3]
+    assert heights.min() == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_height_above_the_ground_is_added() -> None:
+    matrix = object_to_world(describe("ball", given={"pose.z": 0.25}))
+    assert matrix[2, 3] == pytest.approx(0.25, abs=1e-6)
+
+
+def test_rotations_turn_yaw_counter_clockwise_seen_from_above() -> None:
+    assert np.allclose(rotation(90.0, 0.0, 0.0) @ [1, 0, 0], [0, 1, 0])
+
+
+def test_every_default_lies_in_its_range_and_resolves() -> None:
+    values = resolve({})
+    assert set(values) == set(SETTINGS)
+    for name, setting in SETTINGS.items():
+        assert setting.default is None or setting.low <= setting.default <= setting.high, name
+
+
+def test_a_wrong_setting_is_explained() -> None:
+    with pytest.raises(
+        UnknownNameError, match=r"unknown scene parameter 'camera.azimut'. Did you mean 'camera.azimuth'"
+    ):
+        resolve({"camera.azimut": 1.0})
+    with pytest.raises(InputError, match=r"--set camera.fov: expected a number from 1 to 170 \(degrees\), got 200"):
+        resolve({"camera.fov": 200.0})
+    with pytest.raises(InputError, match="got nan"):
+        resolve({"pose.x": float("nan")})
+    with pytest.raises(InputError, match="expected a number in degrees, got 'left'"):
+        resolve({"pose.yaw": "left"})  # type: ignore[dict-item]
+
+
+def test_unknown_names_and_a_needless_up_are_explained() -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown object 'mugg'. Did you mean 'mug'"):
+        describe("mugg")
+    with pytest.raises(UnknownNameError, match=r"unknown environment 'studo'. Did you mean 'studio'"):
+        describe("mug", "studo")
+    with pytest.raises(InputError, match="--up: bundled objects stand upright already"):
+        describe("mug", up="y")

@@ -1,0 +1,52 @@
+"""Thread counts and how idle threads wait."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from advsearch import threads
+from advsearch.errors import InputError
+
+SHOW = (
+    "import json, os, sys; from advsearch import threads; assert 'torch' not in sys.modules\n"
+    "count = threads.configure(); import torch\n"
+    "print(json.dumps([count, torch.get_num_threads(), {n: os.environ.get(n) for n in threads.OPENMP_DEFAULTS}]))"
+)
+
+
+def in_new_process(**variables: str) -> list[object]:
+    """What a process with these variables ends up with: our count, torch's, and the variables."""
+    ours = (*threads.OPENMP_DEFAULTS, "OMP_WAIT_POLICY", "OMP_NUM_THREADS")
+    environ = {name: value for name, value in os.environ.items() if name not in ours} | variables
+    done = subprocess.run([sys.executable, "-c", SHOW], capture_output=True, text=True, check=True, env=environ)
+    answer: list[object] = json.loads(done.stdout)
+    return answer
+
+
+def test_torch_gets_the_count_and_openmp_its_defaults() -> None:
+    assert in_new_process() == [threads.cores(), threads.cores(), threads.OPENMP_DEFAULTS]
+
+
+def test_what_the_user_has_set_is_left_alone() -> None:
+    kept = {"GOMP_SPINCOUNT": "7", "KMP_BLOCKTIME": threads.OPENMP_DEFAULTS["KMP_BLOCKTIME"]}
+    assert in_new_process(GOMP_SPINCOUNT="7", OMP_NUM_THREADS="1") == [1, 1, kept]
+    assert in_new_process(OMP_WAIT_POLICY="PASSIVE")[2] == dict.fromkeys(threads.OPENMP_DEFAULTS)
+
+
+@pytest.mark.parametrize(("text", "expected"), [("100000 100000\n", 1), ("20000 100000", 1), ("max 100000\n", None)])
+def test_a_containers_quota_bounds_the_cores(tmp_path: Path, text: str, expected: int | None) -> None:
+    quota = tmp_path / "cpu.max"
+    quota.write_text(text)
+    assert threads.cores(quota) == (expected or threads.cores(tmp_path / "absent"))
+
+
+@pytest.mark.parametrize("wrong", [0, -2])
+def test_fewer_than_one_thread_is_an_error(wrong: int) -> None:
+    with pytest.raises(InputError, match=rf"threads: expected a number of at least 1, got {wrong}"):
+        threads.configure(wrong)
