@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from advsearch.attacks.projections import project_l2_box
 from advsearch.errors import InputError
 
 QP_TOLERANCE = 2e-5  # SLSQP stops here; the projection itself is exact to float32
+ROUNDING = 2e-7  # a few units in the last place of values up to 1
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -110,7 +110,7 @@ def test_projection_lies_inside_is_idempotent_and_nonexpansive(
     u, v = (domain.start + scale * torch.randn(d, generator=rng) for _ in range(2))
     p, q = domain.project(u), domain.project(v)
     assert domain.contains(p)
-    assert torch.equal(domain.project(p), p)
+    assert torch.allclose(domain.project(p), p, rtol=0.0, atol=ROUNDING)
     assert float((p - q).norm()) <= float((u - v).norm()) * (1 + 1e-5) + 1e-6
 
 
@@ -247,16 +247,17 @@ def test_the_start_is_copied_and_kept_in_float32() -> None:
     assert torch.equal(domain.start, torch.full((2,), 0.5))
 
 
-def test_a_large_l2_projection_is_exact_and_quick() -> None:
-    d = 200_000
+def test_a_large_l2_projection_is_exact() -> None:
+    d = 200_000  # several chunks, sums of many terms
     start = torch.rand(d, generator=generator())
     domain = ball("l2", 20.0, start)
     u = start + 0.3 * torch.randn(d, generator=generator(1))
-    seconds = []
-    for _ in range(5):
-        begun = time.perf_counter()
-        projected = domain.project(u)
-        seconds.append(time.perf_counter() - begun)
+    projected = domain.project(u)
     assert domain.violation(projected) <= TOLERANCE
     assert float((projected - start).double().norm()) == pytest.approx(20.0, rel=1e-6)
-    assert min(seconds) < 0.25  # 2 ms alone; the bound only catches a change of algorithm on a busy machine
+    free = (projected > 0) & (projected < 1)
+    t = (projected - start)[free].double() / (u - start)[free].double()
+    assert float(t.median()) == pytest.approx(float(t.mean()), rel=1e-3)  # one multiplier for all that is free
+    bound = ~free
+    reach = (start + float(t.median()) * (u - start))[bound]
+    assert bool(((reach <= 1e-6) | (reach >= 1 - 1e-6)).all())  # what is clipped would have gone past its bound

@@ -298,10 +298,10 @@ def test_every_python_example_compiles_and_names_what_exists(page: Path) -> None
             if isinstance(node, ast.ImportFrom):
                 module = importlib.import_module(node.module or "")
                 assert not [alias.name for alias in node.names if not hasattr(module, alias.name)]
-            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "advsearch":
+            if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "advsearch":
                 assert node.attr in advsearch.__all__
-            if isinstance(node, ast.Call) and ast.unparse(node.func).startswith("advsearch."):
-                known = parameters(ast.unparse(node.func).partition(".")[2])
+            if isinstance(node, ast.Call) and re.fullmatch(r"advsearch\.\w+", ast.unparse(node.func)):
+                known = parameters(ast.unparse(node.func).removeprefix("advsearch."))
                 assert not {keyword.arg for keyword in node.keywords} - known
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -21,10 +22,12 @@ linux_only = pytest.mark.skipif(not llvm._own_elf_header(), reason="libraries ar
 
 
 @pytest.fixture(autouse=True)
-def _fresh(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each test starts without the variable and without a remembered choice."""
+def _fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Each test starts without the variable and a remembered choice, and leaves none to the tests after it."""
     monkeypatch.delenv(llvm.VARIABLE, raising=False)
     monkeypatch.delenv("CONDA_PREFIX", raising=False)
+    llvm.ensure_llvm.cache_clear()
+    yield
     llvm.ensure_llvm.cache_clear()
 
 

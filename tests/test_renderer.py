@@ -95,26 +95,27 @@ def test_a_tensor_changed_in_place_is_uploaded_again(raw: Renderer) -> None:
     assert float(raw.scene.radiance({BASE_COLOR: texture}, 5, 4).mean()) > 1.1 * float(dark.mean())
 
 
-def test_a_recorded_adjoint_survives_the_death_of_another_scene(raw: Renderer) -> None:
-    """Dr.Jit crashes the process when a recording is replayed after a scene it knew has gone."""
-
-    def gradient() -> Tensor:
-        return raw.scene.adjoint({BASE_COLOR: texture}, torch.ones(SIZE, SIZE, 3), 1, 4)[BASE_COLOR]
-
-    texture = raw.scene.base(BASE_COLOR)
-    before = gradient()
-    other = MitsubaScene(describe("ball"), (SIZE, SIZE))
-    other.adjoint({BASE_COLOR: other.base(BASE_COLOR)}, torch.ones(SIZE, SIZE, 3), 1, 4)
-    del other
-    assert torch.allclose(gradient(), before, rtol=1e-4, atol=1e-6)
+def test_a_recording_survives_the_birth_and_death_of_other_scenes(raw: Renderer) -> None:
+    """Dr.Jit leaves undefined what happens when a recording is replayed after the scenes in memory have changed."""
+    before = raw.scene.radiance({}, 1, 4)
+    for name in ("ball", "book"):
+        other = MitsubaScene(describe(name), (SIZE, SIZE))
+        other.adjoint({BASE_COLOR: other.base(BASE_COLOR)}, torch.ones(SIZE, SIZE, 3), 1, 4)
+        assert torch.equal(raw.scene.radiance({}, 1, 4), before)
+        del other
+        assert torch.equal(raw.scene.radiance({}, 1, 4), before)
 
 
-def test_recording_kernels_changes_no_byte() -> None:
+@pytest.mark.parametrize("size, spp, texels", [(16, 1, 16), (32, 4, 32), (32, 2, 4), (24, 3, 64)])
+def test_recording_kernels_changes_no_byte(size: int, spp: int, texels: int) -> None:
     description = describe("mug")
-    frozen = MitsubaScene(description, (SIZE, SIZE))
-    plain = MitsubaScene(description, (SIZE, SIZE), freeze=False)
-    for seed in range(4):
-        assert torch.equal(frozen.radiance({}, seed, 4), plain.radiance({}, seed, 4))
+    frozen = MitsubaScene(description, (size, size))
+    plain = MitsubaScene(description, (size, size), freeze=False)
+    for seed in range(5):
+        inputs = {BASE_COLOR: torch.full((texels, texels, 3), 0.1 + 0.15 * seed)}
+        assert torch.equal(frozen.radiance(inputs, seed, spp), plain.radiance(inputs, seed, spp))
+        for ours, theirs in zip(frozen.guides(inputs, seed, spp), plain.guides(inputs, seed, spp), strict=True):
+            assert torch.equal(ours, theirs)
 
 
 def test_the_gradient_agrees_with_a_central_difference_of_the_same_samples(raw: Renderer) -> None:
@@ -223,13 +224,3 @@ def test_metering_puts_a_white_card_under_uniform_light_at_its_level() -> None:
 
 def test_a_black_environment_meters_to_one() -> None:
     assert metered_gain(EnvironmentAsset("night", np.zeros((8, 16, 3), np.float32))) == 1.0
-
-
-def test_recorded_adjoints_of_small_textures_replay() -> None:
-    """Dr.Jit's per-thread copies of small scatter targets corrupt the heap when a recording is replayed."""
-    frozen, plain = (MitsubaScene(describe("mug"), (SIZE, SIZE), freeze=freeze) for freeze in (True, False))
-    cotangent = torch.ones(SIZE, SIZE, 3)
-    for seed in range(6):
-        inputs = {BASE_COLOR: torch.full((4, 4, 3), 0.2 + 0.1 * seed)}
-        replayed, computed = (scene.adjoint(inputs, cotangent, seed, 4)[BASE_COLOR] for scene in (frozen, plain))
-        assert torch.allclose(replayed, computed, rtol=1e-3, atol=1e-5)

@@ -15,13 +15,12 @@ from advsearch.errors import InputError
 
 SHOW = (
     "import json, os, sys; from advsearch import threads; assert 'torch' not in sys.modules\n"
-    "count = threads.configure(); import torch\n"
-    "print(json.dumps([count, torch.get_num_threads(), {n: os.environ.get(n) for n in threads.OPENMP_DEFAULTS}]))"
+    "print(json.dumps([threads.configure(), {n: os.environ.get(n) for n in threads.OPENMP_DEFAULTS}]))"
 )
 
 
 def in_new_process(**variables: str) -> list[object]:
-    """What a process with these variables ends up with: our count, torch's, and the variables."""
+    """The count that `configure` chooses in a process with these variables, and what OpenMP will read there."""
     ours = (*threads.OPENMP_DEFAULTS, "OMP_WAIT_POLICY", "OMP_NUM_THREADS")
     environ = {name: value for name, value in os.environ.items() if name not in ours} | variables
     done = subprocess.run([sys.executable, "-c", SHOW], capture_output=True, text=True, check=True, env=environ)
@@ -29,14 +28,25 @@ def in_new_process(**variables: str) -> list[object]:
     return answer
 
 
-def test_torch_gets_the_count_and_openmp_its_defaults() -> None:
-    assert in_new_process() == [threads.cores(), threads.cores(), threads.OPENMP_DEFAULTS]
+def test_every_core_and_openmp_set_without_importing_torch() -> None:
+    assert in_new_process() == [threads.cores(), threads.OPENMP_DEFAULTS]
 
 
 def test_what_the_user_has_set_is_left_alone() -> None:
     kept = {"GOMP_SPINCOUNT": "7", "KMP_BLOCKTIME": threads.OPENMP_DEFAULTS["KMP_BLOCKTIME"]}
-    assert in_new_process(GOMP_SPINCOUNT="7", OMP_NUM_THREADS="1") == [1, 1, kept]
-    assert in_new_process(OMP_WAIT_POLICY="PASSIVE")[2] == dict.fromkeys(threads.OPENMP_DEFAULTS)
+    assert in_new_process(GOMP_SPINCOUNT="7", OMP_NUM_THREADS="1") == [1, kept]
+    assert in_new_process(OMP_WAIT_POLICY="PASSIVE") == [threads.cores(), dict.fromkeys(threads.OPENMP_DEFAULTS)]
+
+
+def test_a_torch_that_is_loaded_gets_the_count() -> None:
+    import torch
+
+    before = torch.get_num_threads()
+    try:
+        assert threads.configure(1) == torch.get_num_threads() == 1
+        assert os.environ["OMP_NUM_THREADS"] == "1"
+    finally:
+        threads.configure(before)
 
 
 @pytest.mark.parametrize(("text", "expected"), [("100000 100000\n", 1), ("20000 100000", 1), ("max 100000\n", None)])

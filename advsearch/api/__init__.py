@@ -6,6 +6,6 @@ from advsearch import threads as threads  # before torch: it sets how OpenMP wai
 from advsearch.api.attacking import attack, attack_from_config
 from advsearch.api.outcome import AttackResult
 from advsearch.api.scene import Scene, load_scene
-from advsearch.models import load_model
+from advsearch.models import Model, load_model
 
-__all__ = ["AttackResult", "Scene", "attack", "attack_from_config", "load_model", "load_scene"]
+__all__ = ["AttackResult", "Model", "Scene", "attack", "attack_from_config", "load_model", "load_scene"]

@@ -159,7 +159,10 @@ def _policy_options(config: AttackConfig) -> dict[str, Any]:
 def _label_set(model: Model, config: AttackConfig, label: str | None) -> LabelSet:
     """The right answers: what was said, or else the object's own label."""
     if config.label is not None:
-        return model.label_set(config.label)
+        try:
+            return model.label_set(config.label)
+        except InputError as error:
+            raise InputError(f"--label: {error}") from None
     if label is None:
         raise InputError(
             f'--label: expected the right answers for {config.object}, got none; add --label "name" with a class of '

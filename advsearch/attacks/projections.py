@@ -11,8 +11,7 @@ CHUNK = 32768
 """Elements worked on at once: small enough for a core's cache, and torch uses one thread below it."""
 
 SLACK = 1e-6
-"""A norm at most this fraction over the radius counts as inside: float32 rounding, which makes projecting
-idempotent."""
+"""A norm at most this fraction over the radius counts as inside, so that projecting twice changes nothing."""
 
 _MAX_ITERATIONS = 100
 
@@ -39,7 +38,7 @@ def project_l2_box(u: Tensor, centre: Tensor, radius: float, low: float = 0.0, h
         low, high: the box's bounds.
 
     Returns:
-        (d,) float32. Points inside come back bit for bit.
+        (d,) float32. Points inside come back bit for bit; projecting again changes at most the last bits.
     """
     squares, rooms = [], []
     full = inside = 0.0

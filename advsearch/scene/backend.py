@@ -37,8 +37,4 @@ def _settle(mi: ModuleType) -> None:
 
     mi.set_log_level(mi.LogLevel.Warn)
     dr.set_log_level(dr.LogLevel.Warn)
-    # Scatters into small arrays (textures, in an adjoint) would go to one copy of the array per thread. Recorded by
-    # `dr.freeze` and replayed, that writes past the end of the copies and corrupts the heap (Dr.Jit 1.5.0: a 16 x 16
-    # texture crashes at the first replay). Atomic additions are as fast here.
-    dr.set_expand_threshold(0)
     threads.apply_to_drjit()

@@ -44,8 +44,8 @@ _PATTERNS = (
 """Where the packages of Debian, Ubuntu, Fedora, Arch, Homebrew and LLVM's own Windows installer put the file."""
 
 _NAME = re.compile(r"libLLVM([-.]\d+(\.\d+)*)?\.(so[^/]*|dylib)|LLVM-C\.dll")
-_NAME_VERSION = re.compile(r"libLLVM(?:\.so\.|[-.])(\d+(?:\.\d+)*)")
-_FOLDER_VERSION = re.compile(r"llvm[-@]?/?(\d+(?:\.\d+)*)")
+_NAME_VERSION = re.compile(r"libLLVM(?:\.so\.|[-.])(\d\d(?:\.\d+)*)")
+_FOLDER_VERSION = re.compile(r"llvm[-@]?/?(\d\d(?:\.\d+)*)")
 
 _PROBE = (
     "import ctypes, sys\n"

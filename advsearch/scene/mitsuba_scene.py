@@ -32,18 +32,36 @@ BASE_COLOR = "object.base_color"
 
 
 class _Population:
-    """Counts scenes made and destroyed in this process.
+    """The scenes inside Mitsuba that this process holds, and when they may go.
 
-    A recorded kernel refers to the objects of all scenes that lived when it was recorded; Dr.Jit says that replaying it
-    after one was added or removed is undefined, and a replayed adjoint does crash then. So every change makes every
-    recording stale.
+    A recorded kernel refers to the objects of all scenes that lived when it was recorded, and Dr.Jit leaves undefined
+    what happens when it is replayed after one was added or removed. So every change of the population makes every
+    recording stale, and a scene that nobody uses any more is kept until no render is under way: Python's garbage
+    collector may strike in the middle of one.
     """
 
-    changes: int = 0
+    def __init__(self) -> None:
+        self.changes = 0
+        self._held: dict[int, tuple[Any, ...]] = {}
+        self._unused: list[int] = []
 
-    @classmethod
-    def changed(cls) -> None:
-        cls.changes += 1
+    def add(self, owner: MitsubaScene, *objects: Any) -> None:
+        """Hold Mitsuba's objects for as long as their owner lives, and a little longer."""
+        self.changes += 1
+        self._held[self.changes] = objects
+        weakref.finalize(owner, self._unused.append, self.changes)
+
+    def bury(self) -> None:
+        """Let go of what has lost its owner. Call it between renders only."""
+        if not self._unused:
+            return
+        while self._unused:
+            self._held.pop(self._unused.pop(), None)
+        gc.collect()  # Mitsuba's Python objects form cycles; they have to go now, not during a later render
+        self.changes += 1
+
+
+_population = _Population()
 
 
 class MitsubaScene:
@@ -53,7 +71,7 @@ class MitsubaScene:
         description: what to build.
         resolution: (height, width) in pixels.
         filter: reconstruction filter, "box" or "gaussian".
-        freeze: record each kernel once and replay it (`dr.freeze`); off only to measure what it brings.
+        freeze: record primal renders once and replay them (`dr.freeze`); off only to measure what it brings.
         max_depth: longest light path in segments.
     """
 
@@ -77,15 +95,14 @@ class MitsubaScene:
         self._keys = {BASE_COLOR: _only(self._parameters, "object.", ".base_color.data")}
         self._base = {name: mi.TensorXf(self._parameters[key]) for name, key in self._keys.items()}
         self._applied: dict[str, tuple[Tensor, int]] = {}
-        self._recorded: dict[tuple[str, int, tuple[str, ...]], Callable[..., Any]] = {}
+        self._recorded: dict[tuple[str, int], Callable[..., Any]] = {}
         self._recorded_at = 0
-        _Population.changed()
-        weakref.finalize(self, _Population.changed)
+        _population.bury()
+        _population.add(self, self._scene, self._path, self._guides, self._parameters)
 
     def base(self, name: str) -> Tensor:
         """Return the base value of an input, as a fresh torch tensor."""
-        base: Tensor = self._base[name].torch()
-        return base.clone()
+        return _torch(self._base[name])
 
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
         """Render linear radiance, (H, W, 3) float32, with `spp` independent samples a pixel."""
@@ -112,19 +129,20 @@ class MitsubaScene:
         mi = mitsuba()
         import drjit as dr
 
-        self._apply(inputs)
-        names = tuple(inputs)
-        values = [mi.TensorXf(_contiguous(inputs[name])) for name in names]
-        function = self._function("adjoint", spp, names, lambda: self._adjoint_function(names, spp))
-        gradients = function(
-            self._scene,
-            self._sensor,
-            self._path,
-            values,
-            mi.TensorXf(_contiguous(cotangent)),
-            dr.opaque(mi.UInt32, seed),
-        )
-        return {name: gradient.torch().clone() for name, gradient in zip(names, gradients, strict=True)}
+        self._apply({})
+        tracked = {name: mi.TensorXf(_contiguous(tensor)) for name, tensor in inputs.items()}
+        for name, value in tracked.items():
+            dr.enable_grad(value)
+            self._parameters[self._keys[name]] = value
+        self._parameters.update()
+        arriving = mi.TensorXf(_contiguous(cotangent))
+        self._path.render_backward(self._scene, self._parameters, arriving, sensor=self._sensor, seed=seed, spp=spp)
+        gradients = {name: _torch(dr.grad(value)) for name, value in tracked.items()}
+        for name, value in tracked.items():
+            self._parameters[self._keys[name]] = dr.detach(value)
+            self._applied[name] = (inputs[name], inputs[name]._version)
+        self._parameters.update()
+        return gradients
 
     # ---- inside
     # -------------------------------------------------------------------------------------------------------
@@ -158,51 +176,34 @@ class MitsubaScene:
             sensor.sampler().seed(0, 1)  # otherwise the sampler's state keeps the whole render alive
             return image
 
-        function = self._function(what, spp, (), lambda: record)
-        image: Tensor = function(self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)).torch()
-        return image.clone()
+        function = self._function(what, spp, record)
+        return _torch(function(self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)))
 
-    def _adjoint_function(self, names: tuple[str, ...], spp: int) -> Callable[..., Any]:
-        mi = mitsuba()
+    def _function(self, what: str, spp: int, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the recorded function for one job at one sample count, recording it on first use.
+
+        Only primal renders are recorded. Dr.Jit 1.5.0 corrupts memory when it replays some adjoints (a texture of
+        32 x 32 under a film of 32 x 32 pixels, say), and the gain there is small.
+        """
         import drjit as dr
 
-        keys = [self._keys[name] for name in names]
-
-        def adjoint(scene: Any, sensor: Any, integrator: Any, values: Any, cotangent: Any, seed: Any) -> Any:
-            parameters = mi.traverse(scene)
-            tracked = [mi.TensorXf(value) for value in values]
-            for key, value in zip(keys, tracked, strict=True):
-                dr.enable_grad(value)
-                parameters[key] = value
-            parameters.update()
-            integrator.render_backward(scene, parameters, cotangent, sensor=sensor, seed=seed, spp=spp)
-            gradients = [dr.grad(value) for value in tracked]
-            for key, value in zip(keys, values, strict=True):
-                parameters[key] = value
-            parameters.update()
-            return gradients
-
-        return adjoint
-
-    def _function(
-        self, what: str, spp: int, names: tuple[str, ...], make: Callable[[], Callable[..., Any]]
-    ) -> Callable[..., Any]:
-        """Return the recorded function for one job at one sample count, recording it on first use."""
-        import drjit as dr
-
-        if self._recorded_at != _Population.changes:
+        _population.bury()
+        if self._recorded_at != _population.changes:
             self._recorded.clear()
-            gc.collect()  # what is left of a scene in reference cycles must go now, not after the next recording
-            self._recorded_at = _Population.changes
-        key = (what, spp, names)
-        if key not in self._recorded:
-            function = make()
-            self._recorded[key] = dr.freeze(function) if self._freeze else function
-        return self._recorded[key]
+            self._recorded_at = _population.changes
+        if not self._freeze:
+            return function
+        return self._recorded.setdefault((what, spp), dr.freeze(function))
 
 
 def _contiguous(tensor: Tensor) -> Tensor:
     return tensor.detach().to(torch.float32).contiguous()
+
+
+def _torch(value: Any) -> Tensor:
+    """Return a Dr.Jit tensor as a torch tensor with memory of its own."""
+    tensor: Tensor = value.torch()
+    return tensor.clone()
 
 
 def _only(parameters: Any, prefix: str, suffix: str) -> str:

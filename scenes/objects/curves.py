@@ -1,4 +1,4 @@
-"""Plane and space curves from which the bundled objects are turned and swept. Float64; lengths in the object's units."""
+"""Plane and space curves from which the bundled objects are made. Float64; lengths in the object's units."""
 
 from __future__ import annotations
 

@@ -1,0 +1,194 @@
+"""`attack` from Python, end to end, with a tiny model and pictures of 32 pixels."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import advsearch
+from advsearch.api.problem import Problem
+from advsearch.config import AttackConfig
+from advsearch.errors import InputError, RunExistsError, UnknownNameError
+
+SIZE = 32
+LABELS = ("mug", "vase")
+FAST: dict[str, Any] = {"resolution": (SIZE, SIZE), "steps": 6, "spp": 2, "trials": 4, "verify_spp": 4}
+
+
+class Brightness(nn.Module):
+    """Says "mug" while the middle of the picture is darker than a threshold: an easy victim with a known weakness."""
+
+    def __init__(self, threshold: float, slope: float = 40.0) -> None:
+        super().__init__()
+        self.threshold, self.slope = threshold, slope
+
+    def forward(self, images: Tensor) -> Tensor:
+        middle = images[:, :, SIZE // 4 : -SIZE // 4, SIZE // 4 : -SIZE // 4].mean(dim=(1, 2, 3))
+        score = self.slope * (middle - self.threshold)
+        return torch.stack([-score, score], dim=1)
+
+
+def model(threshold: float) -> advsearch.Model:
+    return advsearch.load_model(Brightness(threshold), labels=LABELS, input_size=SIZE, name="brightness")
+
+
+@pytest.fixture(scope="module")
+def scene() -> advsearch.Scene:
+    return advsearch.load_scene("mug")
+
+
+@pytest.fixture(scope="module")
+def level(scene: advsearch.Scene) -> float:
+    """What `Brightness` sees of the clean mug."""
+    render = scene.renderer("texture", resolution=SIZE)
+    with torch.no_grad():
+        return float(render(render.start, spp=64)[SIZE // 4 : -SIZE // 4, SIZE // 4 : -SIZE // 4].mean())
+
+
+def test_a_weakness_is_found_verified_and_kept(scene: advsearch.Scene, level: float, tmp_path: Path) -> None:
+    result = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", **FAST)
+    summary = result.summary
+    assert result.found and summary["ending"] == "found"
+    assert summary["verified"]["successes"] == summary["verified"]["trials"] == 4
+    assert summary["clean"]["control"]["correct"] == 4 and summary["clean"]["label"] == "mug"
+    assert summary["adversarial"]["label"] == "vase" and summary["verified"]["labels"] == {"vase": 4}
+    assert summary["renders"]["search"] == summary["baseline"]["renders"]
+    assert json.loads((tmp_path / "run" / "summary.json").read_text("utf-8")) == json.loads(json.dumps(summary))
+    for name in ("clean.png", "clean.exr", "adversarial.png", "adversarial.exr", "difference.png", "search.gif"):
+        assert (tmp_path / "run" / "images" / name).stat().st_size > 0, name
+    for name in ("texture.png", "texture.exr", "texture-original.png"):
+        assert (tmp_path / "run" / "artifacts" / name).stat().st_size > 0, name
+    assert AttackConfig.from_yaml(tmp_path / "run" / "run.yaml").steps == 6
+    assert (tmp_path / "run" / "report.html").is_file()
+
+
+def test_the_answer_stays_in_its_budget_and_beats_its_start(scene: advsearch.Scene, level: float) -> None:
+    result = advsearch.attack(
+        scene, model(level + 0.03), controls={"texture": {"epsilon": 0.05}}, baseline=False, **FAST
+    )
+    start = scene.renderer("texture", resolution=SIZE).start
+    assert float((result.u - start).abs().max()) <= 0.05 + 1e-6
+    assert float(result.u.min()) >= 0.0 and float(result.u.max()) <= 1.0
+    assert float(result.adversarial.mean()) > float(result.clean.mean())
+    assert result.run is None and "baseline" not in result.summary
+
+
+def test_an_l2_budget_is_kept(scene: advsearch.Scene, level: float) -> None:
+    controls = {"texture": {"epsilon": 3.0, "norm": "l2", "resolution": 32}}
+    result = advsearch.attack(scene, model(level + 0.03), controls=controls, baseline=False, **FAST)
+    start = scene.renderer(controls, resolution=SIZE).start
+    assert 2.9 <= float((result.u - start).norm()) <= 3.0 + 1e-4
+
+
+def test_a_start_that_is_already_wrong_is_said_and_not_counted(scene: advsearch.Scene, level: float) -> None:
+    result = advsearch.attack(scene, model(level - 0.1), **FAST)
+    summary = result.summary
+    assert summary["ending"] == "already wrong" and not result.found
+    assert summary["verified"] is None and summary["adversarial"] is None
+    assert summary["clean"]["label"] == "vase" and summary["clean"]["control"]["correct"] == 0
+    assert summary["renders"]["search"] == summary["renders"]["gradient"] == 0
+
+
+def test_what_cannot_be_found_is_not_claimed(scene: advsearch.Scene) -> None:
+    summary = advsearch.attack(scene, model(0.98), **FAST).summary
+    assert summary["ending"] == "budget spent"
+    assert summary["verified"]["successes"] == 0 and summary["clean"]["control"]["correct"] == 4
+
+
+def test_the_same_seed_gives_the_same_numbers_when_deterministic(scene: advsearch.Scene, level: float) -> None:
+    runs = [
+        advsearch.attack(scene, model(level + 0.03), deterministic=True, baseline=False, **FAST).u for _ in range(2)
+    ]
+    assert torch.equal(*runs)
+
+
+def test_a_custom_objective_is_an_ordinary_function(scene: advsearch.Scene, level: float) -> None:
+    seen: list[tuple[torch.Size, torch.Size, tuple[int, ...]]] = []
+
+    def darkest(logits: Tensor, images: Tensor, labels: tuple[int, ...]) -> Tensor:
+        seen.append((logits.shape, images.shape, labels))
+        return -images.mean(dim=(1, 2, 3))
+
+    result = advsearch.attack(scene, model(level + 0.03), objective=darkest, baseline=False, **FAST)
+    assert seen[0] == ((1, 2), (1, SIZE, SIZE, 3), (0,))
+    assert float(result.adversarial.mean()) < float(result.clean.mean())
+    assert result.summary["objective"] == "darkest"
+
+
+def test_render_runs_in_ordinary_autograd(scene: advsearch.Scene, level: float) -> None:
+    """The example of the README."""
+    render = scene.renderer(["texture"], resolution=SIZE)
+    u = render.start.clone().requires_grad_()
+    model(level)(render(u, seed=0, spp=4))[0, 0].backward()
+    assert u.grad is not None and float(u.grad.abs().sum()) > 0.0
+
+
+def test_ctrl_c_keeps_the_run_so_far(
+    scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original, calls = Problem.evaluator, []
+
+    def interrupted(self: Problem, stream: str, on_image: Any = None) -> Any:
+        evaluate = original(self, stream, on_image)
+
+        def stops(u: Tensor, *, index: int, gradient: bool) -> Any:
+            calls.append(index)
+            if len(calls) == 4:
+                raise KeyboardInterrupt
+            return evaluate(u, index=index, gradient=gradient)
+
+        return stops
+
+    monkeypatch.setattr(Problem, "evaluator", interrupted)
+    result = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", **FAST)
+    assert result.summary["ending"] == "interrupted" and result.summary["verified"] is None
+    assert json.loads((tmp_path / "run" / "summary.json").read_text("utf-8"))["ending"] == "interrupted"
+    assert result.summary["steps"] == 3
+
+
+def test_nan_logits_during_the_search_end_it_and_are_counted(
+    scene: advsearch.Scene, level: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Fails(Brightness):
+        calls = 0
+
+        def forward(self, images: Tensor) -> Tensor:
+            Fails.calls += 1
+            logits = super().forward(images)
+            return logits * math.nan if images.requires_grad else logits
+
+    victim = advsearch.load_model(Fails(level + 0.03), labels=LABELS, input_size=SIZE)
+    summary = advsearch.attack(scene, victim, baseline=False, **FAST).summary
+    assert summary["ending"] == "non-finite objective"
+    assert summary["non_finite"]["objectives"] == 3
+
+
+def test_mistakes_are_explained_and_leave_nothing(scene: advsearch.Scene, level: float, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    victim = model(level)
+    with pytest.raises(InputError, match="--label"):
+        advsearch.attack(scene, victim, label="teapot", run=run, **FAST)
+    with pytest.raises(
+        InputError, match="the object's own label does not fit the model; say which is right with --label"
+    ):
+        advsearch.attack("teapot", victim, run=run, **FAST)
+    with pytest.raises(UnknownNameError, match=r"unknown policy 'pgdd'. Did you mean 'pgd'"):
+        advsearch.attack(scene, victim, policy="pgdd", run=run, **FAST)
+    with pytest.raises(UnknownNameError, match=r"unknown objective 'margine'. Did you mean 'margin'"):
+        advsearch.attack(scene, victim, objective="margine", run=run, **FAST)
+    with pytest.raises(UnknownNameError, match=r"unknown control 'textures'. Did you mean 'texture'"):
+        advsearch.attack(scene, victim, controls=["textures"], run=run, **FAST)
+    with pytest.raises(InputError, match="step"):
+        advsearch.attack(scene, victim, run=run, **{**FAST, "steps": 0})
+    assert not run.exists()
+    run.mkdir()
+    (run / "mine.txt").write_text("keep", encoding="utf-8")
+    with pytest.raises(RunExistsError, match="not empty and not a run"):
+        advsearch.attack(scene, victim, run=run, **FAST)
+    assert (run / "mine.txt").read_text("utf-8") == "keep"

@@ -1,0 +1,298 @@
+"""The rules of the house, read from the source: who may import whom, what is shipped, what is pinned, what is heavy."""
+
+from __future__ import annotations
+
+import ast
+import configparser
+import fnmatch
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = {"advsearch": ROOT / "advsearch", "advsearch.bundled": ROOT / "scenes"}
+
+RENDERER = {"mitsuba", "drjit", "mitsuba_oidn"}
+COMMON = {"errors", "seeds", "threads", "progress"}
+"""Small modules that anyone may import and that import nobody but each other."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a room may import.
+
+    Attributes:
+        rooms: of advsearch, besides itself and `COMMON`; None means all but the command line.
+        packages: the third-party packages it may import; None means all that are not forbidden.
+        forbidden: third-party packages it must not import.
+    """
+
+    rooms: set[str] | None
+    packages: set[str] | None = None
+    forbidden: frozenset[str] = frozenset()
+
+
+HEAVY = frozenset(RENDERER | {"torch"})
+RULES = {
+    **{name: Rule(set(), {"numpy"}, HEAVY) for name in COMMON},
+    "config": Rule(set(), {"pydantic", "yaml"}),
+    "scene": Rule(set()),
+    "bundled": Rule({"scene"}),
+    "controls": Rule({"scene"}),
+    "models": Rule(set(), {"torch", "numpy", "safetensors"}),
+    "attacks": Rule(set(), {"torch", "numpy", "scipy"}),
+    "evaluation": Rule({"scene", "bundled", "controls", "models", "attacks"}),
+    "runs": Rule({"config"}, {"numpy", "pydantic", "imageio", "OpenEXR", "PIL"}),
+    "report": Rule({"runs", "config"}, forbidden=HEAVY),
+    "api": Rule(None),
+    "cli": Rule(None),
+    "": Rule({"api"}, set()),
+}
+"""DESIGN, section 2. The empty name is `advsearch/__init__.py`."""
+
+DISTRIBUTIONS = {"PIL": "pillow", "yaml": "PyYAML", "mitsuba_oidn": "mitsuba-oidn", "imageio_ffmpeg": "imageio-ffmpeg"}
+"""Where a package is installed under another name than it is imported."""
+
+BROUGHT_ALONG = {"drjit": "mitsuba"}
+"""Imported, but pinned by another package on purpose: Mitsuba works with exactly one version of Dr.Jit."""
+
+
+def python_files() -> list[tuple[str, Path]]:
+    """Every module of the package: dotted name and file."""
+    found = []
+    for package, folder in SOURCES.items():
+        for path in sorted(folder.rglob("*.py")):
+            parts = path.relative_to(folder).with_suffix("").parts
+            found.append((".".join((package, *parts)).removesuffix(".__init__"), path))
+    return found
+
+
+@cache
+def imports(module: str, path: Path) -> frozenset[str]:
+    """Every module that a file imports anywhere in it, functions and type checking included; relative ones resolved."""
+    names: set[str] = set()
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"), str(path))):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                parent = package.split(".")[: len(package.split(".")) - node.level + 1]
+                base = ".".join([*parent, *([node.module] if node.module else [])])
+            # `from advsearch import threads` names the module threads, `from advsearch import __version__` does not
+            names.update(f"{base}.{a.name}" if base in ("advsearch", "advsearch.bundled") else base for a in node.names)
+    return frozenset(names)
+
+
+def room(module: str) -> str:
+    """The room of one of our modules: the first name below `advsearch`; empty for the package itself."""
+    name = module.split(".")[1] if "." in module else ""
+    folder = SOURCES["advsearch"]
+    return name if name == "bundled" or (folder / name).is_dir() or (folder / f"{name}.py").is_file() else ""
+
+
+def broken_rules() -> Iterator[str]:
+    """Every import that its room's rule does not allow."""
+    for module, path in python_files():
+        own = room(module)
+        rule = RULES.get(own)
+        if rule is None:
+            yield f"{path.relative_to(ROOT)}: the room {own!r} has no rule in {Path(__file__).name}"
+            continue
+        for name in imports(module, path):
+            top = name.split(".")[0]
+            if top == "advsearch":
+                verdict = _room_allowed(own, room(name), rule)
+            elif top in sys.stdlib_module_names:
+                verdict = True
+            else:
+                verdict = top not in rule.forbidden and (rule.packages is None or top in rule.packages)
+            if not verdict:
+                yield f"{path.relative_to(ROOT)} imports {name}"
+
+
+def _room_allowed(own: str, other: str, rule: Rule) -> bool:
+    if other == own or other in COMMON or (other == "" and own not in COMMON):
+        return True
+    if other == "cli":
+        return False
+    return rule.rooms is None or other in rule.rooms
+
+
+def test_rooms_import_only_what_they_may() -> None:
+    assert sorted(broken_rules()) == []
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "expected"),
+    [
+        ("advsearch.attacks.x", "def f():\n    import mitsuba as mi\n", {"mitsuba"}),
+        ("advsearch.attacks.x", "from ..scene import build", {"advsearch.scene"}),
+        ("advsearch.attacks.x", "from . import domain", {"advsearch.attacks"}),
+        ("advsearch.attacks.x", "from .. import threads", {"advsearch.threads"}),
+        ("advsearch.attacks", "from .domain import Domain", {"advsearch.attacks.domain"}),
+        ("advsearch.x", "from advsearch import __version__, cli", {"advsearch.__version__", "advsearch.cli"}),
+    ],
+)
+def test_the_reader_of_imports_sees_all_of_them(tmp_path: Path, module: str, source: str, expected: set[str]) -> None:
+    path = tmp_path / ("__init__.py" if module == "advsearch.attacks" else "x.py")
+    path.write_text(source)
+    assert imports(module, path) == expected
+
+
+def test_the_design_in_one_glance() -> None:
+    """The rules above are the ones of DESIGN section 2: bottom never reaches top, and the command line is the roof."""
+    assert not any("cli" in (rule.rooms or ()) for rule in RULES.values())
+    for name in ("attacks", "models"):
+        assert not RENDERER & (RULES[name].packages or RENDERER) and RULES[name].rooms == set()
+    assert RULES["report"].forbidden >= {"torch", "mitsuba"} and RULES["scene"].rooms == set()
+
+
+def test_everything_imported_is_a_declared_dependency() -> None:
+    declared = {canonicalize_name(one.name) for one in requirements("install_requires")}
+    for module, path in python_files():
+        for name in imports(module, path):
+            top = name.split(".")[0]
+            if top == "advsearch" or top in sys.stdlib_module_names:
+                continue
+            distribution = BROUGHT_ALONG.get(top) or DISTRIBUTIONS.get(top, top)
+            assert canonicalize_name(distribution) in declared, f"{path.relative_to(ROOT)} imports {name}"
+
+
+# -- what is heavy ---------------------------------------------------------------------------------------------------
+
+SHOW_HEAVY = "import sys; print([m for m in ('torch', 'mitsuba', 'drjit', 'scipy', 'trimesh') if m in sys.modules])"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import advsearch, advsearch.errors, advsearch.seeds, advsearch.threads, advsearch.config",
+        "import advsearch.runs, advsearch.report, advsearch.scene, advsearch.scene.assets, advsearch.scene.llvm",
+        "import contextlib, io\n"
+        "from advsearch.cli.main import main\n"
+        "with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit): main(['--help'])\n"
+        "assert 'attack' in text.getvalue()",
+    ],
+    ids=["small modules", "rooms", "help"],
+)
+def test_nothing_heavy_is_imported_before_it_is_needed(code: str) -> None:
+    done = subprocess.run([sys.executable, "-c", f"{code}\n{SHOW_HEAVY}"], capture_output=True, text=True, check=False)
+    assert (done.stdout.strip(), done.stderr) == ("[]", "")
+
+
+# -- what is shipped -------------------------------------------------------------------------------------------------
+
+
+@cache
+def setup_cfg() -> configparser.ConfigParser:
+    parser = configparser.ConfigParser()
+    parser.read(ROOT / "setup.cfg", encoding="utf-8")
+    return parser
+
+
+def requirements(key: str, section: str = "options") -> list[Requirement]:
+    return [Requirement(line) for line in setup_cfg()[section][key].split("\n") if line]
+
+
+def test_every_folder_with_python_files_is_listed_as_a_package() -> None:
+    packages = {module for module, path in python_files() if path.name == "__init__.py"}
+    assert set(setup_cfg()["options"]["packages"].split()) == packages
+    unlisted = {path.parent for _, path in python_files() if not (path.parent / "__init__.py").is_file()}
+    assert unlisted == set(), "Python files in a folder without __init__.py are not shipped"
+
+
+def test_every_data_file_is_listed_as_package_data() -> None:
+    patterns = {package: value.split(", ") for package, value in setup_cfg()["options.package_data"].items()}
+    folders = {"advsearch.bundled": ROOT / "scenes", "advsearch.models": ROOT / "advsearch" / "models"}
+    for package, folder in folders.items():
+        for path in (folder / "data").rglob("*"):
+            name = path.relative_to(folder).as_posix()
+            shipped = any(fnmatch.fnmatch(name, pattern.replace("**/", "*")) for pattern in patterns[package])
+            assert shipped or path.is_dir(), f"{name} matches none of {package}'s patterns"
+
+
+def test_metadata_is_in_one_file_only() -> None:
+    assert not re.search(r"^\[project", (ROOT / "pyproject.toml").read_text(encoding="utf-8"), re.MULTILINE)
+    assert not [name for name in setup_cfg().sections() if name.startswith(("tool:", "mypy", "flake8"))]
+
+
+# -- what is pinned --------------------------------------------------------------------------------------------------
+
+
+@cache
+def pins() -> dict[str, list[Requirement]]:
+    """The lines of constraints.txt by canonical name."""
+    found: dict[str, list[Requirement]] = {}
+    for line in (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines():
+        if line and not line.startswith("#"):
+            one = Requirement(line)
+            found.setdefault(canonicalize_name(one.name), []).append(one)
+    return found
+
+
+@pytest.mark.parametrize("version", ["3.10", "3.11", "3.12", "3.13"])
+def test_every_dependency_has_one_pin_within_its_range_for_every_python(version: str) -> None:
+    for one in requirements("install_requires") + requirements("dev", "options.extras_require"):
+        fitting = [
+            pin
+            for pin in pins().get(canonicalize_name(one.name), [])
+            if pin.marker is None
+            or pin.marker.evaluate({"python_version": version, "python_full_version": version + ".0"})
+        ]
+        assert len(fitting) == 1, f"{one.name} on Python {version}: {fitting}"
+        (specifier,) = fitting[0].specifier
+        assert specifier.operator == "==" and one.specifier.contains(specifier.version)
+
+
+def test_what_the_dependencies_need_is_pinned_too() -> None:
+    wanted = {canonicalize_name(one.name) for one in requirements("install_requires")}
+    wanted |= {canonicalize_name(one.name) for one in requirements("dev", "options.extras_require")}
+    seen: set[str] = set()
+    while wanted - seen:
+        name = (wanted - seen).pop()
+        seen.add(name)
+        for text in metadata.requires(name) or []:
+            one = Requirement(text)
+            if one.marker is None or one.marker.evaluate({"extra": ""}):
+                wanted.add(canonicalize_name(one.name))
+    cuda = {name for name in seen if name.startswith(("nvidia-", "cuda-")) or name == "triton"}
+    assert seen - cuda - set(pins()) == set()
+
+
+# -- what must not be in the repository ------------------------------------------------------------------------------
+
+
+def repository_files() -> list[Path]:
+    """Every file that is or would be committed."""
+    command = ["git", "-C", str(ROOT), "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    try:
+        listed = subprocess.run(command, capture_output=True, check=True).stdout.decode().split("\0")
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("not a git checkout")
+    return [ROOT / name for name in listed if name and (ROOT / name).is_file()]
+
+
+def test_no_file_names_a_path_of_the_machine_it_was_written_on() -> None:
+    here = {re.escape(f"{ROOT}/").encode(), re.escape(f"{Path.home()}/").encode()}
+    machine = re.compile(rb"(?<![\w.$}/])/(?:work|root)/|" + b"|".join(sorted(here)))
+    found = [
+        f"{path.relative_to(ROOT)}: {m[0].decode()}"
+        for path in repository_files()
+        for m in machine.finditer(path.read_bytes())
+    ]
+    assert found == []
+
+
+def test_the_repository_stays_small() -> None:
+    assert sum(path.stat().st_size for path in repository_files()) < 25e6

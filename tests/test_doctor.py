@@ -1,0 +1,168 @@
+"""`advsearch doctor`: what it says of parts that work, are missing, are broken, or take their process down."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from advsearch.cli import doctor
+from advsearch.cli.doctor_probe import TRIALS
+from advsearch.scene import llvm
+
+ALL_WELL = {name: (True, "tried") for name in TRIALS} | {"": (True, "")}
+
+
+@pytest.fixture(autouse=True)
+def _fresh() -> Iterator[None]:
+    """No choice of a libLLVM is remembered from another test or left to one."""
+    llvm.ensure_llvm.cache_clear()
+    yield
+    llvm.ensure_llvm.cache_clear()
+
+
+@pytest.fixture
+def well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every part works, and nothing is really tried."""
+    monkeypatch.setattr(doctor, "probe", lambda: ALL_WELL)
+    monkeypatch.setattr(doctor, "reference_weights", lambda: doctor.Part("reference model", "", doctor.OK))
+
+
+def process_that(code: str) -> tuple[str, ...]:
+    """A command that stands for the probe."""
+    return (sys.executable, "-c", code)
+
+
+def test_json_is_one_value_with_every_part(well: None, capsys: pytest.CaptureFixture[str]) -> None:
+    assert doctor.run(json=True) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert (answer["schema"], answer["command"], answer["ok"]) == (1, "doctor", True)
+    assert all(set(part) == {"name", "version", "status", "detail", "fix"} for part in answer["parts"])
+    names = {part["name"] for part in answer["parts"]}
+    assert names >= {"Python", "advsearch", "mitsuba", "drjit", "libLLVM", "bundled scenes", "kernel cache", "disk"}
+    assert names >= set(TRIALS)
+
+
+def test_table_names_every_part_and_says_that_all_is_well(well: None, capsys: pytest.CaptureFixture[str]) -> None:
+    assert doctor.run() == 0
+    text = capsys.readouterr().out
+    assert all(name in text for name in ("numpy", "torch", "render", "libLLVM", "bundled scenes"))
+    assert "Everything that is necessary works." in text
+
+
+def test_a_part_that_does_not_work_is_told_with_what_to_do_and_status_3(
+    well: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(doctor, "probe", lambda: ALL_WELL | {"xatlas": (False, "ImportError: no such file")})
+    assert doctor.run() == doctor.FELL_SHORT == 3
+    text = capsys.readouterr().out
+    assert "broken" in text and "ImportError: no such file" in text
+    assert "xatlas: pip install --force-reinstall --no-deps xatlas" in text
+    assert "Something necessary does not work." in text
+
+
+def test_a_missing_optional_part_is_a_warning(
+    well: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(doctor, "installed_version", lambda name: None if name == "imageio-ffmpeg" else "1.0")
+    assert doctor.run(json=True) == 0
+    (part,) = (p for p in json.loads(capsys.readouterr().out)["parts"] if p["name"] == "imageio-ffmpeg")
+    assert part["status"] == "warning" and "animations" in part["detail"]
+
+
+def test_a_missing_package_is_told() -> None:
+    parts = {part.name: part for part in doctor.packages(ALL_WELL)}
+    assert {part.status for part in parts.values()} == {doctor.OK}
+    part = doctor.other_packages(["rich>=13", "surely-not-installed==1", 'dev-only; extra == "dev"', "numpy"])
+    assert (part.status, part.detail) == (doctor.MISSING, "not installed: surely-not-installed")
+    assert doctor.other_packages(["rich>=13"]).status == doctor.OK
+
+
+def test_a_process_that_is_taken_down_leaves_the_parts_before_it_and_how_it_ended() -> None:
+    code = (
+        "import json, os, sys; print('a library says hello')\n"
+        "print(json.dumps({'name': 'numpy', 'ok': True, 'detail': ''}), flush=True)\n"
+        "print('LLVM ERROR: Cannot select: f32 = fminimum', file=sys.stderr, flush=True); os.abort()"
+    )
+    tried = doctor.probe(process_that(code))
+    assert set(tried) == {"numpy", ""}
+    parts = {part.name: part for part in doctor.packages(tried)}
+    assert parts["numpy"].status == doctor.OK
+    assert parts["render"].status == doctor.BROKEN
+    assert "SIGABRT (LLVM ERROR: Cannot select" in parts["render"].detail
+    assert parts["render"].fix == "see libLLVM below"
+
+
+def test_a_process_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "SECONDS_ALLOWED", 0.5)
+    tried = doctor.probe(process_that("import time; time.sleep(60)"))
+    assert tried[""] == (False, "the trial took longer than 0.5 s")
+
+
+def test_llvm_tells_which_was_chosen_and_why_others_were_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    chosen, other = Path("/lib/libLLVM.so.19.1"), Path("/lib/libLLVM-15.so.1")
+    candidates = [llvm.Candidate(chosen, (19, 1), ""), llvm.Candidate(other, (15,), llvm.refusal((15,)))]
+    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+    monkeypatch.setattr(llvm, "find", lambda: candidates)
+    monkeypatch.setattr(llvm, "ensure_llvm", lambda: llvm.LLVM(chosen, (19, 1)))
+    part = doctor.llvm()
+    assert (part.version, part.status, part.fix) == ("19.1", doctor.OK, "")
+    assert f"chosen: {chosen}" in part.detail
+    assert f"refused: {other} (15: it aborts the process" in part.detail
+
+
+def test_llvm_without_a_usable_one_tells_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+    monkeypatch.setattr(llvm, "find", lambda: [])
+    part = doctor.llvm()
+    assert part.status == doctor.MISSING
+    assert llvm.install_command() in part.fix and llvm.VARIABLE in part.fix
+
+
+def test_llvm_that_the_variable_names_wrongly_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM.so")
+    part = doctor.llvm()
+    assert part.status == doctor.BROKEN and "does not exist" in part.detail
+    assert part.fix == f"unset {llvm.VARIABLE}"
+
+
+def test_a_cache_folder_that_cannot_be_made_is_a_warning(tmp_path: Path) -> None:
+    assert doctor.kernel_cache(tmp_path / "cache").detail.endswith("0 files, 0 MB")
+    (tmp_path / "file").touch()
+    part = doctor.kernel_cache(tmp_path / "file" / "cache")
+    assert part.status == doctor.WARNING and "cannot be written" in part.detail
+
+
+def test_little_disk_or_memory_is_a_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert (doctor.disk(tmp_path).status, doctor.machine().status) == (doctor.OK, doctor.OK)
+    monkeypatch.setattr(doctor, "DISK_WANTED", 2**80)
+    monkeypatch.setattr(doctor, "MEMORY_WANTED", 2**80)
+    assert (doctor.disk(tmp_path).status, doctor.machine().status) == (doctor.WARNING, doctor.WARNING)
+
+
+def test_every_part_really_works_here() -> None:
+    """The only test that tries them: imports, a render with its gradient, a denoised picture."""
+    tried = doctor.probe()
+    assert {name for name, (worked, _) in tried.items() if not worked} == set(), tried
+    assert set(tried) == set(ALL_WELL)
+
+
+def test_an_old_llvm_takes_the_probe_down_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the guard switched off, as a user has it who calls Mitsuba by hand."""
+    old = [c.path for c in llvm.find() if c.version and c.version[0] in (15, 16)]
+    if not old:
+        pytest.skip("no libLLVM 15 or 16 on this machine")
+    code = (
+        "import runpy, advsearch.scene.llvm as llvm, advsearch.cli.doctor_probe as probe\n"
+        "llvm.MINIMUM = 15; probe.TRIALS = {'render': probe.render}; probe.main()"
+    )
+    monkeypatch.setenv(llvm.VARIABLE, str(old[0]))
+    monkeypatch.setenv("HOME", os.devnull + "/none")  # no kernels from an earlier render
+    tried = doctor.probe(process_that(code))
+    if tried.get("render", (False, ""))[0]:
+        pytest.skip("this processor can do without the operation that old versions lack")
+    assert "signal SIGABRT" in tried[""][1] or "fminimum" in tried[""][1]
