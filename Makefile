@@ -10,7 +10,7 @@ ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
-SOURCES := advsearch scenes tests benchmarks
+SOURCES := advsearch scenes tests benchmarks docs
 
 export TORCH_INDEX
 

@@ -78,7 +78,10 @@ class AttackConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False)
 
     object: str = _setting(
-        ..., "scene", "what the model should recognise", "the name of an object or a .obj, .ply, .glb or .gltf file"
+        ...,
+        "scene",
+        "what the model should recognise",
+        "the name of an object or a .obj, .ply, .glb, .gltf or .stl file",
     )
     environment: str = _setting(
         "studio", "scene", "what lights it", "the name of an environment or a .hdr or .exr file"
@@ -94,7 +97,7 @@ class AttackConfig(BaseModel):
         alias="set",
     )
     exposure: float = _setting(
-        0.0, "scene", "brightness of the picture", "a number from -20 to 20", unit="stops", ge=-20.0, le=20.0
+        0.0, "scene", "brightness of the picture", "a number from -10 to 10", unit="stops", ge=-10.0, le=10.0
     )
     resolution: tuple[int, int] | None = _setting(
         None,
@@ -109,7 +112,7 @@ class AttackConfig(BaseModel):
         "reference",
         "model",
         "the network under test",
-        "reference, a .pt2 (torch.export), .pt or .ts (TorchScript) file, or package.module:callable",
+        "reference, a .pt2 (torch.export), .pt or .ts (TorchScript) file, package.module:callable, or torchvision:NAME",
     )
     labels: str | None = _setting(
         None, "model", "names of the model's classes", "a JSON or text file", otherwise="the model's own"
@@ -142,11 +145,11 @@ class AttackConfig(BaseModel):
         None,
         "search",
         "side of the searched texture",
-        "a whole number from 2 to 8192",
+        "a whole number from 2 to 4096",
         unit="texels",
         otherwise="chosen from the object's own",
         ge=2,
-        le=8192,
+        le=4096,
     )
     policy: str = _setting("pgd", "search", "the rule that proposes configurations", "the name of a policy")
     steps: int = _setting(

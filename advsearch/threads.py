@@ -6,9 +6,10 @@ milliseconds: as soon as anything else wants a core, the polling thread holds th
 a network of a hundred short layers has hundreds of barriers. Sleeping at once costs more than it saves on a quiet
 machine. About half a millisecond of polling is as fast as the default there and harmless elsewhere.
 
-Measured (`benchmarks/threads.py`; two cores, 224 x 224, 16 samples, a network like MobileNetV2; a step against the best
-setting's): polling as chosen here 1.00 quiet and 1.1 with one core taken by others; torch's default 1.01 and 1.2, and
-6.5 on a machine with five other busy processes; OMP_WAIT_POLICY=PASSIVE 1.08; ACTIVE 1.5; torch on one thread 1.03.
+Measured (`benchmarks/threads.py`; two cores, 224 x 224, 16 samples, a network like MobileNetV2; medians of a step, 1.00
+is the best): polling as chosen here 1.00 to 1.02, torch's default 1.01, torch on one thread 1.04, PASSIVE waiting 1.12,
+ACTIVE waiting 1.5. With one core taken by another process 1.7, 1.8, 1.6; on a machine with five busy processes torch's
+default made a step 6.5 times slower, short polling 1.05 times. At 64 x 64 torch is best on one thread, by 5 to 10 %.
 
 OpenMP reads its environment once, when torch is imported, so this module sets it when it is imported itself and has to
 come before torch. What the user has set already is left alone. Imports the standard library only.

@@ -95,8 +95,13 @@ def imports(module: str, path: Path) -> frozenset[str]:
 
 
 def room(module: str) -> str:
-    """The room of one of our modules: the first name below `advsearch`; empty for the package itself."""
+    """The room of one of our modules: the first name below `advsearch`; empty for the package itself.
+
+    `python -m advsearch` is the command line's front door, so `__main__` belongs to its room.
+    """
     name = module.split(".")[1] if "." in module else ""
+    if name == "__main__":
+        return "cli"
     folder = SOURCES["advsearch"]
     return name if name == "bundled" or (folder / name).is_dir() or (folder / f"{name}.py").is_file() else ""
 

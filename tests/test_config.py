@@ -24,7 +24,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "environment": ([], "expected the name of an environment or a .hdr or .exr file, got "),
     "up": ("x", "expected y or z, got x"),
     "set_": ({"camera.azimuth": math.nan}, "got camera.azimuth=nan"),
-    "exposure": (99, "expected a number from -20 to 20, got 99"),
+    "exposure": (99, "expected a number from -10 to 10, got 99"),
     "resolution": ("4x4", "expected SIDE or HEIGHTxWIDTH, each from 8 to 4096, got 4x4"),
     "model": (
         "a\0b",
@@ -35,7 +35,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "controls": ({"texture": 3}, "expected names of controls, or NAME={PARAMETER: VALUE}, got texture=3"),
     "epsilon": ("nan", "expected a number greater than 0, got nan"),
     "norm": ("l3", "expected linf or l2, got l3"),
-    "texture_resolution": (0, "expected a whole number from 2 to 8192, got 0"),
+    "texture_resolution": (0, "expected a whole number from 2 to 4096, got 0"),
     "policy": (None, "expected the name of a policy, got None"),
     "steps": (2.5, "expected a whole number from 1 to 1000000, got 2.5"),
     "step_size": (0.0, "expected a number greater than 0, got 0.0"),

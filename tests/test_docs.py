@@ -28,7 +28,8 @@ from advsearch.cli.list import REGISTRIES
 from advsearch.cli.main import COMMANDS, _parse
 from advsearch.config import AttackConfig, parse_assignment, settings
 from advsearch.controls import CONTROLS, make_control, texture
-from advsearch.models import calibration, loading
+from advsearch.evaluation import reference_scenes
+from advsearch.models import calibration, loading, reference
 from advsearch.scene import description, environments, formation, importing, library, mitsuba_scene
 from advsearch.scene.import_images import TEXTURE_LIMIT
 from advsearch.scene.settings import SETTINGS, resolve
@@ -118,6 +119,12 @@ def test_every_make_target_is_in_the_page_about_development() -> None:
     assert not [target for target in targets if f"`{target}`" not in page and f"make {target}" not in page]
 
 
+def test_every_benchmark_is_in_the_table() -> None:
+    page = (DOCS / "design.md").read_text("utf-8")
+    scripts = [path.name for path in (ROOT / "benchmarks").glob("[!_]*.py")]
+    assert scripts and not [name for name in scripts if f"| [`{name}`]" not in page]
+
+
 def test_every_field_of_a_summary_is_in_the_table() -> None:
     page = (DOCS / "design.md").read_text("utf-8")
     said = set(re.findall(r"`([a-z_]+)`", page.partition("### summary.json")[2].partition("\n## ")[0]))
@@ -166,6 +173,8 @@ MADE_BY_HAND = [
     ("policies/pgd.md", f"the first after {100 * pgd.FIRST_WINDOW:.0f} % of the steps"),
     ("policies/pgd.md", {0.75: "fewer than three quarters of the steps"}[pgd.IMPROVING]),
     ("policies/pgd.md", {5: "Five in a row end the search"}[pgd.PATIENCE]),
+    ("reference-model.md", {0.25: "A quarter of the pictures is not denoised"}[reference_scenes.RAW_SHARE]),
+    ("reference-model.md", "pictures of {} x {} pixels".format(*reference.INPUT_SIZE)),
     ("models.md", "goes in as {} x {}, RGB".format(*loading.DEFAULT_INPUT_SIZE)),
 ]
 

@@ -79,8 +79,9 @@ def attack(
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
     instances = as_controls(controls)
     described = {
-        "object": scene.description.object.source or scene.description.object.name,
-        "environment": scene.description.environment.source or scene.description.environment.name,
+        "object": scene.description.object_spec or scene.description.object.name,
+        "environment": scene.description.environment_spec or scene.description.environment.name,
+        "up": scene.description.up,
         "model": model if isinstance(model, str) else getattr(model, "name", None) or type(model).__name__,
         "controls": {one.kind: _settings_of(one) for one in instances},
         "objective": objective if isinstance(objective, str) else getattr(objective, "__name__", "custom"),
@@ -237,8 +238,8 @@ def _worth_attacking(
     findings.first_look = run_trials(problem.trial, start, spp=config.spp, seed=seed, trials=FIRST_LOOK)
     if any(trial.right for trial in findings.first_look):
         return True
+    _choose_spp(problem, {"clean": start}, config, findings, stages)
     stages.begin("verification", "verification", config.trials)
-    _choose_spp(problem, {"clean": start}, config, findings)
     _clean_trials(problem, config, findings, recorder, stages)
     return not already_wrong(count_right(findings.clean, findings.spp))
 
@@ -290,18 +291,21 @@ def _verify(problem: Problem, config: AttackConfig, findings: Findings, recorder
     found, baseline = findings.search, findings.baseline
     if found is None:
         raise RuntimeError("nothing was searched, so there is nothing to verify")
-    stages.begin("verification", "verification", (2 + (baseline is not None)) * config.trials)
     answer = problem.domain.project(found.best_u)
-    _choose_spp(problem, {"clean": problem.domain.start, "adversarial": answer}, config, findings)
+    _choose_spp(problem, {"clean": problem.domain.start, "adversarial": answer}, config, findings, stages)
+    stages.begin("verification", "verification", (2 + (baseline is not None)) * config.trials)
     _clean_trials(problem, config, findings, recorder, stages)
     findings.verification = _verified(problem, found, config, findings, recorder, stages)
     if baseline is not None:
         findings.baseline_verification = _verified(problem, baseline, config, findings, recorder, stages)
 
 
-def _choose_spp(problem: Problem, candidates: dict[str, Tensor], config: AttackConfig, findings: Findings) -> None:
+def _choose_spp(
+    problem: Problem, candidates: dict[str, Tensor], config: AttackConfig, findings: Findings, stages: Stages
+) -> None:
     ladder = LADDER if config.verify_spp is None else (config.verify_spp,)
-    margins = {name: _margin_of(problem, u) for name, u in candidates.items()}
+    stages.begin("verification", "sample count")
+    margins = {name: _margin_of(problem, u, stages) for name, u in candidates.items()}
     findings.sample_count = choose_spp(margins, seed=config.seed, ladder=ladder)
     findings.verification_renders += findings.sample_count.renders
 
@@ -352,5 +356,9 @@ def _teller(kind: str, findings: Findings, recorder: Recorder, stages: Stages) -
     return on_trial
 
 
-def _margin_of(problem: Problem, u: Tensor) -> Callable[[int, int], float]:
-    return lambda spp, seed: problem.trial(u, seed, spp).margin
+def _margin_of(problem: Problem, u: Tensor, stages: Stages) -> Callable[[int, int], float]:
+    def margin(spp: int, seed: int) -> float:
+        stages.progress.advance(1, samples=spp)
+        return problem.trial(u, seed, spp).margin
+
+    return margin

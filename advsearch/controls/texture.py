@@ -35,7 +35,7 @@ NORMS = ("linf", "l2")
 
 @dataclass(frozen=True)
 class TextureControl(Control):
-    """Every texel of the object's base-colour map, inside a ball around the original; the map is in the module's text.
+    """Every texel of the object's base-colour map, inside a ball around the original.
 
     Attributes:
         epsilon: radius of the ball, display-referred; None takes the norm's default.

@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one step, or all of them."""
     parser = argparse.ArgumentParser(prog="python -m advsearch.evaluation.reference", description=__doc__)
     parser.add_argument("step", choices=["render", "train", "evaluate", "all"])
-    parser.add_argument("--cache", type=Path, default=Path("build/reference"), help="folder for the pictures")
+    parser.add_argument("--cache", type=Path, default=Path(".cache/reference"), help="folder for the pictures")
     parser.add_argument("--seed", type=int, default=0, help="root of all randomness (default 0)")
     parser.add_argument("--epochs", type=int, default=EPOCHS, help=f"passes over the pictures (default {EPOCHS})")
     parser.add_argument("--count", type=int, default=None, help="training pictures, to try it on fewer")

@@ -61,7 +61,7 @@ def train(
     classes: int,
     epochs: int,
     batch_size: int = 64,
-    lr: float = 2e-3,
+    lr: float = 1e-3,
     seed: int = 0,
     label_smoothing: float = 0.02,
     augmentation: Augmentation | None = None,

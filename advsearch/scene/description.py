@@ -35,11 +35,17 @@ class SceneDescription:
         object: the thing to recognise.
         environment: what lights it.
         values: every setting of `advsearch.scene.settings` by name; None where the scene works the value out.
+        object_spec: how the object was asked for: a bundled name, a path, or an asset's own name.
+        environment_spec: how the environment was asked for, likewise.
+        up: the up axis that was given for a mesh file, or None.
     """
 
     object: ObjectAsset
     environment: EnvironmentAsset
     values: Mapping[str, float | None] = field(default_factory=dict)
+    object_spec: str = ""
+    environment_spec: str = ""
+    up: str | None = None
 
     def number(self, name: str) -> float:
         """Return a setting that always has a value."""
@@ -82,7 +88,14 @@ def describe(
         InputError: a name is unknown, a file cannot be used, or a setting is out of range.
     """
     values = settings.resolve(given or {})
-    return SceneDescription(_object(object_spec, up), _environment(environment_spec or DEFAULT_ENVIRONMENT), values)
+    lit_by = environment_spec or DEFAULT_ENVIRONMENT
+    return SceneDescription(
+        _object(object_spec, up), _environment(lit_by), values, _spec(object_spec), _spec(lit_by), up
+    )
+
+
+def _spec(spec: str | Path | ObjectAsset | EnvironmentAsset) -> str:
+    return spec.name if isinstance(spec, (ObjectAsset, EnvironmentAsset)) else str(spec)
 
 
 def _object(spec: str | Path | ObjectAsset, up: str | None) -> ObjectAsset:

@@ -1,0 +1,70 @@
+"""Time and memory of a search step over a thousand steps: neither may grow.
+
+    python benchmarks/growth.py [--steps 1000] [--size 64]
+
+Prints the median step of the last tenth over that of the second tenth, and the resident memory at the end over that
+after the first tenth (by then every kernel is compiled and every pool is filled).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import sys
+import time
+from pathlib import Path
+
+import torch
+
+from advsearch import threads
+
+threads.configure()
+
+from advsearch.api.problem import Problem  # noqa: E402
+from advsearch.api.scene import load_scene, make_renderer  # noqa: E402
+from advsearch.attacks import get_objective, make_policy  # noqa: E402
+from advsearch.controls import TextureControl, make_space  # noqa: E402
+from advsearch.models import load_model  # noqa: E402
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=1000, help="steps of the search (default 1000)")
+    parser.add_argument("--size", type=int, default=64, help="side of the picture in pixels (default 64)")
+    args = parser.parse_args()
+    description = load_scene("mug").description
+    space = make_space([TextureControl()], description)
+    model = load_model("reference")
+    renderer = make_renderer(description, space, args.size, "oidn", 0)
+    problem = Problem(renderer, space, model, model.label_set("mug"), get_objective("margin"), 4, 0)
+    policy, evaluate = make_policy("pgd"), problem.evaluator("search")
+    state = policy.start(problem.domain, torch.Generator().manual_seed(0), args.steps)
+    seconds, memory = [], []
+    for index in range(args.steps):
+        begun = time.perf_counter()
+        proposal, state = policy.propose(state)
+        if proposal is None:  # nothing more to propose: go on measuring from where it stands
+            break
+        state = policy.update(state, proposal.u, evaluate(proposal.u, index=index, gradient=True))
+        seconds.append(time.perf_counter() - begun)
+        memory.append(resident())
+    tenth = len(seconds) // 10
+    early, late = statistics.median(seconds[tenth : 2 * tenth]), statistics.median(seconds[-tenth:])
+    print(f"{len(seconds)} steps at {args.size} x {args.size}")
+    print(f"  time of a step, last tenth over second tenth:   {late / early:.3f}")
+    print(f"  memory, end over after the first tenth:         {memory[-1] / memory[tenth]:.3f}")
+    print(f"  memory at the end:                              {memory[-1] / 2**20:.0f} MiB")
+
+
+def resident() -> int:
+    """Return this process's resident memory in bytes."""
+    if sys.platform == "linux":
+        return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+if __name__ == "__main__":
+    main()
