@@ -1,9 +1,8 @@
 # Two commands do everything from a fresh clone: `make attack` and `make test`. `make help` lists the rest.
 
 PYTHON ?= python3
-# On Linux the CPU build of torch is taken (200 MB instead of gigabytes of CUDA). Another index of torch builds:
-#   make TORCH_INDEX=https://download.pytorch.org/whl/cu130 setup
-# and TORCH_INDEX=none takes what pip finds by itself.
+# On Linux pip by itself takes torch's CUDA build, gigabytes that are of no use here. PyTorch's "Get started" page names
+# an index of CPU wheels (200 MB): make TORCH_INDEX=ITS-ADDRESS setup. TORCH_INDEX=none silences the advice.
 TORCH_INDEX ?=
 ARGS ?=
 

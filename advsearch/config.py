@@ -26,6 +26,9 @@ HEADER = "# A run of advsearch. To repeat it: advsearch run FILE\n"
 """First line of every `run.yaml` that advsearch writes; a run directory is recognised by it."""
 
 
+SEARCH_SPP = {"oidn": 8, "none": 16}
+"""Samples a pixel of a search that asks for none. Denoised, 8 reach the verified margin that 16 do (docs/design.md)."""
+
 PLACE: dict[str, Any] = {"run": None, "overwrite": False}
 """The settings that say where a run is kept, not what it does, as a repetition has them."""
 
@@ -169,11 +172,12 @@ class AttackConfig(BaseModel):
         gt=0.0,
     )
     objective: str = _setting("margin", "search", "what is maximised", "the name of an objective")
-    spp: int = _setting(
-        16,
+    spp: int | None = _setting(
+        None,
         "search",
         "samples per pixel of a render of the search",
         "a whole number from 1 to 65536",
+        otherwise="8 with the denoiser, 16 without",
         unit="samples",
         ge=1,
         le=65536,
@@ -321,6 +325,11 @@ class AttackConfig(BaseModel):
         """Return the YAML form; `from_yaml` of it gives an equal configuration."""
         data = {"schema": SCHEMA, "command": "attack", **self.plain()}
         return HEADER + str(yaml.safe_dump(data, sort_keys=False))
+
+    @property
+    def search_spp(self) -> int:
+        """Samples a pixel of the search: what was asked for, or the default for the denoiser."""
+        return self.spp if self.spp is not None else SEARCH_SPP[self.denoise]
 
     def plain(self) -> dict[str, Any]:
         """Return every setting by the name it has in YAML, as JSON values."""

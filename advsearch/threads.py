@@ -1,15 +1,25 @@
 """How many threads torch and Dr.Jit use, and how torch's wait, so that the two pools do not fight.
 
 A search step renders (Dr.Jit's pool), then runs the model (torch's OpenMP pool), then renders again. An idle Dr.Jit
-worker polls for 20 ms before it sleeps. An idle OpenMP worker polls at its barriers, by default for about ten
-milliseconds: as soon as anything else wants a core, the polling thread holds the one that the awaited thread needs, and
-a network of a hundred short layers has hundreds of barriers. Sleeping at once costs more than it saves on a quiet
-machine. About half a millisecond of polling is as fast as the default there and harmless elsewhere.
+worker polls for 20 ms before it sleeps. OpenMP threads poll at their barriers, by default for about ten milliseconds:
+as soon as anything else wants a core, the polling thread holds the one that the awaited thread needs, and a network of
+a hundred short layers has hundreds of barriers. A thread that sleeps at once costs a few microseconds to wake instead.
 
-Measured (`benchmarks/threads.py`; two cores, 224 x 224, 16 samples, a network like MobileNetV2; medians of a step, 1.00
-is the best): polling as chosen here 1.00 to 1.02, torch's default 1.01, torch on one thread 1.04, PASSIVE waiting 1.12,
-ACTIVE waiting 1.5. With one core taken by another process 1.7, 1.8, 1.6; on a machine with five busy processes torch's
-default made a step 6.5 times slower, short polling 1.05 times. At 64 x 64 torch is best on one thread, by 5 to 10 %.
+Measured (`benchmarks/threads.py`; two cores, 16 samples, a network like MobileNetV2; medians of a step, 1.00 is the
+best that any setting reached in the same run):
+
+                                    quiet, 224 x 224    quiet, 64 x 64    busy, 224    busy, 64
+    sleeping at once (PASSIVE)      1.12                1.08              1.03         1.09
+    a millisecond of polling        1.00                1.15                           4.26
+    torch's default                 1.01                                  6.50         1.35
+    polling on (ACTIVE)             1.5                 2.0               1.53         1.82
+    torch on one thread             1.04                1.00                           1.07
+
+Busy is a machine that others use as well; its figures vary a good deal. Sleeping is never far from the best, and the
+others are at times. Right after a render Dr.Jit's workers still poll, and a model that shares their cores waits at
+every barrier: in a search at 128 x 128 the reference model took 23 ms forward with two threads and 4 ms with one, and
+MobileNetV2 at 224 x 224 took 30 and 18 ms (64 and 56 ms forward and backward). So while there is rendering, torch gets
+half of the cores, and all of them only where it works alone (training).
 
 OpenMP reads its environment once, when torch is imported, so this module sets it when it is imported itself and has to
 come before torch. What the user has set already is left alone. Imports the standard library only.
@@ -23,13 +33,13 @@ from pathlib import Path
 
 from advsearch.errors import InputError
 
-OPENMP_DEFAULTS = {"GOMP_SPINCOUNT": "10000", "KMP_BLOCKTIME": "1"}
-"""How long an idle worker polls: in rounds for GNU OpenMP (torch on Linux), in ms for LLVM's and Intel's (macOS)."""
+OPENMP_DEFAULTS = {"OMP_WAIT_POLICY": "PASSIVE", "KMP_BLOCKTIME": "0"}
+"""Idle threads sleep at once: the first for GNU OpenMP (torch on Linux), the second for LLVM's and Intel's (macOS)."""
 
 _CPU_MAX = Path("/sys/fs/cgroup/cpu.max")
 _USERS_COUNT = os.environ.get("OMP_NUM_THREADS", "")
 
-if "OMP_WAIT_POLICY" not in os.environ:  # the user's wish, which the others would overrule
+if "GOMP_SPINCOUNT" not in os.environ:  # a user who has set this has decided about waiting
     for _name, _value in OPENMP_DEFAULTS.items():
         os.environ.setdefault(_name, _value)
 
@@ -51,17 +61,16 @@ def cores(quota: Path = _CPU_MAX) -> int:
     return allowed
 
 
-def configure(threads: int | None = None) -> int:
-    """Give torch and Dr.Jit the same number of threads, now and (Dr.Jit) when Mitsuba is imported later.
-
-    The pools take turns, so both get all of them: halving them makes each half as fast and wins nothing.
+def configure(threads: int | None = None, *, rendering: bool = True) -> int:
+    """Give Dr.Jit a number of threads and torch half as many, now and (Dr.Jit) when Mitsuba is imported later.
 
     Args:
         threads: how many, at least 1; None means what ``OMP_NUM_THREADS`` said when this module was imported, and
             without it every core that this process may use.
+        rendering: whether renders and the model take turns; if not, torch gets all threads too.
 
     Returns:
-        The number that was set.
+        The number that Dr.Jit gets.
 
     Raises:
         InputError: fewer than one thread was asked for.
@@ -70,9 +79,10 @@ def configure(threads: int | None = None) -> int:
     if threads is not None and threads < 1:
         raise InputError(f"threads: expected a number of at least 1, got {threads}")
     _chosen = threads if threads is not None else _default()
-    os.environ["OMP_NUM_THREADS"] = str(_chosen)  # for a torch that is imported later
+    for_torch = max(1, _chosen // 2) if rendering else _chosen
+    os.environ["OMP_NUM_THREADS"] = str(for_torch)  # for a torch that is imported later
     if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(_chosen)
+        sys.modules["torch"].set_num_threads(for_torch)
     if "drjit" in sys.modules:
         apply_to_drjit()
     return _chosen

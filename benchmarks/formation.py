@@ -6,7 +6,7 @@
 For each formation and sample count: the mean margin of the right label over the rest (logits), its drift from the
 margin at the highest sample count of the same formation, the standard deviation over seeds, and the time of a render
 over the time of a raw render with as many samples. A search at a sample count is honest where drift and deviation are
-small. """
+small."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from advsearch.api.scene import load_scene  # noqa: E402
 from advsearch.attacks import margin  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 
-COUNTS = (4, 16, 64, 256)
+COUNTS = (4, 8, 16, 64, 256)
 
 
 def main() -> None:

@@ -71,7 +71,7 @@ def picture(
     import mitsuba as mi
     import torch
 
-    from advsearch.scene.denoise import denoise
+    from advsearch.scene.denoise import Denoiser
 
     if mi.variant() is None:
         mi.set_variant("llvm_ad_rgb")
@@ -111,7 +111,7 @@ def picture(
         }
     )
     layers = torch.from_numpy(np.array(mi.render(scene, spp=spp, seed=1), dtype=np.float32))
-    radiance = denoise(layers[..., :3], layers[..., -6:-3].clamp(0.0, 1.0), layers[..., -3:])
+    radiance = Denoiser(tuple(layers.shape[:2]))(layers[..., :3], layers[..., -6:-3].clamp(0.0, 1.0), layers[..., -3:])
     return linear_to_srgb(radiance.numpy())
 
 

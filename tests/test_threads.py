@@ -21,7 +21,7 @@ SHOW = (
 
 def in_new_process(**variables: str) -> list[object]:
     """The count that `configure` chooses in a process with these variables, and what OpenMP will read there."""
-    ours = (*threads.OPENMP_DEFAULTS, "OMP_WAIT_POLICY", "OMP_NUM_THREADS")
+    ours = (*threads.OPENMP_DEFAULTS, "GOMP_SPINCOUNT", "OMP_NUM_THREADS")
     environ = {name: value for name, value in os.environ.items() if name not in ours} | variables
     done = subprocess.run([sys.executable, "-c", SHOW], capture_output=True, text=True, check=True, env=environ)
     answer: list[object] = json.loads(done.stdout)
@@ -33,20 +33,21 @@ def test_every_core_and_openmp_set_without_importing_torch() -> None:
 
 
 def test_what_the_user_has_set_is_left_alone() -> None:
-    kept = {"GOMP_SPINCOUNT": "7", "KMP_BLOCKTIME": threads.OPENMP_DEFAULTS["KMP_BLOCKTIME"]}
-    assert in_new_process(GOMP_SPINCOUNT="7", OMP_NUM_THREADS="1") == [1, kept]
-    assert in_new_process(OMP_WAIT_POLICY="PASSIVE") == [threads.cores(), dict.fromkeys(threads.OPENMP_DEFAULTS)]
+    kept = {"OMP_WAIT_POLICY": "ACTIVE", "KMP_BLOCKTIME": threads.OPENMP_DEFAULTS["KMP_BLOCKTIME"]}
+    assert in_new_process(OMP_WAIT_POLICY="ACTIVE", OMP_NUM_THREADS="1") == [1, kept]
+    assert in_new_process(GOMP_SPINCOUNT="7") == [threads.cores(), dict.fromkeys(threads.OPENMP_DEFAULTS)]
 
 
-def test_a_torch_that_is_loaded_gets_the_count() -> None:
+@pytest.mark.parametrize(("count", "rendering", "expected"), [(1, True, 1), (4, True, 2), (4, False, 4)])
+def test_a_torch_that_is_loaded_gets_its_share(count: int, rendering: bool, expected: int) -> None:
     import torch
 
-    before = torch.get_num_threads()
     try:
-        assert threads.configure(1) == torch.get_num_threads() == 1
-        assert os.environ["OMP_NUM_THREADS"] == "1"
+        assert threads.configure(count, rendering=rendering) == count
+        assert torch.get_num_threads() == expected
+        assert os.environ["OMP_NUM_THREADS"] == str(expected)
     finally:
-        threads.configure(before)
+        threads.configure()
 
 
 @pytest.mark.parametrize(("text", "expected"), [("100000 100000\n", 1), ("20000 100000", 1), ("max 100000\n", None)])

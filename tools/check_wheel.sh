@@ -12,8 +12,8 @@ rm -rf build
 "$builder" -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir "$work" .
 ls -l "$work"/*.whl
 "$builder" -m venv "$work/venv"
-"$work/venv/bin/python" -m pip install --quiet -c "$constraints" pip
-"$work/venv/bin/python" -m pip install --quiet -c "$constraints" "$work"/*.whl
+"$work/venv/bin/python" -m pip install -qq -c "$constraints" pip
+"$work/venv/bin/python" -m pip install -qq -c "$constraints" "$work"/*.whl
 
 cd "$work"
 "$work/venv/bin/advsearch" --help >/dev/null

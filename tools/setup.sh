@@ -5,7 +5,6 @@ set -euo pipefail
 
 python=${1:-python3}
 venv=${2:-.venv}
-cpu_index=https://download.pytorch.org/whl/cpu
 
 say() { printf 'set-up: %s\n' "$*"; }
 stop() { printf 'set-up: %s\n' "$@" >&2; exit 2; }
@@ -50,12 +49,8 @@ torch_index() {
     [ "$(uname -s)" = Linux ] || return 0
     report=$(pip install --quiet --dry-run --no-deps --ignore-installed --report - -c constraints.txt torch 2>/dev/null)
     case "$report" in *'+cpu"'*) return ;; esac # the machine's own settings lead to a CPU build already
-    if "$venv/bin/python" -c "import urllib.request as u; u.urlopen('$cpu_index/torch/', timeout=10)" 2>/dev/null; then
-        echo "$cpu_index"
-    else
-        say "no CPU build of torch can be reached; pip takes the CUDA build (gigabytes). To name another index," >&2
-        say "stop this and type: make TORCH_INDEX=$cpu_index setup" >&2
-    fi
+    say "pip takes torch's CUDA build here (gigabytes). For the CPU build stop this and give the address of PyTorch's" >&2
+    say "index of CPU wheels, as its 'Get started' page says: make TORCH_INDEX=ADDRESS setup" >&2
 }
 
 install_packages() {

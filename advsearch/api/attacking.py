@@ -185,7 +185,7 @@ def _problem(job: _Job) -> Problem:
     resolution = config.resolution or (model.input_size[0], model.input_size[1])
     renderer = make_renderer(description, space, resolution, config.denoise, config.seed)
     objective = get_objective(job.objective)
-    return Problem(renderer, space, model, labels, objective, config.spp, config.seed)
+    return Problem(renderer, space, model, labels, objective, config.search_spp, config.seed)
 
 
 # ---- the stages -----------------------------------------------------------------------------------------------------
@@ -235,7 +235,7 @@ def _worth_attacking(
     """Look at the clean configuration; one that is wrong in every first look goes through the full trials at once."""
     start = problem.domain.start
     seed = seeds.stream(config.seed, "first look")
-    findings.first_look = run_trials(problem.trial, start, spp=config.spp, seed=seed, trials=FIRST_LOOK)
+    findings.first_look = run_trials(problem.trial, start, spp=config.search_spp, seed=seed, trials=FIRST_LOOK)
     if any(trial.right for trial in findings.first_look):
         return True
     _choose_spp(problem, {"clean": start}, config, findings, stages)

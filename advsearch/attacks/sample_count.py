@@ -17,7 +17,7 @@ from advsearch.attacks.trials import CONFIDENCE
 from advsearch.errors import InputError
 from advsearch.seeds import stream
 
-LADDER = (16, 64, 256, 1024)
+LADDER = (4, 16, 64, 256, 1024)
 """Sample counts to try; each quarters the variance of the one before."""
 
 DRIFT = 0.25

@@ -26,6 +26,7 @@ COUNTS = {"train": 11_998, "validation": 994, "heldout": 2_002}
 BLOCK = 500
 """Pictures rendered by one process before a fresh one takes over: Mitsuba does not give back all memory of a scene."""
 EPOCHS = 16
+LEARNING_RATE = 2e-3
 
 Pictures = np.ndarray[tuple[int, ...], np.dtype[np.uint8]]
 
@@ -99,7 +100,7 @@ def pictures(cache: Path, split: str, count: int, seed: int) -> tuple[Pictures, 
 
 def train(cache: Path, counts: dict[str, int], epochs: int, seed: int) -> None:
     """Train on the rendered pictures, calibrate on the validation split, and store the weights in the package."""
-    threads.configure()
+    threads.configure(rendering=False)
     from advsearch.evaluation.reference_scenes import labels
     from advsearch.models import calibration, reference, training
 
@@ -114,7 +115,9 @@ def train(cache: Path, counts: dict[str, int], epochs: int, seed: int) -> None:
                 flush=True,
             )
 
-    trained = training.train(images, truth, classes=len(labels()), epochs=epochs, seed=seed, progress=say)
+    trained = training.train(
+        images, truth, classes=len(labels()), epochs=epochs, lr=LEARNING_RATE, seed=seed, progress=say
+    )
     folder = reference.data_folder()
     folder.mkdir(exist_ok=True)
     reference.save(folder, trained.state, labels())

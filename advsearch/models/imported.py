@@ -158,7 +158,7 @@ def _import_torchvision(spec: str) -> Any:
         raise ModelError(
             f"model {spec}: needs torchvision, built for torch {torch.__version__}, which cannot be imported "
             f"({first_line(error)}). Install it from the index that torch came from (pip install torchvision "
-            "--index-url https://download.pytorch.org/whl/cpu), or export the network with torch.export "
+            "from the same index as torch), or export the network with torch.export "
             "where torchvision works"
         ) from error
 

@@ -150,13 +150,14 @@ def save(
     """Write ``reference.safetensors`` and ``reference.json`` to a folder and return the two paths.
 
     Args:
-        folder: an existing folder; that of the package is `data_folder()`.
+        folder: made if it is not there; that of the package is `data_folder()`.
         state: the state dict of a `ReferenceNet` for ``len(labels)`` classes.
         labels: the label names in index order.
         figures: what is known of it (accuracy, calibration, seed, ...), kept in the record as it is.
     """
     net = build(len(labels))
     net.load_state_dict(dict(state))
+    folder.mkdir(parents=True, exist_ok=True)
     weights, record = folder / WEIGHTS, folder / RECORD
     tensors = {key: value.contiguous() for key, value in net.state_dict().items()}
     weights.write_bytes(safetensors.save(tensors))

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.errors import InputError
-from advsearch.scene.denoise import denoise
+from advsearch.scene.denoise import Denoiser
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.mitsuba_scene import MitsubaScene
 
@@ -56,6 +56,7 @@ class Renderer:
         self.space = space
         self.formation = formation
         self.root_seed = root_seed
+        self._denoise = Denoiser(formation.resolution)
         self.renders = 0
         self.gradients = 0
         self.non_finite = 0
@@ -106,7 +107,7 @@ class Renderer:
         radiance = self._finite(self.scene.radiance(inputs, noise, spp))
         if self.formation.denoiser == "oidn":
             albedo, normal = self.scene.guides(inputs, seeds.stream(self.root_seed, "guides", seed), spp)
-            radiance = denoise(radiance, albedo, normal)
+            radiance = self._denoise(radiance, albedo, normal)
         self.renders += 1
         return radiance
 
