@@ -80,9 +80,10 @@ def configure(threads: int | None = None, *, rendering: bool = True) -> int:
         raise InputError(f"threads: expected a number of at least 1, got {threads}")
     _chosen = threads if threads is not None else _default()
     for_torch = max(1, _chosen // 2) if rendering else _chosen
-    os.environ["OMP_NUM_THREADS"] = str(for_torch)  # for a torch that is imported later
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(for_torch)
+    else:  # read when torch is imported later; not otherwise, because child processes would inherit it
+        os.environ["OMP_NUM_THREADS"] = str(for_torch)
     if "drjit" in sys.modules:
         apply_to_drjit()
     return _chosen

@@ -17,11 +17,14 @@ from advsearch.attacks.trials import CONFIDENCE
 from advsearch.errors import InputError
 from advsearch.seeds import stream
 
-LADDER = (4, 16, 64, 256, 1024)
+LADDER = (4, 16, 64, 256)
 """Sample counts to try; each quarters the variance of the one before."""
 
-DRIFT = 0.25
-"""The largest drift from rung to rung, its uncertainty included, as a fraction of the margin."""
+DRIFT = 0.5
+"""The largest drift from rung to rung, its uncertainty included, as a fraction of the margin.
+
+The drift left above the upper rung is smaller than the one that led there, so a margin that passes keeps its sign.
+"""
 
 MarginOf = Callable[[int, int], float]
 """(spp, seed) -> margin in logits of one render."""
@@ -70,7 +73,7 @@ def choose_spp(
     *,
     seed: int,
     ladder: Sequence[int] = LADDER,
-    seeds: int = 4,
+    seeds: int = 8,
     drift: float = DRIFT,
 ) -> SampleCount:
     """Climb a ladder of sample counts until no configuration's margin drifts, and return the rung reached.

@@ -157,9 +157,8 @@ def _import_torchvision(spec: str) -> Any:
     except Exception as error:  # a build for another torch raises RuntimeError, among others
         raise ModelError(
             f"model {spec}: needs torchvision, built for torch {torch.__version__}, which cannot be imported "
-            f"({first_line(error)}). Install it from the index that torch came from (pip install torchvision "
-            "from the same index as torch), or export the network with torch.export "
-            "where torchvision works"
+            f"({first_line(error)}). Install it from the index that torch came from, or export the network with "
+            "torch.export where torchvision works"
         ) from error
 
 
