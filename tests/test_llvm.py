@@ -131,7 +131,7 @@ def test_message_without_any_usable_file_lists_what_is_there_and_what_to_type(
     [
         (DEBIAN, "linux", "apt-get install libllvm19"),
         (UBUNTU, "linux", "apt-get install libllvm19"),
-        (UBUNTU_22, "linux", "apt.llvm.org"),
+        (UBUNTU_22, "linux", "conda install"),
         (FEDORA, "linux", "dnf install llvm-libs"),
         ("", "darwin", "brew install llvm"),
     ],

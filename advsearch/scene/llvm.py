@@ -160,7 +160,7 @@ def install_command(os_release: str | None = None, platform: str = sys.platform)
     release = _read_os_release() if os_release is None else os_release
     ids = " ".join(re.findall(r'^ID(?:_LIKE)?="?([^"\n]*)', release, re.MULTILINE)).split()
     if "ubuntu" in ids and re.search(r'^VERSION_ID="?(1\d|2[0-3])\.', release, re.MULTILINE):
-        return f"curl -fsSL https://apt.llvm.org/llvm.sh | {sudo}bash -s 19"  # its own packages end with LLVM 15
+        return commands["conda"]  # its own packages end with LLVM 15
     for name, known in (("Debian, Ubuntu", {"debian", "ubuntu"}), ("Fedora", {"fedora", "rhel"})):
         if known & set(ids):
             return commands[name]
