@@ -26,11 +26,11 @@ import time
 from collections.abc import Callable
 
 SETTINGS: dict[str, tuple[int, int, dict[str, str]]] = {
-    "both 2, as advsearch sets them": (2, 2, {}),
+    "both 2, sleeping at once (PASSIVE)": (2, 2, {}),
     "both 2, a millisecond of polling": (2, 2, {"GOMP_SPINCOUNT": "10000"}),
     "both 2, torch's default polling": (2, 2, {"GOMP_SPINCOUNT": "300000"}),
     "both 2, polling on (ACTIVE)": (2, 2, {"OMP_WAIT_POLICY": "ACTIVE"}),
-    "torch 1, Dr.Jit 2": (1, 2, {}),
+    "torch 1, Dr.Jit 2, as advsearch sets them": (1, 2, {}),
     "torch 2, Dr.Jit 1": (2, 1, {}),
     "both 1": (1, 1, {}),
     "both 4 (more than cores), default polling": (4, 4, {"GOMP_SPINCOUNT": "300000"}),
