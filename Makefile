@@ -51,7 +51,7 @@ bench: $(STAMP) ## the benchmarks: ratios against a floor measured in the same r
 	@set -e; for file in benchmarks/*.py; do case $$file in benchmarks/_*) continue;; esac; \
 	  echo "== $$file"; $(BIN)/python $$file $(ARGS); done
 
-reference: $(STAMP) ## render, train and evaluate the bundled classifier again (hours)
+reference: $(STAMP) ## render, train and evaluate the bundled classifier again (some 45 minutes)
 	@$(BIN)/python -m advsearch.evaluation.reference all $(ARGS)
 
 wheel: $(STAMP) ## build the wheel into dist/

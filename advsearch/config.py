@@ -27,7 +27,7 @@ HEADER = "# A run of advsearch. To repeat it: advsearch run FILE\n"
 
 
 SEARCH_SPP = {"oidn": 8, "none": 16}
-"""Samples a pixel of a search that asks for none. Denoised, 8 reach the verified margin that 16 do (docs/design.md)."""
+"""Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
 
 PLACE: dict[str, Any] = {"run": None, "overwrite": False}
 """The settings that say where a run is kept, not what it does, as a repetition has them."""

@@ -82,6 +82,19 @@ def test_a_gradient_leaves_the_scene_as_it_was(raw: Renderer) -> None:
         assert torch.equal(before, raw(raw.start, seed=2, spp=4))
 
 
+def test_an_interrupted_gradient_leaves_nothing_behind(raw: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    base = raw.scene.radiance({}, 5, 4)
+
+    class Interrupted:
+        def render_backward(self, *_: object, **__: object) -> None:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(raw.scene, "_path", Interrupted())
+        raw.scene.adjoint({BASE_COLOR: torch.zeros(TEXELS, TEXELS, 3)}, torch.ones(SIZE, SIZE, 3), 1, 4)
+    assert torch.equal(base, raw.scene.radiance({}, 5, 4))
+
+
 def test_inputs_that_are_not_named_have_their_base_value(raw: Renderer) -> None:
     base = raw.scene.radiance({}, 5, 4)
     raw.scene.radiance({BASE_COLOR: torch.zeros(TEXELS, TEXELS, 3)}, 5, 4)

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch
 from torch import Tensor, nn
 
 from advsearch import seeds, threads
@@ -43,6 +41,7 @@ from advsearch.errors import InputError
 from advsearch.models import LabelSet, Model, ModelWarning, load_model
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory, check_free
+from advsearch.scene.formation import to_8_bit
 
 FIRST_LOOK = 4
 """Renders that decide whether a start is worth attacking; the verdict itself takes the full trials."""
@@ -253,7 +252,7 @@ def _search(
 
     def keep(index: int, image: Tensor) -> None:
         if index < config.steps and index % every == 0:
-            findings.frames.append((image * 255.0).round().to(torch.uint8).numpy().astype(np.float32) / 255.0)
+            findings.frames.append(to_8_bit(image).numpy())
 
     def told(kind: str) -> Callable[[StepRecord, Tensor, Evaluation], None]:
         def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:

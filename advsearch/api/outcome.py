@@ -19,6 +19,7 @@ from advsearch.config import AttackConfig
 from advsearch.report.page import write_report
 from advsearch.runs import images
 from advsearch.runs.directory import RunDirectory
+from advsearch.scene.formation import to_8_bit
 
 PICTURE_SPP = 64
 """Samples a pixel of the pictures that are kept, unless verification needed more."""
@@ -61,7 +62,12 @@ def summarise(
     u = start if search is None else problem.domain.project(search.best_u)
     spp = max(PICTURE_SPP, findings.sample_count.spp if findings.sample_count else 0)
     noise = seeds.stream(config.seed, "pictures")
-    clean, adversarial = problem.picture(start, noise, spp), problem.picture(u, noise, spp)
+    with torch.no_grad():
+        linear = {
+            "clean": problem.renderer.radiance(start, noise, spp),
+            "adversarial": problem.renderer.radiance(u, noise, spp),
+        }
+    clean, adversarial = (to_8_bit(problem.renderer.formation.display(radiance)) for radiance in linear.values())
     artifacts = problem.space.artifacts(u)
     answers = _answers(config, problem, findings, clean, adversarial)
     run = recorder.run
@@ -70,7 +76,7 @@ def summarise(
     summary = {"schema": 1, "command": "attack", **where, **answers, **costs, "seed": config.seed}
     summary |= {"warnings": [*said, *_remarks(findings, problem)], "command_line": config.command_line()}
     if run is not None:
-        _write_pictures(run, problem, findings, u, noise, spp, clean, adversarial)
+        _write_pictures(run, problem, findings, linear, clean, adversarial)
         _write_artifacts(run, artifacts)
         summary["seconds"]["total"] = stages.total
         run.write_summary(summary)
@@ -204,17 +210,14 @@ def _write_pictures(
     run: RunDirectory,
     problem: Problem,
     findings: Findings,
-    u: Tensor,
-    noise: int,
-    spp: int,
+    linear: dict[str, Tensor],
     clean: Tensor,
     adversarial: Tensor,
 ) -> None:
     gain = problem.renderer.formation.gain
-    for name, picture, at in (("clean", clean, problem.domain.start), ("adversarial", adversarial, u)):
+    for name, picture in (("clean", clean), ("adversarial", adversarial)):
         run.save_image(name, picture)
-        with torch.no_grad():
-            run.save_exr(name, problem.renderer.radiance(at, seed=noise, spp=spp) * gain)
+        run.save_exr(name, linear[name] * gain)
     run.save_image("difference", images.difference(clean, adversarial))
     if findings.verification is not None:
         for number in range(min(4, len(findings.verification.adversarial_trials))):

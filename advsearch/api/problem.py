@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Block, Domain, Evaluate, Evaluation, Objective, Trial, margin
+from advsearch.attacks import Block, Domain, Evaluate, Evaluation, Objective, Trial, margin, succeeded
 from advsearch.controls import Space
 from advsearch.models import LabelSet, Model
 from advsearch.scene.formation import to_8_bit
@@ -64,12 +64,11 @@ class Problem:
             derivative = torch.autograd.grad(value, at)[0] if gradient else None
             if on_image is not None:
                 on_image(index, image.detach())
-            worst = float(margin(logits.detach(), image[None].detach(), self.labels.indices)[0])
             return Evaluation(
                 objective=float(value.detach()),
                 gradient=derivative,
                 logits=logits.detach()[0],
-                success=worst > 0.0,
+                success=bool(succeeded(logits.detach(), self.labels.indices)[0]),
                 non_finite=self.renderer.non_finite - before,
             )
 

@@ -150,7 +150,8 @@ def default_views(spp: int = 64) -> dict[str, float]:
     """Return the probability that the reference model gives each bundled object in its default view."""
     import torch
 
-    from advsearch.evaluation.reference_scenes import SIZE, _Nothing
+    from advsearch.controls import Space
+    from advsearch.evaluation.reference_scenes import SIZE
     from advsearch.models import reference
     from advsearch.scene import library
     from advsearch.scene.description import describe
@@ -163,7 +164,7 @@ def default_views(spp: int = 64) -> dict[str, float]:
     for name in library.list_objects():
         description = describe(name)
         formation = ImageFormation(resolution=SIZE, gain=description.gain)
-        renderer = Renderer(MitsubaScene(description, SIZE), _Nothing(), formation)
+        renderer = Renderer(MitsubaScene(description, SIZE), Space(()), formation)
         with torch.no_grad():
             probabilities = model(renderer(torch.zeros(0), seed=0, spp=spp)).softmax(dim=-1)[0]
         found[name] = float(probabilities[model.labels.index(description.object.label or name)])

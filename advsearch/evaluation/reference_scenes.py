@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from advsearch.bundled.objects import OBJECTS
+from advsearch.controls import Space
 from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
 from advsearch.scene.description import SceneDescription
@@ -51,19 +52,10 @@ def picture(split: str, index: int, seed: int = 0) -> Picture:
     description = random_scene(CLASSES[class_of(index)], "heldout" if split == "heldout" else "train", rng)
     denoiser = "none" if rng.random() < RAW_SHARE else "oidn"
     formation = ImageFormation(denoiser=denoiser, resolution=SIZE, gain=description.gain)
-    renderer = Renderer(MitsubaScene(description, SIZE, freeze=False), _Nothing(), formation, root_seed=seed)
+    renderer = Renderer(MitsubaScene(description, SIZE, freeze=False), Space(()), formation, root_seed=seed)
     with torch.no_grad():
         display = renderer(torch.zeros(0), seed=index, spp=SPP * (2 if denoiser == "none" else 1))
     return (display * 255.0).round().to(torch.uint8).numpy()
-
-
-class _Nothing:
-    """The space without controls."""
-
-    start = torch.zeros(0)
-
-    def inputs(self, u: torch.Tensor) -> dict[str, torch.Tensor]:
-        return {}
 
 
 def random_scene(name: str, environments: str, rng: np.random.Generator) -> SceneDescription:

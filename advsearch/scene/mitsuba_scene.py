@@ -129,7 +129,7 @@ class MitsubaScene:
         mi = mitsuba()
         import drjit as dr
 
-        self._apply({})
+        self._apply(inputs)
         tracked = {name: mi.TensorXf(_contiguous(tensor)) for name, tensor in inputs.items()}
         for name, value in tracked.items():
             dr.enable_grad(value)
@@ -140,12 +140,10 @@ class MitsubaScene:
         gradients = {name: _torch(dr.grad(value)) for name, value in tracked.items()}
         for name, value in tracked.items():
             self._parameters[self._keys[name]] = dr.detach(value)
-            self._applied[name] = (inputs[name], inputs[name]._version)
         self._parameters.update()
         return gradients
 
-    # ---- inside
-    # -------------------------------------------------------------------------------------------------------
+    # ---- inside -----------------------------------------------------------------------------------------------------
 
     def _apply(self, inputs: Mapping[str, Tensor]) -> None:
         """Set exactly these inputs, everything else at its base value; does nothing for what is set already."""
@@ -193,7 +191,9 @@ class MitsubaScene:
             self._recorded_at = _population.changes
         if not self._freeze:
             return function
-        return self._recorded.setdefault((what, spp), dr.freeze(function))
+        if (what, spp) not in self._recorded:
+            self._recorded[what, spp] = dr.freeze(function)
+        return self._recorded[what, spp]
 
 
 def _contiguous(tensor: Tensor) -> Tensor:

@@ -98,8 +98,7 @@ class Renderer:
         if not bool((values >= 0.0).all() & (values <= 1.0).all()):
             raise InputError("render: expected every entry of u in [0, 1]; project u before you render it")
 
-    # ---- the two halves of the autograd function
-    # ----------------------------------------------------------------------
+    # ---- the two halves of the autograd function --------------------------------------------------------------------
 
     def primal(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
         """Radiance of given scene inputs, without a graph; counted in `renders`."""
