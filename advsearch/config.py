@@ -132,7 +132,7 @@ class AttackConfig(BaseModel):
         lambda: {"texture": {}},
         "search",
         "what may change, separated by commas",
-        "names of controls, or NAME={PARAMETER: VALUE}",
+        "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
         min_length=1,
     )
     epsilon: float | None = _setting(
@@ -153,6 +153,19 @@ class AttackConfig(BaseModel):
         otherwise="chosen from the object's own",
         ge=2,
         le=4096,
+    )
+    estimators: dict[str, str] = _setting(
+        dict,
+        "search",
+        "force how derivatives are obtained",
+        "NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME; `advsearch plan` shows the names",
+        alias="estimator",
+    )
+    measure: Literal["no", "quick", "full"] = _setting(
+        "quick",
+        "search",
+        "measure which valid estimator of a derivative is best on this scene; full chooses step and samples too",
+        "no, quick or full",
     )
     policy: str = _setting("pgd", "search", "the rule that proposes configurations", "the name of a policy")
     steps: int = _setting(
@@ -259,6 +272,12 @@ class AttackConfig(BaseModel):
         if isinstance(names, Mapping):
             return {name: {} if given is None else given for name, given in names.items()}
         return value
+
+    @field_validator("estimators", mode="before")
+    @classmethod
+    def _estimators_from_name(cls, value: Any) -> Any:
+        """Accept ``differences`` for all controls."""
+        return {"*": value} if isinstance(value, str) else value
 
     @field_validator("resolution", mode="before")
     @classmethod
@@ -406,7 +425,8 @@ def settings() -> tuple[Setting, ...]:
 
 def flag(name: str) -> str:
     """Return the flag of the setting `name`: ``texture_resolution`` is ``--texture-resolution``."""
-    special = {"controls": "--control", "set_": "--set", "set": "--set", "baseline": "--no-baseline"}
+    special = {"controls": "--control", "set_": "--set", "set": "--set"}
+    special |= {"estimators": "--estimator", "estimator": "--estimator", "baseline": "--no-baseline"}
     return special.get(name) or "--" + name.replace("_", "-")
 
 
@@ -520,6 +540,8 @@ def _as_flags(setting: Setting, value: Any) -> list[str]:
         plain, tuned = [name for name in value if not value[name]], [name for name in value if value[name]]
         words = ["--control", ",".join(plain)] if plain else []
         return words + [word for name in tuned for word in ("--control", f"{name}={_flow(value[name])}")]
+    if setting.field == "estimators":
+        return [word for name, given in value.items() for word in ("--estimator", f"{name}={given}")]
     if setting.field == "resolution":
         return ["--resolution", "x".join(str(side) for side in value)]
     return [f"{setting.flag}={_number(value)}"] if str(value).startswith("-") else [setting.flag, _number(value)]

@@ -21,6 +21,7 @@ from typing import Any
 
 from advsearch.cli.flags import GROUPS, help_text
 from advsearch.config import Setting, settings
+from advsearch.controls import OWN
 from advsearch.scene.settings import SETTINGS
 
 DOCS = Path(__file__).resolve().parent
@@ -134,6 +135,32 @@ def environments(record: Record) -> str:
     return table(["environment", "half"], [[f"`{one.name}`", half[one.split]] for one in ENVIRONMENTS.values()])
 
 
+def controls(record: Record) -> str:
+    """Every control with one sentence and its picture."""
+    from advsearch.controls import CONTROLS
+
+    rows = [
+        [f"[{kind}]({kind}.md)", CONTROLS[kind].summary, f"![{kind}](../images/controls/{kind}.png)"] for kind in OWN
+    ]
+    return table(["control", "what may vary", "examples"], rows)
+
+
+def _searched(parameter: Any) -> str:
+    """The range that is searched when nothing is said."""
+    if parameter.search is None:
+        return "only if asked"
+    if parameter.options:
+        return "all"
+    return f"{parameter.search[0]:g} to {parameter.search[1]:g}" + (", logarithmic" if parameter.log else "")
+
+
+def _remarks(parameter: Any) -> str:
+    """Estimators, and what the plan has to know."""
+    said = [", ".join(parameter.estimators) if parameter.differentiable and parameter.estimators else "none"]
+    said += ["periodic"] if parameter.periodic else []
+    return "; ".join(said + (["moves outlines"] if parameter.moves_silhouettes else []))
+
+
 def control(kind: str) -> Callable[[Record], str]:
     """The parameters and settings that a control declares."""
 
@@ -146,16 +173,18 @@ def control(kind: str) -> Callable[[Record], str]:
                 f"`{one.name}`",
                 " x ".join("any" if side is None else str(side) for side in one.shape) or "number",
                 one.unit,
-                f"{one.low:g} to {one.high:g}",
-                str(one.default),
-                "yes" if one.differentiable else "no",
+                ", ".join(one.options) if one.options else f"{one.low:g} to {one.high:g}",
+                _searched(one),
+                f"{one.default:g}" if isinstance(one.default, float) else str(one.default),
+                _remarks(one),
                 one.description,
             ]
             for one in declared.parameters
         ]
-        heads = ["parameter", "shape", "unit", "range", "default", "differentiable", "what"]
+        heads = ["parameter", "shape", "unit", "allowed", "searched", "default", "derivative", "what"]
         choices = [[f"`{one.name}`", _shown(one.default), one.description] for one in declared.choices]
-        return table(heads, parameters) + "\n" + table(["setting", "default", "what"], choices)
+        settings_table = "\n" + table(["setting", "default", "what"], choices) if choices else ""
+        return table(heads, parameters) + settings_table
 
     return make
 
@@ -309,7 +338,8 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("scenes.md", "parameters"): scene_parameters,
     ("scenes.md", "objects"): objects,
     ("scenes.md", "environments"): environments,
-    ("controls/texture.md", "texture"): control("texture"),
+    ("controls/README.md", "controls"): controls,
+    **{(f"controls/{kind}.md", kind): control(kind) for kind in OWN},
     ("policies/pgd.md", "pgd"): policy("pgd"),
     ("design.md", "endings"): endings,
     ("reference-model.md", "reference"): reference,

@@ -120,7 +120,7 @@ def test_no_command_prints_help_and_version_is_told(capsys: pytest.CaptureFixtur
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
-        (["atack"], "unknown command 'atack'. Did you mean 'attack'? Known: attack, doctor, list, run, show. See adv"),
+        (["atack"], "unknown command 'atack'. Did you mean 'attack'? Known: attack, check, "),
         (["--jsn"], "unknown flag '--jsn'."),
         (["attack", "--epsilom", "1"], "unknown flag '--epsilom'. Did you mean '--epsilon'"),
         (["attack", "--eps", "1"], "unknown flag '--eps'."),

@@ -7,12 +7,18 @@ import math
 import pytest
 import torch
 
-from advsearch.controls import CONTROLS, TextureControl, make_control, make_space
+from advsearch.controls import CONTROLS, BoundControl, TextureControl, make_control, make_space
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import describe
 from advsearch.scene.formation import srgb_to_linear
+from advsearch.scene.plan import ESTIMATORS
 
 every_control = pytest.mark.parametrize("kind", CONTROLS)
+
+
+def bound(kind: str, object: str = "mug") -> BoundControl:
+    """A control with its defaults in a scene, alone."""
+    return make_space([CONTROLS[kind]()], describe(object)).controls[0]
 
 
 @every_control
@@ -21,27 +27,92 @@ def test_a_control_declares_itself(kind: str) -> None:
     assert control.kind == kind and control.summary.endswith(".") and control.parameters
     for parameter in control.parameters:
         assert parameter.low < parameter.high and parameter.unit and parameter.description.endswith(".")
-    for choice in control.choices:
-        assert hasattr(control(), choice.name), choice.name
+        assert set(parameter.estimators) <= set(ESTIMATORS)
+        if parameter.search is not None and not parameter.options:
+            assert parameter.low <= parameter.search[0] < parameter.search[1] <= parameter.high or parameter.log
+        if parameter.options:
+            assert parameter.low == 0.0 and parameter.high == len(parameter.options) - 1
+        if parameter.moves_silhouettes:
+            assert not {"adjoint"} & set(parameter.estimators), "an interior adjoint misses moving outlines"
+    assert len({one.name for one in (*control.parameters, *control.choices)}) == len(control.parameters) + len(
+        control.choices
+    )
 
 
 @every_control
 def test_a_bound_control_starts_inside_and_maps_differentiably(kind: str) -> None:
-    bound = CONTROLS[kind]().bind(describe("mug"))
-    start = bound.start
+    control = bound(kind)
+    start = control.start
     assert start.ndim == 1 and start.dtype == torch.float32
     assert float(start.min()) >= 0.0 and float(start.max()) <= 1.0
-    u = (start * 0.5 + 0.25).requires_grad_()
-    total = sum(tensor.sum() for tensor in bound.inputs(u).values())
+    assert sum(group.size for group in control.groups) == len(start)
+    inner = start * 0.5 + 0.25
+    begin = 0
+    for group in control.groups:
+        if group.options:
+            inner[begin] = start[begin]
+        begin += group.size
+    u = inner.requires_grad_()
+    picture = torch.rand(24, 24, 3, generator=torch.Generator().manual_seed(0))
+    total = sum((tensor.sin().sum() for tensor in control.inputs(u).values()), control.picture(u, picture).sin().sum())
+    if not total.requires_grad:
+        assert not any(set(group.estimators) & {"adjoint", "image", "material"} for group in control.groups)
+        return
     total.backward()
-    assert u.grad is not None and bool(torch.isfinite(u.grad).all()) and float(u.grad.abs().sum()) > 0.0
+    assert u.grad is not None and bool(torch.isfinite(u.grad).all())
+    begin = 0
+    for group in control.groups:
+        part = u.grad[begin : begin + group.size]
+        begin += group.size
+        if "adjoint" in group.estimators or "image" in group.estimators or "material" in group.estimators:
+            assert bool(part.any()), f"{kind}.{group.name} says that its derivative runs through its inputs"
+
+
+@every_control
+def test_a_control_is_finite_in_every_corner(kind: str) -> None:
+    control = bound(kind)
+    picture = torch.rand(24, 24, 3, generator=torch.Generator().manual_seed(0))
+    for corner in (torch.zeros_like(control.start), torch.ones_like(control.start)):
+        u = corner.requires_grad_()
+        changed = control.picture(u, picture)
+        assert float(changed.detach().min()) >= 0.0 and float(changed.detach().max()) <= 1.0
+        outputs = [*control.inputs(u).values(), changed]
+        assert all(bool(torch.isfinite(one).all()) for one in outputs)
+        live = [one.sum() for one in outputs if one.requires_grad]
+        if live:
+            (gradient,) = torch.autograd.grad(torch.stack(live).sum(), u, allow_unused=True)
+            assert gradient is None or bool(torch.isfinite(gradient).all())
 
 
 @every_control
 def test_a_bound_control_says_its_configuration_in_values_with_units(kind: str) -> None:
-    bound = CONTROLS[kind]().bind(describe("mug"))
-    for name, value in bound.describe(bound.start).items():
-        assert name.startswith(bound.name + ".") and value["unit"] and isinstance(value["value"], (float, str))
+    control = bound(kind)
+    said = control.describe(control.start)
+    assert said
+    for name, value in said.items():
+        assert name.startswith(control.name + ".") and value["unit"] and isinstance(value["value"], (float, str))
+
+
+@every_control
+def test_a_control_can_be_made_again_from_its_settings(kind: str) -> None:
+    control = CONTROLS[kind]()
+    again = make_control(kind, control.settings())
+    first, second = (make_space([one], describe("mug")).controls[0] for one in (control, again))
+    assert torch.equal(first.start, second.start) and first.groups == second.groups
+
+
+@pytest.mark.parametrize("kind", ["light", "occlusion", "patch"])
+def test_two_of_a_kind_live_side_by_side(kind: str) -> None:
+    space = make_space([make_control(f"{kind}:one"), make_control(f"{kind}:two")], describe("mug"))
+    assert [control.name for control in space.controls] == ["one", "two"]
+    u = torch.full_like(space.start, 0.4)
+    both = space.inputs(u)
+    half = len(u) // 2
+    only_first = u.clone()
+    only_first[half:] = 0.8
+    changed = space.inputs(only_first)
+    assert any(not torch.equal(both[name], changed[name]) for name in both)
+    assert {name.split(".")[0] for name in space.describe(u)} == {"one", "two"}
 
 
 def test_names_and_settings_that_do_not_exist_are_explained() -> None:

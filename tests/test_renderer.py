@@ -90,7 +90,7 @@ def test_an_interrupted_gradient_leaves_nothing_behind(raw: Renderer, monkeypatc
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(raw.scene, "_path", Interrupted())
+        patch.setitem(raw.scene._integrators, "path", Interrupted())
         raw.scene.adjoint({BASE_COLOR: torch.zeros(TEXELS, TEXELS, 3)}, torch.ones(SIZE, SIZE, 3), 1, 4)
     assert torch.equal(base, raw.scene.radiance({}, 5, 4))
 
@@ -181,7 +181,7 @@ def test_the_denoiser_brings_few_samples_close_to_many(raw: Renderer, denoised: 
 def test_non_finite_radiance_is_counted_and_set_to_zero(raw: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
     broken = torch.full((SIZE, SIZE, 3), 0.5)
     broken[0, 0, 0], broken[1, 1, 1] = float("nan"), float("inf")
-    monkeypatch.setattr(raw.scene, "radiance", lambda *_: broken)
+    monkeypatch.setattr(raw.scene, "radiance", lambda *_, **__: broken)
     before = raw.non_finite
     with torch.no_grad():
         image = raw(raw.start, seed=0, spp=1)

@@ -17,6 +17,7 @@ from advsearch.api.problem import Problem
 from advsearch.api.record import Findings, Recorder, Stages
 from advsearch.api.scene import Controls, Scene, as_controls, load_scene, make_renderer
 from advsearch.attacks import (
+    POLICIES,
     Ending,
     Evaluation,
     Policy,
@@ -38,6 +39,8 @@ from advsearch.attacks.sample_count import LADDER
 from advsearch.config import AttackConfig
 from advsearch.controls import CONTROLS, make_space
 from advsearch.errors import InputError
+from advsearch.evaluation.gradients import inside
+from advsearch.evaluation.planning import cosines, measured_plan, tuned
 from advsearch.models import LabelSet, Model, ModelWarning, load_model
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory, check_free
@@ -82,7 +85,7 @@ def attack(
         "environment": scene.description.environment_spec or scene.description.environment.name,
         "up": scene.description.up,
         "model": model if isinstance(model, str) else getattr(model, "name", None) or type(model).__name__,
-        "controls": {one.kind: _settings_of(one) for one in instances},
+        "controls": {one.name: one.settings() for one in instances},
         "objective": objective if isinstance(objective, str) else getattr(objective, "__name__", "custom"),
         "policy": policy if isinstance(policy, str) else policy.name,
         "set": {name: value for name, value in scene.description.values.items() if value is not None},
@@ -98,16 +101,18 @@ def attack_from_config(config: AttackConfig, *, progress: Progress | None = None
         check_free(config.run, overwrite=config.overwrite)
     progress = progress or NullProgress()
     progress.stage("set-up")
-    controls = as_controls({kind: _control_settings(kind, config, given) for kind, given in config.controls.items()})
-    objective, policy = get_objective(config.objective), make_policy(config.policy, **_policy_options(config))
-    given: dict[str, Any] = dict(config.set_)
-    if config.exposure:
-        if "camera.exposure" in given:
-            raise InputError("--exposure and --set camera.exposure say the same thing; leave one of them out")
-        given["camera.exposure"] = config.exposure
-    scene = load_scene(config.object, config.environment, up=config.up, settings=given)
-    model = _model(config.model, config)
-    return _carry_out(_Job(config, scene, model, controls, objective, policy, True), progress)
+    return _carry_out(_job(config), progress)
+
+
+def problem_from_config(config: AttackConfig, *, denoise: str | None = None) -> tuple[Problem, list[str]]:
+    """Load what a configuration describes without searching: the problem, and warnings on the way.
+
+    Args:
+        config: what.
+        denoise: another denoiser than the configuration's.
+    """
+    job = _job(config if denoise is None else config.model_copy(update={"denoise": denoise}))
+    return _problem(job), job.loaded[1]
 
 
 # ---- from names to things -------------------------------------------------------------------------------------------
@@ -126,6 +131,20 @@ class _Job:
     keep: bool
 
 
+def _job(config: AttackConfig) -> _Job:
+    """Find and load everything that a configuration names."""
+    controls = as_controls({kind: _control_settings(kind, config, given) for kind, given in config.controls.items()})
+    objective, policy = get_objective(config.objective), make_policy(config.policy, **_policy_options(config))
+    given: dict[str, Any] = dict(config.set_)
+    if config.exposure:
+        if "camera.exposure" in given:
+            raise InputError("--exposure and --set camera.exposure say the same thing; leave one of them out")
+        given["camera.exposure"] = config.exposure
+    scene = load_scene(config.object, config.environment, up=config.up, settings=given)
+    model = _model(config.model, config)
+    return _Job(config, scene, model, controls, objective, policy, True)
+
+
 def _model(model: Model | nn.Module | str | Path, config: AttackConfig) -> tuple[Model, list[str]]:
     """Load the model; its warnings become sentences of the run."""
     threads.configure(1 if config.deterministic else config.threads)
@@ -139,17 +158,16 @@ def _model(model: Model | nn.Module | str | Path, config: AttackConfig) -> tuple
     return loaded, said
 
 
-def _control_settings(kind: str, config: AttackConfig, given: Mapping[str, Any]) -> dict[str, Any]:
+def _control_settings(asked: str, config: AttackConfig, given: Mapping[str, Any]) -> dict[str, Any]:
     """Settings of one control: its own over the run's `epsilon`, `norm` and `texture_resolution`."""
+    kind = str(given.get("kind") or asked.partition(":")[0].partition(".")[0])
     if kind not in CONTROLS:
         return dict(given)
     known = {choice.name for choice in CONTROLS[kind].choices}
     shared = {"epsilon": config.epsilon, "norm": config.norm, "resolution": config.texture_resolution}
+    if kind != "texture":
+        shared = {"epsilon": config.epsilon}
     return {**{name: value for name, value in shared.items() if name in known}, **given}
-
-
-def _settings_of(control: Any) -> dict[str, Any]:
-    return {choice.name: getattr(control, choice.name) for choice in control.choices}
 
 
 def _policy_options(config: AttackConfig) -> dict[str, Any]:
@@ -182,7 +200,7 @@ def _problem(job: _Job) -> Problem:
     labels = _label_set(model, config, description.object.label)
     space = make_space(job.controls, description)
     resolution = config.resolution or (model.input_size[0], model.input_size[1])
-    renderer = make_renderer(description, space, resolution, config.denoise, config.seed)
+    renderer = make_renderer(description, space, resolution, config.denoise, config.seed, config.estimators)
     objective = get_objective(job.objective)
     return Problem(renderer, space, model, labels, objective, config.search_spp, config.seed)
 
@@ -197,6 +215,7 @@ def _carry_out(job: _Job, progress: Progress) -> AttackResult:
     said = [*job.scene.description.object.warnings, *job.scene.description.environment.warnings, *job.loaded[1]]
     for text in said:
         progress.message(text)
+    _measure(problem, job.config)
     with _directory(job) as run:
         recorder = Recorder(run, problem)
         findings = Findings()
@@ -206,6 +225,20 @@ def _carry_out(job: _Job, progress: Progress) -> AttackResult:
             findings.interrupted = True
         stages.end()
         return summarise(job.config, problem, findings, recorder, stages, said)
+
+
+def _measure(problem: Problem, config: AttackConfig) -> None:
+    """Replace the first gradient plan by a measured one, as far as the configuration wants that."""
+    renderer, policy = problem.renderer, make_policy(config.policy) if config.policy in POLICIES else None
+    if config.measure == "no" or (policy is not None and not policy.uses_gradient):
+        return
+    u, seed = inside(renderer), seeds.stream(config.seed, "measure")
+    renderer.plan = measured_plan(renderer, problem.loss, u, seed=seed, spp=problem.spp, every=config.measure == "full")
+    if config.measure == "full":
+        table = cosines(renderer, problem.loss, u, seed=seed)
+        renderer.plan, spp = tuned(renderer.plan, table)
+        problem.spp = problem.spp if config.spp is not None or spp is None else spp
+    problem.refresh()
 
 
 @contextmanager

@@ -19,6 +19,7 @@ from advsearch.config import AttackConfig
 from advsearch.report.page import write_report
 from advsearch.runs import images
 from advsearch.runs.directory import RunDirectory
+from advsearch.runs.files import write_bytes
 from advsearch.scene.formation import to_8_bit
 
 PICTURE_SPP = 64
@@ -67,7 +68,10 @@ def summarise(
             "clean": problem.renderer.radiance(start, noise, spp),
             "adversarial": problem.renderer.radiance(u, noise, spp),
         }
-    clean, adversarial = (to_8_bit(problem.renderer.formation.display(radiance)) for radiance in linear.values())
+    clean, adversarial = (
+        to_8_bit(problem.space.picture(at, problem.renderer.formation.display(radiance)))
+        for at, radiance in zip((start, u), linear.values(), strict=True)
+    )
     artifacts = problem.space.artifacts(u)
     answers = _answers(config, problem, findings, clean, adversarial)
     run = recorder.run
@@ -78,6 +82,8 @@ def summarise(
     if run is not None:
         _write_pictures(run, problem, findings, linear, clean, adversarial)
         _write_artifacts(run, artifacts)
+        for name, data in problem.space.files(u).items():
+            write_bytes(run.path / "artifacts" / name, data)
         summary["seconds"]["total"] = stages.total
         run.write_summary(summary)
         write_report(run.path)
@@ -109,6 +115,7 @@ def _answers(
         "label_set": list(problem.labels.names),
         "ending": _ending(findings).value,
         "image_formation": problem.renderer.formation.summary(),
+        "gradient_plan": problem.renderer.plan.to_dict(),
         "clean": {
             **_named(clean_trial, labels),
             "correct": clean_trial.predicted in problem.labels.indices,

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Block, Domain, Evaluate, Evaluation, Objective, Trial, margin, succeeded
-from advsearch.controls import Space
+from advsearch.attacks.evaluation import Wanted
+from advsearch.controls import Group, Space
 from advsearch.models import LabelSet, Model
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
@@ -44,35 +45,54 @@ class Problem:
     domain: Domain = field(init=False)
 
     def __post_init__(self) -> None:
-        blocks = tuple(
-            Block(len(control.start), control.budget.norm, control.budget.epsilon, name=control.name)  # type: ignore[arg-type]
-            for control in self.space.controls
-        )
-        self.domain = Domain(self.space.start, blocks)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Make the domain anew, after the gradient plan has changed."""
+        blocks = tuple(_block(control.name, group) for control, group in self.space.groups)
+        self.domain = Domain(self.space.start, blocks, gradient_cost=self.renderer.plan.renders, partial_gradients=True)
 
     def evaluator(self, stream: str, on_image: OnImage | None = None) -> Evaluate:
         """Return the evaluation of configurations whose noise comes from one stream of seeds."""
 
-        def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        def evaluate(u: Tensor, *, index: int, gradient: Wanted) -> Evaluation:
             noise = seeds.stream(self.seed, stream, index)
-            with torch.set_grad_enabled(gradient):
-                at = u.clone().requires_grad_(gradient)
-                image = self.renderer(at, seed=noise, spp=self.spp)
-                logits = self.model(image)
-                value = self.objective(logits, image[None], self.labels.indices)[0]
-            before = self.renderer.non_finite
-            derivative = torch.autograd.grad(value, at)[0] if gradient else None
+            before, renders = self.renderer.non_finite, self.renderer.renders
+            seen: list[tuple[Tensor, Tensor]] = []
+
+            def loss(image: Tensor) -> Tensor:
+                value, logits = self._judge(image)
+                seen.append((image.detach(), logits.detach()))
+                return value
+
+            if gradient:
+                value, derivative = self.renderer.gradient(loss, u, noise, self.spp, free=gradient == "free")
+            else:
+                derivative = None
+                with torch.no_grad():
+                    value = loss(self.renderer(u, seed=noise, spp=self.spp))
+            image, logits = seen[0]
             if on_image is not None:
-                on_image(index, image.detach())
+                on_image(index, image)
             return Evaluation(
-                objective=float(value.detach()),
+                objective=float(value),
                 gradient=derivative,
-                logits=logits.detach()[0],
-                success=bool(succeeded(logits.detach(), self.labels.indices)[0]),
+                logits=logits[0],
+                success=bool(succeeded(logits, self.labels.indices)[0]),
                 non_finite=self.renderer.non_finite - before,
+                cost=self.renderer.renders - renders,
             )
 
         return evaluate
+
+    def _judge(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """The objective of a picture (H, W, 3), and the logits (1, C) behind it."""
+        logits = self.model(image)
+        return self.objective(logits, image[None], self.labels.indices)[0], logits
+
+    def loss(self, image: Tensor) -> Tensor:
+        """The objective of a picture (H, W, 3) sRGB, as a number with a graph."""
+        return self._judge(image)[0]
 
     def picture(self, u: Tensor, seed: int, spp: int) -> Tensor:
         """Render a configuration as a file would hold it: (H, W, 3) sRGB in [0, 1], rounded to 8 bits."""
@@ -88,3 +108,15 @@ class Problem:
         probabilities = logits[0].softmax(dim=0)
         predicted = int(probabilities.argmax())
         return Trial(worst, predicted, float(probabilities[predicted]))
+
+
+def _block(name: str, group: Group) -> Block:
+    budget = group.budget
+    return Block(
+        group.size,
+        budget.norm,  # type: ignore[arg-type]
+        budget.epsilon,
+        periodic=group.periodic,
+        name=name,
+        options=group.options,
+    )

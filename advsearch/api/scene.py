@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
-from advsearch.controls import Control, Space, make_control, make_space
+from advsearch.controls import Control, Space, gathered, make_control, make_space
 from advsearch.errors import InputError
 from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.mitsuba_scene import MitsubaScene
+from advsearch.scene.motion import Motion
 from advsearch.scene.renderer import Renderer
 
 Controls = str | Sequence[str | Control] | Mapping[str, Mapping[str, object]]
@@ -40,6 +41,7 @@ class Scene:
         resolution: int | tuple[int, int] = DEFAULT_RESOLUTION,
         denoise: str = "oidn",
         seed: int = 0,
+        estimators: Mapping[str, str] | None = None,
     ) -> Renderer:
         """Return `render(u, seed, spp)` for the space of these controls.
 
@@ -48,12 +50,13 @@ class Scene:
             resolution: side, or (height, width), in pixels.
             denoise: "oidn" or "none".
             seed: root of the noise; the `seed` of each call counts on from it.
+            estimators: how derivatives are obtained, by "control.parameter", "control" or "*"; see `advsearch plan`.
 
         Raises:
             InputError: a control is unknown or impossible in this scene, or an argument is out of range.
         """
         space = make_space(as_controls(controls), self.description)
-        return make_renderer(self.description, space, resolution, denoise, seed)
+        return make_renderer(self.description, space, resolution, denoise, seed, estimators)
 
     def with_settings(self, given: Mapping[str, float]) -> Scene:
         """Return the scene with some of its parameters fixed to other values.
@@ -87,14 +90,22 @@ def load_scene(
 
 
 def make_renderer(
-    description: SceneDescription, space: Space, resolution: int | tuple[int, int], denoise: str, seed: int
+    description: SceneDescription,
+    space: Space,
+    resolution: int | tuple[int, int],
+    denoise: str,
+    seed: int,
+    estimators: Mapping[str, str] | None = None,
 ) -> Renderer:
-    """Put a described scene into Mitsuba at one size and return its renderer."""
+    """Put a described scene, with what the space's controls need in it, into Mitsuba at one size."""
     size = (resolution, resolution) if isinstance(resolution, int) else resolution
+    description = space.scene or description
     formation = ImageFormation(
         denoiser=denoise, exposure=description.number("camera.exposure"), resolution=size, gain=description.gain
     )
-    return Renderer(MitsubaScene(description, size, filter=formation.filter), space, formation, seed)
+    scene = MitsubaScene(description, size, filter=formation.filter)
+    motion = Motion(description, size, scene.assembly)
+    return Renderer(scene, space, formation, seed, motion=motion, estimators=estimators)
 
 
 def as_controls(controls: Controls) -> tuple[Control, ...]:
@@ -106,8 +117,14 @@ def as_controls(controls: Controls) -> tuple[Control, ...]:
     """
     if isinstance(controls, str):
         controls = [part.strip() for part in controls.split(",") if part.strip()]
-    if isinstance(controls, Mapping):
-        return tuple(make_control(kind, given) for kind, given in controls.items())
-    if not all(isinstance(one, (str, Control)) for one in controls):
-        raise InputError(f"controls: expected names or Control instances, got {controls!r}")
-    return tuple(one if isinstance(one, Control) else make_control(one) for one in controls)
+    if not isinstance(controls, Mapping):
+        if not all(isinstance(one, (str, Control)) for one in controls):
+            raise InputError(f"controls: expected names or Control instances, got {controls!r}")
+        ready = tuple(one for one in controls if isinstance(one, Control))
+        if ready and len(ready) == len(controls):
+            return ready
+        names = [one for one in controls if isinstance(one, str)]
+        if len(set(names)) != len(names):
+            raise InputError(f"--control: every instance needs a name of its own, got {', '.join(names)}")
+        return ready + as_controls({one: {} for one in names})
+    return tuple(make_control(name, given) for name, given in gathered(controls).items())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from advsearch.attacks.domain import Block, Domain
 from advsearch.attacks.ending import Ending
-from advsearch.attacks.evaluation import Evaluate, Evaluation
+from advsearch.attacks.evaluation import Evaluate, Evaluation, Wanted
 from advsearch.attacks.objectives import (
     OBJECTIVES,
     Objective,
@@ -17,6 +17,7 @@ from advsearch.attacks.objectives import (
 from advsearch.attacks.policies import (
     PGD,
     POLICIES,
+    Auto,
     Policy,
     Proposal,
     Random,
@@ -41,6 +42,7 @@ __all__ = [
     "OBJECTIVES",
     "PGD",
     "POLICIES",
+    "Auto",
     "Block",
     "Domain",
     "Ending",
@@ -57,6 +59,7 @@ __all__ = [
     "Trial",
     "Trials",
     "Verification",
+    "Wanted",
     "already_wrong",
     "choose_spp",
     "clopper_pearson",

@@ -31,7 +31,10 @@ class Block:
         low, high: bounds, 0 <= low < high <= 1.
         periodic: whether `high` and `low` are the same place (an angle): projecting wraps around. Only for "box".
         name: for messages, e.g. "texture".
+        options: over 0 for a discrete choice among so many: u means option floor(u * options). Such a block has
+            size 1, norm "box" and the whole unit interval; it has no direction that is uphill.
         flag: the command-line flag that sets epsilon, for messages.
+        reach: length of one whole step in a "box", over 0; None for half the diagonal of the bounds.
 
     Raises:
         InputError: a value is outside what is said here.
@@ -45,6 +48,8 @@ class Block:
     periodic: bool = False
     name: str = ""
     flag: str = "--epsilon"
+    options: int = 0
+    reach: float | None = None
 
     def __post_init__(self) -> None:
         where = f" of {self.name!r}" if self.name else ""
@@ -64,16 +69,30 @@ class Block:
             )
         if self.periodic and self.norm != "box":
             raise InputError(f"block{where}: a periodic block cannot have a norm budget; use norm 'box'")
+        if self.reach is not None and (self.norm != "box" or not self.reach > 0.0):
+            raise InputError(
+                f"block{where}: expected a reach over 0 and norm 'box', got {self.reach} and {self.norm!r}"
+            )
+        if self.options:
+            self._check_choice(where)
+
+    def _check_choice(self, where: str) -> None:
+        whole = (self.size, self.norm, self.low, self.high, self.periodic) == (1, "box", 0.0, 1.0, False)
+        if self.options < 0 or not whole:
+            raise InputError(
+                f"block{where}: expected a discrete choice to have at least one option, size 1, norm 'box' and bounds "
+                f"[0, 1], got {self}"
+            )
 
     @property
     def radius(self) -> float:
-        """The length of one whole step, in the block's own norm: epsilon, or half the diagonal of the bounds.
+        """The length of one whole step, in the block's own norm: epsilon, or the reach in a box.
 
         Never more than the bounds let the start move.
         """
         width = self.high - self.low
         if self.norm == "box":
-            return 0.5 * width * math.sqrt(self.size)
+            return 0.5 * width * math.sqrt(self.size) if self.reach is None else self.reach
         reach = width if self.norm == "linf" else width * math.sqrt(self.size)
         return min(float(self.epsilon or 0.0), reach)
 
@@ -85,14 +104,20 @@ class Domain:
     Attributes:
         start: (d,) float32, the clean configuration, inside every block's bounds. A copy is kept.
         blocks: consecutive slices of u that add up to d.
+        gradient_cost: pictures that one whole gradient costs on top of the one it belongs to: 0 for an adjoint, two
+            for each number with central differences.
+        partial_gradients: whether `evaluate` understands `gradient="free"`, the part of the gradient that costs
+            nothing.
         lower, upper: (d,) float32 bounds; those of an l-infinity ball are cut into them already.
 
     Raises:
-        InputError: sizes do not add up, or the start is not finite or outside the bounds.
+        InputError: sizes do not add up, a cost is under 0, or the start is not finite or outside the bounds.
     """
 
     start: Tensor
     blocks: tuple[Block, ...]
+    gradient_cost: int = 0
+    partial_gradients: bool = False
     lower: Tensor = field(init=False, repr=False)
     upper: Tensor = field(init=False, repr=False)
 
@@ -103,12 +128,14 @@ class Domain:
             raise InputError(f"start: expected shape ({total},), the sum of the blocks, got {tuple(start.shape)}")
         if not bool(torch.isfinite(start).all()):
             raise InputError("start: found NaN or infinite values; a start must be a configuration")
+        if self.gradient_cost < 0:
+            raise InputError(f"gradient_cost: expected at least 0, got {self.gradient_cost}")
         lower, upper = torch.empty_like(start), torch.empty_like(start)
         object.__setattr__(self, "start", start)
         object.__setattr__(self, "blocks", tuple(self.blocks))
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
-        for block, part in self._parts():
+        for block, part in self.parts():
             lower[part], upper[part] = block.low, block.high
             if not bool(((start[part] >= lower[part]) & (start[part] <= upper[part])).all()):
                 low, high = float(start[part].min()), float(start[part].max())
@@ -125,8 +152,8 @@ class Domain:
         """Number of elements of u."""
         return self.start.numel()
 
-    def _parts(self) -> list[tuple[Block, slice]]:
-        """Every block with its slice of u."""
+    def parts(self) -> list[tuple[Block, slice]]:
+        """Return every block with its slice of u."""
         parts, begin = [], 0
         for block in self.blocks:
             parts.append((block, slice(begin, begin + block.size)))
@@ -146,7 +173,7 @@ class Domain:
         """
         u = u.detach()
         projected = torch.clamp(u, self.lower, self.upper)
-        for block, part in self._parts():
+        for block, part in self.parts():
             if block.norm == "l2" and block.epsilon is not None:
                 projected[part] = project_l2_box(u[part], self.start[part], block.epsilon, block.low, block.high)
             elif block.periodic:
@@ -162,7 +189,7 @@ class Domain:
         radius where that is over 1).
         """
         excess = float(torch.maximum(self.lower - u, u - self.upper).amax())
-        for block, part in self._parts():
+        for block, part in self.parts():
             if block.norm == "l2" and block.epsilon is not None:
                 norm = math.sqrt(float((u[part] - self.start[part]).square_().sum()))
                 excess = max(excess, (norm - block.epsilon) / max(1.0, block.epsilon))
@@ -175,7 +202,8 @@ class Domain:
     def sample(self, generator: torch.Generator, n: int = 1, *, extreme: bool = False) -> Tensor:
         """Draw configurations at random within the budget.
 
-        - "linf" and "box": uniform in the box that the bounds (and the ball) leave.
+        - "linf" and "box": uniform in the box that the bounds (and the ball) leave; of a discrete choice, the centre of
+          a random option.
         - "l2": uniform in the ball, then projected onto the bounds; not uniform where the bounds cut the ball.
         - with `extreme`, a norm ball is sampled where random search is strongest: an l-infinity ball at random
           corners, an l2 ball at its surface in a direction of random signs. A "box" has no such place (the corners of
@@ -194,8 +222,10 @@ class Domain:
     def _draw(self, generator: torch.Generator, extreme: bool) -> Tensor:
         """One sample of `sample`."""
         u = torch.empty_like(self.start)
-        for block, part in self._parts():
+        for block, part in self.parts():
             noise = torch.rand(block.size, generator=generator)
+            if block.options:
+                noise = centre_of_option(noise, block.options)
             if block.norm == "l2" and block.epsilon is not None:
                 u[part] = self.start[part] + _l2_offset(noise, block.epsilon, generator, extreme)
                 continue
@@ -209,6 +239,7 @@ class Domain:
 
         - "linf": radius * sign(gradient);
         - "l2": radius * gradient / ||gradient||;
+        - a discrete choice: nothing;
         - "box": the same, without the elements that point out of a bound at which u already lies (the free part of
           the gradient, as in projected-gradient methods for bounds), so that they do not use up the step.
 
@@ -220,8 +251,11 @@ class Domain:
             (d,) float32; zero for a block whose gradient is zero. Add a multiple of it to u and project.
         """
         step = torch.empty_like(gradient)
-        for block, part in self._parts():
+        for block, part in self.parts():
             slope = gradient[part]
+            if block.options:
+                step[part] = 0.0
+                continue
             if block.norm == "linf":
                 torch.sign(slope, out=step[part])
                 step[part] *= block.radius
@@ -232,6 +266,11 @@ class Domain:
             slope = slope / slope.abs().amax().clamp_min(torch.finfo(slope.dtype).tiny)
             step[part] = slope * (block.radius / max(float(torch.linalg.vector_norm(slope)), 1.0))
         return step
+
+
+def centre_of_option(u: Tensor, options: Tensor | int) -> Tensor:
+    """Return the middle of the option's share of [0, 1] in which u lies."""
+    return (torch.floor(u * options).clamp_(max=options - 1) + 0.5) / options
 
 
 def _l2_offset(noise: Tensor, radius: float, generator: torch.Generator, extreme: bool) -> Tensor:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
+
+Wanted = bool | Literal["free"]
+"""Which derivative is wanted: none, all of it, or only what costs no extra render, with zeros elsewhere."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +24,8 @@ class Evaluation:
         logits: (C,) float32 output of the model.
         success: the model's answer lies outside the label set. Never derived from the objective.
         non_finite: gradient elements that were NaN or infinite and were set to zero where they arose.
+        cost: pictures that were rendered for it, at least 1: one, and those that differences took. An adjoint is not
+            a picture and counts 0; `SearchResult.gradients` counts it.
     """
 
     objective: float
@@ -28,6 +33,7 @@ class Evaluation:
     logits: Tensor
     success: bool
     non_finite: int = 0
+    cost: int = 1
 
     @property
     def finite(self) -> bool:
@@ -38,14 +44,15 @@ class Evaluation:
 class Evaluate(Protocol):
     """Renders a configuration and classifies it; supplied by whoever owns the scene."""
 
-    def __call__(self, u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def __call__(self, u: Tensor, *, index: int, gradient: Wanted) -> Evaluation:
         """Evaluate u.
 
         Args:
             u: (d,) float32 in [0, 1]; must not be written to.
             index: which of the search's seeds to render with. Equal indices mean equal seeds, others independent
                 ones.
-            gradient: whether the derivative is wanted.
+            gradient: whether the derivative is wanted. "free" only ever comes where the domain has
+                `partial_gradients`.
         """
         ...
 

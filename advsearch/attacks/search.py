@@ -40,6 +40,7 @@ class StepRecord:
         gradient_norm: l2 norm of the gradient after cleaning; NaN without one.
         non_finite: gradient elements that had to be set to zero.
         seconds: time the evaluation took.
+        renders: pictures that all evaluations so far took together, this one included.
     """
 
     step: int
@@ -52,6 +53,7 @@ class StepRecord:
     gradient_norm: float
     non_finite: int
     seconds: float
+    renders: int = 0
 
 
 OnStep = Callable[[StepRecord, Tensor, Evaluation], None]
@@ -72,7 +74,7 @@ class SearchResult:
         stopped: why the loop stopped, whatever it had found.
         history: one record per evaluation of the search itself.
         ranking: one record per new render of a candidate.
-        renders: evaluations in all: len(history) + len(ranking).
+        renders: pictures in all, those that differences took and those of the ranking included.
         gradients: how many of them included a gradient.
         non_finite_objectives: evaluations whose objective was NaN or infinite.
         non_finite_elements: gradient elements that were set to zero, over all evaluations.
@@ -95,7 +97,7 @@ class SearchResult:
 
 
 def planned_renders(steps: int, candidates: int = 4, repeats: int = 2) -> int:
-    """Return how many evaluations `search` makes at most with these arguments."""
+    """Return how many pictures `search` renders at most with these arguments."""
     return steps + candidates * repeats
 
 
@@ -113,9 +115,10 @@ def search(
 ) -> SearchResult:
     """Run one policy on one domain and return the worst configuration it found.
 
-    1. For each step: the policy proposes; the proposal is checked against the domain; it is evaluated with the seed
-       index of its step (a new one every time, DESIGN 4.4); the policy is told. The last evaluation needs no gradient
-       and asks for none.
+    1. Until `steps` renders are spent: the policy proposes; the proposal is checked against the domain; it is evaluated
+       with the seed index of its step (a new one every time, DESIGN 4.4); the policy is told. An evaluation costs one
+       render, and a gradient by differences `Domain.gradient_cost` more. A gradient after which no render would be
+       left to use it is not asked for: never in the last evaluation, and with differences in none of the last few.
     2. The `candidates` best distinct configurations are each evaluated `repeats` times more, with new seed indices
        that are the same for all, without gradient. The best by these renders is the answer (see `candidates`). With
        `candidates=0`, for an objective without noise, the raw best is the answer.
@@ -128,8 +131,8 @@ def search(
         evaluate: renders and classifies one configuration.
         domain: where to search.
         policy: what proposes.
-        steps: evaluations of the search, at least 1. By default all are spent: the worst case is wanted, not the
-            first.
+        steps: renders of the search, at least 1; as many evaluations where no gradient costs any. By default all are
+            spent: the worst case is wanted, not the first.
         seed: root seed of this search's own randomness (not of the renders), at least 0.
         candidates, repeats: see above; together they cost `candidates * repeats` renders on top of `steps`.
         stop_when: ends step 1 early where it returns true, e.g. `stop_at_margin(1.0, labels)`.
@@ -167,6 +170,7 @@ class _Log:
     records: list[StepRecord] = field(default_factory=list)
     gradients: int = 0
     non_finite: int = 0
+    renders: int = 0
 
     def render(self, proposal: Proposal, index: int, phase: Phase) -> Evaluation:
         """Evaluate one proposal and take note of it."""
@@ -174,8 +178,10 @@ class _Log:
         raw = self.evaluate(proposal.u, index=index, gradient=proposal.gradient)
         seconds = time.perf_counter() - begun
         _check_gradient(raw, proposal)
+        _check_cost(raw, proposal, self.domain)
         evaluation = usable(raw)
-        self.gradients += proposal.gradient
+        self.gradients += bool(proposal.gradient)
+        self.renders += raw.cost
         if not evaluation.finite:
             self.non_finite += 1
         elif phase == "search":
@@ -193,6 +199,7 @@ class _Log:
             gradient_norm=math.nan if evaluation.gradient is None else float(evaluation.gradient.norm()),
             non_finite=evaluation.non_finite,
             seconds=seconds,
+            renders=self.renders,
         )
         self.records.append(record)
         if self.on_step is not None:
@@ -205,21 +212,27 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, stop_when: S
     generator = torch.Generator().manual_seed(stream(seed, "search"))
     state = policy.start(log.domain, generator, steps)
     in_a_row = 0
-    for step in range(steps):
+    while log.renders < steps:
+        step = len(log.records)
         proposal, state = policy.propose(state)
         if proposal is None:
             return Ending.STALLED
         _check_inside(proposal.u, log.domain, policy.name)
-        last = step == steps - 1
-        evaluation = log.render(replace(proposal, gradient=proposal.gradient and not last), step, "search")
+        evaluation = log.render(_affordable(proposal, log.domain, steps - log.renders), step, "search")
         in_a_row = 0 if evaluation.finite else in_a_row + 1
         if in_a_row == NON_FINITE_LIMIT:
             return Ending.NON_FINITE
         if evaluation.finite and stop_when is not None and stop_when(evaluation):
             return Ending.FOUND
-        if not last:
+        if log.renders < steps:
             state = policy.update(state, proposal.u, evaluation)
     return Ending.BUDGET_SPENT
+
+
+def _affordable(proposal: Proposal, domain: Domain, left: int) -> Proposal:
+    """Return the proposal without its gradient unless renders are left to use it."""
+    extra = domain.gradient_cost if proposal.gradient is True else 0
+    return proposal if 1 + extra < left else replace(proposal, gradient=False)
 
 
 def _rank(log: _Log, first_index: int, repeats: int) -> None:
@@ -249,7 +262,7 @@ def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
         stopped=stopped,
         history=tuple(r for r in log.records if r.phase == "search"),
         ranking=tuple(r for r in log.records if r.phase == "ranking"),
-        renders=len(log.records),
+        renders=log.renders,
         gradients=log.gradients,
         non_finite_objectives=log.non_finite,
         non_finite_elements=sum(r.non_finite for r in log.records),
@@ -267,6 +280,15 @@ def _check_inside(u: Tensor, domain: Domain, name: str) -> None:
     outside = domain.violation(u)
     if not outside <= TOLERANCE:
         raise RuntimeError(f"policy {name!r} left its budget by {outside:.3g}; it must project what it proposes")
+
+
+def _check_cost(evaluation: Evaluation, proposal: Proposal, domain: Domain) -> None:
+    """Raise RuntimeError unless an evaluation cost what the domain said it would; a budget rests on that."""
+    most = 1 + (domain.gradient_cost if proposal.gradient is True else 0)
+    if not 1 <= evaluation.cost <= most:
+        raise RuntimeError(
+            f"evaluate took {evaluation.cost} renders; expected 1 to {most}, by the domain's gradient_cost"
+        )
 
 
 def _check_gradient(evaluation: Evaluation, proposal: Proposal) -> None:

@@ -19,14 +19,23 @@ GROUPS = {
     "run": "run",
 }
 
-_LISTS = ("controls", "set_")
+_LISTS = ("controls", "set_", "estimators")
 
 
-def add_settings(parser: argparse.ArgumentParser) -> None:
-    """Add a flag for every setting, under the heading of its group."""
-    groups = {name: parser.add_argument_group(heading) for name, heading in GROUPS.items()}
-    for setting in settings():
-        group = groups[setting.group]
+def add_settings(
+    parser: argparse.ArgumentParser, groups: Sequence[str] = tuple(GROUPS), fields: Sequence[str] = ()
+) -> None:
+    """Add flags for settings, under the headings of their groups.
+
+    Args:
+        parser: gets them.
+        groups: all settings of these groups.
+        fields: and these settings.
+    """
+    wanted = [one for one in settings() if one.group in groups or one.field in fields]
+    headings = {one.group: parser.add_argument_group(GROUPS[one.group]) for one in wanted}
+    for setting in wanted:
+        group = headings[setting.group]
         if setting.is_switch:
             group.add_argument(
                 setting.flag,
@@ -47,18 +56,25 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
             )
 
 
-def config_from(args: argparse.Namespace) -> AttackConfig:
+def config_from(args: argparse.Namespace, **otherwise: Any) -> AttackConfig:
     """Return the configuration that the flags describe.
+
+    Args:
+        args: parsed flags.
+        **otherwise: values for settings that were not given.
 
     Raises:
         InputError: a value is not allowed; the message names the flag.
     """
     known = {setting.field for setting in settings()}
-    data: dict[str, Any] = {name: value for name, value in vars(args).items() if name in known}
+    data: dict[str, Any] = {**otherwise, **{name: value for name, value in vars(args).items() if name in known}}
     if "controls" in data:
         data["controls"] = _controls(data["controls"])
     if "set_" in data:
         data["set_"] = dict(parse_assignment(text, "--set") for text in data["set_"])
+    if "estimators" in data:
+        pairs = [text if "=" in text else f"*={text}" for text in data["estimators"]]
+        data["estimators"] = dict(parse_assignment(text, "--estimator") for text in pairs)
     return AttackConfig.from_flags(data)
 
 
@@ -74,19 +90,23 @@ def help_text(setting: Setting) -> str:
 
 
 def _controls(given: Sequence[str]) -> dict[str, Any]:
-    """Return control to parameters from ``texture,pose`` and ``texture={resolution: 64}``."""
+    """Return control to settings from ``texture,pose``, ``texture={resolution: 64}`` and ``pose,texture={...}``."""
     found: dict[str, Any] = {}
     for text in given:
-        if "=" in text:
-            name, parameters = parse_assignment(text, "--control")
+        names, equals, settings_text = text.partition("=")
+        plain = [name.strip() for name in names.split(",") if name.strip()]
+        if equals:
+            last = plain.pop() if plain else ""
+            found.update({name: {} for name in plain})
+            name, parameters = parse_assignment(f"{last}={settings_text}", "--control")
             found[name] = parameters
         else:
-            found.update({name.strip(): {} for name in text.split(",") if name.strip()})
+            found.update({name: {} for name in plain})
     return found
 
 
 def _metavar(setting: Setting) -> str:
-    names = {"set_": "PARAMETER=VALUE", "controls": "NAME", "labels": "FILE"}
+    names = {"set_": "PARAMETER=VALUE", "controls": "NAME", "labels": "FILE", "estimators": "NAME"}
     return names.get(setting.field, setting.field.rpartition("_")[2].upper())
 
 

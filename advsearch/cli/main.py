@@ -24,6 +24,8 @@ from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 COMMANDS = {
     "attack": "advsearch.cli.attack",
     "run": "advsearch.cli.run",
+    "check": "advsearch.cli.check",
+    "plan": "advsearch.cli.plan",
     "list": "advsearch.cli.list",
     "show": "advsearch.cli.show",
     "doctor": "advsearch.cli.doctor_command",

@@ -1,50 +1,189 @@
-"""Controls: the families of scene parameters that may vary. `CONTROLS` is the registry."""
+"""Controls: the families of scene parameters that may vary. `CONTROLS` is the registry.
+
+A package outside adds its own through the entry-point group `advsearch.controls` (docs/controls/writing.md).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
 
-from advsearch.controls.base import BoundControl, Budget, Choice, Control, Parameter
+from advsearch.controls.base import BoundControl, Budget, Choice, Control, Group, Parameter
+from advsearch.controls.numbers import NumberControl
 from advsearch.controls.space import Space
-from advsearch.controls.texture import TextureControl
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import SceneDescription
 
-CONTROLS: Mapping[str, type[Control]] = {TextureControl.kind: TextureControl}
+ENTRY_POINTS = "advsearch.controls"
+"""Group of entry points that name further controls: `NAME = module:Class`."""
+
+OWN = {
+    "pose": "PoseControl",
+    "camera": "CameraControl",
+    "texture": "TextureControl",
+    "light": "LightControl",
+    "environment": "EnvironmentControl",
+    "sky": "SkyControl",
+    "geometry": "GeometryControl",
+    "patch": "PatchControl",
+    "background": "BackgroundControl",
+    "haze": "HazeControl",
+    "lens": "LensControl",
+    "corruption": "CorruptionControl",
+}
+"""The package's own controls: the word on the command line is the module's name, and this is its class."""
+
+
+class _Registry(Mapping[str, type[Control]]):
+    """Every control by its word, imported when it is asked for; those of other packages after our own."""
+
+    def __getitem__(self, kind: str) -> type[Control]:
+        if kind in OWN:
+            found: type[Control] = getattr(import_module(f"{__name__}.{kind}"), OWN[kind])
+            return found
+        if kind in _outside():
+            return _outside()[kind]
+        raise KeyError(kind)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter([*OWN, *(kind for kind in _outside() if kind not in OWN)])
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+
+@cache
+def _outside() -> dict[str, type[Control]]:
+    """Controls of other packages.
+
+    Raises:
+        InputError: an entry point is not a control.
+    """
+    found = {}
+    for point in entry_points(group=ENTRY_POINTS):
+        control = point.load()
+        if not (isinstance(control, type) and issubclass(control, Control)) or control.kind != point.name:
+            raise InputError(
+                f"entry point {point.name} = {point.value} of group {ENTRY_POINTS}: expected a subclass of Control "
+                f"whose kind is {point.name!r}; repair or uninstall the package that declares it"
+            )
+        found[point.name] = control
+    return found
+
+
+CONTROLS: Mapping[str, type[Control]] = _Registry()
 """Every control by its word on the command line."""
 
 
-def make_control(kind: str, settings: Mapping[str, object] | None = None) -> Control:
+def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Control:
     """Return a control from its name and settings.
 
     Args:
-        kind: a key of `CONTROLS`.
-        settings: values for the names in its `choices`; None or missing keeps the default.
+        asked: "kind"; "kind:name" for an instance with a name of its own (light:key); or "kind.parameter" to search
+            one parameter only, over its default range. With "kind" among the settings, this is the instance's name.
+        settings: values for its parameters and choices; None or missing keeps the default.
 
     Raises:
         UnknownNameError: no such control, or no such setting.
         InputError: a setting is out of range.
     """
+    given = {name: value for name, value in (settings or {}).items() if value is not None}
+    kind, name, parameter = _read_name(asked, given)
     if kind not in CONTROLS:
         raise UnknownNameError("control", kind, CONTROLS)
     control = CONTROLS[kind]
-    given = {name: value for name, value in (settings or {}).items() if value is not None}
-    known = [choice.name for choice in control.choices]
-    for name in given:
-        if name not in known:
-            raise UnknownNameError(f"setting of control {kind}", name, known)
+    if parameter is not None:
+        given.setdefault(parameter, _default_range(control, parameter))
+    known = [one.name for one in control.choices] + [one.name for one in control.parameters]
+    for setting in given:
+        if setting not in known:
+            raise UnknownNameError(f"setting of control {kind}", setting, known)
+    if name != kind:
+        given["name"] = name
     return control(**given)
 
 
+def _read_name(asked: str, given: dict[str, object]) -> tuple[str, str, str | None]:
+    """Return kind, instance name and single parameter; takes "kind" out of the settings."""
+    kind, colon, name = asked.partition(":")
+    kind, dot, parameter = kind.partition(".")
+    said = given.pop("kind", None)
+    if said is not None:
+        return str(said), asked, None
+    if colon and not name.isidentifier():
+        raise InputError(f"--control {asked}: expected a name of letters, digits and _ after the colon, got {name!r}")
+    return kind, name or kind, parameter if dot else None
+
+
+def _default_range(control: type[Control], parameter: str) -> object:
+    for one in control.parameters:
+        if one.name == parameter:
+            if one.options:
+                return {"choices": list(one.options)}
+            return list(one.search or (one.low, one.high))
+    raise UnknownNameError(f"parameter of control {control.kind}", parameter, [one.name for one in control.parameters])
+
+
+def gathered(asked: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, object]]:
+    """Return settings by control for names as `make_control` takes them.
+
+    `camera.azimuth` and `camera.elevation` become one control that searches both.
+
+    Args:
+        asked: settings by name; a name may be "kind", "kind:name" or "kind.parameter".
+    """
+    found: dict[str, dict[str, object]] = {}
+    for name, given in asked.items():
+        kind, dot, rest = name.partition(".")
+        if not dot or kind not in CONTROLS:
+            found.setdefault(name, {}).update(given or {})
+            continue
+        parameter, colon, instance = rest.partition(":")
+        into = found.setdefault(kind + colon + instance, {})
+        into.update({parameter: _default_range(CONTROLS[kind], parameter), **(given or {})})
+    return found
+
+
 def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
-    """Bind controls to a scene and compose them.
+    """Let controls prepare a scene, bind them to it and compose them.
 
     Raises:
         InputError: no control, two of one name, or one that the scene cannot take.
     """
     if not controls:
         raise InputError(f"--control: expected at least one of {', '.join(CONTROLS)}")
-    return Space(tuple(control.bind(scene) for control in controls))
+    names = [control.name for control in controls]
+    if len(set(names)) != len(names):
+        raise InputError(
+            f"--control: every instance needs a name of its own, got {', '.join(names)}; write KIND:NAME, such as "
+            f"light:key,light:fill"
+        )
+    for control in controls:
+        scene = control.prepare(scene)
+    space = Space(tuple(control.bind(scene) for control in controls), scene)
+    if not len(space.start):
+        raise InputError(
+            f"--control {', '.join(names)}: every parameter is fixed, so there is nothing to search; give one a range, "
+            f"such as {_suggestion(controls[0])}"
+        )
+    return space
+
+
+def _suggestion(control: Control) -> str:
+    """A range that could be given, for a message."""
+    one = next((one for one in control.parameters if one.search is not None), control.parameters[0])
+    low, high = one.search or (one.low, one.high)
+    return f"{control.name}={{{one.name}: [{low:g}, {high:g}]}}"
+
+
+def __getattr__(name: str) -> object:
+    """Import the class of a control when it is asked for by name."""
+    for module, class_name in OWN.items():
+        if class_name == name:
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 __all__ = [
@@ -53,9 +192,11 @@ __all__ = [
     "Budget",
     "Choice",
     "Control",
+    "Group",
+    "NumberControl",
     "Parameter",
     "Space",
-    "TextureControl",
+    "gathered",
     "make_control",
     "make_space",
 ]

@@ -1,39 +1,50 @@
 """What a control is: a named family of scene parameters that may vary, and their map from the unit box.
 
 A control declares its parameters as data (unit, range, default, whether periodic, differentiable, silhouette-moving)
-that the command line, the documentation and the shared tests read. Bound to a scene it becomes a `BoundControl`: a
-slice of
-u, its budget, and the map from that slice to scene inputs, written in torch so that autograd runs through it.
+that the command line, the documentation, the gradient plan and the shared tests read. Bound to a scene it becomes a
+`BoundControl`: a slice of u, its budgets, and the map from that slice to scene inputs, written in torch so that
+autograd runs through it.
 
-A new control is one file with these two classes and one line in `advsearch.controls.CONTROLS`.
+Most controls are a handful of numbers: those subclass `advsearch.controls.numbers.NumberControl` and are one small
+file. `docs/controls/writing.md` has a worked example.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import ClassVar, TypedDict
 
+import torch
 from torch import Tensor
 
 from advsearch.scene.description import SceneDescription
 
+NOTHING: Mapping[str, Tensor] = MappingProxyType({})
+"""No scene inputs yet."""
+
 
 @dataclass(frozen=True)
 class Parameter:
-    """One named, bounded number or tensor of a control.
+    """One named, bounded number, tensor or choice of a control.
 
     Attributes:
         name: short name; `control.name` addresses it everywhere.
         shape: of its value; () for a number, None in a place that depends on the scene or a choice.
-        unit: "degrees", "object sizes", "sRGB", ..., or "1".
-        low: smallest value.
-        high: largest value.
+        unit: "degrees", "object sizes", "sRGB", "stops", "name", ..., or "1".
+        low: smallest allowed value (0 for a choice among names).
+        high: largest allowed value (number of names - 1 for a choice among names).
         default: the value that leaves the scene as it is, in words if it depends on the scene.
         description: one sentence.
-        periodic: the ends of the range are the same value.
+        periodic: the value and the value plus 360 degrees (`high - low` of a full turn) are the same.
         differentiable: a derivative exists and is computed.
         moves_silhouettes: changing it can move an outline in the picture, so interior adjoints miss a term.
+        search: the range that is searched when nothing is said about the parameter; None: it stays at its default.
+        log: the unit interval runs over the logarithm of the value (scales, powers, distances).
+        options: the names of a discrete choice; empty for numbers.
+        estimators: the valid ways to differentiate it, preferred first (keys of `advsearch.scene.plan.ESTIMATORS`).
     """
 
     name: str
@@ -46,6 +57,10 @@ class Parameter:
     periodic: bool = False
     differentiable: bool = True
     moves_silhouettes: bool = False
+    search: tuple[float, float] | None = None
+    log: bool = False
+    options: tuple[str, ...] = ()
+    estimators: tuple[str, ...] = ("differences",)
 
 
 @dataclass(frozen=True)
@@ -59,7 +74,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Budget:
-    """How far a control's slice of u may go from its start, inside the unit box.
+    """How far a group of u may go from its start, inside the unit box.
 
     Attributes:
         norm: "linf" or "l2" for a ball around the start, "box" for the whole range.
@@ -68,6 +83,32 @@ class Budget:
 
     norm: str
     epsilon: float | None
+
+
+WHOLE_RANGE = Budget("box", None)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Neighbouring coordinates of a control's slice with one budget and one way to be differentiated.
+
+    Attributes:
+        name: of the parameter behind them.
+        size: number of coordinates.
+        estimators: the valid estimators, preferred first; empty for a discrete choice, which has no derivative.
+        budget: how far they may go.
+        periodic: 0 and 1 are the same value.
+        options: number of options of a discrete choice; 0 for a continuous parameter.
+        moves_silhouettes: see `Parameter`.
+    """
+
+    name: str
+    size: int
+    estimators: tuple[str, ...]
+    budget: Budget = WHOLE_RANGE
+    periodic: bool = False
+    options: int = 0
+    moves_silhouettes: bool = False
 
 
 class Value(TypedDict):
@@ -83,24 +124,44 @@ class BoundControl(ABC):
     Attributes:
         name: the instance's name.
         start: (d,) float32 in [0, 1], the value that leaves the scene as it is.
-        budget: how far the slice may go.
+        groups: the coordinates of the slice in order; their sizes add up to d.
+        refines: the scene inputs that this control takes from the ones before it and changes (a patch on a texture).
     """
 
     name: str
     start: Tensor
-    budget: Budget
+    groups: tuple[Group, ...]
+    refines: frozenset[str] = frozenset()
+
+    @property
+    def budget(self) -> Budget:
+        """The budget of the whole slice: that of its largest group."""
+        return max(self.groups, key=lambda group: group.size).budget if self.groups else WHOLE_RANGE
 
     @abstractmethod
-    def inputs(self, u: Tensor) -> dict[str, Tensor]:
-        """Map a slice (d,) of u to named scene inputs, by differentiable torch operations."""
+    def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
+        """Map a slice (d,) of u to named scene inputs, by differentiable torch operations.
+
+        Args:
+            u: (d,) in [0, 1].
+            so_far: inputs of the controls before this one; only names in `refines` may be returned again.
+        """
+
+    def picture(self, u: Tensor, image: Tensor) -> Tensor:
+        """Change the finished picture (H, W, 3), display-referred sRGB in [0, 1]; differentiable in both arguments."""
+        return image
 
     @abstractmethod
     def describe(self, u: Tensor) -> dict[str, Value]:
         """Say a configuration in a few named values with units, small enough for one row of a table."""
 
-    @abstractmethod
     def artifacts(self, u: Tensor) -> dict[str, Tensor]:
         """Return pictures worth keeping, by file stem: (h, w, 3) display-referred sRGB in [0, 1]."""
+        return {}
+
+    def files(self, u: Tensor) -> dict[str, bytes]:
+        """Return other files worth keeping, by name with ending: a mesh as PLY, say."""
+        return {}
 
 
 class Control(ABC):
@@ -111,17 +172,37 @@ class Control(ABC):
         summary: one sentence.
         parameters: what may vary.
         choices: what may be chosen.
+        name: the instance's name; `kind` unless said otherwise.
     """
 
     kind: ClassVar[str]
     summary: ClassVar[str]
     parameters: ClassVar[tuple[Parameter, ...]]
     choices: ClassVar[tuple[Choice, ...]]
+    name: str
+
+    def settings(self) -> dict[str, object]:
+        """Return what `make_control` needs to make an equal instance, as JSON values."""
+        named = {} if self.name == self.kind else {"kind": self.kind}
+        return {**named, **{choice.name: getattr(self, choice.name) for choice in self.choices}}
+
+    def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """Return the scene with whatever this control needs to be in it (a light, a medium); by default unchanged.
+
+        Raises:
+            InputError: the scene cannot take it.
+        """
+        return scene
 
     @abstractmethod
     def bind(self, scene: SceneDescription) -> BoundControl:
-        """Fit the control to a scene.
+        """Fit the control to a scene that all controls of the space have prepared.
 
         Raises:
             InputError: a setting of the control is impossible in this scene.
         """
+
+
+def scalar(value: float) -> Tensor:
+    """Return a number as a float32 tensor without dimensions."""
+    return torch.tensor(value, dtype=torch.float32)

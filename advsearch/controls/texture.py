@@ -1,112 +1,314 @@
-"""The `texture` control: every texel of the object's base-colour map, inside a ball around the original.
+"""The `texture` control: the base-colour map of the object or of another mesh, inside a ball around the original.
 
-    u = texel values, display-referred sRGB in [0, 1];   reflectance = linear(u);   ||u - original||_p <= epsilon
+    texels     u = texel values, display-referred sRGB in [0, 1];   ||u - original||_p <= epsilon
+    palette    u = k colours in a ball around those of the original;   texel = original + sum_i w_i(texel) (u_i - c_i)
+    waves      u = (a + 1) / 2 per wave and channel;   texel = original + r tanh(sum_mn s_mn a_mn cos_m(x) cos_n(y))
 
-Values are display-referred because that is what a person sees and a printer prints: a step of 0.1 is as visible in a
-dark texel as in a bright one. The threat model of a bounded change of texture is REVAMP's and Athalye et al.'s (2018,
-arXiv 1707.07397, section 3); here the ball is around the texture, not around the picture.
+and reflectance = linear(texel). Values are display-referred because that is what a person sees and a printer prints: a
+step of 0.1 is as visible in a dark texel as in a bright one. The threat model of a bounded change of texture is
+REVAMP's and Athalye et al.'s (2018, arXiv 1707.07397, section 3); here the ball is around the texture, not around the
+picture.
 
 The L2 radius is the plain Euclidean norm over all texel values. A search over many texels moves each by little: a
 radius of `r * sqrt(3 h w)` lets the root-mean-square change reach r.
+
+The palette follows Chang et al. (2015, "Palette-based Photo Recoloring", sections 3.2 and 3.4): k-means colours, and
+weights that fall off with the distance of a texel's colour from each, so that shades inside a surface survive. Ours are
+in sRGB instead of CIELAB, and normalised, so that no texel moves further than the palette does. The waves are the
+low-frequency search of Guo et al. (2019, arXiv 1809.08758, section 3) carried over from pictures to textures.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from advsearch.controls.base import BoundControl, Budget, Choice, Control, Parameter, Value
-from advsearch.errors import InputError
+from advsearch.controls.base import NOTHING, BoundControl, Budget, Choice, Control, Group, Parameter, Value
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import srgb_to_linear
-from advsearch.scene.mitsuba_scene import BASE_COLOR
+from advsearch.scene.parts import MeshPart
+from advsearch.scene.surface_map import texel_area
 
 RESOLUTIONS = (256, 512)
 """Smallest and largest side that is taken from the object's own texture when none is asked for."""
 DEFAULT_EPSILON = 0.1
 """Default radius of the L-infinity ball; the default L2 ball has the same root-mean-square change at its edge."""
 NORMS = ("linf", "l2")
+FORMS = ("texels", "palette", "waves")
+OBJECT = "object"
+LARGEST_WAVES = 64
+LARGEST_PALETTE = 64
+LLOYD_STEPS = 30
+WAVE_REACH = 3.0
+"""Argument of the tanh that the slowest wave alone reaches at its largest amplitude: 0.995 of the ball's radius."""
 
 
 @dataclass(frozen=True)
 class TextureControl(Control):
-    """Every texel of the object's base-colour map, inside a ball around the original.
+    """The base-colour map of one mesh, inside a ball around the original.
 
     Attributes:
         epsilon: radius of the ball, display-referred; None takes the norm's default.
         norm: "linf" or "l2".
-        resolution: side of the searched texture in texels, 2 to 4096; None takes the longer side of the object's own
+        resolution: side of the searched texture in texels, 2 to 4096; None takes the longer side of the mesh's own
             texture, but at least 256 and at most 512.
+        form: "texels" (each on its own), "palette" (a few colours) or "waves" (smooth).
+        colors: number of colours of the palette, 1 to 64.
+        waves: number of waves along each side of the texture, 1 to 64.
+        part: which mesh of the scene: "object", or the name of a part such as an occluder.
+        texels: stands for form "texels" when `texture.texels` is asked for; its range cannot be set.
+        palette: likewise.
+        amplitudes: likewise, for form "waves".
         name: the instance's name.
     """
 
     epsilon: float | None = None
     norm: str = "linf"
     resolution: int | None = None
+    form: str | None = None
+    colors: int = 6
+    waves: int = 8
+    part: str = OBJECT
+    texels: object = None
+    palette: object = None
+    amplitudes: object = None
     name: str = "texture"
 
     kind: ClassVar[str] = "texture"
-    summary: ClassVar[str] = "Every texel of the object's base-colour map, inside a ball around the original."
+    summary: ClassVar[str] = "The base-colour map of the object or another mesh, inside a ball around the original."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
-            "texels", (None, None, 3), "sRGB", 0.0, 1.0, "the object's own texture", "Display-referred texel values."
+            "texels",
+            (None, None, 3),
+            "sRGB",
+            0.0,
+            1.0,
+            "the object's own texture",
+            "Display-referred texel values.",
+            search=(0.0, 1.0),
+            estimators=("adjoint",),
+        ),
+        Parameter(
+            "palette",
+            (None, 3),
+            "sRGB",
+            0.0,
+            1.0,
+            "the texture's own colours",
+            "Colours that the texture is repainted with (form palette).",
+            search=(0.0, 1.0),
+            estimators=("adjoint", "differences"),
+        ),
+        Parameter(
+            "amplitudes",
+            (None, None, 3),
+            "1",
+            -1.0,
+            1.0,
+            0.0,
+            "Strength of each wave in each colour channel (form waves).",
+            search=(-1.0, 1.0),
+            estimators=("adjoint", "simultaneous"),
         ),
     )
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice("epsilon", DEFAULT_EPSILON, "Radius of the ball around the original texture, display-referred."),
         Choice("norm", "linf", "Norm of the ball: linf (per texel value) or l2 (Euclidean, over all texel values)."),
         Choice("resolution", None, "Side of the searched texture in texels; by default the object's own, 256 to 512."),
+        Choice("form", "texels", "What is searched: texels, palette (a few colours) or waves (smooth patterns)."),
+        Choice("colors", 6, "Number of colours of the palette."),
+        Choice("waves", 8, "Number of waves along each side of the texture."),
+        Choice("part", OBJECT, "Which mesh of the scene: object, or the name of an instance that put one there."),
     )
 
     def __post_init__(self) -> None:
         if self.norm not in NORMS:
             raise InputError(f"--norm: expected one of {', '.join(NORMS)}, got {self.norm!r}")
-        if self.epsilon is not None and not (math.isfinite(self.epsilon) and self.epsilon > 0.0):
-            raise InputError(f"--epsilon: expected a finite number greater than 0, got {self.epsilon:g}")
-        if self.resolution is not None and not 2 <= self.resolution <= 4096:
+        if self.epsilon is not None and not (_is_number(self.epsilon) and self.epsilon > 0.0):
+            raise InputError(f"--epsilon: expected a finite number greater than 0, got {self.epsilon}")
+        if self.resolution is not None and not _is_count(self.resolution, 2, 4096):
             raise InputError(f"--texture-resolution: expected 2 to 4096 texels, got {self.resolution}")
+        object.__setattr__(self, "form", self._form())
+        for choice, largest in (("colors", LARGEST_PALETTE), ("waves", LARGEST_WAVES)):
+            if not _is_count(getattr(self, choice), 1, largest):
+                raise InputError(
+                    f"{self.name}.{choice}: expected a whole number from 1 to {largest}, got {getattr(self, choice)!r}"
+                )
+
+    def _form(self) -> str:
+        """The form that was asked for, by name or by one of the forms' parameters.
+
+        Raises:
+            InputError: there is no such form, two are asked for, or a parameter was given a range of its own.
+        """
+        asked = dict(zip(FORMS, (self.texels, self.palette, self.amplitudes), strict=True))
+        named = [form for form, given in asked.items() if given is not None]
+        for one, form in zip(self.parameters, FORMS, strict=True):
+            if asked[form] not in (None, [one.low, one.high], (one.low, one.high)):
+                raise InputError(
+                    f"{self.name}.{one.name}: expected no value but [{one.low:g}, {one.high:g}], got {asked[form]!r}; "
+                    f"set how far it may go with {self.name}.epsilon"
+                )
+        if self.form is not None and self.form not in FORMS:
+            raise UnknownNameError(f"{self.name}.form", str(self.form), FORMS)
+        if len({*named, *([self.form] if self.form else [])}) > 1:
+            raise InputError(f"{self.name}.form: expected one form, got {', '.join([*named, self.form or ''])}")
+        return self.form or (named[0] if named else FORMS[0])
+
+    def settings(self) -> dict[str, object]:
+        said = {"kind": self.kind} if self.name != self.kind else {}
+        return {**said, **super().settings()}
 
     def bind(self, scene: SceneDescription) -> BoundControl:
-        own = torch.from_numpy(scene.object.base_color.copy())
-        original = resampled(own, self.resolution or min(max(max(own.shape[:2]), RESOLUTIONS[0]), RESOLUTIONS[1]))
-        epsilon = self.epsilon
-        if epsilon is None:
-            epsilon = DEFAULT_EPSILON * (math.sqrt(original.numel()) if self.norm == "l2" else 1.0)
-        return BoundTexture(self.name, original, Budget(self.norm, epsilon))
+        mesh, base_color = self._target(scene)
+        own = torch.from_numpy(base_color.copy())
+        side = self.resolution or min(max(max(own.shape[:2]), RESOLUTIONS[0]), RESOLUTIONS[1])
+        original = resampled(own, int(side))
+        return BoundTexture(self.name, self.part, original, self._painter(mesh, original))
+
+    def _target(self, scene: SceneDescription) -> tuple[Mesh, Floats]:
+        """The mesh to paint and its base colour (h, w, 3) sRGB.
+
+        Raises:
+            UnknownNameError: the scene has no such mesh.
+        """
+        parts = {part.name: part for part in scene.parts if isinstance(part, MeshPart)}
+        if self.part == OBJECT:
+            return scene.object.mesh, scene.object.base_color
+        if self.part not in parts:
+            raise UnknownNameError(f"{self.name}.part", str(self.part), [OBJECT, *parts])
+        return parts[self.part].mesh, parts[self.part].base_color
+
+    def _painter(self, mesh: Mesh, original: Tensor) -> Painter:
+        if self.form == "palette":
+            centres = palette(original, texel_area(mesh, len(original)), int(self.colors))
+            return Recoloured(original, centres, Budget(self.norm, self._radius(centres.numel())))
+        if self.form == "waves":
+            flat = self._radius(original.numel()) / (math.sqrt(original.numel()) if self.norm == "l2" else 1.0)
+            return Waved(original, int(self.waves), flat)
+        return Repainted(original, Budget(self.norm, self._radius(original.numel())))
+
+    def _radius(self, count: int) -> float:
+        """Radius of the ball over `count` numbers."""
+        if self.epsilon is not None:
+            return float(self.epsilon)
+        return DEFAULT_EPSILON * (math.sqrt(count) if self.norm == "l2" else 1.0)
+
+
+class Painter(ABC):
+    """One form of the control: a map from its slice of u to texels.
+
+    Attributes:
+        start: (d,) float32, the slice that gives the original.
+        group: the slice as a group.
+    """
+
+    start: Tensor
+    group: Group
+
+    @abstractmethod
+    def texels(self, u: Tensor) -> Tensor:
+        """Map (d,) in [0, 1] to (h, w, 3) display-referred sRGB in [0, 1]; differentiable."""
+
+
+class Repainted(Painter):
+    """Each texel value on its own."""
+
+    def __init__(self, original: Tensor, budget: Budget) -> None:
+        self._shape = original.shape
+        self.start = original.reshape(-1)
+        self.group = Group("texels", original.numel(), ("adjoint",), budget)
+
+    def texels(self, u: Tensor) -> Tensor:
+        return u.reshape(self._shape)
+
+
+class Recoloured(Painter):
+    """A few colours, from which each texel takes its change by how much it resembles them.
+
+    Args:
+        original: (h, w, 3) sRGB.
+        centres: (k, 3) sRGB, the palette of the original.
+        budget: ball around the palette.
+    """
+
+    def __init__(self, original: Tensor, centres: Tensor, budget: Budget) -> None:
+        self._original, self._centres = original, centres
+        squared = (original[:, :, None, :] - centres).square().sum(dim=-1)
+        self._weights = torch.softmax(-squared / (2.0 * _spread(centres) ** 2), dim=-1)
+        self.start = centres.reshape(-1)
+        self.group = Group("palette", centres.numel(), ("adjoint", "differences"), budget)
+
+    def texels(self, u: Tensor) -> Tensor:
+        return (self._original + self._weights @ (u.reshape(-1, 3) - self._centres)).clamp(0.0, 1.0)
+
+
+class Waved(Painter):
+    """Cosine waves along both sides of the texture, added up and held inside a radius by a tanh.
+
+    Args:
+        original: (h, w, 3) sRGB.
+        count: number of waves along each side; wave m has m half periods, and the amplitude that a coordinate at the
+            end of its range gives falls as 1 / (1 + the wave's frequency).
+        radius: largest change of a texel value.
+    """
+
+    def __init__(self, original: Tensor, count: int, radius: float) -> None:
+        height, width = original.shape[:2]
+        self._original, self._count, self._radius = original, count, radius
+        number = torch.arange(count)
+        self._down = torch.cos(math.pi * (torch.arange(height) + 0.5)[:, None] * number / height)
+        self._across = torch.cos(math.pi * (torch.arange(width) + 0.5)[:, None] * number / width)
+        self._reach = (WAVE_REACH / (1.0 + torch.hypot(number[:, None].float(), number[None, :].float())))[..., None]
+        self.start = torch.full((count * count * 3,), 0.5)
+        self.group = Group("amplitudes", len(self.start), ("adjoint", "simultaneous"))
+
+    def texels(self, u: Tensor) -> Tensor:
+        amplitudes = (2.0 * u - 1.0).reshape(self._count, self._count, 3) * self._reach
+        summed = torch.einsum("hm,wn,mnc->hwc", self._down, self._across, amplitudes)
+        return (self._original + self._radius * torch.tanh(summed)).clamp(0.0, 1.0)
 
 
 class BoundTexture(BoundControl):
-    """The texels of one object's base-colour map.
+    """The base-colour map of one mesh.
 
     Args:
         name: the instance's name.
+        part: name of the mesh.
         original: (h, w, 3) float32 display-referred sRGB in [0, 1].
-        budget: ball around the original.
+        painter: maps u to texels.
     """
 
-    def __init__(self, name: str, original: Tensor, budget: Budget) -> None:
+    def __init__(self, name: str, on: str, original: Tensor, painter: Painter) -> None:
         self.name = name
-        self.shape = tuple(original.shape)
-        self.start = original.reshape(-1)
-        self.budget = budget
+        self._on = on
+        self._original = original
+        self._painter = painter
+        self.start = painter.start
+        self.groups = (painter.group,)
 
-    def inputs(self, u: Tensor) -> dict[str, Tensor]:
-        return {BASE_COLOR: srgb_to_linear(u.reshape(self.shape))}
+    def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
+        return {f"{self._on}.base_color": srgb_to_linear(self._painter.texels(u))}
 
     def describe(self, u: Tensor) -> dict[str, Value]:
-        change = (u - self.start).detach()
+        change = self._painter.texels(u.detach()) - self._original
         return {
             f"{self.name}.linf": {"value": float(change.abs().max()), "unit": "sRGB"},
             f"{self.name}.rms": {"value": float(change.pow(2).mean().sqrt()), "unit": "sRGB"},
         }
 
     def artifacts(self, u: Tensor) -> dict[str, Tensor]:
-        return {self.name: u.detach().reshape(self.shape), f"{self.name}-original": self.start.reshape(self.shape)}
+        return {self.name: self._painter.texels(u.detach()), f"{self.name}-original": self._original}
 
 
 def resampled(image: Tensor, side: int) -> Tensor:
@@ -116,3 +318,54 @@ def resampled(image: Tensor, side: int) -> Tensor:
     channels_first = image.permute(2, 0, 1)[None]
     resized = F.interpolate(channels_first, size=(side, side), mode="bilinear", antialias=True, align_corners=False)
     return resized[0].permute(1, 2, 0).clamp(0.0, 1.0).contiguous()
+
+
+def palette(image: Tensor, weight: Floats, count: int) -> Tensor:
+    """Return the colours of an image by weighted k-means, heaviest first; fewer if it has fewer.
+
+    Lloyd's algorithm on the image's 5-bit colours from a start without chance: the heaviest colour, then each time the
+    one with the largest weight times squared distance from those chosen (k-means++ of Arthur and Vassilvitskii 2007
+    with its draw replaced by the most likely outcome).
+
+    Args:
+        image: (h, w, 3) sRGB in [0, 1].
+        weight: (h, w) how much each texel counts, e.g. its area on the surface.
+        count: number of colours, at least 1.
+    """
+    colors = image.reshape(-1, 3).double().numpy()
+    weights = weight.reshape(-1).astype(np.float64)
+    keys, index = np.unique((colors * 31.0).round().astype(np.int64), axis=0, return_inverse=True)
+    mass = np.bincount(index.reshape(-1), weights=weights, minlength=len(keys))
+    sums = [np.bincount(index.reshape(-1), weights=weights * colors[:, c], minlength=len(keys)) for c in range(3)]
+    points = np.stack(sums, axis=1)[mass > 0.0] / mass[mass > 0.0, None]
+    mass = np.sqrt(mass[mass > 0.0])  # or else the shades of the largest surface take all centres
+    chosen = [int(mass.argmax())]
+    while len(chosen) < min(count, len(points)):
+        squared = ((points[:, None] - points[chosen]) ** 2).sum(axis=-1).min(axis=1)
+        if not squared.max() > 0.0:
+            break
+        chosen.append(int((mass * squared).argmax()))
+    centres = points[chosen]
+    for _ in range(LLOYD_STEPS):
+        nearest = ((points[:, None] - centres) ** 2).sum(axis=-1).argmin(axis=1)
+        share = np.bincount(nearest, weights=mass, minlength=len(centres))
+        means = np.stack([np.bincount(nearest, mass * points[:, c], len(centres)) for c in range(3)], axis=1)
+        centres = np.where(share[:, None] > 0.0, means / np.maximum(share[:, None], 1e-12), centres)
+    order = np.argsort(-share, kind="stable")
+    return torch.from_numpy(centres[order].clip(0.0, 1.0).astype(np.float32))
+
+
+def _spread(centres: Tensor) -> float:
+    """Distance over which a palette colour's influence falls off: half the mean distance to the nearest other one."""
+    if len(centres) < 2:
+        return 1.0
+    apart = torch.cdist(centres, centres) + torch.diag(torch.full((len(centres),), 10.0))
+    return max(0.5 * float(apart.min(dim=1).values.mean()), 1e-3)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_count(value: object, low: int, high: int) -> bool:
+    return _is_number(value) and float(value) == int(value) and low <= value <= high  # type: ignore[arg-type, call-overload, operator]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,7 @@ import numpy.typing as npt
 from advsearch.errors import InputError
 from advsearch.scene import environments, importing, library, settings
 from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
+from advsearch.scene.parts import Part
 
 Doubles = npt.NDArray[np.float64]
 
@@ -38,6 +39,9 @@ class SceneDescription:
         object_spec: how the object was asked for: a bundled name, a path, or an asset's own name.
         environment_spec: how the environment was asked for, likewise.
         up: the up axis that was given for a mesh file, or None.
+        parts: what controls have put into the scene beside the object, the environment and the ground.
+        thin_lens: the camera has an aperture and a focus distance.
+        backdrop: the environment may be hidden behind a plain colour (`backdrop.color`).
     """
 
     object: ObjectAsset
@@ -46,6 +50,31 @@ class SceneDescription:
     object_spec: str = ""
     environment_spec: str = ""
     up: str | None = None
+    parts: tuple[Part, ...] = ()
+    thin_lens: bool = False
+    backdrop: bool = False
+
+    def with_part(self, part: Part) -> SceneDescription:
+        """Return the scene with one more part.
+
+        Raises:
+            InputError: its name is taken.
+        """
+        if part.name in ("object", "environment", "ground", "camera", *(one.name for one in self.parts)):
+            raise InputError(f"--control {part.name}: the scene has something of that name already; choose another")
+        return replace(self, parts=(*self.parts, part))
+
+    def with_values(self, **given: float | None) -> SceneDescription:
+        """Return the scene with some settings replaced; dots in their names are written as two underscores."""
+        return replace(self, values={**self.values, **{name.replace("__", "."): v for name, v in given.items()}})
+
+    @property
+    def base_vertices(self) -> Doubles:
+        """(V, 3) the object's vertices in world space, in its base pose."""
+        from advsearch.scene.geometry import object_to_world
+
+        matrix = object_to_world(self)
+        return np.asarray(self.object.mesh.vertices.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3])
 
     def number(self, name: str) -> float:
         """Return a setting that always has a value."""

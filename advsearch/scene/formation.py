@@ -29,6 +29,8 @@ class ImageFormation:
         exposure: stops over the metered exposure; kept for the record, `gain` is what is applied.
         resolution: (height, width) in pixels.
         gain: factor from radiance to display-linear values.
+        transfer: "srgb"; or "linear", neither clipped nor encoded, for checks of derivatives: the mean of a noisy
+            picture after a curve is not the curve of the mean.
     """
 
     denoiser: str = "oidn"
@@ -36,6 +38,7 @@ class ImageFormation:
     exposure: float = 0.0
     resolution: tuple[int, int] = (128, 128)
     gain: float = 1.0
+    transfer: str = "srgb"
 
     def __post_init__(self) -> None:
         if self.denoiser not in DENOISERS:
@@ -51,6 +54,8 @@ class ImageFormation:
 
     def display(self, radiance: Tensor) -> Tensor:
         """Map linear radiance (..., 3) to display-referred sRGB in [0, 1]; differentiable, flat where clipped."""
+        if self.transfer == "linear":
+            return radiance * self.gain
         return linear_to_srgb(radiance * self.gain)
 
     def summary(self) -> dict[str, object]:

@@ -1,6 +1,6 @@
 """A described scene inside Mitsuba: built once, changed only through named inputs, rendered and differentiated.
 
-Inputs are torch tensors with names of ours (`object.base_color`), so that nothing outside this file knows Mitsuba's
+Inputs are torch tensors with names of ours (`object.base_color`), so that nothing outside this room knows Mitsuba's
 parameter paths. Every call states all inputs it wants changed; those it does not name have their base values, so that
 no configuration is ever applied on top of another.
 """
@@ -9,18 +9,20 @@ from __future__ import annotations
 
 import gc
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.scene.assets import Mesh
+from advsearch.errors import InputError
+from advsearch.scene.assembly import Assembly
 from advsearch.scene.backend import mitsuba
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.parts import MeshPart, PartInput, as_is, number, transform
 
 MAX_DEPTH = 6
 """Longest light path in segments: five bounces off surfaces."""
@@ -29,6 +31,9 @@ NO_ROULETTE = 1000
 
 BASE_COLOR = "object.base_color"
 """Input: (h, w, 3) linear reflectance of the object, row 0 at v = 1 (top of the image)."""
+
+ENVIRONMENT_INPUT = PartInput("environment.padded", "environment.data", as_is, interior=True)
+"""(H, W + 2, 3): Mitsuba keeps a copy of the last column before the first, and of the first after the last."""
 
 
 class _Population:
@@ -67,6 +72,11 @@ _population = _Population()
 class MitsubaScene:
     """Renders one scene at one size.
 
+    Attributes:
+        assembly: turns the inputs of a space into those of this scene.
+        names: every input that can be set.
+        interior: those that the interior adjoint differentiates correctly.
+
     Args:
         description: what to build.
         resolution: (height, width) in pixels.
@@ -86,86 +96,209 @@ class MitsubaScene:
     ) -> None:
         mi = mitsuba()
         self.resolution = resolution
+        self.assembly = Assembly(description)
+        self.max_depth = max_depth
         self._freeze = freeze
-        self._scene = mi.load_dict(_scene_dict(description, resolution, filter), optimize=False)
+        self._backdrop = description.backdrop
+        object_part = MeshPart(
+            "object",
+            description.object.mesh,
+            object_to_world(description),
+            description.object.base_color,
+            description.material,
+        )
+        parts = (object_part, *description.parts)
+        self.volumetric = any(part.volumetric for part in parts)
+        plugins = _scene_dict(description, resolution, filter)
+        for part in parts:
+            plugins |= part.plugins()
+            plugins["camera"] |= part.sensor()
+        self._path: dict[str, Any] = {}
+        for part in parts:
+            self._path |= part.integrator(plugins)
+        self._scene = mi.load_dict(plugins, optimize=False)
         self._sensor = self._scene.sensors()[0]
-        self._path = mi.load_dict({"type": "prb", "max_depth": max_depth, "rr_depth": NO_ROULETTE})
-        self._guides = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"})
         self._parameters = mi.traverse(self._scene)
-        self._keys = {BASE_COLOR: _only(self._parameters, "object.", ".base_color.data")}
-        self._base = {name: mi.TensorXf(self._parameters[key]) for name, key in self._keys.items()}
-        self._applied: dict[str, tuple[Tensor, int]] = {}
+        self._integrators: dict[str, Any] = {}
+        declared = [*_camera_inputs(resolution), ENVIRONMENT_INPUT, *(one for part in parts for one in part.inputs())]
+        self._inputs = {one.name: (key, one) for one in declared if (key := _key(self._parameters, one.key))}
+        self.names = frozenset(self._inputs)
+        self.interior = frozenset(name for name, (_, one) in self._inputs.items() if one.interior)
+        self._shapes = frozenset(name for name, (key, _) in self._inputs.items() if _is_of_a_shape(key))
+        self._unsettled: set[str] = set()
+        self._base: dict[str, Any] = {}
+        self._applied: dict[str, Tensor] = {}
         self._recorded: dict[tuple[str, int], Callable[..., Any]] = {}
         self._recorded_at = 0
         _population.bury()
-        _population.add(self, self._scene, self._path, self._guides, self._parameters)
+        _population.add(self, self._scene, self._integrators, self._parameters)
 
     def base(self, name: str) -> Tensor:
-        """Return the base value of an input, as a fresh torch tensor."""
-        return _torch(self._base[name])
+        """Return the base value of an input, as a fresh torch tensor of the input's shape."""
+        key, one = self._inputs[name]
+        self._apply({})
+        value = _torch(self._parameters[key])
+        return value if one.shape is None else value.reshape(one.shape)
 
-    def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
-        """Render linear radiance, (H, W, 3) float32, with `spp` independent samples a pixel."""
+    def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int, *, hide: bool = False) -> Tensor:
+        """Render linear radiance with `spp` independent samples a pixel.
+
+        Args:
+            inputs: what differs from the base values.
+            seed: number of the noise.
+            spp: samples a pixel.
+            hide: leave out what the environment shows directly, for a backdrop.
+
+        Returns:
+            (H, W, 3) float32; (H, W, 4) with the coverage of the scene's surfaces where the scene has a backdrop.
+        """
         self._apply(inputs)
-        return self._render("path", self._path, seed, spp)
+        return self._render("hidden" if hide else "path", seed, spp)
 
     def guides(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> tuple[Tensor, Tensor]:
         """Render what guides the denoiser: first-hit albedo and shading normal, each (H, W, 3) float32."""
         self._apply(inputs)
-        both = self._render("guides", self._guides, seed, spp)
+        both = self._render("guides", seed, spp)[..., -6:]
         return both[..., :3].clamp(0.0, 1.0), both[..., 3:6]
 
-    def adjoint(self, inputs: Mapping[str, Tensor], cotangent: Tensor, seed: int, spp: int) -> dict[str, Tensor]:
-        """Return the gradient of `sum(cotangent * radiance)` with respect to every named input.
-
-        Path replay backpropagation (Vicini et al. 2021): unbiased for inputs that do not move silhouettes.
+    def adjoint(
+        self,
+        inputs: Mapping[str, Tensor],
+        cotangent: Tensor,
+        seed: int,
+        spp: int,
+        *,
+        wrt: Collection[str] | None = None,
+        method: str = "path",
+    ) -> dict[str, Tensor]:
+        """Return the gradient of `sum(cotangent * radiance)` with respect to named inputs.
 
         Args:
-            inputs: as in `radiance`; the gradient has one tensor of the same shape for each.
+            inputs: as in `radiance`.
             cotangent: (H, W, 3) float32.
             seed: should differ from the primal's, or the gradient of a noisy picture is returned.
             spp: independent samples a pixel.
+            wrt: the inputs whose gradients are wanted; None means all that are named.
+            method: "path", the interior adjoint (path replay backpropagation, Vicini et al. 2021), unbiased for inputs
+                that do not move silhouettes; "hidden", the same without the visible environment; "boundary", Mitsuba's
+                projective integrator without guiding (Zhang et al. 2023), for vertices too.
+
+        Returns:
+            For each of `wrt` a float32 tensor of the input's shape.
         """
         mi = mitsuba()
         import drjit as dr
 
         self._apply(inputs)
-        tracked = {name: mi.TensorXf(_contiguous(tensor)) for name, tensor in inputs.items()}
-        for name, value in tracked.items():
-            dr.enable_grad(value)
-            self._parameters[self._keys[name]] = value
-        self._parameters.update()
-        arriving = mi.TensorXf(_contiguous(cotangent))
-        self._path.render_backward(self._scene, self._parameters, arriving, sensor=self._sensor, seed=seed, spp=spp)
-        gradients = {name: _torch(dr.grad(value)) for name, value in tracked.items()}
-        for name, value in tracked.items():
-            self._parameters[self._keys[name]] = dr.detach(value)
-        self._parameters.update()
-        return gradients
+        wanted = tuple(inputs if wrt is None else wrt)
+        tracked = {name: mi.TensorXf(_contiguous(inputs[name])) for name in wanted}
+        try:
+            for name, value in tracked.items():
+                dr.enable_grad(value)
+                self._write(name, value)
+            self._parameters.update()
+            shown = _contiguous(cotangent)
+            if self._backdrop:
+                shown = torch.cat([shown, torch.zeros_like(shown[..., :1])], dim=-1)
+            arriving = mi.TensorXf(shown)
+            self._integrator(method).render_backward(
+                self._scene, self._parameters, arriving, sensor=self._sensor, seed=seed, spp=spp
+            )
+            return {name: _torch(dr.grad(value)).reshape(inputs[name].shape) for name, value in tracked.items()}
+        finally:
+            for name in wanted:
+                self._write(name, mi.TensorXf(_contiguous(inputs[name])))
+            self._parameters.update()
+
+    def material_adjoint(
+        self, inputs: Mapping[str, Tensor], cotangent: Tensor, seed: int, spp: int, *, meshes: Collection[str]
+    ) -> dict[str, Tensor]:
+        """Return the gradient with respect to the vertices and normals of some meshes, by the material form.
+
+        Args:
+            inputs: as in `radiance`; has `NAME.vertices` and `NAME.normals` of each mesh.
+            cotangent: (H, W, 3) float32.
+            seed: as in `adjoint`.
+            spp: samples a pixel of the interior term.
+            meshes: names of the meshes.
+        """
+        from advsearch.scene.material_form import material_adjoint
+
+        self._apply(inputs)
+        found: dict[str, Tensor] = {}
+        for name in meshes:
+            vertices, normals = f"{name}.vertices", f"{name}.normals"
+            found[vertices], found[normals] = material_adjoint(
+                self._scene,
+                self._sensor,
+                self._parameters,
+                mesh_key=name,
+                vertices=inputs[vertices],
+                normals=inputs[normals],
+                cotangent=cotangent,
+                seed=seed,
+                spp=spp,
+                max_depth=self.max_depth,
+            )
+        return found
 
     # ---- inside -----------------------------------------------------------------------------------------------------
 
     def _apply(self, inputs: Mapping[str, Tensor]) -> None:
         """Set exactly these inputs, everything else at its base value; does nothing for what is set already."""
         mi = mitsuba()
-        changed = False
-        for name, key in self._keys.items():
-            tensor = inputs.get(name)
-            if tensor is None:
-                if self._applied.pop(name, None) is not None:
-                    self._parameters[key] = mi.TensorXf(self._base[name])
-                    changed = True
-                continue
+
+        unknown = [name for name in inputs if name not in self._inputs]
+        if unknown:
+            raise InputError(f"the scene has no input {', '.join(unknown)}; it has {', '.join(sorted(self._inputs))}")
+        changed: set[str] = set()
+        for name in [name for name in self._applied if name not in inputs]:
+            self._parameters[self._inputs[name][0]] = type(self._base[name])(self._base[name])
+            del self._applied[name]
+            changed.add(name)
+        for name, tensor in inputs.items():
+            value = _contiguous(tensor)
             held = self._applied.get(name)
-            if held is not None and held[0] is tensor and held[1] == tensor._version:
+            if held is not None and held.shape == value.shape and torch.equal(held, value):
                 continue
-            self._parameters[key] = mi.TensorXf(_contiguous(tensor))
-            self._applied[name] = (tensor, tensor._version)
-            changed = True
+            if name not in self._base:
+                own = self._parameters[self._inputs[name][0]]
+                self._base[name] = type(own)(own)
+            self._write(name, mi.TensorXf(value))
+            self._applied[name] = value.clone()
+            changed.add(name)
         if changed:
             self._parameters.update()
+        if not changed.isdisjoint(self._shapes):
+            self._unsettled = {"path", "hidden", "guides"}
+            _population.changes += 1
 
-    def _render(self, what: str, integrator: Any, seed: int, spp: int) -> Tensor:
+    def _write(self, name: str, value: Any) -> None:
+        key, one = self._inputs[name]
+        self._parameters[key] = one.write(value)
+
+    def _integrator(self, method: str) -> Any:
+        """Return the integrator of one method, made on first use."""
+        if method not in self._integrators:
+            mi = mitsuba()
+            path = {"type": "prb", "max_depth": self.max_depth, "rr_depth": NO_ROULETTE, **self._path}
+            recipes: dict[str, dict[str, Any]] = {
+                "path": path,
+                "hidden": {**path, "hide_emitters": True},
+                "guides": {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"},
+                "boundary": {
+                    "type": "prb_projective",
+                    "max_depth": self.max_depth,
+                    "rr_depth": NO_ROULETTE,
+                    "guiding": "none",
+                },
+                "guided": {"type": "prb_projective", "max_depth": self.max_depth, "rr_depth": NO_ROULETTE},
+            }
+            self._integrators[method] = mi.load_dict(recipes[method])
+            _population.changes += 1
+        return self._integrators[method]
+
+    def _render(self, what: str, seed: int, spp: int) -> Tensor:
         mi = mitsuba()
         import drjit as dr
 
@@ -174,6 +307,7 @@ class MitsubaScene:
             sensor.sampler().seed(0, 1)  # otherwise the sampler's state keeps the whole render alive
             return image
 
+        integrator = self._integrator(what)
         function = self._function(what, spp, record)
         return _torch(function(self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)))
 
@@ -181,7 +315,9 @@ class MitsubaScene:
         """Return the recorded function for one job at one sample count, recording it on first use.
 
         Only primal renders are recorded. Dr.Jit 1.5.0 corrupts memory when it replays some adjoints (a texture of
-        32 x 32 under a film of 32 x 32 pixels, say), and the gain there is small.
+        32 x 32 under a film of 32 x 32 pixels, say), and the gain there is small. A recording made before a shape
+        moved renders something else (measured: wrong from the third pose on), so that every move makes all of them
+        stale, and the first render after a move is not recorded: in a search over poses none would be replayed.
         """
         import drjit as dr
 
@@ -189,7 +325,8 @@ class MitsubaScene:
         if self._recorded_at != _population.changes:
             self._recorded.clear()
             self._recorded_at = _population.changes
-        if not self._freeze:
+        if not self._freeze or what in self._unsettled:
+            self._unsettled.discard(what)
             return function
         if (what, spp) not in self._recorded:
             self._recorded[what, spp] = dr.freeze(function)
@@ -201,112 +338,104 @@ def _contiguous(tensor: Tensor) -> Tensor:
 
 
 def _torch(value: Any) -> Tensor:
-    """Return a Dr.Jit tensor as a torch tensor with memory of its own."""
-    tensor: Tensor = value.torch()
-    return tensor.clone()
+    """Return a Dr.Jit value as a torch tensor with memory of its own."""
+    value = getattr(value, "matrix", value)
+    if hasattr(value, "torch"):
+        tensor: Tensor = value.torch()
+        return tensor.clone()
+    return torch.tensor(np.array(value, dtype=np.float32))
 
 
-def _only(parameters: Any, prefix: str, suffix: str) -> str:
-    found = [key for key in parameters.keys() if key.startswith(prefix) and key.endswith(suffix)]
-    if len(found) != 1:
-        raise RuntimeError(f"expected one Mitsuba parameter {prefix}*{suffix}, found {found}")
-    return str(found[0])
+def _is_of_a_shape(key: str) -> bool:
+    """Whether a change of this Mitsuba parameter moves a shape, so that ray tracing is set up anew."""
+    return key.endswith(("vertex_positions", "vertex_normals")) or (
+        key.endswith("to_world") and not key.startswith(("camera", "environment"))
+    )
+
+
+def _key(parameters: Any, pattern: str) -> str | None:
+    """Return the parameter that a pattern with at most one "*" means, or None if the scene has none such.
+
+    Raises:
+        RuntimeError: there are several.
+    """
+    before, star, after = pattern.partition("*")
+    found = [
+        key for key in parameters.keys() if (key.startswith(before) and key.endswith(after) if star else key == pattern)
+    ]
+    if len(found) > 1:
+        raise RuntimeError(f"expected one Mitsuba parameter {pattern}, found {found}")
+    return str(found[0]) if found else None
 
 
 def _scene_dict(description: SceneDescription, resolution: tuple[int, int], filter: str) -> dict[str, Any]:
+    """Everything but the object and the parts."""
     mi = mitsuba()
-    transform = mi.ScalarTransform4f
-    height, width = resolution
+    place = mi.ScalarTransform4f
     number = description.number
     scene: dict[str, Any] = {
         "type": "scene",
-        "sensor": {
-            "type": "perspective",
-            "fov": number("camera.fov"),
-            "fov_axis": "larger",
-            "near_clip": 0.01,
-            "far_clip": 1e5,
-            "to_world": transform(camera_to_world(description, width / height)),
-            "film": {
-                "type": "hdrfilm",
-                "width": width,
-                "height": height,
-                "pixel_format": "rgb",
-                "component_format": "float32",
-                "rfilter": {"type": filter},
-            },
-            "sampler": {"type": "independent"},
-        },
+        "camera": _camera(description, resolution, filter),
         "environment": {
             "type": "envmap",
             "bitmap": mi.Bitmap(np.ascontiguousarray(description.environment.radiance, dtype=np.float32)),
             "scale": 2.0 ** number("environment.exposure"),
-            "to_world": transform().rotate([0, 0, 1], number("environment.rotation")).rotate([1, 0, 0], 90),
+            "to_world": place().rotate([0, 0, 1], number("environment.rotation")).rotate([1, 0, 0], 90),
         },
-        "object": mitsuba_mesh("object", description.object.mesh, object_to_world(description), surface(description)),
     }
     if number("ground.size") > 0.0:
         color = [number(f"ground.{channel}") for channel in ("red", "green", "blue")]
+        reflectance = srgb_to_linear(np.array(color, np.float32)).tolist()
         scene["ground"] = {
             "type": "rectangle",
-            "to_world": transform().scale(number("ground.size") / 2.0),
+            "to_world": place().scale(number("ground.size") / 2.0),
             "bsdf": {
                 "type": "twosided",
-                "bsdf": {
-                    "type": "diffuse",
-                    "reflectance": {"type": "rgb", "value": srgb_to_linear(np.array(color, np.float32)).tolist()},
-                },
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": reflectance}},
             },
         }
     return scene
 
 
-def surface(description: SceneDescription) -> dict[str, Any]:
-    """The object's BSDF: principled, two-sided, with the base colour as a bilinear texture of linear reflectance."""
-    mi = mitsuba()
-    material = description.material
-    linear = srgb_to_linear(description.object.base_color)
-    principled: dict[str, Any] = {
-        "type": "principled",
-        "base_color": {
-            "type": "bitmap",
-            "bitmap": mi.Bitmap(np.ascontiguousarray(linear, dtype=np.float32)),
-            "raw": True,
-            "filter_type": "bilinear",
+def _camera(description: SceneDescription, resolution: tuple[int, int], filter: str) -> dict[str, Any]:
+    height, width = resolution
+    camera: dict[str, Any] = {
+        "type": "thinlens" if description.thin_lens else "perspective",
+        "fov": description.number("camera.fov"),
+        "fov_axis": "larger",
+        "near_clip": 0.01,
+        "far_clip": 1e5,
+        "to_world": mitsuba().ScalarTransform4f(camera_to_world(description, width / height)),
+        "film": {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "pixel_format": "rgba" if description.backdrop else "rgb",
+            "component_format": "float32",
+            "rfilter": {"type": filter},
         },
-        "roughness": material.roughness,
-        "metallic": material.metallic,
-        "specular": material.specular,
+        "sampler": {"type": "independent"},
     }
-    if material.clearcoat > 0.0:
-        principled["clearcoat"] = material.clearcoat
-    return {"type": "twosided", "bsdf": principled}
+    if description.thin_lens:
+        camera |= {"aperture_radius": 1e-4, "focus_distance": 1.0}
+    return camera
 
 
-def mitsuba_mesh(name: str, mesh: Mesh, to_world: Any, bsdf: dict[str, Any]) -> Any:
-    """Return a Mitsuba mesh of the given geometry under a pose, with shading normals and texture coordinates.
+def _camera_inputs(resolution: tuple[int, int]) -> tuple[PartInput, ...]:
+    """The camera's inputs. Our field of view is along the larger side, Mitsuba's parameter along the width."""
+    height, width = resolution
 
-    Mitsuba's bitmaps have row 0 at v = 0 while ours have it at v = 1, hence the flip.
-    """
-    mi = mitsuba()
-    vertices = mesh.vertices.astype(np.float64) @ to_world[:3, :3].T + to_world[:3, 3]
-    normals = mesh.normals.astype(np.float64) @ np.linalg.inv(to_world[:3, :3])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    uvs = np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1)
-    properties = mi.Properties()
-    properties["bsdf"] = mi.load_dict(bsdf)
-    result = mi.Mesh(
-        name,
-        vertex_count=len(vertices),
-        face_count=len(mesh.faces),
-        has_vertex_normals=True,
-        has_vertex_texcoords=True,
-        props=properties,
+    def along_width(value: Any) -> Any:
+        import drjit as dr
+
+        half = dr.deg2rad(value.array) / 2.0
+        return mitsuba().Float(2.0 * dr.rad2deg(dr.atan(dr.tan(half) * min(1.0, width / height))))
+
+    return (
+        PartInput("camera.to_world", "camera.to_world", transform, shape=(4, 4)),
+        PartInput("camera.fov", "camera.x_fov", along_width, shape=(1,)),
+        PartInput("camera.shift_x", "camera.principal_point_offset_x", number, shape=(1,)),
+        PartInput("camera.shift_y", "camera.principal_point_offset_y", number, shape=(1,)),
+        PartInput("camera.aperture", "camera.aperture_radius", number, shape=(1,)),
+        PartInput("camera.focus", "camera.focus_distance", number, shape=(1,)),
     )
-    parameters = mi.traverse(result)
-    parameters["vertex_positions"] = mi.Float(vertices.astype(np.float32).ravel())
-    parameters["vertex_normals"] = mi.Float(normals.astype(np.float32).ravel())
-    parameters["vertex_texcoords"] = mi.Float(uvs.astype(np.float32).ravel())
-    parameters["faces"] = mi.UInt32(mesh.faces.astype(np.uint32).ravel())
-    parameters.update()
-    return result

@@ -1,14 +1,15 @@
 """The function in the middle: `render(u, seed, spp)`, differentiable in ordinary torch autograd (DESIGN section 1).
 
-    u in [0, 1]^d  --space-->  scene inputs  --Mitsuba-->  radiance  --image formation-->  (H, W, 3) sRGB in [0, 1]
+    u in [0, 1]^d --space--> scene inputs --assembly, Mitsuba--> radiance --image formation--> (H, W, 3) sRGB in [0, 1]
 
 The arrows outside Mitsuba are torch operations and differentiate themselves. Mitsuba's is a custom autograd function
-whose backward pass renders the adjoint with a seed of its own.
+whose backward pass renders the adjoint with a seed of its own. Coordinates that the gradient plan gives to differences
+get their derivative from a second one, which is the identity in the forward pass.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import torch
@@ -16,22 +17,31 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.errors import InputError
+from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.denoise import Denoiser
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.mitsuba_scene import MitsubaScene
+from advsearch.scene.motion import Motion, steps_for
+from advsearch.scene.plan import BY_ADJOINT, BY_DIFFERENCES, DIRECTIONS, GroupPlan, first_plan
 
 MAX_SPP = 65536
 
 
 class InputSpace(Protocol):
-    """What the renderer asks of a space: its start, and the scene inputs of a configuration."""
+    """What the renderer asks of a space: its start, its groups, and what a configuration does."""
 
     @property
     def start(self) -> Tensor:
         """(d,) float32 in [0, 1]: the unchanged scene."""
 
+    def group_plans(self) -> tuple[GroupPlan, ...]:
+        """Every group of coordinates with its valid estimators."""
+
     def inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Map u to scene inputs by torch operations; differentiable."""
+
+    def picture(self, u: Tensor, image: Tensor) -> Tensor:
+        """Change the finished picture; differentiable."""
 
 
 class Renderer:
@@ -40,7 +50,8 @@ class Renderer:
     Attributes:
         start: (d,) float32 in [0, 1], the configuration that leaves the scene as it is.
         formation: how radiance becomes the picture.
-        renders: number of primal renders so far.
+        plan: how each coordinate is differentiated; may be replaced.
+        renders: number of primal renders so far, those of differences included.
         gradients: number of adjoint renders so far.
         non_finite: number of pixels and gradient entries that were NaN or infinite and were set to zero.
 
@@ -49,9 +60,20 @@ class Renderer:
         space: maps u to scene inputs.
         formation: how radiance becomes the picture.
         root_seed: seeds of different roots never meet, whatever is passed as `seed`.
+        motion: measures how fast coordinates move points; None takes the default step for all.
+        estimators: estimators forced by "control.parameter", "control" or "*".
     """
 
-    def __init__(self, scene: MitsubaScene, space: InputSpace, formation: ImageFormation, root_seed: int = 0) -> None:
+    def __init__(
+        self,
+        scene: MitsubaScene,
+        space: InputSpace,
+        formation: ImageFormation,
+        root_seed: int = 0,
+        *,
+        motion: Motion | None = None,
+        estimators: Mapping[str, str] | None = None,
+    ) -> None:
         self.scene = scene
         self.space = space
         self.formation = formation
@@ -60,6 +82,10 @@ class Renderer:
         self.renders = 0
         self.gradients = 0
         self.non_finite = 0
+        self._left_out: frozenset[str] = frozenset()
+        groups = space.group_plans()
+        self.plan = first_plan(groups, self._steps(groups, motion), estimators)
+        self._routes = self._find_routes(groups)
 
     @property
     def start(self) -> Tensor:
@@ -79,15 +105,53 @@ class Renderer:
         Raises:
             InputError: u has another shape, or values outside [0, 1], or spp is out of range.
         """
-        return self.formation.display(self.radiance(u, seed, spp))
+        self._check(u, spp)
+        image = self._picture(u, seed, spp)
+        if u.requires_grad and torch.is_grad_enabled() and self._differenced():
+            result: Tensor = _Differences.apply(self, seed, spp, u, image)  # type: ignore[no-untyped-call]
+            return result
+        return image
 
     def radiance(self, u: Tensor, seed: int = 0, spp: int = 16) -> Tensor:
-        """Render linear radiance, denoised if the formation says so; arguments as for a call; (H, W, 3) float32."""
+        """Render linear radiance, denoised if the formation says so; arguments as for a call; (H, W, 3) float32.
+
+        Exposure and backdrop of the configuration are in it; what controls do to the finished picture is not.
+        """
         self._check(u, spp)
-        inputs = self.space.inputs(u)
-        names = tuple(inputs)
-        result: Tensor = _Radiance.apply(self, names, seed, spp, *inputs.values())  # type: ignore[no-untyped-call]
-        return result
+        return self._radiance(self._through(u), seed, spp)
+
+    def gradient(
+        self, loss: Callable[[Tensor], Tensor], u: Tensor, seed: int, spp: int, *, free: bool = False
+    ) -> tuple[Tensor, Tensor]:
+        """Return the loss of a picture and its derivative with respect to u, by the plan.
+
+        Unlike autograd through a call, this gives coordinates with the estimator "secant" differences of the loss.
+
+        Args:
+            loss: from (H, W, 3) sRGB to a number.
+            u: (d,) in [0, 1].
+            seed: as in a call.
+            spp: as in a call.
+            free: leave out what takes primal renders of its own; zero for coordinates that use differences.
+
+        Returns:
+            The loss, without graph, and (d,) float32.
+        """
+        at = u.detach().clone().requires_grad_()
+        self._left_out = BY_DIFFERENCES if free else frozenset({"secant"})
+        try:
+            value = loss(self(at, seed, spp))
+            found = torch.autograd.grad(value, at, allow_unused=True)[0] if value.requires_grad else None
+        finally:
+            self._left_out = frozenset()
+        derivative = torch.zeros_like(at) if found is None else found
+        secants = () if free else self.plan.having("secant")
+        if secants:
+            noise = seeds.stream(self.root_seed, "differences", seed)
+            with torch.no_grad():
+                for group in secants:
+                    self._central(group, u.detach(), noise, self.plan.spp or spp, loss, derivative)
+        return value.detach(), derivative
 
     def _check(self, u: Tensor, spp: int) -> None:
         if u.shape != self.start.shape:
@@ -98,24 +162,81 @@ class Renderer:
         if not bool((values >= 0.0).all() & (values <= 1.0).all()):
             raise InputError("render: expected every entry of u in [0, 1]; project u before you render it")
 
-    # ---- the two halves of the autograd function --------------------------------------------------------------------
+    # ---- from u to the picture --------------------------------------------------------------------------------------
 
-    def primal(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> Tensor:
-        """Radiance of given scene inputs, without a graph; counted in `renders`."""
-        noise = seeds.stream(self.root_seed, "primal", seed)
-        radiance = self._finite(self.scene.radiance(inputs, noise, spp))
-        if self.formation.denoiser == "oidn":
-            albedo, normal = self.scene.guides(inputs, seeds.stream(self.root_seed, "guides", seed), spp)
-            radiance = self._denoise(radiance, albedo, normal)
-        self.renders += 1
+    def _through(self, u: Tensor) -> Tensor:
+        """Return u with a graph only where the derivative runs back through scene inputs or the picture."""
+        if not u.requires_grad:
+            return u
+        mask = self.plan.through_inputs(len(u))
+        if bool(mask.all()):
+            return u
+        return u.detach() + mask * (u - u.detach())
+
+    def _picture(self, u: Tensor, seed: int, spp: int) -> Tensor:
+        through = self._through(u)
+        return self.space.picture(through, self.formation.display(self._radiance(through, seed, spp)))
+
+    def _radiance(self, u: Tensor, seed: int, spp: int) -> Tensor:
+        inputs = self.scene.assembly(self.space.inputs(u))
+        applied = {name: inputs.pop(name) for name in ON_PICTURE if name in inputs}
+        hide = "backdrop.color" in applied
+        rendered: Tensor = _Radiance.apply(self, tuple(inputs), seed, spp, hide, *inputs.values())  # type: ignore[no-untyped-call]
+        radiance = rendered[..., :3]
+        if "camera.exposure" in applied:
+            radiance = radiance * torch.exp2(applied["camera.exposure"])
+        if hide:
+            uncovered = (1.0 - rendered[..., 3:]).clamp(0.0, 1.0)
+            radiance = radiance + uncovered * (applied["backdrop.color"] / self.formation.gain)
         return radiance
 
-    def backward(self, inputs: Mapping[str, Tensor], cotangent: Tensor, seed: int, spp: int) -> dict[str, Tensor]:
-        """Gradient of `sum(cotangent * radiance)` for each input; the denoiser counts as the identity."""
+    # ---- the halves of the autograd functions -----------------------------------------------------------------------
+
+    def primal(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool = False) -> Tensor:
+        """Radiance of given scene inputs, without a graph, with coverage if hidden; counted in `renders`."""
+        noise = seeds.stream(self.root_seed, "primal", seed)
+        rendered = self._finite(self.scene.radiance(inputs, noise, spp, hide=hide))
+        if self.formation.denoiser == "oidn":
+            albedo, normal = self.scene.guides(inputs, seeds.stream(self.root_seed, "guides", seed), spp)
+            clean = self._denoise(rendered[..., :3].contiguous(), albedo, normal)
+            rendered = torch.cat([clean, rendered[..., 3:]], dim=-1) if hide else clean
+        self.renders += 1
+        return rendered
+
+    def backward(
+        self, inputs: Mapping[str, Tensor], cotangent: Tensor, seed: int, spp: int, hide: bool = False
+    ) -> dict[str, Tensor]:
+        """Gradient of `sum(cotangent * radiance)` for the inputs whose coordinates use an adjoint.
+
+        The denoiser counts as the identity. An input that no coordinate needs is left out.
+        """
         noise = seeds.stream(self.root_seed, "gradient", seed)
-        gradients = self.scene.adjoint(inputs, cotangent, noise, spp)
-        self.gradients += 1
-        return {name: self._finite(gradient) for name, gradient in gradients.items()}
+        cotangent = self._finite(cotangent[..., :3])
+        found: dict[str, Tensor] = {}
+        for estimator, wrt in self._wanted(inputs).items():
+            if estimator == "material":
+                meshes = sorted({name.rpartition(".")[0] for name in wrt})
+                gradients = self.scene.material_adjoint(inputs, cotangent, noise, spp, meshes=meshes)
+            else:
+                method = {"adjoint": "hidden" if hide else "path"}.get(estimator, estimator)
+                gradients = self.scene.adjoint(inputs, cotangent, noise, spp, wrt=wrt, method=method)
+            self.gradients += 1
+            found |= {name: self._finite(gradient) for name, gradient in gradients.items()}
+        return found
+
+    def _wanted(self, inputs: Mapping[str, Tensor]) -> dict[str, list[str]]:
+        """Which inputs each adjoint has to differentiate; an input that two ask for goes to the more general one."""
+        wanted: dict[str, list[str]] = {}
+        taken: set[str] = set()
+        for estimator in ("material", "boundary", "guided", "adjoint"):
+            names = {name for group in self.plan.having(estimator) for name in self._routes.get(group.name, ())}
+            if estimator == "adjoint":
+                names &= self.scene.interior
+            chosen = [name for name in inputs if name in names and name not in taken]
+            if chosen:
+                wanted[estimator] = chosen
+                taken |= set(chosen)
+        return wanted
 
     def _finite(self, values: Tensor) -> Tensor:
         """Replace NaN and infinite entries by zero and count them (DESIGN 4.9)."""
@@ -125,19 +246,167 @@ class Renderer:
         self.non_finite += int((~finite).sum())
         return torch.where(finite, values, torch.zeros_like(values))
 
+    # ---- differences ------------------------------------------------------------------------------------------------
+
+    def _differenced(self) -> tuple[GroupPlan, ...]:
+        return self.plan.having(*sorted(BY_DIFFERENCES - self._left_out))
+
+    def differences(self, u: Tensor, cotangent: Tensor, seed: int, spp: int) -> Tensor:
+        """Gradient of `sum(cotangent * picture)` for the coordinates that use differences; zero for the others.
+
+        All renders share one seed (common random numbers), and the picture is taken after the tone curve and after
+        what controls do to it.
+        """
+        noise = seeds.stream(self.root_seed, "differences", seed)
+        spp = self.plan.spp or spp
+        found = torch.zeros_like(u)
+
+        def loss(picture: Tensor) -> Tensor:
+            return (cotangent * picture).sum()
+
+        for group in self._differenced():
+            if group.estimator in ("differences", "secant"):
+                self._central(group, u, noise, spp, loss, found)
+        self._one_sided(self.plan.having("forward"), u, noise, spp, loss, found)
+        self._random_directions(self.plan.having("simultaneous"), u, noise, spp, loss, found)
+        return self._finite(found)
+
+    def _central(
+        self, group: GroupPlan, u: Tensor, noise: int, spp: int, loss: Callable[[Tensor], Tensor], found: Tensor
+    ) -> None:
+        for number in range(group.begin, group.begin + group.size):
+            step = torch.zeros_like(u)
+            step[number] = group.step
+            (above, up), (below, down) = _moved(u, step, group.periodic), _moved(u, -step, group.periodic)
+            rise = loss(self._picture(above, noise, spp)) - loss(self._picture(below, noise, spp))
+            found[number] = float(rise) / float((up - down)[number])
+
+    def _one_sided(
+        self,
+        groups: tuple[GroupPlan, ...],
+        u: Tensor,
+        noise: int,
+        spp: int,
+        loss: Callable[[Tensor], Tensor],
+        found: Tensor,
+    ) -> None:
+        if not groups:
+            return
+        here = float(loss(self._picture(u, noise, spp)))
+        for group in groups:
+            for number in range(group.begin, group.begin + group.size):
+                step = torch.zeros_like(u)
+                step[number] = group.step if group.periodic or float(u[number]) + group.step <= 1.0 else -group.step
+                moved, width = _moved(u, step, group.periodic)
+                found[number] = (float(loss(self._picture(moved, noise, spp))) - here) / float(width[number])
+
+    def _random_directions(
+        self,
+        groups: tuple[GroupPlan, ...],
+        u: Tensor,
+        noise: int,
+        spp: int,
+        loss: Callable[[Tensor], Tensor],
+        found: Tensor,
+    ) -> None:
+        """Simultaneous perturbation (Spall 1992, section 2) along a few random sign vectors, scaled by the steps."""
+        if not groups:
+            return
+        scale, periodic = torch.zeros_like(u), torch.zeros_like(u)
+        for group in groups:
+            scale[group.coordinates] = group.step
+            periodic[group.coordinates] = float(group.periodic)
+        generator = torch.Generator().manual_seed(noise % 2**63)
+        total = torch.zeros_like(u)
+        for _ in range(DIRECTIONS):
+            signs = torch.randint(0, 2, u.shape, generator=generator).to(u.dtype) * 2.0 - 1.0
+            (above, up), (below, down) = (_moved(u, way * signs * scale, periodic.bool()) for way in (1.0, -1.0))
+            rise = float(loss(self._picture(above, noise, spp)) - loss(self._picture(below, noise, spp)))
+            width = up - down
+            total += torch.where(width == 0.0, 0.0, rise / torch.where(width == 0.0, 1.0, width))
+        found += total / DIRECTIONS
+
+    # ---- set-up -----------------------------------------------------------------------------------------------------
+
+    def _assembled(self, u: Tensor) -> dict[str, Tensor]:
+        return self.scene.assembly(self.space.inputs(u))
+
+    def _steps(self, groups: tuple[GroupPlan, ...], motion: Motion | None) -> Tensor:
+        moving = [
+            number
+            for group in groups
+            if set(group.valid) - {"adjoint", "image"} and group.size <= 64
+            for number in range(group.begin, group.begin + group.size)
+        ]
+        if motion is None or not moving:
+            return steps_for(torch.zeros(len(self.start)))
+        return steps_for(motion.speeds(self._assembled, self.start, moving))
+
+    def _find_routes(self, groups: tuple[GroupPlan, ...]) -> dict[str, frozenset[str]]:
+        """Which scene inputs each group of coordinates reaches, found by autograd at a point inside the box."""
+        routes: dict[str, set[str]] = {group.name: set() for group in groups}
+        if not any(set(group.valid) & BY_ADJOINT for group in groups):
+            return {}
+        generator = torch.Generator().manual_seed(0)
+        noise = torch.rand(self.start.shape, generator=generator)
+        at = (0.5 * self.start + 0.25 + 0.1 * (noise - 0.5)).requires_grad_()
+        with torch.enable_grad():
+            inputs = self._assembled(at)
+            for name, tensor in inputs.items():
+                if not tensor.requires_grad:
+                    continue
+                weights = torch.rand(tensor.shape, generator=generator)
+                (reached,) = torch.autograd.grad((tensor * weights).sum(), at, retain_graph=True, allow_unused=True)
+                for group in groups:
+                    if reached is not None and bool(reached[group.coordinates].any()):
+                        routes[group.name].add(name)
+        return {name: frozenset(found) for name, found in routes.items()}
+
+
+def _moved(u: Tensor, step: Tensor, periodic: bool | Tensor) -> tuple[Tensor, Tensor]:
+    """Return u + step brought back into the box, and the step that was really taken.
+
+    Periodic coordinates wrap around, so that they can go the whole step.
+    """
+    there = u + step
+    wrapped = torch.remainder(there, 1.0)
+    clipped = there.clamp(0.0, 1.0)
+    cyclic = torch.as_tensor(periodic).expand(u.shape)
+    return torch.where(cyclic, wrapped, clipped), torch.where(cyclic, step, clipped - u)
+
 
 class _Radiance(torch.autograd.Function):
     """Mitsuba as one torch operation; the adjoint is rendered only if a gradient is asked for."""
 
     @staticmethod
-    def forward(ctx: Any, renderer: Renderer, names: tuple[str, ...], seed: int, spp: int, *tensors: Tensor) -> Tensor:
-        ctx.renderer, ctx.names, ctx.seed, ctx.spp = renderer, names, seed, spp
+    def forward(
+        ctx: Any, renderer: Renderer, names: tuple[str, ...], seed: int, spp: int, hide: bool, *tensors: Tensor
+    ) -> Tensor:
+        ctx.renderer, ctx.names, ctx.seed, ctx.spp, ctx.hide = renderer, names, seed, spp, hide
         ctx.save_for_backward(*tensors)
-        return renderer.primal(dict(zip(names, tensors, strict=True)), seed, spp)
+        return renderer.primal(dict(zip(names, tensors, strict=True)), seed, spp, hide)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
         inputs = dict(zip(ctx.names, ctx.saved_tensors, strict=True))
-        gradients = ctx.renderer.backward(inputs, cotangent, ctx.seed, ctx.spp)
-        return None, None, None, None, *(gradients[name] for name in ctx.names)
+        gradients = ctx.renderer.backward(inputs, cotangent, ctx.seed, ctx.spp, ctx.hide)
+        return None, None, None, None, None, *(gradients.get(name) for name in ctx.names)
+
+
+class _Differences(torch.autograd.Function):
+    """The identity on the picture; its backward pass adds the derivative of coordinates that use differences."""
+
+    @staticmethod
+    def forward(ctx: Any, renderer: Renderer, seed: int, spp: int, u: Tensor, image: Tensor) -> Tensor:
+        ctx.renderer, ctx.seed, ctx.spp = renderer, seed, spp
+        ctx.save_for_backward(u)
+        return image.view_as(image)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor | None, ...]:
+        (u,) = ctx.saved_tensors
+        with torch.no_grad():
+            found = ctx.renderer.differences(u, cotangent, ctx.seed, ctx.spp)
+        return None, None, None, found, cotangent

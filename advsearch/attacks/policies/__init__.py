@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any
 
+from advsearch.attacks.policies.auto import Auto
 from advsearch.attacks.policies.base import Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.pgd import PGD
 from advsearch.attacks.policies.random import Random
 from advsearch.errors import UnknownNameError
 
-POLICIES: dict[str, type[Policy[Any]]] = {"pgd": PGD, "random": Random}
+POLICIES: dict[str, type[Policy[Any]]] = {"auto": Auto, "pgd": PGD, "random": Random}
 
 
 def make_policy(name: str, **options: Any) -> Policy[Any]:
@@ -33,6 +34,7 @@ def make_policy(name: str, **options: Any) -> Policy[Any]:
 __all__ = [
     "PGD",
     "POLICIES",
+    "Auto",
     "Policy",
     "Proposal",
     "Random",

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.evaluation import Evaluation
+from advsearch.attacks.evaluation import Evaluation, Wanted
 from advsearch.seeds import stream
 
 State = TypeVar("State")
@@ -28,12 +28,14 @@ class Proposal:
 
     Attributes:
         u: (d,) float32 inside the domain; the caller must not write to it.
-        gradient: whether the policy wants the derivative there (it costs several renders).
+        gradient: whether the policy wants the derivative there: not, all of it (`Domain.gradient_cost` more pictures),
+            or what is "free" (only where the domain has `partial_gradients`). A wish: the last evaluations of a budget
+            get none, and `update` sees None.
         step_size: the step that led here in units of each block's radius, for the log; NaN where there is none.
     """
 
     u: Tensor
-    gradient: bool = False
+    gradient: Wanted = False
     step_size: float = math.nan
 
 
@@ -50,7 +52,8 @@ class Policy(ABC, Generic[State]):
         Args:
             domain: where to search.
             generator: the search's source of randomness, to draw a seed from; use `seeded` for numbers later on.
-            steps: how many evaluations there will be at most: a plan for schedules, never to be counted on.
+            steps: how many renders there will be at most, those of gradients included: a plan for schedules, never to
+                be counted on.
         """
 
     @abstractmethod
@@ -62,9 +65,9 @@ class Policy(ABC, Generic[State]):
     def update(self, state: State, u: Tensor, evaluation: Evaluation) -> State:
         """Return the state after `u`, the latest proposal, was evaluated.
 
-        The evaluation is `usable`: its gradient (None where it was not asked for) is finite, and its objective is
-        finite or -inf, which stands for "could not be evaluated". The objective is noisy: the same u with another
-        seed gives another value, and a maximum over many is biased upwards.
+        The evaluation is `usable`: its gradient (None where it was not asked for or could not be paid) is finite, and
+        its objective is finite or -inf, which stands for "could not be evaluated". The objective is noisy: the same u
+        with another seed gives another value, and a maximum over many is biased upwards.
         """
 
 

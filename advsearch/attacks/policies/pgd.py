@@ -88,6 +88,7 @@ class PGDState:
     """Where an ascent stands.
 
     Attributes:
+        steps: evaluations that the renders suffice for.
         u: (d,) what to propose next.
         direction: (d,) accumulated gradient.
         step_size: in units of each block's radius.
@@ -157,6 +158,7 @@ class PGD(Policy[PGDState]):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> PGDState:
         seed = draw_seed(generator)
         u = domain.sample(seeded(seed, 0))[0] if self.random_start else domain.start
+        steps = max(1, steps // (1 + domain.gradient_cost))
         window = Window(max(FEWEST, round(FIRST_WINDOW * steps)))
         return PGDState(domain, steps, seed, u, torch.zeros_like(u), self.step_size, None, window)
 
@@ -188,8 +190,10 @@ def _retreat(state: PGDState) -> PGDState:
 
 def _accumulate(state: PGDState, gradient: Tensor | None, momentum: float) -> PGDState:
     """Add a gradient, divided by the mean of its absolute values, to the accumulated ones."""
-    largest = 0.0 if gradient is None else float(gradient.abs().amax())
-    if gradient is None or largest == 0.0:
+    if gradient is None:  # nothing was asked, so nothing is known: go on as before
+        return state
+    largest = float(gradient.abs().amax())
+    if largest == 0.0:
         return replace(state, flat=state.flat + 1)
     scaled = gradient / largest  # so that sums of huge or tiny elements neither overflow nor vanish
     direction = (state.direction * momentum).add_(scaled, alpha=1.0 / float(scaled.abs().mean()))

@@ -1,0 +1,210 @@
+"""Checks and plans gradients of a scene as it is: what `advsearch check` and `advsearch plan` do."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+from advsearch import seeds
+from advsearch.api.attacking import problem_from_config
+from advsearch.api.problem import Problem
+from advsearch.config import AttackConfig
+from advsearch.controls import CONTROLS
+from advsearch.evaluation.gradients import (
+    EXPENSIVE,
+    Loss,
+    Probe,
+    estimates,
+    inside,
+    probes,
+    reference,
+    scale_of,
+    smooth_loss,
+    verdict,
+)
+from advsearch.evaluation.planning import COUNTS, cosines, measured_plan, tuned
+from advsearch.progress import NullProgress, Progress
+from advsearch.scene.plan import BY_DIFFERENCES, ESTIMATORS
+
+SCENES = (("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"))
+"""Bundled scenes that `check --all` goes through."""
+LOSSES = ("linear", "model")
+RAW_SPP = 16
+"""Samples a pixel of a working gradient of the linear loss, which is taken without denoiser."""
+REFERENCE_SPP = 64
+"""Samples a pixel of a reference render; seeds are added until the reference's noise is small."""
+
+
+def check(
+    config: AttackConfig, *, losses: Sequence[str] = LOSSES, everything: bool = False, progress: Progress | None = None
+) -> list[dict[str, Any]]:
+    """Compare the gradient of every parameter with differences, on the actual scene.
+
+    Args:
+        config: scene, model, controls, resolution, samples and seed.
+        losses: "linear", a smooth linear loss of the raw picture before the tone curve; "model", the model's own loss
+            in the run's image formation.
+        everything: every control, on each of `SCENES`.
+        progress: told how far it is.
+
+    Returns:
+        One row for each parameter, estimator and loss, as DESIGN section 6 lists them, and for the model's loss one
+        row for each control with the cosine of a working gradient with the converged one.
+    """
+    progress = progress or NullProgress()
+    rows: list[dict[str, Any]] = []
+    for one in _configurations(config, everything):
+        progress.stage(f"{one.object} in {one.environment}: {', '.join(one.controls)}")
+        if "linear" in losses:
+            rows += _linear(one, progress)
+        if "model" in losses:
+            rows += _model(one, progress)
+    return rows
+
+
+def plan(config: AttackConfig, *, progress: Progress | None = None) -> dict[str, Any]:
+    """Choose how every derivative is obtained, by measurement, and say why.
+
+    Returns:
+        The plan with its reasons, the cosines that chose steps and samples, and the limits of the estimators.
+    """
+    progress = progress or NullProgress()
+    progress.stage("set-up")
+    problem, _ = problem_from_config(config)
+    renderer, seed = problem.renderer, seeds.stream(config.seed, "measure")
+    u = inside(renderer)
+    progress.stage("estimators")
+    renderer.plan = measured_plan(renderer, problem.loss, u, seed=seed, spp=problem.spp, every=True)
+    progress.stage("steps and samples")
+    table = cosines(renderer, problem.loss, u, seed=seed)
+    renderer.plan, spp = tuned(renderer.plan, table)
+    chosen = renderer.plan.to_dict()
+    used = {group.estimator for group in renderer.plan.groups}
+    return {
+        "schema": 1,
+        "command": "plan",
+        "object": config.object,
+        "environment": config.environment,
+        "controls": list(config.controls),
+        "model": problem.model.name,
+        "image_formation": renderer.formation.summary(),
+        "spp": spp or problem.spp,
+        **chosen,
+        "cosines": [vars(row) for row in table],
+        "left_out": _left_out(problem),
+        "limits": _limits() if "material" in used else [],
+    }
+
+
+def _limits() -> list[Any]:
+    """What the material form does not cover, as it states itself."""
+    from advsearch.scene.material_form import LIMITS
+
+    return [vars(limit) if hasattr(limit, "__dict__") else str(limit) for limit in LIMITS]
+
+
+def _left_out(problem: Problem) -> list[str]:
+    """What this search does not compute, in sentences."""
+    used = {group.estimator for group in problem.renderer.plan.groups}
+    said = []
+    if not used & {"boundary", "guided", "material"}:
+        said.append("boundary terms: nothing that an adjoint differentiates moves an outline")
+    if not used & {"adjoint", "boundary", "guided", "material"}:
+        said.append("adjoint renders: no coordinate needs one")
+    if not used & BY_DIFFERENCES:
+        said.append("renders for differences: every derivative is an adjoint or of the picture itself")
+    if not problem.renderer.scene.volumetric:
+        said.append("the volumetric integrator: there is no medium")
+    return said
+
+
+# ---- inside ---------------------------------------------------------------------------------------------------------
+
+
+def _configurations(config: AttackConfig, everything: bool) -> Iterator[AttackConfig]:
+    if not everything:
+        yield config
+        return
+    for object, environment in SCENES:
+        for control in CONTROLS:
+            if control == "contents" and object == "bottle":
+                continue  # a bottle is closed
+            update: dict[str, Any] = {
+                "object": object,
+                "environment": environment,
+                "controls": {control: {}},
+                "label": None,
+            }
+            yield config.model_copy(update=update)
+
+
+def _linear(config: AttackConfig, progress: Progress) -> list[dict[str, Any]]:
+    problem, _ = problem_from_config(config, denoise="none")
+    problem.renderer.formation = replace(problem.renderer.formation, transfer="linear")
+    loss = smooth_loss(problem.renderer.formation.resolution, config.seed)
+    return _rows(problem, config, loss, "linear", config.spp or RAW_SPP, progress)
+
+
+def _model(config: AttackConfig, progress: Progress) -> list[dict[str, Any]]:
+    problem, _ = problem_from_config(config)
+    renderer = problem.renderer
+    counts = tuple(count for count in COUNTS if count >= problem.spp) or (problem.spp,)
+    table = cosines(renderer, problem.loss, inside(renderer), seed=config.seed, counts=counts)
+    rows = []
+    for row in table:
+        progress.advance(1)
+        status = "ok" if row.cosine >= 0.9 else "reference unusable" if row.converged < 0.9 else "noisy"
+        rows.append({**_place(config, "model"), **vars(row), "parameter": "*", "status": status})
+    return rows
+
+
+def _rows(
+    problem: Problem, config: AttackConfig, loss: Loss, name: str, spp: int, progress: Progress
+) -> list[dict[str, Any]]:
+    renderer, seed = problem.renderer, seeds.stream(config.seed, "check")
+    u = inside(renderer)
+    found = []
+    for group in _sets(probes(renderer, loss, u, seed, spp)):
+        references = [reference(renderer, loss, u, one, seed=seed, spp=max(spp, REFERENCE_SPP)) for one in group]
+        forced = "forced" in group[0].group.reason
+        wanted = [group[0].group.estimator] if forced else [one for one in group[0].group.valid if one not in EXPENSIVE]
+        for estimator in wanted:
+            measured = estimates(renderer, loss, u, estimator, group, seed=seed, spp=spp)
+            for probe, against, estimate in zip(group, references, measured, strict=True):
+                size = scale_of(against, references)
+                status, error = verdict(estimate, against, size)
+                found.append(
+                    {
+                        **_place(config, name),
+                        "control": probe.group.control,
+                        "parameter": probe.name.partition(".")[2],
+                        "estimator": estimator,
+                        "gradient": estimate.value,
+                        "reference": against.value,
+                        "reference_steps": list(against.steps),
+                        "reference_noise": against.noise,
+                        "relative_error": error,
+                        "noise": estimate.noise / size if size else float("inf"),
+                        "spp": spp,
+                        "seconds": estimate.seconds,
+                        "status": status,
+                    }
+                )
+                progress.advance(1)
+    return found
+
+
+def _sets(found: Sequence[Probe]) -> list[list[Probe]]:
+    """Probes that one gradient answers together: of one control, with the same valid estimators."""
+    sets: dict[tuple[str, tuple[str, ...], str], list[Probe]] = {}
+    for probe in found:
+        sets.setdefault((probe.group.control, probe.group.valid, probe.group.estimator), []).append(probe)
+    return list(sets.values())
+
+
+def _place(config: AttackConfig, loss: str) -> dict[str, Any]:
+    return {"object": config.object, "environment": config.environment, "loss": loss}
+
+
+__all__ = ["ESTIMATORS", "check", "plan"]

@@ -1,0 +1,233 @@
+"""The policy to use first: looks everywhere, then where a model of what it has seen promises most, then uphill."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from advsearch.attacks.domain import Domain
+from advsearch.attacks.evaluation import Evaluation, Wanted
+from advsearch.attacks.policies.base import Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.coordinates import Coordinates, box_coordinates
+from advsearch.attacks.policies.pgd import PGD, PGDState
+from advsearch.attacks.policies.surrogate import Scales, Surrogate, fit
+
+SCREEN, SCREEN_MIXED = 0.5, 0.25
+"""Share of the renders that the screen takes, in a box alone and beside a norm ball."""
+
+UNTIL_MIXED = 0.5
+"""Share of the renders after which an ascent takes over beside a norm ball."""
+
+LOW = 10
+"""Up to so many box coordinates are worth the whole screen; of more it sees less and less."""
+
+PAYS = 4
+"""A gradient is worth its renders if so many would fit into what is left."""
+
+REACH = 0.1
+"""Length of the ascent's whole step in a box, as a share of half the diagonal: the screen has been everywhere else."""
+
+CURIOSITY = 2.0
+"""How many standard deviations of the surrogate a candidate gets on top of its mean. With less, and a noise as large
+as all differences, the search settles on a lucky point and random search beats it."""
+
+NEAR, FAR, CENTRES = 256, 128, 4
+"""Candidates near the best points, candidates anywhere, and the number of best points."""
+
+REFIT = 5
+"""The surrogate's lengths and noise are fitted again after so many new points, and after each tenth more of them."""
+
+MEMORY = 100
+"""The surrogate sees so many of the best points and so many of the latest."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the renders are for.
+
+    Attributes:
+        steps: renders in all.
+        screen: renders of the screen.
+        until: renders after which the ascent begins; `steps` if there is none.
+        gradient: what the ascent asks for.
+    """
+
+    steps: int
+    screen: int
+    until: int
+    gradient: Wanted
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A random move of the box coordinates during an ascent: where they stood, and the objective there."""
+
+    x: Tensor
+    objective: float
+
+
+@dataclass(frozen=True, eq=False)
+class AutoState:
+    """Where the search stands.
+
+    Attributes:
+        box: the coordinates that are screened.
+        spent: renders so far.
+        points: (n, k) where the box coordinates have been, the norm balls at their start.
+        values: the n objectives there.
+        scales: of the surrogate, fitted to the first `fitted` points.
+        ascent: of PGD, once it has begun.
+        climbing: whether the latest proposal was the ascent's.
+        last: the objective of the ascent's latest evaluation.
+        trial: what the latest proposal tried, if it did.
+    """
+
+    domain: Domain
+    box: Coordinates
+    plan: Plan
+    seed: int
+    points: Tensor
+    values: tuple[float, ...] = ()
+    spent: int = 0
+    scales: Scales | None = None
+    fitted: int = 0
+    ascent: PGDState | None = None
+    climbing: bool = False
+    last: float = -math.inf
+    trial: Trial | None = None
+
+
+@dataclass(frozen=True)
+class Auto(Policy[AutoState]):
+    """What to use first; it has no options.
+
+    - Norm balls alone (a texture): `PGD`, bit for bit.
+    - Box coordinates alone (poses, cameras, lights, choices): the start and scrambled Sobol points take half of the
+      renders (less above `LOW` coordinates if gradients are cheap). Then a Gaussian process is fitted to all that was
+      seen, and the next point is the candidate with the largest mean plus `CURIOSITY` standard deviations, among moves
+      of the best points, points anywhere, and the best point itself (Srinivas et al. 2010, GP-UCB). It models the
+      noise, so a lucky value does not pass for a peak, and rendering the best point again is one of its choices.
+      Where there are many coordinates and gradients cost little, `PGD` with small steps ends it.
+    - Both: screen and surrogate over the box coordinates with the balls at their start take half of the renders,
+      `PGD` over everything the rest. If the box coordinates' gradient costs too much, PGD follows the balls' alone, and
+      every second evaluation tries a random move of the box coordinates, which is taken back if the objective falls.
+    """
+
+    name: ClassVar[str] = "auto"
+    uses_gradient: ClassVar[bool] = True
+
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> AutoState:
+        box = box_coordinates(domain)
+        points = torch.empty(0, box.count)
+        plan = make_plan(domain, box, steps)
+        if box.count == 0:
+            return AutoState(domain, box, plan, 0, points, ascent=PGD().start(domain, generator, steps))
+        return AutoState(domain, box, plan, draw_seed(generator), points)
+
+    def propose(self, state: AutoState) -> tuple[Proposal | None, AutoState]:
+        state = replace(state, climbing=False, trial=None)
+        if state.ascent is None and state.spent >= state.plan.until:
+            state = _begin_ascent(state)
+        if state.ascent is not None:
+            proposal, _ = PGD().propose(state.ascent)
+            if proposal is not None:
+                return _climb(state, proposal)
+            if state.box.count < state.domain.dim:
+                return None, state
+        x, state = _next_point(state)
+        return Proposal(state.domain.project(state.box.put(state.domain.start, x))), state
+
+    def update(self, state: AutoState, u: Tensor, evaluation: Evaluation) -> AutoState:
+        state = replace(state, spent=state.spent + evaluation.cost)
+        if state.climbing and state.ascent is not None:
+            ascent = PGD().update(state.ascent, u, evaluation)
+            if state.trial is not None and evaluation.objective < state.trial.objective:
+                ascent = replace(ascent, u=state.domain.project(state.box.put(ascent.u, state.trial.x)))
+            return replace(state, ascent=ascent, last=evaluation.objective)
+        points = torch.cat([state.points, state.box.take(u)[None]])
+        return replace(state, points=points, values=(*state.values, evaluation.objective))
+
+
+def make_plan(domain: Domain, box: Coordinates, steps: int) -> Plan:
+    """Return what `steps` renders are for."""
+    if box.count == 0:
+        return Plan(steps, 0, 0, True)
+    if box.count < domain.dim:
+        screen, until = math.ceil(SCREEN_MIXED * steps), math.ceil(UNTIL_MIXED * steps)
+        pays = PAYS * domain.gradient_cost <= steps - until or not domain.partial_gradients
+        return Plan(steps, screen, until, True if pays else "free")
+    screen = math.ceil(SCREEN * steps)
+    ways = int((box.options == 0).sum())
+    seen = math.ceil(screen * LOW / max(ways, LOW))
+    if ways > LOW and PAYS * domain.gradient_cost <= steps - seen:
+        return Plan(steps, seen, seen, True)
+    return Plan(steps, screen, steps, True)
+
+
+# ---- the surrogate --------------------------------------------------------------------------------------------------
+
+
+def _next_point(state: AutoState) -> tuple[Tensor, AutoState]:
+    """The start, then the screen, then what the surrogate likes; (k,) in the unit box."""
+    n, screen = len(state.values), max(1, state.plan.screen)
+    if n == 0:
+        return state.box.take(state.domain.start), state
+    if n < screen or not any(math.isfinite(value) for value in state.values):
+        return state.box.screen(state.seed, max(n, screen - 1))[n - 1], state
+    surrogate, state = _surrogate(state)
+    generator = seeded(state.seed, n)
+    best = surrogate.x[surrogate.predict(surrogate.x)[0].argsort(descending=True, stable=True)]
+    centres = torch.randint(0, min(CENTRES, len(best)), (NEAR,), generator=generator)
+    centres[: NEAR // 2] = 0
+    near = state.box.moves(best[centres], generator)
+    far = state.box.tidy(torch.rand(FAR, state.box.count, generator=generator))
+    candidates = torch.cat([best[:1], near, far])
+    mean, deviation = surrogate.predict(candidates)
+    return candidates[int((mean + CURIOSITY * deviation).argmax())], state
+
+
+def _surrogate(state: AutoState) -> tuple[Surrogate, AutoState]:
+    """The process behind the points seen so far, its scales fitted again if it is time."""
+    n = len(state.values)
+    values = torch.tensor(state.values, dtype=torch.float64)
+    finite = torch.isfinite(values)
+    values = torch.where(finite, values, values[finite].min())
+    kept = torch.arange(n)
+    if n > 2 * MEMORY:
+        best = values[: n - MEMORY].argsort(descending=True, stable=True)[:MEMORY]
+        kept = torch.cat([best, kept[n - MEMORY :]])
+    due = state.scales is None or n - state.fitted >= max(REFIT, state.fitted // 10)
+    surrogate = fit(state.box, state.points[kept], values[kept], None if due else state.scales)
+    return surrogate, replace(state, scales=surrogate.scales, fitted=n) if due else state
+
+
+# ---- the ascent -----------------------------------------------------------------------------------------------------
+
+
+def _begin_ascent(state: AutoState) -> AutoState:
+    """Let PGD go on from the best of the points seen so far, with small steps in the box."""
+    x = state.box.take(state.domain.start)
+    if any(math.isfinite(value) for value in state.values):
+        surrogate, state = _surrogate(state)
+        x = surrogate.x[int(surrogate.predict(surrogate.x)[0].argmax())]
+    blocks = tuple(
+        replace(block, reach=REACH * block.radius) if block.norm == "box" else block for block in state.domain.blocks
+    )
+    domain = replace(state.domain, blocks=blocks)
+    ascent = PGD().start(domain, seeded(state.seed, 0), max(1, state.plan.steps - state.spent))
+    return replace(state, ascent=replace(ascent, u=domain.project(state.box.put(domain.start, x))))
+
+
+def _climb(state: AutoState, proposal: Proposal) -> tuple[Proposal, AutoState]:
+    """The ascent's proposal; with a gradient for the balls alone, every second one with a random move in the box."""
+    state = replace(state, climbing=True)
+    if state.plan.gradient is not True and state.ascent is not None and state.ascent.count % 2:
+        x = state.box.take(proposal.u)
+        moved = state.box.moves(x[None], seeded(state.seed, state.plan.steps + state.ascent.count))[0]
+        u = state.domain.project(state.box.put(proposal.u, moved))
+        return replace(proposal, u=u, gradient=state.plan.gradient), replace(state, trial=Trial(x, state.last))
+    return replace(proposal, gradient=state.plan.gradient), state

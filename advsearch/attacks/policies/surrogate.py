@@ -1,0 +1,123 @@
+"""A Gaussian process over a few coordinates: what a handful of noisy renders say about the rest of the box.
+
+Matérn-5/2 kernel, one length for each coordinate, and a noise that stands for the renderer's and for all roughness
+finer than the points tell apart. Everything is fitted by maximum likelihood over fixed grids and every proposal is one
+of a finite set of candidates, so that the last bits of a matrix factorisation do not change an answer.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from advsearch.attacks.policies.coordinates import Coordinates
+
+LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
+"""Candidate lengths, times the square root of the number of coordinates (as distances between points grow)."""
+
+NOISES = (1e-4, 1e-2, 0.1, 0.5, 2.0)
+"""Candidate variances of the noise, as shares of the signal's."""
+
+STRETCHES = (0.5, 2.0, 4.0)
+"""By how much one coordinate's length is changed on trial."""
+
+LONGEST = 8.0
+"""No length is more than this many times the square root of the number of coordinates: it no longer matters then."""
+
+EVIDENCE = 1.0
+"""Gain in log-likelihood that a coordinate's own length must bring; less would fit the noise."""
+
+MOST_OWN = 16
+"""Up to so many coordinates have lengths of their own; more share one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scales:
+    """What is fitted: (k,) lengths, and the noise's variance as a share of the signal's."""
+
+    lengths: Tensor
+    noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class Surrogate:
+    """A fitted process.
+
+    Attributes:
+        space: measures distances.
+        x: (n, k) points of the unit box.
+        scales: see there.
+        factor: (n, n) Cholesky factor of the kernel matrix with noise, signal variance 1.
+        weights: (n,) its inverse times the centred values.
+        mean, variance: of the signal.
+    """
+
+    space: Coordinates
+    x: Tensor
+    scales: Scales
+    factor: Tensor
+    weights: Tensor
+    mean: float
+    variance: float
+
+    def predict(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Return mean and standard deviation (m,) of the noise-free objective at points (m, k)."""
+        lengths = self.scales.lengths
+        cross = kernel(self.space.embed(x, lengths), self.space.embed(self.x, lengths))
+        solved = torch.linalg.solve_triangular(self.factor, cross.mT, upper=False)
+        left = (1.0 - solved.square().sum(dim=0)).clamp_(min=1e-12)
+        return self.mean + cross @ self.weights, (self.variance * left).sqrt_()
+
+
+def kernel(a: Tensor, b: Tensor) -> Tensor:
+    """Matérn-5/2 correlation between points (n, f) and (m, f)."""
+    r = math.sqrt(5.0) * torch.cdist(a, b)
+    return (1.0 + r + r.square() / 3.0) * torch.exp(-r)
+
+
+def fit(space: Coordinates, x: Tensor, y: Tensor, scales: Scales | None = None) -> Surrogate:
+    """Return the process given values (n,) at points (n, k); the scales too are fitted unless they are given."""
+    scales = scales or _best_scales(space, x, y)
+    factor, weights, mean, variance, _ = _solve(space, x, y, scales)
+    return Surrogate(space, x, scales, factor, weights, mean, variance)
+
+
+def _best_scales(space: Coordinates, x: Tensor, y: Tensor) -> Scales:
+    """The most likely common length and noise, then length by length what the evidence asks for."""
+    k = x.shape[1]
+    unit = math.sqrt(k)
+    tried = [Scales(torch.full((k,), unit * length).double(), noise) for length in LENGTHS for noise in NOISES]
+    best, score = _most_likely(space, x, y, tried)
+    for j in range(k if 1 < k <= MOST_OWN else 0):
+        changed = []
+        for stretch in STRETCHES:
+            lengths = best.lengths.clone()
+            lengths[j] = min(unit * LONGEST, float(lengths[j]) * stretch)
+            changed.append(Scales(lengths, best.noise))
+        other, higher = _most_likely(space, x, y, changed)
+        if higher > score + EVIDENCE:
+            best, score = other, higher
+    return best
+
+
+def _most_likely(space: Coordinates, x: Tensor, y: Tensor, tried: list[Scales]) -> tuple[Scales, float]:
+    scores = [_solve(space, x, y, scales)[4] for scales in tried]
+    best = max(range(len(tried)), key=scores.__getitem__)
+    return tried[best], scores[best]
+
+
+def _solve(space: Coordinates, x: Tensor, y: Tensor, scales: Scales) -> tuple[Tensor, Tensor, float, float, float]:
+    """Return the Cholesky factor, weights, mean, variance and log-likelihood, mean and variance at their best."""
+    points = space.embed(x, scales.lengths)
+    n = len(points)
+    matrix = kernel(points, points) + (scales.noise + 1e-8) * torch.eye(n, dtype=torch.float64)
+    factor = torch.linalg.cholesky(matrix)
+    both = torch.cholesky_solve(torch.stack([y.double(), torch.ones(n, dtype=torch.float64)], dim=1), factor)
+    mean = float(both[:, 0].sum() / both[:, 1].sum())
+    weights = both[:, 0] - mean * both[:, 1]
+    variance = max(float(weights @ (y.double() - mean)) / n, 1e-30)
+    likelihood = -0.5 * n * math.log(variance) - float(factor.diagonal().log().sum())
+    return factor, weights, mean, variance, likelihood

@@ -1,0 +1,119 @@
+"""The `background` control: a plain colour behind the object, in place of what the camera sees of the environment.
+
+    sRGB = hsv(hue, saturation, value);   backdrop = linear(sRGB)
+
+The environment keeps lighting the object, so that only what is behind it changes, as in the studies of how much a
+classifier leans on backgrounds (Xiao et al. 2020, Noise or signal, arXiv 2006.09994). Hue, saturation and value are
+the hexcone model of Smith (Color gamut transform pairs, SIGGRAPH 1978), in display-referred values: piecewise linear,
+so that it has a derivative almost everywhere.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from advsearch.controls.base import Choice, Parameter, Value
+from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.values import Fixed
+from advsearch.errors import InputError
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.formation import srgb_to_linear
+
+COLOR = "backdrop.color"
+"""The scene input: (3,) display-linear values in [0, 1]."""
+GROUNDS = ("keep", "hide")
+WHAT = ("colour", "environment")
+NUMBERS = ("hue", "saturation", "value")
+
+
+class BackgroundControl(NumberControl):
+    """A plain colour behind the object."""
+
+    kind: ClassVar[str] = "background"
+    summary: ClassVar[str] = "A plain colour behind the object; the environment keeps lighting it."
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter(
+            "what",
+            (),
+            "name",
+            0,
+            len(WHAT) - 1,
+            "colour",
+            "What is behind the object: the colour, or the environment as ever.",
+            differentiable=False,
+            options=WHAT,
+            estimators=(),
+        ),
+        Parameter(
+            "hue",
+            (),
+            "degrees",
+            0.0,
+            360.0,
+            0.0,
+            "Hue: 0 is red, 120 green, 240 blue.",
+            periodic=True,
+            search=(0.0, 360.0),
+            estimators=("image",),
+        ),
+        Parameter(
+            "saturation", (), "1", 0.0, 1.0, 0.0, "Saturation: 0 is grey.", search=(0.0, 1.0), estimators=("image",)
+        ),
+        Parameter(
+            "value",
+            (),
+            "sRGB",
+            0.0,
+            1.0,
+            0.5,
+            "The largest of red, green and blue: 0 is black.",
+            search=(0.0, 1.0),
+            estimators=("image",),
+        ),
+    )
+    choices: ClassVar[tuple[Choice, ...]] = (
+        Choice("ground", "hide", "Whether the ground plane stays in the picture: keep or hide."),
+    )
+
+    def __init__(self, name: str | None = None, **settings: object) -> None:
+        super().__init__(name, **settings)
+        # a list for `what` alone leaves the colour to be searched
+        self.asked = any(not isinstance(self.specs.get(one, Fixed(0.0)), Fixed) for one in NUMBERS)
+        if self.specs.get("what") == Fixed("environment"):
+            raise InputError(
+                f"{self.name}.what: environment alone leaves nothing to search; use what=[colour, environment], or "
+                f"leave the control out"
+            )
+
+    def check_choices(self) -> None:
+        if self.chosen["ground"] not in GROUNDS:
+            raise InputError(f"{self.name}.ground: expected one of {', '.join(GROUNDS)}, got {self.chosen['ground']!r}")
+
+    def prepare(self, scene: SceneDescription) -> SceneDescription:
+        scene = dataclasses.replace(scene, backdrop=True)
+        return scene.with_values(ground__size=0.0) if self.chosen["ground"] == "hide" else scene
+
+    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        if WHAT[int(values["what"])] == "environment":
+            return {}
+        return {COLOR: srgb_to_linear(hsv_to_rgb(values["hue"], values["saturation"], values["value"]))}
+
+    def measured(self, scene: SceneDescription, values: Values) -> dict[str, Value]:
+        color = hsv_to_rgb(values["hue"], values["saturation"], values["value"])
+        names = ("red", "green", "blue")
+        return {name: {"value": float(one), "unit": "sRGB"} for name, one in zip(names, color, strict=True)}
+
+
+def hsv_to_rgb(hue: Tensor, saturation: Tensor, value: Tensor) -> Tensor:
+    """Return the (3,) colour of a hue in degrees and a saturation and a value in [0, 1]; all display-referred.
+
+    Piecewise linear in each argument, so differentiable almost everywhere; a grey has no derivative by hue but zero.
+    """
+    sector = torch.remainder(torch.tensor([5.0, 3.0, 1.0], dtype=hue.dtype) + hue / 60.0, 6.0)
+    ramp = torch.minimum(sector, 4.0 - sector).clamp(0.0, 1.0)
+    return value * (1.0 - saturation * ramp)

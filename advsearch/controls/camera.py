@@ -1,0 +1,147 @@
+"""The `camera` control: an orbit around the object, the lens, and the exposure.
+
+The camera looks at the middle of the object in its default pose. "Keeps what it frames": while the distance is not
+searched or set, it follows the field of view so that the object's size in the picture stays the same (a dolly zoom),
+down to where the camera would enter the object.
+
+    distance(fov) = distance_0 * tan(fov_0 / 2) / tan(fov / 2)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advsearch.controls.base import Parameter
+from advsearch.controls.numbers import NumberControl, Values
+from advsearch.errors import InputError
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.geometry import camera_to_world
+
+ORBIT = ("secant", "differences", "forward", "simultaneous")
+"""Mitsuba has no derivative of sensors, so a camera is differentiated by differences."""
+SENSOR_WIDTH = 36.0
+"""Width in millimetres of the full-frame sensor that a focal length refers to."""
+CLEARANCE = 0.02
+"""Smallest distance, in object sizes, that a distance worked out here keeps from the object's bounding sphere."""
+
+
+def _moving(
+    name: str,
+    unit: str,
+    low: float,
+    high: float,
+    default: float | str,
+    text: str,
+    search: tuple[float, float] | None = None,
+    periodic: bool = False,
+    log: bool = False,
+    moves: bool = True,
+) -> Parameter:
+    return Parameter(name, (), unit, low, high, default, text, periodic, True, moves, search, log, estimators=ORBIT)
+
+
+class CameraControl(NumberControl):
+    """An orbit around the object, the lens, and the exposure."""
+
+    kind: ClassVar[str] = "camera"
+    summary: ClassVar[str] = "An orbit around the object, the lens, and the exposure."
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        _moving("azimuth", "degrees", -3600.0, 3600.0, 40.0, "Direction around the object.", (0.0, 360.0), True),
+        _moving("elevation", "degrees", -89.0, 89.0, 25.0, "Height above the ground plane.", (5.0, 60.0)),
+        _moving(
+            "roll", "degrees", -360.0, 360.0, 0.0, "Rotation of the picture, counter-clockwise.", (-15.0, 15.0), True
+        ),
+        _moving(
+            "distance", "object sizes", 0.05, 1000.0, "fits the object", "To the object's middle.", (0.8, 1.5), log=True
+        ),
+        _moving("fov", "degrees", 1.0, 170.0, 35.0, "Field of view along the larger side."),
+        _moving("focal_length", "mm", 1.5, 2100.0, "as fov", "The same for a sensor 36 mm wide.", log=True),
+        _moving("shift_x", "picture widths", -2.0, 2.0, 0.0, "Shift of the picture to the right."),
+        _moving("shift_y", "picture heights", -2.0, 2.0, 0.0, "Shift of the picture downwards."),
+        _moving("aperture", "object sizes", 0.0, 10.0, 0.0, "Radius of the lens; 0 is a pinhole.", moves=False),
+        _moving("focus", "object sizes", 0.01, 1e4, "the object's middle", "Distance in focus.", log=True, moves=False),
+        Parameter("exposure", (), "stops", -10.0, 10.0, 0.0, "Over the metered exposure.", estimators=("image",)),
+    )
+
+    def prepare(self, scene: SceneDescription) -> SceneDescription:
+        if "fov" in self.specs and "focal_length" in self.specs:
+            raise InputError(f"--control {self.name}: fov and focal_length say the same thing; leave one of them out")
+        wanted = "aperture" in self.specs or "focus" in self.specs
+        if wanted and ("shift_x" in self.specs or "shift_y" in self.specs):
+            raise InputError(
+                f"--control {self.name}: a shifted picture together with an aperture is not supported; leave one out"
+            )
+        return replace(scene, thin_lens=True) if wanted else scene
+
+    def default(self, scene: SceneDescription, parameter: Parameter) -> float | str:
+        if parameter.name == "distance" or parameter.name == "focus":
+            return fitted_distance(scene)
+        if parameter.name == "focal_length":
+            return SENSOR_WIDTH / 2.0 / math.tan(math.radians(scene.number("camera.fov")) / 2.0)
+        if parameter.name == "exposure":
+            return 0.0
+        return super().default(scene, parameter)
+
+    def search_range(self, scene: SceneDescription, parameter: Parameter) -> tuple[float, float] | None:
+        if parameter.name == "distance" and parameter.search is not None:
+            fitted = fitted_distance(scene)
+            return parameter.search[0] * fitted, parameter.search[1] * fitted
+        return parameter.search
+
+    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        fov = values["fov"]
+        if "focal_length" in self.specs:
+            fov = torch.rad2deg(2.0 * torch.atan(SENSOR_WIDTH / 2.0 / values["focal_length"]))
+        distance = values["distance"] if self._distance_is_free() else self._following(scene, fov)
+        inputs = {"camera.to_world": self._orbit(scene, values, distance), "camera.fov": fov.reshape(1)}
+        if scene.thin_lens and ("aperture" in self.specs or "focus" in self.specs):
+            inputs["camera.aperture"] = values["aperture"].clamp_min(1e-5).reshape(1)
+            focus = values["focus"] if "focus" in self.specs else distance
+            inputs["camera.focus"] = focus.reshape(1)
+        if "shift_x" in self.specs or "shift_y" in self.specs:
+            inputs["camera.shift"] = torch.stack([values["shift_x"], values["shift_y"]])
+        if "exposure" in self.specs:
+            inputs["camera.exposure"] = values["exposure"]
+        return inputs
+
+    def _distance_is_free(self) -> bool:
+        return "distance" in self.specs or not self.asked
+
+    def _following(self, scene: SceneDescription, fov: Tensor) -> Tensor:
+        """The distance that keeps the object's size in the picture."""
+        half = math.tan(math.radians(scene.number("camera.fov")) / 2.0)
+        wanted = fitted_distance(scene) * half / torch.tan(torch.deg2rad(fov) / 2.0)
+        return wanted.clamp_min(_radius(scene) + CLEARANCE)
+
+    def _orbit(self, scene: SceneDescription, values: Values, distance: Tensor) -> Tensor:
+        azimuth, elevation, roll = (torch.deg2rad(values[name]) for name in ("azimuth", "elevation", "roll"))
+        zero = torch.zeros(())
+        outwards = torch.stack([elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()])
+        left = torch.stack([azimuth.sin(), -azimuth.cos(), zero])
+        up = torch.linalg.cross(-outwards, left)
+        left, up = roll.cos() * left + roll.sin() * up, roll.cos() * up - roll.sin() * left
+        place = torch.from_numpy(_middle(scene)).float() + distance * outwards
+        top = torch.stack([left, up, -outwards, place], dim=1)
+        return torch.cat([top, torch.tensor([[0.0, 0.0, 0.0, 1.0]])])
+
+
+def fitted_distance(scene: SceneDescription) -> float:
+    """Return the distance of the scene's own camera to what it looks at, for a square picture; object sizes."""
+    return float(np.linalg.norm(camera_to_world(scene)[:3, 3] - _middle(scene)))
+
+
+def _middle(scene: SceneDescription) -> np.ndarray:
+    vertices = scene.object.mesh.vertices.astype(np.float64)
+    return np.asarray((vertices.min(axis=0) + vertices.max(axis=0)) / 2.0)
+
+
+def _radius(scene: SceneDescription) -> float:
+    offsets = scene.object.mesh.vertices.astype(np.float64) - _middle(scene)
+    return float(np.linalg.norm(offsets, axis=1).max())

@@ -1,0 +1,178 @@
+"""The `environment` control: which map lights the scene, how it is turned, how bright it is, and its colour.
+
+Mitsuba's own derivative of an environment's rotation has the wrong sign: the sampling of the light is detached from it
+(DESIGN section 5). Here the map itself is resampled along its columns by torch, and the adjoint differentiates its
+texels, which is right:
+
+    map(rotation)[column c] = (1 - f) base[c + k] + f base[c + k + 1],    rotation / 360 * columns = k + f
+
+`harmonics` adds light of low order: real spherical harmonics of degrees 0 to 2 (Ramamoorthi and Hanrahan 2001,
+section 3), 9 coefficients for each colour channel as multiples of the map's mean radiance, inside an L2 ball.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Parameter
+from advsearch.controls.numbers import NumberControl, Values
+from advsearch.errors import InputError
+from advsearch.scene import library
+from advsearch.scene.description import SceneDescription, metered_gain
+
+LIT = ("adjoint", "differences")
+"""Valid estimators for what only changes light."""
+OWN_MAP = "own"
+"""The option of `which` that keeps the scene's environment."""
+COEFFICIENTS = 27
+"""Degrees 0 to 2 of three colour channels."""
+
+
+class EnvironmentControl(NumberControl):
+    """Which environment lights the scene, how it is turned, how bright it is, and its colour."""
+
+    kind: ClassVar[str] = "environment"
+    summary: ClassVar[str] = "Which environment lights the scene, how it is turned, how bright it is, and its colour."
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter(
+            "which",
+            (),
+            "name",
+            0.0,
+            float(len(library.list_environments())),
+            OWN_MAP,
+            "A bundled environment instead of the scene's own, metered afresh.",
+            differentiable=False,
+            options=(OWN_MAP, *library.list_environments()),
+            estimators=(),
+        ),
+        Parameter(
+            "rotation",
+            (),
+            "degrees",
+            -3600.0,
+            3600.0,
+            0.0,
+            "Rotation about the vertical.",
+            periodic=True,
+            search=(0.0, 360.0),
+            estimators=LIT,
+        ),
+        Parameter(
+            "exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness, after metering.", search=(-1.0, 1.0), estimators=LIT
+        ),
+        *(
+            Parameter(f"tint_{color}", (), "1", 0.0, 10.0, 1.0, f"Factor on the map's {color}.", estimators=LIT)
+            for color in ("red", "green", "blue")
+        ),
+        Parameter(
+            "harmonics",
+            (COEFFICIENTS,),
+            "mean radiances",
+            -1.0,
+            1.0,
+            0.0,
+            "Low-order light that is added: spherical-harmonic coefficients, 9 for each channel, inside the ball.",
+            estimators=LIT,
+        ),
+    )
+    choices: ClassVar[tuple[Choice, ...]] = (
+        Choice("epsilon", 0.5, "Radius of the ball of `harmonics`: L2 norm of all coefficients."),
+    )
+
+    def check_choices(self) -> None:
+        given = self.chosen["epsilon"]
+        if isinstance(given, bool) or not isinstance(given, (int, float)) or not 0.0 < float(given) <= 100.0:
+            raise InputError(f"{self.name}.epsilon: expected a number over 0 and at most 100, got {given!r}")
+
+    def budget(self, scene: SceneDescription, parameter: Parameter) -> Budget:
+        if parameter.name != "harmonics":
+            return WHOLE_RANGE
+        spec = self.specs["harmonics"]
+        width = getattr(spec, "high", 1.0) - getattr(spec, "low", -1.0)
+        return Budget("l2", float(str(self.chosen["epsilon"])) / width)
+
+    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        base = self._map(scene, int(values["which"]))
+        turned = turn(base, values["rotation"] - scene.number("environment.rotation"))
+        tint = torch.stack([values[f"tint_{color}"] for color in ("red", "green", "blue")])
+        stops = values["exposure"] - scene.number("environment.exposure")
+        lit = turned * tint * torch.exp2(stops)
+        if "harmonics" in self.specs:
+            lit = (lit + harmonics(values["harmonics"], base)).clamp_min(0.0)
+        return {"environment.data": lit}
+
+    def _map(self, scene: SceneDescription, which: int) -> Tensor:
+        name = self.parameters[0].options[which]
+        if name == OWN_MAP:
+            return _tensor_of(scene)
+        height, width = scene.environment.radiance.shape[:2]
+        return _bundled(name, height, width) / metered_gain(scene.environment)
+
+
+@lru_cache(maxsize=4)
+def _tensor_of(scene: SceneDescription) -> Tensor:
+    return torch.from_numpy(scene.environment.radiance.copy())
+
+
+@lru_cache(maxsize=16)
+def _bundled(name: str, height: int, width: int) -> Tensor:
+    """A bundled map at another size, times its own metered gain, so that pictures keep their exposure."""
+    asset = library.load_environment(name)
+    channels_first = torch.from_numpy(asset.radiance.copy()).permute(2, 0, 1)[None]
+    if channels_first.shape[-2:] != (height, width):
+        channels_first = F.interpolate(channels_first, (height, width), mode="bilinear", antialias=True)
+    return channels_first[0].permute(1, 2, 0).contiguous() * metered_gain(asset)
+
+
+def turn(radiance: Tensor, degrees: Tensor) -> Tensor:
+    """Turn a map (H, W, 3) about the vertical as `environment.rotation` does, by linear resampling of its columns.
+
+    Periodic and differentiable in both arguments; exact at whole columns.
+    """
+    columns = radiance.shape[1]
+    shift = torch.remainder(degrees / 360.0, 1.0) * columns
+    whole = int(shift.detach().floor())
+    share = shift - whole
+    near, far = radiance.roll(-whole, dims=1), radiance.roll(-whole - 1, dims=1)
+    return near + share * (far - near)
+
+
+def harmonics(coefficients: Tensor, like: Tensor) -> Tensor:
+    """Return (H, W, 3) light from 9 coefficients a channel, scaled by the mean of the map `like` (H, W, 3)."""
+    height, width = like.shape[:2]
+    basis = _basis(height, width)
+    mean = like.detach().mean(dim=(0, 1))
+    return basis @ coefficients.reshape(9, 3) * mean
+
+
+@lru_cache(maxsize=4)
+def _basis(height: int, width: int) -> Tensor:
+    """Real spherical harmonics of degrees 0 to 2 over the map, each with root mean square 1; (H, W, 9)."""
+    theta = (torch.arange(height) + 0.5) * math.pi / height
+    phi = (torch.arange(width) + 0.5) * 2.0 * math.pi / width
+    x = theta.sin()[:, None] * phi.cos()[None]
+    y = theta.sin()[:, None] * phi.sin()[None]
+    z = theta.cos()[:, None].expand(height, width)
+    root3, root15, root5 = math.sqrt(3.0), math.sqrt(15.0), math.sqrt(5.0)
+    return torch.stack(
+        [
+            torch.ones_like(z),
+            root3 * y,
+            root3 * z,
+            root3 * x,
+            root15 * x * y,
+            root15 * y * z,
+            root5 / 2.0 * (3.0 * z * z - 1.0),
+            root15 * x * z,
+            root15 / 2.0 * (x * x - y * y),
+        ],
+        dim=-1,
+    )

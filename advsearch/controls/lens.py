@@ -1,0 +1,172 @@
+"""The `lens` control: translucent dots on the front of the camera's lens, as an adversarial sticker has them.
+
+    opacity_k(p) = opacity_k * exp(-(|p - centre_k|^2 / radius_k^2) ^ falloff)
+    light(p)    <- (1 - opacity_k(p)) light(p) + opacity_k(p) color_k,     for each dot k in turn
+
+The model of a dot, a colour that is mixed in with an opacity that falls off exponentially with the squared distance,
+is that of Li, Schmidt and Kolter (Adversarial camera stickers, ICML 2019, arXiv 1904.00759, section 3): a dot on the
+glass is so far out of focus that all that is left of its outline is a smooth blob. They mix display values. Here the
+mixing is of linear light, because what a lens adds up on the sensor is light; the colours are given as sRGB.
+
+Dots are part of the camera, not of the scene: they are put on the finished picture, and nothing is rendered anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from advsearch.controls.base import Choice, Parameter
+from advsearch.controls.numbers import BoundNumbers, NumberControl, Values
+from advsearch.errors import InputError
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
+
+DOTS = 4
+"""How many dots there are when nothing is said."""
+MOST_DOTS = 64
+PLACES = ("x", "y")
+STICKER_SIDE = 256
+"""Side in pixels of the picture of the sticker that is kept with a run."""
+_FAR = 40.0
+"""Past this exponent a dot counts as invisible: exp(-40) is 4e-18, and no power overflows."""
+
+
+def _per_dot(name: str, unit: str, default: float, description: str, **more: object) -> Parameter:
+    """A parameter in [0, 1] with one number a dot, searched over its whole range unless `more` says otherwise."""
+    return Parameter(
+        name,
+        (None,),
+        unit,
+        **{"low": 0.0, "high": 1.0, "search": (0.0, 1.0), **more},  # type: ignore[arg-type]
+        default=default,
+        description=description,
+        estimators=("image",),
+    )
+
+
+class LensControl(NumberControl):
+    """Translucent dots on the camera's lens."""
+
+    kind: ClassVar[str] = "lens"
+    summary: ClassVar[str] = "Translucent, blurred dots on the camera's lens: their places, sizes, colours, opacities."
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        _per_dot("x", "picture widths", 0.5, "Centre of each dot, from the left edge."),
+        _per_dot("y", "picture heights", 0.5, "Centre of each dot, from the top edge."),
+        _per_dot(
+            "radius",
+            "picture sizes",
+            0.12,
+            "Distance at which a dot has lost 63 % of its opacity, as a share of the picture's smaller side.",
+            low=0.01,
+            search=(0.03, 0.25),
+            log=True,
+        ),
+        _per_dot("red", "sRGB", 0.5, "Red of each dot."),
+        _per_dot("green", "sRGB", 0.5, "Green of each dot."),
+        _per_dot("blue", "sRGB", 0.5, "Blue of each dot."),
+        _per_dot("opacity", "1", 0.0, "Opacity in the middle of each dot; 0 is no dot.", search=(0.0, 0.5)),
+        Parameter(
+            "falloff",
+            (),
+            "1",
+            1.0,
+            8.0,
+            1.0,
+            "How sharp the edges are: 1 is a Gaussian blob, 8 nearly a disc.",
+            estimators=("image",),
+        ),
+    )
+    choices: ClassVar[tuple[Choice, ...]] = (Choice("dots", DOTS, f"How many dots there are, 1 to {MOST_DOTS}."),)
+
+    def check_choices(self) -> None:
+        given = self.chosen["dots"]
+        number = isinstance(given, (int, float)) and not isinstance(given, bool)
+        if not number or not float(given).is_integer() or not 1 <= given <= MOST_DOTS:  # type: ignore[arg-type,operator]
+            raise InputError(f"{self.name}.dots: expected a whole number from 1 to {MOST_DOTS}, got {given!r}")
+
+    @property
+    def dots(self) -> int:
+        """How many dots there are."""
+        return int(self.chosen["dots"])  # type: ignore[call-overload,no-any-return]
+
+    def size(self, parameter: Parameter) -> int:
+        return self.dots if parameter.shape else 1
+
+    def bind(self, scene: SceneDescription) -> BoundNumbers:
+        bound = super().bind(scene)
+        begin = 0
+        for group in bound.groups:
+            if group.name in PLACES and not group.options:
+                bound.start[begin : begin + group.size] = spread(self.dots)[PLACES.index(group.name)]
+            begin += group.size
+        return bound
+
+    def on_picture(self, scene: SceneDescription, values: Values, image: Tensor) -> Tensor:
+        return with_dots(image, self._placed(values))
+
+    def kept_pictures(self, scene: SceneDescription, values: Values) -> dict[str, Tensor]:
+        return {self.name: with_dots(_board(), self._placed(values))}
+
+    def _placed(self, values: Values) -> dict[str, Tensor]:
+        """The values, with the dots spread over the picture along an axis about which nothing was said."""
+        placed = dict(values)
+        for axis, name in enumerate(PLACES):
+            if self.asked and name not in self.specs:
+                placed[name] = spread(self.dots)[axis]
+        return placed
+
+
+def spread(count: int) -> Tensor:
+    """Return `count` places spread evenly over the middle 80 % of the picture, the first in its centre.
+
+    The places are a lattice with the two irrational steps of the plastic number, a two-dimensional golden ratio
+    (Roberts 2018, The unreasonable effectiveness of quasirandom sequences, R2).
+
+    Returns:
+        (2, count) float32: x and y in [0.1, 0.9].
+    """
+    plastic = 1.324717957244746
+    steps = torch.tensor([[1.0 / plastic], [1.0 / plastic**2]], dtype=torch.float64)
+    lattice = torch.remainder(0.5 + steps * torch.arange(count), 1.0)
+    return (0.1 + 0.8 * lattice).float()
+
+
+def with_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+    """Return a picture as it is seen through a lens with dots on it.
+
+    Args:
+        image: (H, W, 3) display-referred sRGB in [0, 1].
+        values: `x`, `y`, `radius`, `red`, `green`, `blue`, `opacity` of shape (dots,) and `falloff` of shape (), as
+            in `LensControl.parameters`.
+
+    Returns:
+        (H, W, 3) sRGB in [0, 1]; differentiable in the picture and in every value.
+    """
+    shades = srgb_to_linear(torch.stack([values["red"], values["green"], values["blue"]], dim=-1))
+    light = srgb_to_linear(image)
+    for cover, shade in zip(_covers(image.shape[0], image.shape[1], values), shades, strict=True):
+        light = light + cover[..., None] * (shade - light)
+    return linear_to_srgb(light)
+
+
+def _board() -> Tensor:
+    """A grey chequerboard, on which white and black dots both show; (STICKER_SIDE, STICKER_SIDE, 3) sRGB."""
+    square = torch.arange(STICKER_SIDE) // (STICKER_SIDE // 16)
+    dark = (square[:, None] + square[None, :]) % 2
+    return (0.6 - 0.2 * dark)[..., None].repeat(1, 1, 3)
+
+
+def _covers(height: int, width: int, values: Mapping[str, Tensor]) -> Tensor:
+    """Return (dots, H, W): the opacity of each dot at each pixel's centre."""
+    side = min(height, width)
+    across = (torch.arange(width) + 0.5 - values["x"][:, None] * width) / side
+    down = (torch.arange(height) + 0.5 - values["y"][:, None] * height) / side
+    squared = down[:, :, None] ** 2 + across[:, None, :] ** 2
+    distance = squared / values["radius"][:, None, None] ** 2
+    falloff = values["falloff"]
+    reach = _FAR ** (1.0 / falloff.detach())
+    return values["opacity"][:, None, None] * torch.exp(-(distance.clamp(1e-12, float(reach)) ** falloff))

@@ -1,0 +1,267 @@
+"""Controls that are a handful of named numbers: each fixed, a range, or a list (see `values`).
+
+Subclass `NumberControl`, declare the parameters, and say in `scene_inputs` what they do to the scene:
+
+    class Exposure(NumberControl):
+        kind = "exposure"
+        summary = "How bright the picture is."
+        parameters = (Parameter("stops", (), "stops", -10, 10, 0.0, "Over the metered exposure.", search=(-2, 2)),)
+
+        def scene_inputs(self, scene, values, so_far):
+            return {"camera.exposure": values["stops"]}
+"""
+
+from __future__ import annotations
+
+from abc import ABC
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from advsearch.controls.base import (
+    NOTHING,
+    WHOLE_RANGE,
+    BoundControl,
+    Budget,
+    Choice,
+    Control,
+    Group,
+    Parameter,
+    Value,
+    scalar,
+)
+from advsearch.controls.values import Choices, Fixed, Number, Range, Spec, option_index, read, to_unit, to_value
+from advsearch.errors import UnknownNameError
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.settings import SETTINGS
+
+Values = Mapping[str, Tensor]
+"""A configuration: parameter name to a float32 tensor of the parameter's shape; of a discrete choice, its number."""
+
+
+class NumberControl(Control, ABC):
+    """A control made of named numbers and choices.
+
+    Args:
+        name: the instance's name; the kind unless given.
+        **settings: a value for any parameter (fixed, range or list) or choice, by name. Once one parameter is given a
+            range or a list, only those given so are searched; otherwise each parameter is searched over its own
+            `search` range, if it has one.
+
+    Raises:
+        UnknownNameError: no such parameter or choice.
+        InputError: a value is out of range.
+    """
+
+    choices: ClassVar[tuple[Choice, ...]] = ()
+
+    def __init__(self, name: str | None = None, **settings: object) -> None:
+        self.name = name or self.kind
+        known = [one.name for one in self.parameters] + [one.name for one in self.choices]
+        for setting in settings:
+            if setting not in known:
+                raise UnknownNameError(f"setting of control {self.kind}", setting, known)
+        self._given = {setting: value for setting, value in settings.items() if value is not None}
+        self.chosen = {choice.name: self._given.get(choice.name, choice.default) for choice in self.choices}
+        self.check_choices()
+        self.specs = {
+            one.name: read(f"{self.name}.{one.name}", one, self._given[one.name])
+            for one in self.parameters
+            if one.name in self._given
+        }
+        self.asked = any(not isinstance(spec, Fixed) for spec in self.specs.values())
+
+    def settings(self) -> dict[str, object]:
+        return {"kind": self.kind, **self._given} if self.name != self.kind else dict(self._given)
+
+    # ---- what a subclass says ---------------------------------------------------------------------------------------
+
+    def check_choices(self) -> None:
+        """Check `self.chosen`; by default all are fine.
+
+        Raises:
+            InputError: a choice is out of range.
+        """
+
+    def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
+        """Return a parameter's value in the unchanged scene: the setting of that name, or else its own default."""
+        setting = f"{self.kind}.{parameter.name}"
+        if setting in SETTINGS:
+            value = scene.values.get(setting)
+            if value is not None:
+                return value
+        return parameter.default
+
+    def size(self, parameter: Parameter) -> int:
+        """Return how many numbers a parameter has: by default the product of its shape."""
+        count = 1
+        for side in parameter.shape:
+            count *= side or 1
+        return count
+
+    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return what the values do to the scene; differentiable torch operations."""
+        return {}
+
+    def on_picture(self, scene: SceneDescription, values: Values, image: Tensor) -> Tensor:
+        """Return what the values make of the finished picture (H, W, 3) sRGB; differentiable in both."""
+        return image
+
+    def refines(self, scene: SceneDescription) -> frozenset[str]:
+        """Return the scene inputs that `scene_inputs` takes from the controls before and changes."""
+        return frozenset()
+
+    def measured(self, scene: SceneDescription, values: Values) -> dict[str, Value]:
+        """Return further values worth storing with a configuration, by name without the instance's."""
+        return {}
+
+    def kept_pictures(self, scene: SceneDescription, values: Values) -> dict[str, Tensor]:
+        """Return pictures worth keeping, by file stem: (h, w, 3) sRGB in [0, 1]."""
+        return {}
+
+    def kept_files(self, scene: SceneDescription, values: Values) -> dict[str, bytes]:
+        """Return other files worth keeping, by name with ending."""
+        return {}
+
+    def search_range(self, scene: SceneDescription, parameter: Parameter) -> tuple[float, float] | None:
+        """Return the range searched when nothing is said about a parameter, or None to leave it at its default."""
+        return parameter.search
+
+    def budget(self, scene: SceneDescription, parameter: Parameter) -> Budget:
+        """Return how far a searched parameter may go: by default its whole range."""
+        return WHOLE_RANGE
+
+    def estimators(self, scene: SceneDescription, parameter: Parameter) -> tuple[str, ...]:
+        """Return the valid estimators of a parameter in this scene, preferred first."""
+        return parameter.estimators if parameter.differentiable else ()
+
+    # ---- what it makes of it ----------------------------------------------------------------------------------------
+
+    def bind(self, scene: SceneDescription) -> BoundNumbers:
+        slots: list[_Slot] = []
+        begin = 0
+        for parameter in self.parameters:
+            value = self.default(scene, parameter)
+            slot = _Slot(parameter, self._spec(scene, parameter, value), self.size(parameter), begin, value)
+            slots.append(slot)
+            begin += slot.width
+        return BoundNumbers(self, scene, tuple(slots))
+
+    def _spec(self, scene: SceneDescription, parameter: Parameter, value: Number) -> Spec:
+        if parameter.name in self.specs:
+            return self.specs[parameter.name]
+        wanted = None if self.asked else self.search_range(scene, parameter)
+        if wanted is None:
+            return Fixed(value)
+        return Choices(parameter.options) if parameter.options else Range(*wanted)
+
+
+@dataclass(frozen=True)
+class _Slot:
+    """One parameter in a bound control: what it is set to and where its coordinates begin."""
+
+    parameter: Parameter
+    spec: Spec
+    size: int
+    begin: int
+    default: Number
+
+    @property
+    def width(self) -> int:
+        """Number of coordinates of u."""
+        return 0 if isinstance(self.spec, Fixed) else 1 if isinstance(self.spec, Choices) else self.size
+
+    @property
+    def periodic(self) -> bool:
+        spec, parameter = self.spec, self.parameter
+        return parameter.periodic and isinstance(spec, Range) and abs(spec.high - spec.low - 360.0) < 1e-9
+
+    def start(self) -> list[float]:
+        """Coordinates of the default; the nearest end of the range where the default lies outside."""
+        spec = self.spec
+        if isinstance(spec, Fixed):
+            return []
+        if isinstance(spec, Choices):
+            index = spec.values.index(self.default) if self.default in spec.values else 0
+            return [(index + 0.5) / len(spec.values)]
+        value = float(self.default)
+        if self.periodic:
+            value = spec.low + (value - spec.low) % 360.0
+        return [to_unit(spec, self.parameter.log, value)] * self.size
+
+    def value(self, u: Tensor) -> Tensor:
+        """The value at a configuration: a float32 tensor of the parameter's shape, or the number of an option."""
+        parameter, spec = self.parameter, self.spec
+        if isinstance(spec, Range):
+            part = u[self.begin : self.begin + self.size]
+            value = to_value(spec, parameter.log, part)
+            return value.reshape(()) if not parameter.shape else value
+        chosen = spec.value if isinstance(spec, Fixed) else spec.values[option_index(len(spec.values), u[self.begin])]
+        if isinstance(chosen, str):
+            return scalar(float(parameter.options.index(chosen)))
+        return scalar(chosen) if not parameter.shape else torch.full((self.size,), float(chosen))
+
+
+class BoundNumbers(BoundControl):
+    """A `NumberControl` in a scene."""
+
+    def __init__(self, control: NumberControl, scene: SceneDescription, slots: tuple[_Slot, ...]) -> None:
+        self.control = control
+        self.scene = scene
+        self.name = control.name
+        self.refines = control.refines(scene)
+        self._slots = slots
+        self.start = torch.tensor([share for slot in slots for share in slot.start()], dtype=torch.float32)
+        self.groups = tuple(self._group(slot) for slot in slots if slot.width)
+
+    def _group(self, slot: _Slot) -> Group:
+        parameter, spec = slot.parameter, slot.spec
+        options = len(spec.values) if isinstance(spec, Choices) else 0
+        estimators = () if options else self.control.estimators(self.scene, parameter)
+        return Group(
+            parameter.name,
+            slot.width,
+            estimators,
+            WHOLE_RANGE if options else self.control.budget(self.scene, parameter),
+            periodic=slot.periodic,
+            options=options,
+            moves_silhouettes=parameter.moves_silhouettes,
+        )
+
+    def values(self, u: Tensor) -> dict[str, Tensor]:
+        """Return every parameter's value at a slice of u, fixed ones too."""
+        return {slot.parameter.name: slot.value(u) for slot in self._slots}
+
+    def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
+        return self.control.scene_inputs(self.scene, self.values(u), so_far)
+
+    def picture(self, u: Tensor, image: Tensor) -> Tensor:
+        return self.control.on_picture(self.scene, self.values(u), image)
+
+    def describe(self, u: Tensor) -> dict[str, Value]:
+        u = u.detach()
+        values = self.values(u)
+        said: dict[str, Value] = {}
+        for slot in self._slots:
+            if slot.width == 0:
+                continue
+            parameter, value = slot.parameter, values[slot.parameter.name]
+            if parameter.options:
+                said[f"{self.name}.{parameter.name}"] = {"value": parameter.options[int(value)], "unit": "name"}
+            elif value.ndim == 0:
+                said[f"{self.name}.{parameter.name}"] = {"value": float(value), "unit": parameter.unit}
+            else:
+                for number, one in enumerate(value):
+                    said[f"{self.name}.{parameter.name}.{number}"] = {"value": float(one), "unit": parameter.unit}
+        for name, one_value in self.control.measured(self.scene, values).items():
+            said[f"{self.name}.{name}"] = one_value
+        return said
+
+    def artifacts(self, u: Tensor) -> dict[str, Tensor]:
+        return self.control.kept_pictures(self.scene, self.values(u.detach()))
+
+    def files(self, u: Tensor) -> dict[str, bytes]:
+        return self.control.kept_files(self.scene, self.values(u.detach()))

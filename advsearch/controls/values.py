@@ -1,0 +1,125 @@
+"""What a parameter was set to: fixed, a range to search, or a list of values to choose from.
+
+    pose: {yaw: [0, 360], pitch: 10, scale: {choices: [0.8, 1.0, 1.2]}}
+
+The same form in Python, YAML and on the command line (DESIGN section 7). Two numbers in a list are a range; three or
+more, or names, are a choice.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from advsearch.controls.base import Parameter
+from advsearch.errors import InputError, UnknownNameError
+
+Number = float | str
+
+
+@dataclass(frozen=True)
+class Fixed:
+    """One value, not searched."""
+
+    value: Number
+
+
+@dataclass(frozen=True)
+class Range:
+    """Every value from `low` to `high`."""
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Choices:
+    """One of a few values: numbers or names."""
+
+    values: tuple[Number, ...]
+
+
+Spec = Fixed | Range | Choices
+
+
+def read(where: str, parameter: Parameter, given: object) -> Spec:
+    """Return the setting of a parameter from what was given for it.
+
+    Args:
+        where: how messages name it, e.g. "pose.yaw".
+        parameter: says what is allowed.
+        given: a number or a name, [low, high], a list of values, or {"choices": [...]}.
+
+    Raises:
+        InputError: not such a form, or a value outside the parameter's range.
+    """
+    if isinstance(given, Mapping):
+        if set(given) != {"choices"} or not _is_list(given["choices"]) or not given["choices"]:
+            raise InputError(f"{where}: expected {{choices: [value, ...]}}, got {dict(given)!r}")
+        return Choices(tuple(_value(where, parameter, one) for one in given["choices"]))
+    if not _is_list(given):
+        return Fixed(_value(where, parameter, given))
+    values = [_value(where, parameter, one) for one in given]  # type: ignore[attr-defined]
+    if parameter.options or len(values) > 2:
+        return Choices(tuple(values))
+    if len(values) != 2:
+        raise InputError(f"{where}: expected a number, [low, high] or a list of values, got {given!r}")
+    low, high = (float(value) for value in values)
+    if low == high:
+        raise InputError(f"{where}: the range [{low:g}, {high:g}] has no size; write {low:g} to fix the value")
+    if low > high:
+        raise InputError(f"{where}: the range [{low:g}, {high:g}] is reversed; write [{high:g}, {low:g}]")
+    if parameter.log and low <= 0.0:
+        raise InputError(f"{where}: expected a range over 0 (it is searched on a logarithmic scale), got {low:g}")
+    return Range(low, high)
+
+
+def _is_list(given: object) -> bool:
+    return isinstance(given, Sequence) and not isinstance(given, (str, bytes))
+
+
+def _value(where: str, parameter: Parameter, given: object) -> Number:
+    """Check one value."""
+    if parameter.options:
+        if not isinstance(given, str):
+            raise InputError(f"{where}: expected one of {', '.join(parameter.options)}, got {given!r}")
+        if given not in parameter.options:
+            raise UnknownNameError(where, given, parameter.options)
+        return given
+    if parameter.unit == "name" and isinstance(given, str) and given.strip():
+        return given
+    if isinstance(given, bool) or not isinstance(given, (int, float)):
+        raise InputError(f"{where}: expected a number in {parameter.unit}, got {given!r}")
+    number = float(given)
+    if not math.isfinite(number) or not parameter.low <= number <= parameter.high:
+        raise InputError(
+            f"{where}: expected a number from {parameter.low:g} to {parameter.high:g} ({parameter.unit}), "
+            f"got {number:g}"
+        )
+    return number
+
+
+def to_value(spec: Range, log: bool, u: Tensor) -> Tensor:
+    """Map coordinates in [0, 1] to values of a range; differentiable."""
+    if log:
+        return torch.exp(torch.lerp(torch.full_like(u, math.log(spec.low)), torch.full_like(u, math.log(spec.high)), u))
+    return spec.low + (spec.high - spec.low) * u
+
+
+def to_unit(spec: Range, log: bool, value: float) -> float:
+    """Map a value to its coordinate, clipped to [0, 1]."""
+    if log:
+        value = max(value, 1e-30)
+        share = (math.log(value) - math.log(spec.low)) / (math.log(spec.high) - math.log(spec.low))
+    else:
+        share = (value - spec.low) / (spec.high - spec.low)
+    return min(1.0, max(0.0, share))
+
+
+def option_index(count: int, u: Tensor) -> int:
+    """Return which of `count` options a coordinate chooses: equal shares of [0, 1]."""
+    return min(count - 1, max(0, int(float(u.detach()) * count)))

@@ -1,0 +1,245 @@
+"""Chooses estimators, steps and sample counts by measurement on the scene and the loss at hand.
+
+Which estimator: the one with the least (squared error) x time, error against differences of the same loss. Which step
+and sample count: the cheapest whose gradient has a cosine of at least `GOAL` with the converged one, of the model's
+own loss (DESIGN 5.2: over poses that loss is rough at the scale of a pixel and sensitive to noise).
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.evaluation.gradients import EXPENSIVE, Loss, estimated
+from advsearch.scene.plan import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, GroupPlan
+from advsearch.scene.renderer import Renderer
+
+GOAL = 0.9
+"""Cosine with the converged gradient that a working gradient should have."""
+FACTORS = (1.0, 3.0)
+"""Steps that are tried, as multiples of the one that moves an outline by a pixel."""
+COUNTS = (8, 16, 32, 64)
+"""Sample counts that are tried."""
+CONVERGED = 128
+"""Samples a pixel of a gradient that counts as converged."""
+
+
+@dataclass(frozen=True)
+class Cosine:
+    """How well a working gradient of the model's loss points the way of the converged one.
+
+    Attributes:
+        control: which control's coordinates.
+        factor: step as a multiple of the plan's.
+        spp: samples a pixel of the working gradient.
+        cosine: mean over seeds; NaN where the converged gradient is zero.
+        converged: cosine of two converged gradients of different seeds: no working gradient can be expected above it.
+        seconds: median time of one working gradient.
+    """
+
+    control: str
+    factor: float
+    spp: int
+    cosine: float
+    converged: float
+    seconds: float
+
+
+def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[GroupPlan, ...], tuple[str, ...]]]:
+    """Return groups of one control with the estimators to compare on them, where there is more than one.
+
+    Args:
+        plan: the plan so far. What was forced is not contested.
+        every: compare all that are valid; otherwise the adjoints and the first kind of differences only.
+    """
+    sets: dict[tuple[str, tuple[str, ...]], list[GroupPlan]] = {}
+    for group in plan.groups:
+        if "forced" in group.reason or not group.valid:
+            continue
+        sets.setdefault((group.control, group.valid), []).append(group)
+    found = []
+    for (_, valid), groups in sets.items():
+        usable = [one for one in valid if one not in EXPENSIVE]
+        by_differences = [one for one in usable if one in BY_DIFFERENCES]
+        size = sum(group.size for group in groups)
+        if size > 16:
+            by_differences = [one for one in by_differences if one == "simultaneous"]
+        adjoints = [one for one in usable if one in BY_ADJOINT]
+        candidates = tuple(adjoints + (by_differences if every else by_differences[:1]))
+        if len(candidates) > 1 and (every or adjoints):
+            found.append((tuple(groups), candidates))
+    return found
+
+
+def measured_plan(
+    renderer: Renderer, loss: Loss, u: Tensor, *, seed: int, spp: int, repeats: int = 3, every: bool = False
+) -> GradientPlan:
+    """Return the renderer's plan with every contested choice made by measurement at u.
+
+    Args:
+        renderer: its plan is the one to improve; it is not changed.
+        loss: what will be differentiated.
+        u: (d,) where.
+        seed: root of the noise.
+        spp: samples a pixel.
+        repeats: gradients of each estimator, at least 2.
+        every: see `contested`.
+    """
+    plan = renderer.plan
+    for groups, candidates in contested(plan, every=every):
+        scores = _scores(renderer, loss, u, groups, candidates, seed, spp, repeats)
+        best = min(scores, key=lambda name: scores[name])
+        others = ", ".join(f"{name} {score / scores[best]:.3g}" for name, score in scores.items() if name != best)
+        reason = f"least squared error x time, measured at {spp} samples (others, as multiples of it: {others})"
+        names = {group.name for group in groups}
+        plan = replace(
+            plan,
+            groups=tuple(
+                replace(one, estimator=best, reason=reason, measured=scores) if one.name in names else one
+                for one in plan.groups
+            ),
+        )
+    return plan
+
+
+def _scores(
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    groups: Sequence[GroupPlan],
+    candidates: Sequence[str],
+    seed: int,
+    spp: int,
+    repeats: int,
+) -> dict[str, float]:
+    """Squared error x seconds of each candidate. The reference is the mean of the differences among them, whose own
+    noise is taken off the others' errors."""
+    names = {group.name for group in groups}
+    gradients: dict[str, Tensor] = {}
+    seconds: dict[str, float] = {}
+    for estimator in candidates:
+        found, times = [], []
+        for number in range(repeats):
+            begun = time.perf_counter()
+            noise = seeds.stream(seed, "plan", number)
+            found.append(estimated(renderer, loss, u, estimator, names, noise, spp))
+            times.append(time.perf_counter() - begun)
+        gradients[estimator], seconds[estimator] = torch.stack(found), statistics.median(times)
+    judge = next((one for one in candidates if one in BY_DIFFERENCES), candidates[0])
+    truth = gradients[judge].mean(dim=0)
+    spread = float((gradients[judge] - truth).square().sum() / max(1, repeats - 1))
+    scores = {}
+    for estimator, found_all in gradients.items():
+        if estimator == judge:
+            error = spread
+        else:
+            error = float((found_all - truth).square().sum(dim=1).mean()) - spread / repeats
+            own = float((found_all - found_all.mean(dim=0)).square().sum() / max(1, repeats - 1))
+            error = max(error, own)
+        scores[estimator] = error * seconds[estimator]
+    return scores
+
+
+def cosines(
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    *,
+    seed: int,
+    factors: Sequence[float] = FACTORS,
+    counts: Sequence[int] = COUNTS,
+    repeats: int = 3,
+    goal: float = GOAL,
+    converged: int = CONVERGED,
+) -> list[Cosine]:
+    """Measure, control by control, the cosine of working gradients with the converged one at the same step.
+
+    Sample counts are tried in their order until one reaches the goal at a step; then the next step follows.
+    """
+    base = renderer.plan
+    found: list[Cosine] = []
+    try:
+        for control in dict.fromkeys(group.control for group in base.groups):
+            names = {one.name for one in base.groups if one.control == control and one.estimator != "none"}
+            if not names:
+                continue
+            by_steps = any(one.estimator in BY_DIFFERENCES for one in base.groups if one.control == control)
+            for factor in factors if by_steps else factors[:1]:
+                renderer.plan = _silenced(base.with_steps(factor), names)
+                found += _cosines_at(renderer, loss, u, control, factor, seed, counts, repeats, goal, converged)
+    finally:
+        renderer.plan = base
+    return found
+
+
+def _silenced(plan: GradientPlan, names: set[str]) -> GradientPlan:
+    """The plan with all other groups left out."""
+    return replace(
+        plan, groups=tuple(one if one.name in names else replace(one, estimator="none") for one in plan.groups)
+    )
+
+
+def _cosines_at(
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    control: str,
+    factor: float,
+    seed: int,
+    counts: Sequence[int],
+    repeats: int,
+    goal: float,
+    converged: int,
+) -> list[Cosine]:
+    ends = [renderer.gradient(loss, u, seeds.stream(seed, "converged", number), converged)[1] for number in range(2)]
+    truth = (ends[0] + ends[1]) / 2.0
+    agreement = _cosine(ends[0], ends[1])
+    found = []
+    for spp in counts:
+        values, times = [], []
+        for number in range(repeats):
+            begun = time.perf_counter()
+            gradient = renderer.gradient(loss, u, seeds.stream(seed, "working", number), spp)[1]
+            times.append(time.perf_counter() - begun)
+            values.append(_cosine(gradient, truth))
+        mean = statistics.fmean(values)
+        found.append(Cosine(control, factor, spp, mean, agreement, statistics.median(times)))
+        if mean >= goal:
+            break
+    return found
+
+
+def _cosine(one: Tensor, other: Tensor) -> float:
+    size = float(one.norm() * other.norm())
+    return float(one @ other) / size if size > 0.0 else float("nan")
+
+
+def tuned(plan: GradientPlan, table: Sequence[Cosine], goal: float = GOAL) -> tuple[GradientPlan, int | None]:
+    """Return the plan with each control's step chosen from measured cosines, and the sample count that all then need.
+
+    The cheapest setting that reaches the goal wins; where none does, the one with the greatest cosine, and the reason
+    says so. The sample count is None where nothing was measured.
+    """
+    counts = []
+    for control in dict.fromkeys(row.control for row in table):
+        rows = [row for row in table if row.control == control and row.cosine == row.cosine]
+        if not rows:
+            continue
+        good = [row for row in rows if row.cosine >= goal]
+        chosen = min(good, key=lambda row: row.seconds) if good else max(rows, key=lambda row: row.cosine)
+        counts.append(chosen.spp)
+        said = f"cosine {chosen.cosine:.2f} with the converged gradient at {chosen.spp} samples"
+        said += f" and {chosen.factor:g} x the step" + ("" if good else f": below {goal:g}, the best that was found")
+        scaled = {one.name: one.step for one in plan.with_steps(chosen.factor).groups}
+        groups = tuple(
+            replace(one, step=scaled[one.name], reason=f"{one.reason}; {said}") if one.control == control else one
+            for one in plan.groups
+        )
+        plan = replace(plan, groups=groups)
+    return plan, max(counts) if counts else None

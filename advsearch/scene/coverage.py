@@ -1,0 +1,225 @@
+"""How much of one thing another hides in the picture: silhouettes, rasterised in numpy, without a renderer.
+
+The second thing moves on a sphere around the camera and keeps its side towards it. So its outline, as a set of
+directions from the camera, turns rigidly: it is rasterised once, and every position afterwards is a rotation of the
+directions in which the first thing is seen and a lookup.
+
+Coordinates here are the camera's: to the right, upwards and forwards, in object sizes; "tangents" are the first two
+over the third.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Doubles = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+
+RASTER = 128
+"""Pixels along the longer side of a silhouette."""
+SCAN = 48
+"""Angles at which the coverage is looked up before the crossing is narrowed down."""
+HALVINGS = 12
+"""Steps that narrow it down."""
+NEAREST = 1e-3
+"""Points nearer to the camera plane than this, or behind it, are left out of silhouettes."""
+TOLERANCE = 1e-6
+"""Barycentric weight by which a pixel's centre may miss a triangle, so that shared edges leave no gaps."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What the picture shows, as tangents: the ranges to the right and upwards."""
+
+    left: float
+    right: float
+    low: float
+    high: float
+
+    @staticmethod
+    def of(fov: float, aspect: float = 1.0, shift: tuple[float, float] = (0.0, 0.0)) -> Frame:
+        """Return the frame of a camera.
+
+        Args:
+            fov: field of view along the larger side, degrees.
+            aspect: width over height.
+            shift: of the picture, to the right in its widths and downwards in its heights.
+        """
+        larger = math.tan(math.radians(fov) / 2.0)
+        x, y = larger * min(1.0, aspect), larger * min(1.0, 1.0 / aspect)
+        right, down = 2.0 * x * shift[0], 2.0 * y * shift[1]
+        return Frame(-x - right, x - right, -y + down, y + down)
+
+    def corners(self) -> Doubles:
+        """Unit directions (4, 3) to the corners."""
+        tangents = [(x, y, 1.0) for x in (self.left, self.right) for y in (self.low, self.high)]
+        return _unit(np.array(tangents))
+
+
+@dataclass(frozen=True, eq=False)
+class Silhouette:
+    """Which directions a thing is seen in: a mask over a window of tangents.
+
+    Attributes:
+        mask: (h, w) row 0 at the low end of the window.
+        window: tangents that the mask spans.
+    """
+
+    mask: Mask
+    window: Frame
+
+    def directions(self) -> Doubles:
+        """Unit directions (N, 3) of the pixels that are covered; all stand for the same area of the picture."""
+        row, column = np.nonzero(self.mask)
+        height, width = self.mask.shape
+        x = self.window.left + (column + 0.5) * (self.window.right - self.window.left) / width
+        y = self.window.low + (row + 0.5) * (self.window.high - self.window.low) / height
+        return _unit(np.stack([x, y, np.ones_like(x)], axis=-1))
+
+    def contains(self, x: Doubles, y: Doubles, forwards: Doubles) -> Mask:
+        """Whether directions, any shape and length, lie in the silhouette."""
+        height, width = self.mask.shape
+        depth = np.maximum(forwards, NEAREST)
+        column = np.floor((x / depth - self.window.left) / (self.window.right - self.window.left) * width)
+        row = np.floor((y / depth - self.window.low) / (self.window.high - self.window.low) * height)
+        inside = (forwards > NEAREST) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        found = self.mask[np.where(inside, row, 0).astype(np.int64), np.where(inside, column, 0).astype(np.int64)]
+        return np.asarray(inside & found)
+
+
+def silhouette(points: Doubles, faces: npt.NDArray[np.uint32], frame: Frame | None = None) -> Silhouette | None:
+    """Rasterise a mesh as the camera sees it.
+
+    Args:
+        points: (V, 3) vertices in camera coordinates.
+        faces: (F, 3) vertex indices; those that reach behind the camera are left out.
+        frame: what the picture shows; None looks everywhere in front.
+
+    Returns:
+        The silhouette within the frame, or None if nothing is seen of it.
+    """
+    corners = points[faces.astype(np.int64)]
+    corners = corners[(corners[..., 2] > NEAREST).all(axis=1)]
+    if len(corners) == 0:
+        return None
+    tangents = corners[..., :2] / corners[..., 2:]
+    (left, low), (right, high) = tangents.min(axis=(0, 1)), tangents.max(axis=(0, 1))
+    if frame is not None:
+        left, right = max(left, frame.left), min(right, frame.right)
+        low, high = max(low, frame.low), min(high, frame.high)
+    if not (right > left and high > low):
+        return None
+    pixel = max(right - left, high - low) / RASTER
+    width, height = (max(1, math.ceil((b - a) / pixel)) for a, b in ((left, right), (low, high)))
+    scaled = (tangents - (left, low)) * (width / (right - left), height / (high - low)) - 0.5
+    _, row, column, _ = pixels_in(scaled, (height, width))
+    mask = np.zeros((height, width), dtype=np.bool_)
+    mask[row, column] = True
+    return Silhouette(mask, Frame(float(left), float(right), float(low), float(high))) if mask.any() else None
+
+
+def pixels_in(corners: Doubles, shape: tuple[int, int]) -> tuple[Ints, Ints, Ints, Doubles]:
+    """List the pixels whose centres lie in each of many triangles.
+
+    Args:
+        corners: (F, 3, 2) column and row; integers are pixel centres.
+        shape: (height, width) of the raster.
+
+    Returns:
+        For every such pixel: its triangle, row, column (N,) and the corners' barycentric weights (N, 3).
+    """
+    (ax, ay), (bx, by), (cx, cy) = (corners[:, number].T for number in range(3))
+    doubled = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+    low = np.clip(np.ceil(corners.min(axis=1) - 1e-6), 0, None).astype(np.int64)
+    high = np.clip(np.floor(corners.max(axis=1) + 1e-6), None, (shape[1] - 1, shape[0] - 1)).astype(np.int64)
+    counts = np.where((doubled != 0.0)[:, None], np.maximum(high - low + 1, 0), 0)
+    area = counts.prod(axis=1)
+    face = np.repeat(np.arange(len(corners)), area)
+    number = np.arange(len(face)) - np.repeat(np.cumsum(area) - area, area)
+    column, row = low[face, 0] + number % counts[face, 0], low[face, 1] + number // counts[face, 0]
+    scale = 1.0 / doubled[face]
+    second = ((column - ax[face]) * (cy - ay)[face] - (row - ay[face]) * (cx - ax)[face]) * scale
+    third = ((bx - ax)[face] * (row - ay[face]) - (by - ay)[face] * (column - ax[face])) * scale
+    weights = np.stack([1.0 - second - third, second, third], axis=-1)
+    inside = (weights >= -TOLERANCE).all(axis=1)
+    return face[inside], row[inside], column[inside], weights[inside]
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """A thing that moves sideways past another, both as the camera sees them.
+
+    Attributes:
+        hidden: directions (N, 3) in which what is to be hidden is seen.
+        cover: silhouette of the moving thing, straight ahead of the camera.
+        axes: (3, 3) rows: where the moving thing's right, up and forward point when it is in the middle of the other.
+        direction: from which side it comes: degrees, 0 from the right of the picture, 90 from above.
+    """
+
+    hidden: Doubles
+    cover: Silhouette
+    axes: Doubles
+    direction: float
+
+    def coverage(self, angles: Doubles) -> Doubles:
+        """Return the hidden share (K,) at angles (K,) in radians away from the middle."""
+        turn = math.radians(self.direction)
+        right, up, forward = (self.hidden @ self.axes.T).T
+        along = math.cos(turn) * right + math.sin(turn) * up
+        across = -math.sin(turn) * right + math.cos(turn) * up
+        shares = []
+        for angle in angles:
+            moved = along * math.cos(angle) - forward * math.sin(angle)
+            depth = along * math.sin(angle) + forward * math.cos(angle)
+            x = math.cos(turn) * moved - math.sin(turn) * across
+            y = math.sin(turn) * moved + math.cos(turn) * across
+            shares.append(float(self.cover.contains(x, y, depth).mean()))
+        return np.array(shares)
+
+    def solve(self, wanted: float, outside: float) -> float:
+        """Return the largest angle in radians at which the wanted share is hidden.
+
+        The thing comes in from `outside`; where it first hides as much as is wanted, it stops. If it never does, the
+        angle at which it hides most is returned.
+        """
+        angles = np.linspace(outside, 0.0, SCAN)
+        shares = self.coverage(angles)
+        enough = np.nonzero(shares >= wanted)[0]
+        if len(enough) == 0:
+            return float(angles[int(np.argmax(shares))])
+        if enough[0] == 0:
+            return float(angles[0])
+        out, within = float(angles[enough[0] - 1]), float(angles[enough[0]])
+        for _ in range(HALVINGS):
+            middle = 0.5 * (out + within)
+            if float(self.coverage(np.array([middle]))[0]) >= wanted:
+                within = middle
+            else:
+                out = middle
+        return 0.5 * (out + within)
+
+
+def middle_axes(hidden: Doubles) -> Doubles:
+    """Return a camera's axes (3, 3) turned to look at the middle of a silhouette: rows right, up, forward."""
+    forward = hidden.mean(axis=0)
+    forward = forward / max(float(np.linalg.norm(forward)), 1e-12)
+    right = np.cross((0.0, 1.0, 0.0), forward)  # forward is never straight up: it is in front of the camera
+    right = right / max(float(np.linalg.norm(right)), 1e-12)
+    return np.stack([right, np.cross(forward, right), forward])
+
+
+def angle_outside(frame: Frame, cover: Silhouette, axes: Doubles) -> float:
+    """Return an angle in radians at which the moving thing is out of the frame, whichever side it comes from."""
+    corners = cover.window.corners()
+    radius = float(np.arccos(np.clip(corners[:, 2], -1.0, 1.0)).max())
+    reach = float(np.arccos(np.clip(frame.corners() @ axes[2], -1.0, 1.0)).max())
+    return min(reach + radius + 0.02, 0.9 * math.pi)
+
+
+def _unit(vectors: Doubles) -> Doubles:
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

@@ -1,0 +1,202 @@
+"""The gradient plan: how the derivative of every coordinate of u is obtained (DESIGN section 5).
+
+A control's groups of coordinates declare which estimators are valid for them. Where only one is, the plan takes it;
+where several are, it takes the first, until a measurement on the actual scene (`advsearch.evaluation.measurement`)
+says which has the least variance x time. Any of them can be forced by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from advsearch.errors import InputError, UnknownNameError
+
+ESTIMATORS: Mapping[str, str] = {
+    "adjoint": "interior adjoint (path replay); right for what moves no outline: textures, colours, lights' power",
+    "material": "adjoint in material form: follows the moving surface, with boundary terms; any number of coordinates",
+    "boundary": "Mitsuba's projective adjoint without guiding; boundary terms for moving meshes",
+    "guided": "Mitsuba's projective adjoint as it comes, with octree guiding; slow, for comparison",
+    "differences": "central differences of the picture with common random numbers; two renders for each coordinate",
+    "secant": "central differences of the loss itself; as many renders, and smooths a rough loss over the step",
+    "forward": "one-sided differences of the picture; one render for each coordinate and one for all",
+    "simultaneous": "central differences along random directions; two renders for each direction",
+    "image": "torch autograd on the picture; no render",
+    "none": "no derivative: a discrete choice, or switched off",
+}
+"""Every estimator by the name that forces it."""
+
+BY_DIFFERENCES = frozenset({"differences", "secant", "forward", "simultaneous"})
+BY_ADJOINT = frozenset({"adjoint", "material", "boundary", "guided"})
+WITH_BOUNDARY = frozenset({"material", "boundary", "guided"})
+"""Adjoints that know of moving outlines."""
+ALWAYS_VALID = ("differences", "secant", "forward", "simultaneous", "none")
+"""Estimators that need nothing but renders, so they can be forced on any continuous coordinate."""
+
+DIRECTIONS = 4
+"""Random directions of one `simultaneous` gradient."""
+DEFAULT_STEP = 0.02
+"""Half of a difference's width in u, for coordinates that move nothing in the picture."""
+DEFAULT_PIXELS = 1.0
+"""How far the fastest point of an outline moves over half a difference, in pixels (DESIGN 5.1)."""
+STEP_RANGE = (1e-4, 0.1)
+"""Smallest and largest step in u."""
+
+
+@dataclass(frozen=True)
+class GroupPlan:
+    """How one group of coordinates is differentiated.
+
+    Attributes:
+        control: name of the control.
+        parameter: name of the parameter.
+        begin: first coordinate in u.
+        size: number of coordinates.
+        estimator: a key of `ESTIMATORS`.
+        valid: the estimators that were valid, preferred first.
+        step: half-width of a difference in u; 0 where none is taken.
+        periodic: 0 and 1 are the same value.
+        reason: why this estimator, in words.
+        measured: what a measurement found for each valid estimator: variance x time, if one was made.
+    """
+
+    control: str
+    parameter: str
+    begin: int
+    size: int
+    estimator: str
+    valid: tuple[str, ...]
+    step: float = 0.0
+    periodic: bool = False
+    reason: str = ""
+    measured: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def coordinates(self) -> slice:
+        """Where the group lies in u."""
+        return slice(self.begin, self.begin + self.size)
+
+    @property
+    def name(self) -> str:
+        """`control.parameter`."""
+        return f"{self.control}.{self.parameter}"
+
+    @property
+    def renders(self) -> int:
+        """Primal renders that one gradient of this group takes, beside those shared by all groups."""
+        if self.estimator in ("differences", "secant"):
+            return 2 * self.size
+        return self.size if self.estimator == "forward" else 0
+
+
+@dataclass(frozen=True)
+class GradientPlan:
+    """How the gradient of a whole space is obtained.
+
+    Attributes:
+        groups: every group of every control, in the order of u.
+        spp: samples a pixel of differences; None takes the primal's.
+    """
+
+    groups: tuple[GroupPlan, ...]
+    spp: int | None = None
+
+    def having(self, *estimators: str) -> tuple[GroupPlan, ...]:
+        """Return the groups that use one of these estimators."""
+        return tuple(group for group in self.groups if group.estimator in estimators)
+
+    @property
+    def renders(self) -> int:
+        """Primal renders of one gradient, adjoints not counted."""
+        shared = int(bool(self.having("forward"))) + 2 * DIRECTIONS * int(bool(self.having("simultaneous")))
+        return shared + sum(group.renders for group in self.groups)
+
+    def through_inputs(self, dimension: int) -> Tensor:
+        """Return (d,) float32: 1 for coordinates whose derivative runs back through scene inputs or the picture."""
+        mask = torch.zeros(dimension)
+        for group in self.groups:
+            if group.estimator in BY_ADJOINT or group.estimator == "image":
+                mask[group.coordinates] = 1.0
+        return mask
+
+    def with_estimator(self, names: Mapping[str, str], reason: str) -> GradientPlan:
+        """Return the plan with the estimators of some groups replaced, by `control.parameter`."""
+        groups = tuple(
+            replace(group, estimator=names[group.name], reason=reason) if group.name in names else group
+            for group in self.groups
+        )
+        return replace(self, groups=groups)
+
+    def with_steps(self, factor: float) -> GradientPlan:
+        """Return the plan with every step multiplied by a factor, within `STEP_RANGE`."""
+        low, high = STEP_RANGE
+        scaled = tuple(replace(one, step=min(high, max(low, one.step * factor))) for one in self.groups)
+        return replace(self, groups=scaled)
+
+    def to_dict(self) -> dict[str, object]:
+        """Return what a run stores of the plan."""
+        return {
+            "renders_per_gradient": self.renders,
+            "spp": self.spp,
+            "groups": [
+                {
+                    "control": one.control,
+                    "parameter": one.parameter,
+                    "size": one.size,
+                    "estimator": one.estimator,
+                    "valid": list(one.valid),
+                    "step": one.step,
+                    "reason": one.reason,
+                    "variance_x_seconds": dict(one.measured),
+                }
+                for one in self.groups
+            ],
+        }
+
+
+def first_plan(
+    groups: Sequence[GroupPlan], steps: Tensor, forced: Mapping[str, str] | None = None, spp: int | None = None
+) -> GradientPlan:
+    """Return the plan before anything was measured: each group's preferred estimator, or the one forced on it.
+
+    Args:
+        groups: with `valid` filled in; `estimator` is set here.
+        steps: (d,) half-widths of differences in u.
+        forced: estimator by "control.parameter", "control", or "*" for all where it is valid.
+        spp: samples a pixel of differences.
+
+    Raises:
+        InputError: an estimator is unknown, or not valid where it was forced by name.
+    """
+    forced = dict(forced or {})
+    for name, estimator in forced.items():
+        if estimator not in ESTIMATORS:
+            raise UnknownNameError(f"estimator for {name}", estimator, ESTIMATORS)
+    names = {key for group in groups for key in (group.name, group.control)}
+    for name in forced:
+        if name != "*" and name not in names:
+            raise UnknownNameError("control in --estimator", name, sorted(names))
+    return GradientPlan(tuple(_first(group, steps, forced) for group in groups), spp)
+
+
+def _first(group: GroupPlan, steps: Tensor, forced: Mapping[str, str]) -> GroupPlan:
+    step = float(steps[group.coordinates].min()) if group.size else 0.0
+    if not group.valid:
+        return replace(group, estimator="none", reason="a discrete choice has no derivative")
+    wanted = forced.get(group.name) or forced.get(group.control)
+    if wanted is not None:
+        if wanted not in group.valid and wanted not in ALWAYS_VALID:
+            raise InputError(
+                f"--estimator {group.name}={wanted}: not valid there; expected one of "
+                f"{', '.join(dict.fromkeys((*group.valid, *ALWAYS_VALID)))}"
+            )
+        return replace(group, estimator=wanted, step=step, reason="forced by name")
+    everywhere = forced.get("*")
+    if everywhere in group.valid or (everywhere in ALWAYS_VALID and "image" not in group.valid):
+        return replace(group, estimator=str(everywhere), step=step, reason="forced for all")
+    only = len(group.valid) == 1
+    reason = "the only valid estimator" if only else f"preferred among {', '.join(group.valid)}; not measured"
+    return replace(group, estimator=group.valid[0], step=step, reason=reason)

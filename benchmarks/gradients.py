@@ -1,0 +1,99 @@
+"""Compares estimators of the gradient over six pose parameters at 224 x 224: squared error x time, as ratios.
+
+    python benchmarks/gradients.py [--size 224] [--repeats 6] [--guided-repeats 2]
+
+The parameters are a rotation vector and a shift of the bundled mug, the loss is linear and smooth. Each estimator gives
+several gradients with seeds of their own; its error is measured against the mean of many central differences. Mitsuba's
+projective integrator is taken as it comes (octree guiding) and with guiding off, at its own share of samples. A camera
+cannot be differentiated by Mitsuba at all, so that there is nothing to compare the six camera parameters with: their
+differences are measured alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import time
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from advsearch import threads
+
+threads.configure()
+
+from advsearch.api.scene import load_scene  # noqa: E402
+from advsearch.evaluation.gradients import estimated, inside, smooth_loss  # noqa: E402
+from advsearch.scene.renderer import Renderer  # noqa: E402
+
+POSE = {"pose": {"rotation": [-30, 30], "x": [-0.15, 0.15], "y": [-0.15, 0.15], "z": [0.05, 0.35]}}
+CAMERA = {
+    "camera": {
+        "azimuth": [0, 90],
+        "elevation": [5, 60],
+        "roll": [-15, 15],
+        "distance": [1.5, 3.0],
+        "fov": [25, 45],
+        "shift_x": [-0.1, 0.1],
+    }
+}
+SPP = 16
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure and print; returns the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--size", type=int, default=224, help="side of the picture (default 224)")
+    parser.add_argument("--repeats", type=int, default=6, help="gradients of each estimator (default 6)")
+    parser.add_argument("--guided-repeats", type=int, default=2, help="gradients with guiding, half a minute each")
+    args = parser.parse_args(argv)
+    scene = load_scene("mug")
+    for name, controls, estimators in (
+        ("six pose parameters", POSE, ("differences", "forward", "material", "boundary", "guided")),
+        ("six camera parameters", CAMERA, ("differences", "forward")),
+    ):
+        renderer = scene.renderer(controls, resolution=args.size, denoise="none")
+        rows = measure(renderer, estimators, args.repeats, args.guided_repeats)
+        best = min(product for _, _, _, product in rows)
+        print(f"{name}, {args.size} x {args.size}, {SPP} samples a pixel")
+        print(f"{'estimator':14} {'seconds':>8} {'relative error':>15} {'error^2 x time':>15} {'times the best':>15}")
+        for estimator, seconds, error, product in rows:
+            print(f"{estimator:14} {seconds:8.2f} {error:15.3f} {product:15.3g} {product / best:15.1f}")
+        products = {estimator: product for estimator, _, _, product in rows}
+        chosen = min(products["differences"], products.get("material", float("inf")))
+        for rival, words in (("guided", "as it comes"), ("boundary", "with guiding off")):
+            if rival in products:
+                print(f"  Mitsuba's projective integrator {words}: {products[rival] / chosen:.0f} times ours")
+        print()
+    return 0
+
+
+def measure(
+    renderer: Renderer, estimators: Sequence[str], repeats: int, guided_repeats: int
+) -> list[tuple[str, float, float, float]]:
+    """Return estimator, median seconds, root mean square relative error, and squared error x seconds."""
+    loss, u = smooth_loss(renderer.formation.resolution), inside(renderer)
+    names = {group.name for group in renderer.plan.groups}
+    references = [estimated(renderer, loss, u, "differences", names, 1000 + number, 64) for number in range(6)]
+    truth = torch.stack(references).mean(dim=0)
+    rows = []
+    for estimator in estimators:
+        seconds, errors = [], []
+        for number in range(guided_repeats if estimator == "guided" else repeats):
+            begun = time.perf_counter()
+            gradient = estimated(renderer, loss, u, estimator, names, number, SPP)
+            seconds.append(time.perf_counter() - begun)
+            errors.append(_squared(gradient - truth) / _squared(truth))
+        mean = statistics.fmean(errors)
+        rows.append((estimator, statistics.median(seconds), mean**0.5, mean * statistics.median(seconds)))
+    return rows
+
+
+def _squared(value: Tensor) -> float:
+    return float(value.square().sum())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,108 @@
+"""The background control: the colour that was asked for, behind the object and nowhere else."""
+
+from __future__ import annotations
+
+import colorsys
+import itertools
+
+import pytest
+import torch
+
+import advsearch
+from advsearch.controls.background import COLOR, BackgroundControl, hsv_to_rgb
+from advsearch.errors import InputError
+from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneDescription:
+    return describe("mug")
+
+
+def test_the_colours_are_those_of_the_standard_library() -> None:
+    for hue, saturation, value in itertools.product(
+        (0.0, 35.0, 60.0, 200.0, 299.0, 360.0), (0.0, 0.4, 1.0), (0.0, 0.7)
+    ):
+        expected = torch.tensor(colorsys.hsv_to_rgb(hue / 360.0 % 1.0, saturation, value))
+        got = hsv_to_rgb(torch.tensor(hue), torch.tensor(saturation), torch.tensor(value))
+        torch.testing.assert_close(got, expected, atol=1e-5, rtol=0)
+
+
+def test_the_derivatives_are_those_of_differences() -> None:
+    for hue in (20.0, 100.0, 170.0, 230.0, 280.0, 350.0):
+        point = [torch.tensor(one, dtype=torch.float64, requires_grad=True) for one in (hue, 0.6, 0.7)]
+        assert torch.autograd.gradcheck(hsv_to_rgb, tuple(point), eps=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0 / 6.0, 0.5, 1.0])
+def test_every_corner_has_a_finite_colour_and_derivative(scene: SceneDescription, share: float) -> None:
+    bound = BackgroundControl().bind(scene)
+    u = torch.full((3,), share, requires_grad=True)
+    color = bound.inputs(u)[COLOR]
+    color.sum().backward()
+    assert color.shape == (3,) and float(color.detach().min()) >= 0.0 and float(color.detach().max()) <= 1.0
+    assert u.grad is not None and bool(torch.isfinite(u.grad).all())
+
+
+def test_it_starts_at_mid_grey_with_a_slope(scene: SceneDescription) -> None:
+    bound = BackgroundControl().bind(scene)
+    u = bound.start.clone().requires_grad_()
+    color = bound.inputs(u)[COLOR]
+    torch.testing.assert_close(color, srgb_to_linear(torch.full((3,), 0.5)))
+    (color * torch.tensor([1.0, 2.0, 4.0])).sum().backward()
+    assert u.grad is not None and float(u.grad[1].abs()) > 0.1 and float(u.grad[2].abs()) > 0.1
+    hue = bound.groups[0]
+    assert hue.name == "hue" and hue.periodic and hue.estimators == ("image",)
+    assert bound.describe(u)["background.green"] == {"value": pytest.approx(0.5), "unit": "sRGB"}
+
+
+def test_it_asks_for_a_backdrop_and_takes_the_ground_away_unless_told_to_keep_it(scene: SceneDescription) -> None:
+    prepared = BackgroundControl().prepare(scene)
+    assert prepared.backdrop and prepared.number("ground.size") == 0.0
+    kept = BackgroundControl(ground="keep").prepare(scene)
+    assert kept.backdrop and kept.number("ground.size") == scene.number("ground.size") > 0.0
+    assert kept.values == scene.values and kept.parts == scene.parts
+
+
+def test_the_environment_may_be_a_choice(scene: SceneDescription) -> None:
+    bound = BackgroundControl(what=["colour", "environment"]).bind(scene)
+    assert [group.name for group in bound.groups] == ["what", "hue", "saturation", "value"]
+    assert COLOR in bound.inputs(bound.start), "it starts as a colour"
+    there = bound.start.clone()
+    there[0] = 0.75
+    assert bound.inputs(there) == {}
+    assert bound.describe(there)["background.what"]["value"] == "environment"
+
+
+def test_only_what_is_given_a_range_is_searched(scene: SceneDescription) -> None:
+    bound = BackgroundControl(hue=[0, 120], saturation=1.0).bind(scene)
+    assert [group.name for group in bound.groups] == ["hue"] and not bound.groups[0].periodic
+    color = linear_to_srgb(bound.inputs(torch.tensor([1.0]))[COLOR])
+    torch.testing.assert_close(color, torch.tensor([0.0, 0.5, 0.0]), atol=1e-5, rtol=0)
+
+
+def test_bad_settings_are_refused() -> None:
+    with pytest.raises(InputError, match=r"background.ground: expected one of keep, hide, got 'gone'"):
+        BackgroundControl(ground="gone")
+    with pytest.raises(InputError, match=r"background.what: environment alone leaves nothing to search; use what="):
+        BackgroundControl(what="environment")
+    with pytest.raises(InputError, match=r"background.hue: expected a number from 0 to 360 \(degrees\), got 400"):
+        BackgroundControl(hue=400)
+
+
+def test_the_picture_has_that_colour_behind_the_object_and_its_slope() -> None:
+    render = advsearch.load_scene("mug").renderer([BackgroundControl()], resolution=32)
+    u = torch.tensor([0.3, 0.7, 0.6], requires_grad=True)
+    image = render(u, seed=0, spp=4)
+    color = hsv_to_rgb(torch.tensor(0.3 * 360.0), torch.tensor(0.7), torch.tensor(0.6))
+    torch.testing.assert_close(image[0, 0], color, atol=1e-4, rtol=0)
+    assert float((image[16, 14] - color).detach().abs().max()) > 0.1, "the mug is in front of it"
+    weights = torch.linspace(0.0, 1.0, 32 * 32 * 3).reshape(32, 32, 3)
+    (slope,) = torch.autograd.grad((image * weights).sum(), u)
+    for index in range(3):
+        step = torch.zeros(3)
+        step[index] = 0.01
+        with torch.no_grad():
+            change = render(u + step, seed=0, spp=4) - render(u - step, seed=0, spp=4)
+        assert float(slope[index]) == pytest.approx(float((change * weights).sum() / 0.02), rel=0.02, abs=0.05)

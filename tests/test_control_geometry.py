@@ -1,0 +1,236 @@
+"""The geometry control: smooth, bounded, and never breaking the mesh."""
+
+from __future__ import annotations
+
+import io
+from typing import cast
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+import advsearch
+from advsearch.controls import make_control
+from advsearch.controls.geometry import OFFSETS, BoundGeometry, GeometryControl
+from advsearch.errors import InputError
+from advsearch.scene.assets import Mesh, ObjectAsset
+from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.shape_modes import WALL_STRAIN, Limits, body, shape_modes
+
+FORMS = ("modes", "large-steps")
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneDescription:
+    return describe("mug")
+
+
+def bound(scene: SceneDescription, **settings: object) -> BoundGeometry:
+    return cast(BoundGeometry, GeometryControl(**settings).bind(scene))  # type: ignore[arg-type]
+
+
+def wild(size: int) -> list[Tensor]:
+    """Configurations that push hard: corners of the box, noise, and all one way."""
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.rand(size, generator=generator)
+    smooth = (torch.sin(torch.arange(size) / 40.0) > 0.0).float()
+    return [noise, noise.round(), smooth, torch.ones(size), torch.zeros(size)]
+
+
+def face_normals(places: Tensor, faces: np.ndarray) -> Tensor:
+    corners = places[torch.from_numpy(faces)]
+    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normals / normals.norm(dim=1, keepdim=True).clamp_min(1e-300)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_it_starts_with_the_shape_as_it_is(scene: SceneDescription, form: str) -> None:
+    control = bound(scene, form=form)
+    offsets = control.inputs(control.start)[OFFSETS]
+    assert offsets.shape == scene.object.mesh.vertices.shape and offsets.dtype == torch.float32
+    assert not bool(offsets.any())
+    assert control.describe(control.start)["geometry.thinnest"]["value"] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("epsilon", [0.03, 0.3])
+@pytest.mark.parametrize("name", ["mug", "wine-glass", "book"])
+def test_no_configuration_breaks_the_mesh(name: str, epsilon: float, form: str) -> None:
+    scene = describe(name)
+    control, solid = bound(scene, form=form, epsilon=epsilon), body(scene.object.mesh)
+    places = torch.from_numpy(solid.places)
+    before = face_normals(places, solid.faces)
+    for u in wild(len(control.start)):
+        offsets = control._offsets(u)
+        assert float(offsets.norm(dim=1).max()) < epsilon
+        assert float((before * face_normals(places + offsets, solid.faces)).sum(dim=1).min()) > 0.0
+        said = control.describe(u)
+        assert said["geometry.thinnest"]["value"] > 1.0 - WALL_STRAIN  # type: ignore[operator]
+
+
+def test_the_whole_displacement_is_used(scene: SceneDescription) -> None:
+    control = bound(scene, epsilon=0.05)
+    said = control.describe(wild(len(control.start))[1])
+    assert said["geometry.largest"]["value"] > 0.04  # type: ignore[operator]
+    one = control.start.clone()
+    one[0] = 1.0
+    assert control.describe(one)["geometry.largest"]["value"] > 0.04  # type: ignore[operator]
+
+
+def test_both_sides_of_a_wall_move_together(scene: SceneDescription) -> None:
+    """The mug's wall is 0.03 thick; 24 modes at a largest displacement of 0.03 leave it so within a tenth."""
+    control, solid = bound(scene, epsilon=0.03), body(scene.object.mesh)
+    gaps = np.linalg.norm(solid.places[solid.walls[:, 0]] - solid.places[solid.walls[:, 1]], axis=1)
+    thin = torch.from_numpy(solid.walls[gaps < 0.05])
+    assert len(thin) > 500
+    for u in wild(len(control.start)):
+        offsets = control._offsets(u)
+        apart = (offsets[thin[:, 0]] - offsets[thin[:, 1]]).norm(dim=1).max()
+        assert float(apart) < 0.1 * float(offsets.norm(dim=1).max()) + 1e-9 or float(apart) < 0.004
+
+
+def test_vertices_that_a_seam_splits_stay_together(scene: SceneDescription) -> None:
+    mesh, control = scene.object.mesh, bound(scene, form="large-steps")
+    offsets = control.inputs(torch.rand(control.start.shape, generator=torch.Generator().manual_seed(3)))[OFFSETS]
+    index = body(mesh).index
+    first = np.unique(index, return_index=True)[1]
+    assert len(first) < len(mesh.vertices)
+    assert torch.equal(offsets, offsets[torch.from_numpy(first[index])])
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_no_rigid_motion_is_left(scene: SceneDescription, form: str) -> None:
+    control, solid = bound(scene, form=form), body(scene.object.mesh)
+    centred = solid.places - solid.places.mean(axis=0)
+    for u in wild(len(control.start))[:3]:
+        field = control._shaper.field(u).numpy()
+        size = float(np.linalg.norm(field))
+        for axis in np.eye(3):
+            for rigid in (np.broadcast_to(axis, field.shape), np.cross(axis, centred)):
+                assert abs(float((field * rigid).sum())) < 0.2 * size * float(np.linalg.norm(rigid))
+
+
+def test_modes_are_kept_in_memory_and_come_smoothest_first(scene: SceneDescription) -> None:
+    mesh = scene.object.mesh
+    modes = shape_modes(mesh, 24)
+    assert modes is shape_modes(mesh, 24)
+    np.testing.assert_allclose(np.linalg.norm(modes, axis=1).max(axis=0), 1.0)
+    places, faces = body(mesh).places, body(mesh).faces
+    edges = np.linalg.norm(places[faces[:, 0]] - places[faces[:, 1]], axis=1)
+    rises = np.linalg.norm(modes[faces[:, 0]] - modes[faces[:, 1]], axis=1) / edges[:, None]
+    slopes = np.sqrt((rises**2).mean(axis=0))
+    assert slopes[:4].mean() < 0.7 * slopes[-4:].mean()
+    fewer = shape_modes(mesh, 3)
+    assert fewer.shape[2] == 3
+
+
+def test_the_derivative_of_the_limits_is_exact(scene: SceneDescription) -> None:
+    solid = body(scene.object.mesh)
+    limits = Limits(solid, 0.2)
+    generator = torch.Generator().manual_seed(5)
+    modes = torch.from_numpy(shape_modes(scene.object.mesh, 4))
+    weights = torch.randn(modes.shape[:2], generator=generator, dtype=torch.float64)
+
+    def total(amplitudes: Tensor) -> Tensor:
+        return (limits.held(modes @ amplitudes) * weights).sum()
+
+    for scale in (0.01, 1.0, 30.0):
+        at = scale * torch.randn(4, generator=generator, dtype=torch.float64)
+        assert torch.autograd.gradcheck(total, (at.requires_grad_(),), eps=1e-6, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_derivative_reaches_u(scene: SceneDescription, form: str) -> None:
+    control = bound(scene, form=form)
+    generator = torch.Generator().manual_seed(6)
+    weights = torch.randn(len(scene.object.mesh.vertices), 3, generator=generator)
+    u = torch.rand(control.start.shape, generator=generator).requires_grad_()
+    (slope,) = torch.autograd.grad((control.inputs(u)[OFFSETS] * weights).sum(), u)
+    direction = torch.randn(u.shape, generator=generator)
+    step = 1e-3 * direction
+    with torch.no_grad():
+        high, low = ((control.inputs(u + way * step)[OFFSETS].double() * weights).sum() for way in (1.0, -1.0))
+    assert bool(torch.isfinite(slope).all())
+    assert float(slope @ step) == pytest.approx(float(high - low) / 2.0, rel=0.02)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+def test_the_derivative_is_finite_at_corners_and_at_rest(scene: SceneDescription, form: str, value: float) -> None:
+    control = bound(scene, form=form)
+    u = torch.full_like(control.start, value, requires_grad=True)
+    control.inputs(u)[OFFSETS].sum().backward()
+    assert u.grad is not None and bool(torch.isfinite(u.grad).all())
+
+
+def blocks(*corners: tuple[float, float, float]) -> Mesh:
+    """Cubes of side 0.3, not connected."""
+    boxes = []
+    for corner in corners:
+        box = trimesh.creation.box((0.3, 0.3, 0.3))
+        box.apply_translation(corner)
+        boxes.append(box)
+    whole = trimesh.util.concatenate(boxes)
+    count = len(whole.vertices)
+    normals = np.asarray(whole.vertex_normals, dtype=np.float32)
+    vertices = np.asarray(whole.vertices, dtype=np.float32)
+    return Mesh(vertices, np.asarray(whole.faces, dtype=np.uint32), normals, np.zeros((count, 2), dtype=np.float32))
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_coarse_and_unconnected_meshes_are_taken(scene: SceneDescription, form: str) -> None:
+    mesh = blocks((0.0, 0.0, 0.2), (0.6, 0.0, 0.2), (0.6, 0.7, 0.2))
+    parts = SceneDescription(ObjectAsset("blocks", mesh, scene.object.base_color), scene.environment, scene.values)
+    control = bound(parts, form=form)
+    for u in wild(len(control.start)):
+        offsets = control.inputs(u)[OFFSETS]
+        assert bool(torch.isfinite(offsets).all()) and float(offsets.norm(dim=1).max()) < 0.03
+    assert float(control.inputs(wild(len(control.start))[1])[OFFSETS].abs().max()) > 0.005
+
+
+def test_the_mesh_is_kept_as_a_file(scene: SceneDescription) -> None:
+    control = bound(scene, epsilon=0.1)
+    u = wild(len(control.start))[1]
+    files = control.files(u)
+    (name,) = files
+    assert name == "geometry.obj"
+    read = trimesh.load(io.BytesIO(files[name]), file_type="obj", process=False, maintain_order=True)
+    wanted = scene.object.mesh.vertices + control.inputs(u)[OFFSETS].numpy()
+    np.testing.assert_allclose(read.vertices, wanted, atol=1e-5)
+    np.testing.assert_array_equal(read.faces, scene.object.mesh.faces)
+    np.testing.assert_allclose(read.visual.uv, scene.object.mesh.uvs, atol=1e-5)
+
+
+def test_settings_make_the_same_control_again() -> None:
+    control = GeometryControl(epsilon=0.1, modes=7, name="dent")
+    assert make_control("dent", control.settings()) == control
+    assert make_control("geometry.pushes").form == "large-steps"  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"epsilon": 0.0}, r"geometry.epsilon: expected a length over 0 and up to 0.5 object sizes, got 0.0"),
+        ({"epsilon": "wide"}, r"geometry.epsilon: expected a length"),
+        ({"modes": 0}, r"geometry.modes: expected a whole number from 1 to 200, got 0"),
+        ({"form": "mods"}, r"unknown geometry.form 'mods'. Did you mean 'modes'"),
+        ({"pushes": 0.1}, r"geometry.pushes: expected no value but \[-1, 1\], got 0.1; set how far"),
+        ({"amplitudes": [-1.0, 1.0], "form": "large-steps"}, r"geometry.form: expected one form"),
+    ],
+)
+def test_what_cannot_be_is_refused(given: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        GeometryControl(**given)  # type: ignore[arg-type]
+
+
+def test_a_render_shows_the_shape_and_starts_with_the_old_one() -> None:
+    scene = advsearch.load_scene("mug")
+    render = scene.renderer([GeometryControl(epsilon=0.1)], resolution=32, denoise="none")
+    clean = render(render.start, seed=0, spp=8)
+    plain = scene.renderer({"texture": {}}, resolution=32, denoise="none")
+    assert float((clean - plain(plain.start, seed=0, spp=8)).abs().mean()) < 1e-3
+    bent = render(wild(len(render.start))[1], seed=0, spp=8)
+    assert float((bent - clean).abs().mean()) > 0.005
+    assert torch.equal(render(render.start, seed=0, spp=8), clean)

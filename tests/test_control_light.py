@@ -1,0 +1,161 @@
+"""The light control: a lamp's power in the environment's units, what its places do, and which derivative is right."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.controls.light import LIT_POWER, LightControl, metered_irradiance
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.description import SceneDescription, describe, irradiance, metered_gain
+from advsearch.scene.formation import srgb_to_linear
+from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.mitsuba_scene import MitsubaScene
+
+DARK = EnvironmentAsset("dark", np.zeros((4, 8, 3), np.float32))
+SIDE = 32
+ROUNDING = 0.002
+"""Relative: no sample depends on power or colour, so that at one seed adjoint and difference are of the same paths."""
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneDescription:
+    return describe("mug")
+
+
+def rendered(control: LightControl, scene: SceneDescription, u: list[float], spp: int = 64, seed: int = 0) -> Tensor:
+    prepared = control.prepare(scene)
+    bound = control.bind(prepared)
+    return MitsubaScene(prepared, (SIDE, SIDE)).radiance(bound.inputs(torch.tensor(u)), seed, spp)
+
+
+def pixel_of(point: np.ndarray, scene: SceneDescription) -> tuple[int, int]:
+    """Row and column where the default camera sees a point."""
+    camera = camera_to_world(scene)
+    x, y, z = (point - camera[:3, 3]) @ camera[:3, :3]
+    scale = SIDE / 2.0 / math.tan(math.radians(scene.number("camera.fov") / 2.0)) / z
+    return int(SIDE / 2.0 - scale * y), int(SIDE / 2.0 - scale * x)
+
+
+def test_the_unit_of_power_is_the_metered_environment(scene: SceneDescription) -> None:
+    radiance = np.zeros((64, 128, 3), np.float32)
+    radiance[16] = 7.0
+    upwards = np.array([[0.0, 0.0, 1.0]])
+    lit = EnvironmentAsset("one ring", radiance)
+    shining = SceneDescription(scene.object, lit, scene.values)
+    assert metered_irradiance(shining) * metered_gain(lit) == pytest.approx(0.9 * math.pi / 0.8)
+    assert metered_irradiance(shining) >= float(irradiance(radiance, upwards)[0]) * 0.99
+
+
+@pytest.mark.parametrize("type", ["area", "point"])
+def test_a_lamp_puts_its_power_over_the_squared_distance_on_what_faces_it(type: str) -> None:
+    """White ground below a lamp in the dark: radiance = albedo E / pi / d^2 for each channel."""
+    scene = describe("mug", DARK, given={"pose.x": 50.0, "ground.red": 1.0, "ground.green": 1.0, "ground.blue": 1.0})
+    settings: dict[str, Any] = {"size": 0.05} if type == "area" else {}
+    control = LightControl(type=type, x=[0, 1], y=0, z=2, red=1, green=0.5, blue=0, power=3, **settings)
+    seen = rendered(control, scene, [0.0], spp=256)
+    row, column = pixel_of(np.zeros(3), scene)
+    under = seen[row - 1 : row + 3, column - 2 : column + 2].mean(dim=(0, 1))
+    expected = 3.0 / 4.0 * metered_irradiance(scene) / math.pi * srgb_to_linear(torch.tensor([1.0, 0.5, 0.0]))
+    assert torch.allclose(under, expected, rtol=0.05, atol=1e-6)
+
+
+def test_size_changes_radiance_and_not_power(scene: SceneDescription) -> None:
+    control = LightControl(size=[0.1, 0.4])
+    bound = control.bind(control.prepare(scene))
+    small, large = (bound.inputs(torch.tensor([u])) for u in (0.0, 1.0))
+    assert torch.allclose(small["light.radiance"] * 0.1**2, large["light.radiance"] * 0.4**2)
+    assert float(small["light.ball"][0, 0]) == pytest.approx(0.05)
+    assert float(large["light.ball"][2, 2]) == pytest.approx(0.2)
+
+
+def test_it_starts_dark_unless_its_power_is_not_searched(scene: SceneDescription) -> None:
+    def power(**settings: Any) -> float:
+        bound = LightControl(**settings).bind(scene)
+        return float(bound.values(bound.start)["power"])  # type: ignore[attr-defined]
+
+    assert power() == 0.0
+    assert power(power=[1, 50]) == 1.0
+    assert power(x=[-1, 1]) == LIT_POWER
+    assert power(x=[-1, 1], power=2) == 2.0
+
+
+@pytest.mark.parametrize("type", ["area", "point"])
+def test_a_dark_lamp_changes_nothing_even_in_view(scene: SceneDescription, type: str) -> None:
+    lamp = LightControl(type=type, x=[-1, 1], y=0.0, z=0.9, power=0)
+    plain = MitsubaScene(scene, (SIDE, SIDE)).radiance({}, 0, 256)
+    assert float(rendered(lamp, scene, [0.9], 256).mean()) == pytest.approx(float(plain.mean()), rel=0.01)
+
+
+@pytest.mark.parametrize("type", ["area", "point"])
+@pytest.mark.parametrize("place", [(0.0, 0.0, 0.4), (0.0, 0.0, 0.0), (1.9, 1.6, 1.5)])
+def test_lamps_in_impossible_places_make_finite_pictures(
+    scene: SceneDescription, type: str, place: tuple[float, float, float]
+) -> None:
+    x, y, z = place
+    lamp = LightControl(type=type, x=[x, x + 0.1], y=y, z=z, power=1000)
+    seen = rendered(lamp, scene, [0.0], 16)
+    assert bool(torch.isfinite(seen).all())
+
+
+@pytest.mark.parametrize("type", ["area", "point"])
+def test_the_adjoint_of_power_and_colour_agrees_with_differences(scene: SceneDescription, type: str) -> None:
+    control = LightControl(type=type, x=0.8, y=-0.8, z=2, power=[0, 10], red=[0.5, 1])
+    prepared = control.prepare(scene)
+    bound = control.bind(prepared)
+    mitsuba_scene = MitsubaScene(prepared, (SIDE, SIDE))
+    weights = torch.linspace(0.5, 1.0, SIDE)[:, None, None].expand(SIDE, SIDE, 3).contiguous()
+    u = torch.tensor([0.5, 0.5], requires_grad=True)
+    inputs = bound.inputs(u)
+    shining = {"area": "light.radiance", "point": "light.intensity"}[type]
+    detached = {name: value.detach() for name, value in inputs.items()}
+    found = mitsuba_scene.adjoint(detached, weights, 2, 64, wrt=[shining])
+    (inputs[shining] * found[shining]).sum().backward()
+    assert u.grad is not None
+    for coordinate in range(2):
+        step = 0.1 * torch.eye(2)[coordinate]
+        above, below = (
+            float((mitsuba_scene.radiance(bound.inputs(u.detach() + way * step), 2, 64) * weights).sum())
+            for way in (1.0, -1.0)
+        )
+        assert float(u.grad[coordinate]) == pytest.approx((above - below) / 0.2, rel=ROUNDING)
+
+
+def test_places_and_size_are_left_to_differences() -> None:
+    by_name = {one.name: one.estimators for one in LightControl.parameters}
+    assert by_name["x"] == by_name["z"] == by_name["size"] == ("differences",)
+    assert by_name["power"][0] == by_name["blue"][0] == "adjoint"
+
+
+def test_two_lamps_stand_side_by_side(scene: SceneDescription) -> None:
+    key, fill = LightControl("key"), LightControl("fill", type="point")
+    prepared = fill.prepare(key.prepare(scene))
+    names = set(key.bind(prepared).inputs(key.bind(prepared).start)) | set(
+        fill.bind(prepared).inputs(fill.bind(prepared).start)
+    )
+    assert names == {"key.ball", "key.radiance", "fill.position", "fill.intensity"}
+    assert names <= MitsubaScene(prepared, (8, 8)).names
+    with pytest.raises(InputError, match="--control key: the scene has something of that name"):
+        LightControl("key").prepare(prepared)
+
+
+def test_what_makes_no_sense_is_refused() -> None:
+    with pytest.raises(InputError, match=r"light\.type: expected one of area, point, got 'disk'"):
+        LightControl(type="disk")
+    with pytest.raises(InputError, match=r"light\.size: expected none for a point light"):
+        LightControl(type="point", size=[0.1, 0.2])
+    with pytest.raises(InputError, match=r"light\.power: expected a number from 0 to 1000"):
+        LightControl(power=-1)
+    with pytest.raises(UnknownNameError, match="unknown setting of control light 'colour'"):
+        LightControl(colour="red")
+
+
+def test_a_point_has_no_size_to_search(scene: SceneDescription) -> None:
+    assert "light.size" not in LightControl(type="point").bind(scene).describe(torch.full((7,), 0.5))
+    assert "light.size" in LightControl().bind(scene).describe(torch.full((8,), 0.5))

@@ -1,0 +1,186 @@
+"""The sky control: the published model, the right way round, metered, and with derivatives of the map."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.controls.sky import METERED_IRRADIANCE, SkyControl
+from advsearch.errors import InputError
+from advsearch.scene.backend import mitsuba
+from advsearch.scene.description import SceneDescription, describe, metered_gain
+from advsearch.scene.mitsuba_scene import MitsubaScene
+from advsearch.scene.part_sky import COLUMNS, ROWS, SUN_APERTURE, Sky, angle_between, direction, sun_irradiance
+
+PLUGIN_UNIT = 106.750
+"""Mitsuba divides by the integral of the CIE luminosity function; maps here do not."""
+SKIES = ((20.0, 45.0, 3.0), (200.0, 80.0, 10.0), (120.0, 12.0, 6.7))
+"""Azimuth, elevation, turbidity."""
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneDescription:
+    return describe("mug")
+
+
+def numbers(*given: float) -> list[Tensor]:
+    return [torch.tensor(one) for one in given]
+
+
+def looked_up(emitter: Any, directions: np.ndarray) -> np.ndarray:
+    """Radiance (N, 3) that a Mitsuba emitter sends from directions (N, 3)."""
+    mi = mitsuba()
+    import drjit as dr
+
+    interaction = dr.zeros(mi.SurfaceInteraction3f, len(directions))
+    interaction.wi = mi.Vector3f(*(mi.Float(-directions[:, axis].astype(np.float32)) for axis in range(3)))
+    return np.array(emitter.eval(interaction)).T
+
+
+def plugin(azimuth: float, elevation: float, turbidity: float, **scales: float) -> Any:
+    sun = direction(*numbers(azimuth, elevation)).tolist()
+    return mitsuba().load_dict(
+        {"type": "sunsky", "sun_direction": sun, "turbidity": turbidity, "albedo": 0.3, **scales}
+    )
+
+
+@pytest.mark.parametrize(("azimuth", "elevation", "turbidity"), SKIES)
+def test_the_dome_is_mitsubas(azimuth: float, elevation: float, turbidity: float) -> None:
+    sky = Sky(torch.full((3,), 0.3))
+    own = sky.dome(direction(*numbers(azimuth, elevation)), *numbers(elevation, turbidity))
+    reference = looked_up(plugin(azimuth, elevation, turbidity, sun_scale=0.0), sky.directions.reshape(-1, 3).numpy())
+    assert np.allclose(own.reshape(-1, 3).numpy(), reference * PLUGIN_UNIT, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("azimuth", "elevation", "turbidity"), SKIES)
+def test_the_suns_light_is_mitsubas(azimuth: float, elevation: float, turbidity: float) -> None:
+    count = 2000
+    sun = direction(*numbers(azimuth, elevation)).double().numpy()
+    across = np.cross(sun, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across)
+    radius = np.tan(SUN_APERTURE * 0.9999) * np.sqrt((np.arange(count) + 0.5) / count)
+    angle = np.arange(count) * math.pi * (3.0 - math.sqrt(5.0))
+    sideways = np.cos(angle)[:, None] * across + np.sin(angle)[:, None] * np.cross(sun, across)
+    directions = sun + radius[:, None] * sideways
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    disk = looked_up(plugin(azimuth, elevation, turbidity, sky_scale=0.0), directions)
+    reference = disk.mean(axis=0) * math.pi * SUN_APERTURE**2 * PLUGIN_UNIT
+    assert np.allclose(sun_irradiance(*numbers(elevation, turbidity)).numpy(), reference, rtol=0.01)
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 90.0, 215.0])
+def test_the_sun_stands_where_it_is_asked_to(azimuth: float) -> None:
+    scene = describe("mug")
+    control = SkyControl(azimuth=azimuth, elevation=[30, 31])
+    emitter = MitsubaScene(control.prepare(scene), (8, 8))._scene.environment()
+    sun = direction(*numbers(azimuth, 30.0)).double().numpy()
+    aside = direction(*numbers(azimuth + 8.0, 30.0)).double().numpy()
+    at_sun, beside = looked_up(emitter, np.stack([sun, aside])).mean(axis=1)
+    assert at_sun > 100.0 * beside > 0.0
+
+
+def test_the_map_keeps_the_suns_light_and_the_ground_reflects_it() -> None:
+    ground = torch.tensor([0.4, 0.3, 0.1])
+    sky = Sky(ground)
+    sun = direction(*numbers(40.0, 35.0))
+    total = (sky.disk(sun) * sky.solid_angles).sum()
+    assert float(total) == pytest.approx(1.0, rel=1e-5)
+    radiance, _ = sky(*numbers(40.0, 35.0, 3.0))
+    assert radiance.shape == (ROWS, COLUMNS, 3) and float(radiance.min()) >= 0.0
+    arriving = (radiance[: ROWS // 2] * sky.solid_angles * sky.cosines).sum((0, 1))
+    assert torch.allclose(radiance[-1, 0], ground * arriving / math.pi, rtol=1e-4)
+
+
+def test_every_sky_is_metered_alike_unless_exposure_is_fixed(scene: SceneDescription) -> None:
+    def gains(**settings: Any) -> list[float]:
+        control = SkyControl(elevation=[5, 85], turbidity=[2, 8], **settings)
+        bound = control.bind(scene)
+        maps = [bound.inputs(torch.tensor(u))["environment.data"].numpy() for u in ([0.0, 0.0], [0.5, 0.5], [1.0, 1.0])]
+        return [metered_gain(replace(scene.environment, radiance=one)) for one in maps]
+
+    assert all(gain == pytest.approx(1.0, abs=0.03) for gain in gains())
+    low, middle, high = gains(exposure="fixed")
+    assert low > 2.0 * middle and high < middle
+
+
+def test_it_replaces_the_environment_and_starts_as_what_it_put_there(scene: SceneDescription) -> None:
+    control = SkyControl()
+    prepared = control.prepare(scene)
+    assert prepared.environment.name == "sky" and prepared.gain == pytest.approx(1.0, abs=0.03)
+    bound = control.bind(prepared)
+    assert torch.equal(bound.inputs(bound.start)["environment.data"], torch.from_numpy(prepared.environment.radiance))
+    assert METERED_IRRADIANCE == pytest.approx(0.9 * math.pi / 0.8)
+
+
+@pytest.mark.parametrize("elevation", [2.0, 5.0, 89.9, 90.0])
+@pytest.mark.parametrize("turbidity", [1.0, 3.0, 10.0])
+def test_extreme_skies_are_finite_and_so_are_their_derivatives(elevation: float, turbidity: float) -> None:
+    given = [torch.tensor(value, requires_grad=True) for value in (90.0, elevation, turbidity)]
+    radiance, metered = Sky(torch.tensor([0.0, 0.5, 1.0]))(*given)
+    assert bool(torch.isfinite(radiance).all()) and bool(metered > 0.0)
+    (radiance / metered).square().sum().backward()
+    assert all(one.grad is not None and bool(torch.isfinite(one.grad)) for one in given)
+
+
+def test_the_maps_derivatives_are_right(scene: SceneDescription) -> None:
+    """A smooth weight over the map: autograd against differences of the map itself, in which there is no noise."""
+    bound = SkyControl().bind(scene)
+    around = torch.linspace(0.0, 2.0 * math.pi, COLUMNS + 1)[None, :-1, None]
+    down = torch.linspace(0.0, math.pi, ROWS)[:, None, None]
+    weights = torch.sin(down) * torch.sin(down + around)
+
+    def weighed(u: Tensor) -> Tensor:
+        return (bound.inputs(u)["environment.data"].double() * weights).sum() / COLUMNS
+
+    u = torch.tensor([0.3, 0.4, 0.45], requires_grad=True)
+    weighed(u).backward()
+    assert u.grad is not None
+    for coordinate in range(3):
+        step = 0.0002 * torch.eye(3)[coordinate]  # the texels bend the slope over longer steps
+        with torch.no_grad():
+            slope = float(weighed(u + step) - weighed(u - step)) / 0.0004
+        assert float(u.grad[coordinate]) == pytest.approx(slope, rel=0.015)
+
+
+def test_angles_are_right_and_differentiable_everywhere() -> None:
+    towards = torch.tensor([0.0, 0.0, 1.0], requires_grad=True)
+    there = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+    angles = angle_between(there, towards)
+    assert angles.tolist() == pytest.approx([0.0, math.pi, math.pi / 2.0], abs=1e-5)
+    angles.sum().backward()
+    assert towards.grad is not None and bool(torch.isfinite(towards.grad).all())
+
+
+def test_the_adjoint_of_turbidity_agrees_with_differences(scene: SceneDescription) -> None:
+    control = SkyControl(turbidity=[2, 8], exposure="fixed")
+    prepared = control.prepare(scene)
+    bound = control.bind(prepared)
+    mitsuba_scene = MitsubaScene(prepared, (32, 32))
+    weights = torch.linspace(0.0, 1.0, 32)[:, None, None].expand(32, 32, 3).contiguous()
+    u = torch.tensor([0.55], requires_grad=True)
+    inputs = mitsuba_scene.assembly(bound.inputs(u))
+    found = mitsuba_scene.adjoint({name: one.detach() for name, one in inputs.items()}, weights, 1, 128)
+    sum((inputs[name] * one).sum() for name, one in found.items()).backward()  # type: ignore[union-attr]
+    above, below = (
+        float(
+            (mitsuba_scene.radiance(mitsuba_scene.assembly(bound.inputs(torch.tensor([at]))), 2, 256) * weights).sum()
+        )
+        for at in (0.65, 0.45)
+    )
+    assert u.grad is not None
+    assert float(u.grad) == pytest.approx((above - below) / 0.2, rel=0.1)
+
+
+def test_what_makes_no_sense_is_refused() -> None:
+    with pytest.raises(InputError, match=r"sky\.exposure: expected one of metered, fixed, got 'auto'"):
+        SkyControl(exposure="auto")
+    with pytest.raises(InputError, match=r"sky\.elevation: expected a number from 2 to 90 \(degrees\), got -5"):
+        SkyControl(elevation=-5)
+    with pytest.raises(InputError, match=r"sky\.turbidity: expected a number from 1 to 10"):
+        SkyControl(turbidity=[0.5, 3])

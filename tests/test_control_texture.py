@@ -1,0 +1,187 @@
+"""The texture control's further forms: a few colours, smooth waves, and other meshes than the object."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import advsearch
+from advsearch.controls import make_control, make_space
+from advsearch.controls.base import BoundControl
+from advsearch.controls.texture import TextureControl, palette
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
+from advsearch.scene.parts import MeshPart
+from advsearch.scene.surface_map import texel_area
+
+EIGHT_BIT = 1e-4
+"""Colours may differ by this much after the way to linear values and back."""
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneDescription:
+    return describe("mug")
+
+
+def texels(bound: BoundControl, u: Tensor) -> Tensor:
+    """The searched texture as sRGB."""
+    (linear,) = bound.inputs(u).values()
+    return linear_to_srgb(linear)
+
+
+@pytest.mark.parametrize("form", ["palette", "waves"])
+def test_a_form_starts_as_the_objects_own_texture(scene: SceneDescription, form: str) -> None:
+    bound = TextureControl(form=form).bind(scene)
+    own = torch.from_numpy(scene.object.base_color.copy())
+    torch.testing.assert_close(texels(bound, bound.start), own, atol=EIGHT_BIT, rtol=0)
+
+
+@pytest.mark.parametrize("form", ["palette", "waves"])
+@pytest.mark.parametrize("norm", ["linf", "l2"])
+def test_no_configuration_in_the_budget_leaves_the_ball(scene: SceneDescription, form: str, norm: str) -> None:
+    bound = TextureControl(form=form, norm=norm, epsilon=0.2, resolution=64).bind(scene)
+    generator = torch.Generator().manual_seed(0)
+    for step in range(4):
+        direction = torch.rand(bound.start.shape, generator=generator) - 0.5
+        direction = direction.sign() if step % 2 else direction
+        if bound.budget.epsilon is None:
+            u = 0.5 + 0.5 * direction.sign()
+        else:
+            length = direction.norm() if norm == "l2" else direction.abs().max()
+            u = (bound.start + bound.budget.epsilon * direction / length).clamp(0.0, 1.0)
+        change = texels(bound, u) - texels(bound, bound.start)
+        reached = float(change.norm()) if norm == "l2" and form == "waves" else float(change.abs().max())
+        assert 0.01 < reached <= 0.2 + EIGHT_BIT
+        assert bound.describe(u)["texture.linf"]["value"] == pytest.approx(float(change.abs().max()), abs=EIGHT_BIT)
+
+
+@pytest.mark.parametrize("form", ["palette", "waves"])
+def test_the_derivative_is_that_of_a_difference(scene: SceneDescription, form: str) -> None:
+    bound = TextureControl(form=form, epsilon=0.3, resolution=32).bind(scene)
+    generator = torch.Generator().manual_seed(1)
+    weights = torch.randn(32, 32, 3, generator=generator)
+    direction = torch.randn(bound.start.shape, generator=generator)
+    u = (0.8 * bound.start + 0.1).requires_grad_()
+
+    def total(at: Tensor) -> Tensor:
+        return (next(iter(bound.inputs(at).values())) * weights).sum()
+
+    (slope,) = torch.autograd.grad(total(u), u)
+    step = 2e-3 * direction
+    with torch.no_grad():
+        rise = float(total(u + step) - total(u - step)) / 2.0
+    assert float(slope @ step) == pytest.approx(rise, rel=0.02, abs=1e-3)
+
+
+def test_corners_of_the_box_are_finite(scene: SceneDescription) -> None:
+    for form in ("palette", "waves"):
+        bound = TextureControl(form=form, resolution=16).bind(scene)
+        for value in (0.0, 1.0):
+            u = torch.full_like(bound.start, value, requires_grad=True)
+            found = texels(bound, u)
+            found.sum().backward()
+            assert bool(torch.isfinite(found).all()) and u.grad is not None and bool(torch.isfinite(u.grad).all())
+
+
+def test_a_palette_repaints_what_resembles_its_colour() -> None:
+    image = torch.zeros(8, 8, 3)
+    image[:, :4] = torch.tensor([0.8, 0.2, 0.2])
+    image[:, 4:] = torch.tensor([0.2, 0.2, 0.8])
+    image[0, 0] = torch.tensor([0.75, 0.2, 0.2])  # a shade of red
+    colors = palette(image, np.ones((8, 8), dtype=np.float32), 2)
+    assert colors.shape == (2, 3)
+    red = int(colors[:, 0].argmax())
+    from advsearch.controls.base import Budget
+    from advsearch.controls.texture import Recoloured
+
+    painter = Recoloured(image, colors, Budget("linf", 0.5))
+    u = colors.clone()
+    u[red] = torch.tensor([0.3, 0.7, 0.2])
+    painted = painter.texels(u.reshape(-1))
+    assert float((painted[4, 2] - torch.tensor([0.3, 0.7, 0.2])).abs().max()) < 0.1
+    assert float((painted[4, 6] - image[4, 6]).abs().max()) < 0.1
+    assert float(painted[0, 0, 0]) < float(painted[4, 2, 0])  # the shade is still darker than the rest
+
+
+def test_the_palette_is_that_of_the_surface_and_never_by_chance(scene: SceneDescription) -> None:
+    own = torch.from_numpy(scene.object.base_color.copy())
+    area = texel_area(scene.object.mesh, len(own))
+    first = palette(own, area, 6)
+    assert torch.equal(first, palette(own, area, 6)) and first.shape == (6, 3)
+    cream, blue = torch.tensor([0.90, 0.85, 0.78]), torch.tensor([0.14, 0.37, 0.58])
+    for wanted in (cream, blue):
+        assert float((first - wanted).norm(dim=1).min()) < 0.08
+    apart = torch.cdist(first, first) + torch.eye(6)
+    assert float(apart.min()) > 0.02
+
+
+def test_a_plain_texture_has_one_colour_however_many_are_asked_for() -> None:
+    plain = torch.full((8, 8, 3), 0.4)
+    found = palette(plain, np.ones((8, 8), dtype=np.float32), 6)
+    torch.testing.assert_close(found, torch.full((1, 3), 0.4))
+
+
+def test_waves_are_smooth_and_few(scene: SceneDescription) -> None:
+    bound = TextureControl(form="waves", waves=4, epsilon=0.1, resolution=64).bind(scene)
+    assert len(bound.start) == 4 * 4 * 3
+    u = torch.rand(bound.start.shape, generator=torch.Generator().manual_seed(2))
+    change = texels(bound, u) - texels(bound, bound.start)
+    inside = (texels(bound, u) > 0.01) & (texels(bound, u) < 0.99)
+    steps = (change[1:] - change[:-1]).abs()[(inside[1:] & inside[:-1])]
+    assert float(change.abs().max()) > 0.05 and float(steps.max()) < 0.03
+
+
+def part(scene: SceneDescription) -> MeshPart:
+    """A second mesh with a plain texture."""
+    return MeshPart("post", scene.object.mesh, np.eye(4), np.full((4, 4, 3), 0.25, dtype=np.float32))
+
+
+def test_another_mesh_of_the_scene_can_be_painted(scene: SceneDescription) -> None:
+    both = scene.with_part(part(scene))
+    bound = TextureControl(part="post", name="second", resolution=16).bind(both)
+    (found,) = bound.inputs(bound.start).items()
+    assert found[0] == "post.base_color"
+    torch.testing.assert_close(found[1], srgb_to_linear(torch.full((16, 16, 3), 0.25)))
+    space = make_space([TextureControl(), TextureControl(part="post", name="second")], both)
+    assert set(space.inputs(space.start)) == {"object.base_color", "post.base_color"}
+    with pytest.raises(UnknownNameError, match=r"unknown texture.part 'pots'. Did you mean 'post'"):
+        TextureControl(part="pots").bind(both)
+
+
+def test_settings_make_the_same_control_again() -> None:
+    control = TextureControl(form="waves", waves=5, part="post", name="second")
+    again = make_control("second", control.settings())
+    assert again == control
+    assert make_control("texture.palette") == TextureControl(form="palette", palette=[0.0, 1.0])
+    assert TextureControl(palette=[0.0, 1.0]).form == "palette"
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"form": "wavs"}, r"unknown texture.form 'wavs'. Did you mean 'waves'"),
+        ({"colors": 0}, r"texture.colors: expected a whole number from 1 to 64, got 0"),
+        ({"waves": 2.5}, r"texture.waves: expected a whole number from 1 to 64, got 2.5"),
+        ({"palette": [0.2, 1.0]}, r"texture.palette: expected no value but \[0, 1\].*set how far it may go"),
+        ({"palette": [0.0, 1.0], "form": "waves"}, r"texture.form: expected one form, got palette, waves"),
+    ],
+)
+def test_what_cannot_be_is_refused(given: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        TextureControl(**given)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("form", ["palette", "waves"])
+def test_a_render_changes_by_the_step_times_the_adjoint(form: str) -> None:
+    render = advsearch.load_scene("mug").renderer(
+        [TextureControl(form=form, epsilon=0.4)], resolution=32, denoise="none"
+    )
+    u = (0.8 * render.start + 0.1).requires_grad_()
+    (slope,) = torch.autograd.grad(render(u, seed=0, spp=64).mean(), u)
+    step = torch.full_like(u, 0.05) if form == "palette" else 0.02 * torch.eye(len(u))[0]
+    with torch.no_grad():
+        rise = float(render(u + step, seed=0, spp=64).mean() - render(u - step, seed=0, spp=64).mean()) / 2.0
+    assert abs(rise) > 1e-4 and float(slope @ step) == pytest.approx(rise, rel=0.1)

@@ -1,0 +1,369 @@
+"""The gradient plan: what each estimator computes, what is left out, and how it is chosen. Renders are small."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.api import load_scene
+from advsearch.controls import make_control
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.evaluation.gradients import (
+    Estimate,
+    Probe,
+    Reference,
+    estimated,
+    inside,
+    probes,
+    reference,
+    scale_of,
+    smooth_loss,
+    verdict,
+)
+from advsearch.evaluation.planning import Cosine, contested, measured_plan, tuned
+from advsearch.scene.plan import ESTIMATORS, GroupPlan, first_plan
+from advsearch.scene.renderer import Renderer
+
+SIZE = 48
+
+
+def renderer(controls: Any, *, object: str = "mug", transfer: str = "linear", **options: Any) -> Renderer:
+    made = load_scene(object).renderer(controls, resolution=SIZE, denoise="none", **options)
+    made.formation = replace(made.formation, transfer=transfer)
+    return made
+
+
+def group(name: str, begin: int, size: int, valid: tuple[str, ...], **more: Any) -> GroupPlan:
+    control, _, parameter = name.partition(".")
+    return GroupPlan(control, parameter, begin, size, "none", valid, **more)
+
+
+# ---- the plan as data -----------------------------------------------------------------------------------------------
+
+
+def test_the_first_plan_takes_what_is_preferred_and_obeys_force() -> None:
+    groups = (
+        group("pose.yaw", 0, 1, ("secant", "material")),
+        group("texture.texels", 1, 9, ("adjoint",)),
+        group("environment.which", 10, 1, ()),
+    )
+    steps = torch.full((11,), 0.02)
+    plan = first_plan(groups, steps)
+    assert [one.estimator for one in plan.groups] == ["secant", "adjoint", "none"]
+    assert plan.renders == 2 and plan.through_inputs(11).tolist() == [0.0] + [1.0] * 9 + [0.0]
+    forced = first_plan(groups, steps, {"pose": "material", "texture.texels": "simultaneous"})
+    assert [one.estimator for one in forced.groups] == ["material", "simultaneous", "none"]
+    assert "forced" in forced.groups[0].reason
+    everywhere = first_plan(groups, steps, {"*": "differences"})
+    assert [one.estimator for one in everywhere.groups] == ["differences", "differences", "none"]
+
+
+@pytest.mark.parametrize(
+    ("forced", "message"),
+    [
+        ({"pose": "magic"}, "unknown estimator for pose 'magic'"),
+        ({"poze": "secant"}, "unknown control in --estimator 'poze'"),
+        ({"pose.yaw": "adjoint"}, "--estimator pose.yaw=adjoint: not valid there; expected one of secant, material"),
+    ],
+)
+def test_an_estimator_that_cannot_be_is_refused(forced: dict[str, str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        first_plan((group("pose.yaw", 0, 1, ("secant", "material")),), torch.zeros(1), forced)
+
+
+def test_every_estimator_that_a_control_names_exists() -> None:
+    from advsearch.controls import CONTROLS
+
+    for kind in CONTROLS:
+        for parameter in CONTROLS[kind].parameters:
+            assert set(parameter.estimators) <= set(ESTIMATORS), kind
+
+
+# ---- what estimators compute ----------------------------------------------------------------------------------------
+
+
+def test_differences_are_central_differences_of_the_picture_with_one_seed() -> None:
+    render = renderer(["camera"], estimators={"*": "differences"})
+    weights = torch.rand(SIZE, SIZE, 3, generator=torch.Generator().manual_seed(1))
+    u = inside(render)
+    leaf = u.clone().requires_grad_()
+    before = render.renders
+    (render(leaf, seed=3, spp=4) * weights).sum().backward()
+    assert render.renders - before == 1 + 2 * len(u)
+    first = render.plan.groups[1]
+    noise = render.differences(u, weights, 3, 4)
+    assert leaf.grad is not None and torch.equal(leaf.grad, noise)
+    assert first.periodic is False
+    step = torch.zeros_like(u)
+    step[1] = first.step
+    from advsearch import seeds
+
+    common = seeds.stream(render.root_seed, "differences", 3)
+    with torch.no_grad():
+        rise = (weights * (render(u + step, common, 4) - render(u - step, common, 4))).sum()
+    assert float(leaf.grad[1]) == pytest.approx(float(rise) / (2.0 * first.step), rel=1e-3)
+
+
+def test_a_secant_differences_the_loss_itself() -> None:
+    render = renderer(["camera.elevation"], estimators={"*": "secant"}, transfer="srgb")
+    u = inside(render)
+
+    def bent(image: Tensor) -> Tensor:
+        return torch.sigmoid(30.0 * (image.mean() - 0.45))
+
+    value, gradient = render.gradient(bent, u, 5, 4)
+    from advsearch import seeds
+
+    common, step = seeds.stream(render.root_seed, "differences", 5), render.plan.groups[0].step
+    with torch.no_grad():
+        rise = bent(render(u + step, common, 4)) - bent(render(u - step, common, 4))
+        assert float(value) == pytest.approx(float(bent(render(u, 5, 4))))
+    assert float(gradient[0]) == pytest.approx(float(rise) / (2.0 * step), rel=1e-3)
+
+
+def test_one_sided_and_random_directions_agree_with_central_differences_where_the_loss_is_smooth() -> None:
+    found = {}
+    for estimator in ("differences", "forward", "simultaneous"):
+        render = renderer(["camera.elevation"], estimators={"*": estimator})
+        loss, u = smooth_loss((SIZE, SIZE)), inside(render)
+        found[estimator] = float(torch.stack([render.gradient(loss, u, seed, 32)[1] for seed in range(4)]).mean())
+    assert found["forward"] == pytest.approx(found["differences"], rel=0.3)
+    assert found["simultaneous"] == pytest.approx(found["differences"], rel=0.3)
+
+
+def test_differences_at_the_edge_of_the_box_stay_inside_and_are_finite() -> None:
+    render = renderer({"camera": {"elevation": [5, 60], "azimuth": [0, 360]}}, estimators={"*": "differences"})
+    for corner in (torch.zeros(2), torch.ones(2)):
+        _, gradient = render.gradient(smooth_loss((SIZE, SIZE)), corner, 0, 4)
+        assert bool(torch.isfinite(gradient).all()) and bool(gradient.any())
+
+
+def test_a_full_turn_meets_itself() -> None:
+    render = renderer(
+        {"camera": {"azimuth": [0, 360]}, "pose": {"yaw": [0, 360]}, "environment": {"rotation": [0, 360]}}
+    )
+    with torch.no_grad():
+        assert torch.allclose(render(torch.zeros(3), 1, 4), render(torch.ones(3), 1, 4), atol=1e-3)
+
+
+def test_the_free_part_of_a_gradient_takes_no_render_of_its_own() -> None:
+    render = renderer({"environment": {"exposure": [-1, 1]}, "camera": {"elevation": [5, 60]}})
+    u, before = inside(render), render.renders
+    _, free = render.gradient(smooth_loss((SIZE, SIZE)), u, 0, 4, free=True)
+    assert render.renders - before == 1
+    assert float(free[0]) != 0.0 and float(free[1]) == 0.0
+
+
+def test_a_texture_beside_a_pose_is_differentiated_once_and_nothing_geometric_for_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    render = renderer({"texture": {"resolution": 16}, "pose": {"yaw": [0, 360]}})
+    asked: list[tuple[str, ...]] = []
+    original = render.scene.adjoint
+
+    def spy(inputs: Any, cotangent: Tensor, seed: int, spp: int, *, wrt: Any = None, method: str = "path") -> Any:
+        asked.append((method, *wrt))
+        return original(inputs, cotangent, seed, spp, wrt=wrt, method=method)
+
+    monkeypatch.setattr(render.scene, "adjoint", spy)
+    _, gradient = render.gradient(smooth_loss((SIZE, SIZE)), inside(render), 0, 4)
+    assert asked == [("path", "object.base_color")]
+    assert bool(gradient[:-1].any()) and float(gradient[-1]) != 0.0
+
+
+def test_turning_an_environment_has_the_right_sign_and_size() -> None:
+    """Mitsuba's own derivative of `to_world` has the wrong sign (DESIGN section 5); texels have the right one."""
+    render = renderer(["environment.rotation"])
+    loss, u = smooth_loss((SIZE, SIZE)), inside(render)
+    names = [render.plan.groups[0].name]
+    adjoint = torch.stack([estimated(render, loss, u, "adjoint", names, seed, 256) for seed in range(6)]).mean()
+    (probe,) = probes(render, loss, u, 0, 16)
+    truth = reference(render, loss, u, probe, seed=0, spp=128)
+    assert float(adjoint) * truth.value > 0.0
+    assert float(adjoint) == pytest.approx(truth.value, rel=0.1)
+
+
+@pytest.mark.parametrize("parameter", ["roughness", "metallic", "specular"])
+def test_the_adjoint_of_a_surface_agrees_with_differences(parameter: str) -> None:
+    render = renderer({"material": {parameter: [0.1, 0.9]}})
+    loss, u = smooth_loss((SIZE, SIZE)), torch.tensor([0.5])
+    names = [render.plan.groups[0].name]
+    adjoint = float(torch.stack([estimated(render, loss, u, "adjoint", names, seed, 64) for seed in range(4)]).mean())
+    (probe,) = probes(render, loss, u, 0, 16)
+    truth = reference(render, loss, u, probe, seed=0, spp=64)
+    assert adjoint == pytest.approx(truth.value, rel=0.08)
+
+
+# ---- nothing stays behind -------------------------------------------------------------------------------------------
+
+
+def test_a_configuration_after_a_thousand_others_is_bitwise_that_of_a_fresh_scene() -> None:
+    controls = {"pose": {}, "camera": {}, "environment": {}, "material": {"roughness": [0.1, 0.9]}}
+    used = load_scene("mug").renderer(controls, resolution=16, denoise="none")
+    generator = torch.Generator().manual_seed(0)
+    probe = torch.rand(used.start.shape, generator=generator)
+    with torch.no_grad():
+        for number in range(1000):
+            used(torch.rand(used.start.shape, generator=generator), seed=number, spp=1)
+        after = used(probe, seed=7, spp=4)
+        fresh = load_scene("mug").renderer(controls, resolution=16, denoise="none")
+        assert torch.equal(after, fresh(probe, seed=7, spp=4))
+
+
+def test_recordings_do_not_outlive_a_move() -> None:
+    """A kernel recorded before a mesh moved renders something else afterwards."""
+    controls = {"pose": {"yaw": [0, 360], "x": [-0.2, 0.2]}}
+    recorded, plain = (load_scene("mug").renderer(controls, resolution=32, denoise="none") for _ in range(2))
+    plain.scene._freeze = False
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for number in range(6):
+            u = torch.rand(2, generator=generator)
+            for again in range(3):
+                assert torch.equal(recorded(u, again, 4), plain(u, again, 4)), (number, again)
+
+
+# ---- judging --------------------------------------------------------------------------------------------------------
+
+
+def test_a_verdict_needs_more_than_noise() -> None:
+    sure = Reference(1.0, 0.001, (1.0, 1.0), 8)
+    assert verdict(Estimate("x", 1.01, 0.05, 9, 1.0), sure, 1.0)[0] == "ok"
+    assert verdict(Estimate("x", 1.2, 0.05, 9, 1.0), sure, 1.0)[0] == "biased"
+    assert verdict(Estimate("x", -1.0, 0.05, 9, 1.0), sure, 1.0) == ("biased", 2.0)
+    assert verdict(Estimate("x", 1.0, 0.5, 9, 1.0), sure, 1.0)[0] == "noisy"
+    unsure = Reference(0.1, 0.5, (0.6, 0.1), 8)
+    assert verdict(Estimate("x", 0.4, 0.1, 9, 1.0), unsure, 0.1)[0] == "reference unusable"
+    large = Reference(5.0, 0.01, (5.0, 5.0), 8)
+    assert scale_of(sure, [sure, large]) == 1.0
+    assert scale_of(Reference(0.01, 0.0, (0.01, 0.01), 8), [sure, large]) == 0.5
+
+
+def test_a_reference_of_a_parabola_has_its_bias_taken_off() -> None:
+    class Curve:
+        renders = 0
+
+        def __call__(self, u: Tensor, seed: int, spp: int) -> Tensor:
+            return u[0] ** 3 + 1e-4 * math.sin(seed)
+
+    one = group("a.b", 0, 1, ("differences",), step=0.2)
+    curve: Any = Curve()
+    found = reference(
+        curve, lambda image: image, torch.tensor([0.5]), Probe(one, "a.b", torch.ones(1), 0.2), seed=0, spp=1
+    )
+    assert found.value == pytest.approx(0.75, abs=1e-4)
+    assert found.steps[0] == pytest.approx(0.75 + 0.04, abs=1e-4)
+
+
+def test_a_measured_plan_keeps_what_was_forced_and_says_what_it_measured() -> None:
+    render = renderer({"environment": {"rotation": [0, 360], "exposure": [-1, 1]}})
+    plan = measured_plan(render, smooth_loss((SIZE, SIZE)), inside(render), seed=0, spp=4, repeats=2)
+    for one in plan.groups:
+        assert set(one.measured) == {"adjoint", "differences"}
+        assert one.estimator == min(one.measured, key=lambda name: one.measured[name])
+        assert "least squared error x time" in one.reason
+    forced = renderer({"environment": {"rotation": [0, 360]}}, estimators={"environment": "adjoint"})
+    assert contested(forced.plan) == []
+
+
+def test_the_cheapest_setting_that_reaches_the_goal_is_taken() -> None:
+    plan = first_plan((group("pose.yaw", 0, 1, ("secant",)),), torch.tensor([0.01]))
+    rows = [
+        Cosine("pose", 1.0, 8, 0.5, 0.99, 1.0),
+        Cosine("pose", 1.0, 64, 0.95, 0.99, 8.0),
+        Cosine("pose", 3.0, 16, 0.93, 0.99, 2.0),
+    ]
+    chosen, spp = tuned(plan, rows)
+    assert spp == 16 and chosen.groups[0].step == pytest.approx(0.03)
+    poor, spp = tuned(plan, rows[:1])
+    assert spp == 8 and "below 0.9, the best that was found" in poor.groups[0].reason
+    assert tuned(plan, [])[1] is None
+
+
+# ---- settings of controls -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"yaw": [10, 10]}, r"pose.yaw: the range \[10, 10\] has no size; write 10 to fix the value"),
+        ({"yaw": [20, 10]}, r"pose.yaw: the range \[20, 10\] is reversed; write \[10, 20\]"),
+        ({"scale": [0.0, 1.0]}, r"pose.scale: expected a number from 0.01 to 100 \(1\), got 0"),
+        ({"scale": 1000}, "pose.scale: expected a number from 0.01 to 100"),
+        ({"yaw": math.nan}, "pose.yaw: expected a number from"),
+        ({"yaw": "north"}, "pose.yaw: expected a number in degrees, got 'north'"),
+        ({"yaw": True}, "pose.yaw: expected a number in degrees, got True"),
+        ({"yaw": {"low": 1}}, r"pose.yaw: expected \{choices: \[value, ...\]\}"),
+        ({"yaw": [5]}, r"pose.yaw: expected a number, \[low, high\] or a list of values"),
+        ({"on_ground": "maybe"}, "pose.on_ground: expected yes or no"),
+        ({"jaw": 5}, "unknown setting of control pose 'jaw'. Did you mean 'yaw'"),
+    ],
+)
+def test_bad_settings_say_what_to_do(settings: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        make_control("pose", settings)
+
+
+def test_a_control_with_nothing_to_search_says_so() -> None:
+    fixed = {name: 0.0 for name in ("yaw", "pitch", "roll", "x", "y", "z")} | {"scale": 1.0}
+    with pytest.raises(InputError, match="--control pose: every parameter is fixed, so there is nothing to search"):
+        load_scene("mug").renderer({"pose": fixed}, resolution=16)
+
+
+def test_naming_one_parameter_searches_only_that() -> None:
+    scene = load_scene("mug")
+    for asked, names in (
+        ({"pose": {"yaw": [0, 90]}}, ["pose.yaw"]),
+        (["pose.yaw", "pose.x"], ["pose.yaw", "pose.x"]),
+        ({"pose": {"yaw": 30}}, ["pose.pitch", "pose.roll", "pose.x", "pose.y", "pose.scale"]),
+        ({"far": {"kind": "pose", "yaw": [0, 90]}}, ["far.yaw"]),
+        (["pose:near"], [f"near.{name}" for name in ("yaw", "pitch", "roll", "x", "y", "scale")]),
+    ):
+        render = scene.renderer(asked, resolution=16)  # type: ignore[arg-type]
+        assert [one.name for one in render.plan.groups] == names
+    with pytest.raises(UnknownNameError, match="unknown parameter of control pose 'yow'"):
+        scene.renderer(["pose.yow"], resolution=16)
+
+
+def test_the_start_is_the_scene_as_it_is() -> None:
+    scene = load_scene("mug")
+    plain = scene.renderer({"texture": {"resolution": 256}}, resolution=32, denoise="none")
+    expected = plain(plain.start, seed=0, spp=64)
+    for controls in (["pose"], ["camera"], ["environment"], ["pose", "camera", "environment"]):
+        render = scene.renderer(controls, resolution=32, denoise="none")
+        assert float((render(render.start, seed=0, spp=64) - expected).abs().mean()) < 2e-3, controls
+
+
+def test_a_rotation_vector_is_a_rotation_with_a_derivative_at_zero() -> None:
+    from advsearch.controls.pose import euler, rotation_vector
+
+    for degrees in ([0.0, 0.0, 0.0], [0.0, 0.0, 90.0], [100.0, -60.0, 45.0], [180.0, 0.0, 0.0]):
+        vector = torch.tensor(degrees, requires_grad=True)
+        matrix = rotation_vector(vector)
+        assert torch.allclose(matrix @ matrix.T, torch.eye(3), atol=1e-5)
+        (gradient,) = torch.autograd.grad((matrix * torch.arange(9.0).reshape(3, 3)).sum(), vector)
+        assert bool(torch.isfinite(gradient).all()) and bool(gradient.any())
+    turned = euler(torch.tensor(30.0), torch.tensor(0.0), torch.tensor(0.0))
+    assert torch.allclose(rotation_vector(torch.tensor([0.0, 0.0, 30.0])), turned, atol=1e-6)
+
+
+def test_a_lens_keeps_what_it_frames() -> None:
+    """A dolly zoom: distance x tan(fov / 2) stays while the field of view changes."""
+    from advsearch.controls.camera import fitted_distance
+
+    control = make_control("camera", {"fov": [15, 60]})
+    scene = load_scene("ball").description
+    bound = control.bind(scene)
+    for share in (0.0, 0.5, 1.0):
+        inputs = bound.inputs(torch.tensor([share]))
+        fov = math.radians(float(inputs["camera.fov"]))
+        middle = torch.from_numpy(scene.base_vertices.min(axis=0) + scene.base_vertices.max(axis=0)) / 2.0
+        distance = float((inputs["camera.to_world"][:3, 3].double() - middle).norm())
+        assert distance * math.tan(fov / 2) == pytest.approx(
+            fitted_distance(scene) * math.tan(math.radians(35.0) / 2), rel=0.05
+        )
