@@ -58,6 +58,8 @@ CONTROLS: Mapping[str, Mapping[str, Any]] = {
         "fill": {"kind": "light", "red": [0, 1], "blue": [0, 1], "power": [0.5, 4]},
     },
     "material": {"material.which": {}},
+    "occlusion": {"occlusion": {"which": ["vase", "banana", "book", "card"], "coverage": [0.0, 0.5]}},
+    "geometry": {"geometry": {"epsilon": 0.12}},
     "haze": {"haze": {"density": [0.0, 0.6]}},
 }
 """What is varied where it is not simply the control with its defaults."""

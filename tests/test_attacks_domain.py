@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from advsearch.attacks.domain import TOLERANCE, Block, Domain
+from advsearch.attacks.domain import TOLERANCE, Block, Domain, centre_of_option
 from advsearch.attacks.projections import project_l2_box
 from advsearch.errors import InputError
 
@@ -138,6 +138,29 @@ def test_a_periodic_block_wraps_around() -> None:
     assert torch.equal(domain.project(torch.tensor([1.0, 0.0])), torch.tensor([1.0, 0.0]))
 
 
+def test_a_discrete_choice_is_sampled_at_the_middle_of_its_options_and_has_no_uphill() -> None:
+    domain = Domain(torch.tensor([0.5, 0.4]), (Block(1, options=3), Block(1)))
+    values = domain.sample(generator(), 3000)[:, 0]
+    options, counts = values.unique(return_counts=True)
+    assert torch.allclose(options, torch.tensor([1 / 6, 0.5, 5 / 6]))
+    assert int(counts.min()) > 900
+    assert domain.steepest(domain.start, torch.ones(2)).tolist() == [0.0, 0.5]
+    u = torch.tensor([0.4, 0.4])
+    assert torch.equal(domain.project(u), u)  # nothing snaps
+    assert domain.project(torch.tensor([1.4, 0.4]))[0] == 1.0
+
+
+def test_the_last_option_ends_at_one() -> None:
+    assert centre_of_option(torch.tensor([0.0, 0.24, 0.26, 0.99, 1.0]), 4).tolist() == [
+        0.125, 0.125, 0.375, 0.875, 0.875,
+    ]  # fmt: skip
+
+
+def test_a_reach_shortens_the_step_in_a_box() -> None:
+    domain = Domain(torch.full((4,), 0.5), (Block(4, reach=0.03),))
+    assert float(domain.steepest(domain.start, torch.ones(4)).norm()) == pytest.approx(0.03)
+
+
 @pytest.mark.parametrize("extreme", [False, True])
 @pytest.mark.parametrize("norm", ["linf", "l2", "box"])
 def test_samples_lie_inside_and_repeat_with_the_seed(norm: str, extreme: bool) -> None:
@@ -229,6 +252,13 @@ def test_a_bad_epsilon_names_the_flag(norm: str, epsilon: float | None) -> None:
         (lambda: Block(3, "box", 0.1), "has bounds and no norm budget; leave --epsilon out"),
         (lambda: Block(3, low=0.5, high=0.5), r"expected 0 <= low < high <= 1, got \[0.5, 0.5\]"),
         (lambda: Block(3, "linf", 0.1, periodic=True), "a periodic block cannot have a norm budget"),
+        (lambda: Block(2, options=3), "expected a discrete choice to have at least one option, size 1, norm 'box'"),
+        (lambda: Block(1, options=-1), "expected a discrete choice to have at least one option"),
+        (lambda: Block(1, periodic=True, options=3), "expected a discrete choice"),
+        (lambda: Block(1, high=0.5, options=3), "expected a discrete choice"),
+        (lambda: Block(2, "linf", 0.1, reach=0.1), "expected a reach over 0 and norm 'box', got 0.1 and 'linf'"),
+        (lambda: Block(2, reach=0.0), "expected a reach over 0 and norm 'box', got 0.0"),
+        (lambda: Domain(torch.zeros(2), (Block(2),), gradient_cost=-1), "gradient_cost: expected at least 0, got -1"),
         (lambda: Domain(torch.zeros(3), (Block(2),)), r"expected shape \(2,\), the sum of the blocks, got \(3,\)"),
         (lambda: Domain(torch.tensor([0.0, 1.5]), (Block(2),)), r"expected values in \[0.0, 1.0\], got 0 to 1.5"),
         (lambda: Domain(torch.tensor([0.0, math.nan]), (Block(2),)), "start: found NaN or infinite values"),

@@ -163,6 +163,18 @@ def test_random_loses_to_pgd_on_a_linear_objective(norm: str, d: int) -> None:
         assert problem.value(theirs.best_u) < 0.75 * problem.optimum
 
 
+def test_random_tries_every_option_of_a_discrete_choice() -> None:
+    domain = Domain(torch.tensor([0.1, 0.5]), (Block(1, options=5), Block(1)))
+    seen: list[float] = []
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        seen.append(float(u[0]))
+        return Evaluation(0.0, None, torch.zeros(2), False)
+
+    search(evaluate, domain, Random(), steps=60, seed=0, candidates=0)
+    assert sorted(set(seen)) == pytest.approx([0.1, 0.3, 0.5, 0.7, 0.9])
+
+
 def test_random_samples_the_corners_by_turns() -> None:
     problem = linear(200, "linf", seed=0)
     seen: list[Tensor] = []
@@ -265,6 +277,20 @@ def test_pgd_without_any_gradient_stalls() -> None:
     assert len(result.history) == 5
 
 
+def test_pgd_goes_on_along_its_momentum_when_a_gradient_cannot_be_paid() -> None:
+    """Ten renders at four a gradient: two gradients, then two renders that are too few for a third."""
+    domain = Domain(torch.full((2,), 0.1), (Block(2, "linf", 0.9),), gradient_cost=3)
+    seen: list[float] = []
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        seen.append(float(u[0]))
+        return Evaluation(seen[-1], torch.ones(2) if gradient else None, torch.zeros(2), False, cost=1 + 3 * gradient)
+
+    result = search(evaluate, domain, PGD(step_size=0.125), steps=10, seed=0, candidates=0)
+    assert (result.gradients, result.renders, len(seen)) == (2, 10, 4)
+    assert seen == pytest.approx([0.1, 0.2125, 0.325, 0.38125])  # the step was halved at a checkpoint, the way kept
+
+
 def test_pgd_leaves_a_flat_start_at_random() -> None:
     """The gradient is zero at the start only, as under a saturated softmax."""
     problem = linear(20, "linf", seed=0)
@@ -296,6 +322,7 @@ MIXED = Domain(
 )
 
 OPTIONS: dict[str, dict[str, object]] = {
+    "auto": {},
     "pgd": {"step_size": 0.5, "momentum": 0.9, "random_start": True},
     "random": {},
 }

@@ -142,6 +142,72 @@ def test_ranking_takes_the_winners_curse_out() -> None:
     assert abs(sum(believed) / 20) < 0.5
 
 
+# ---- what an evaluation costs
+
+
+def priced(cost: int, log: list[tuple[int, bool | str]]) -> Callable[..., Evaluation]:
+    """RISE with gradients that cost so many renders more; notes what was asked for."""
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str) -> Evaluation:
+        log.append((index, gradient))
+        derivative = torch.ones_like(u) if gradient else None
+        extra = cost if gradient is True else 0
+        return Evaluation(float(u[0] - 0.5), derivative, torch.zeros(2), False, cost=1 + extra)
+
+    return evaluate
+
+
+@pytest.mark.parametrize(
+    ("steps", "gradients", "evaluations"),
+    [(1, 0, 1), (13, 0, 13), (14, 1, 2), (26, 1, 14), (27, 2, 3), (40, 3, 4), (100, 7, 16)],
+)
+def test_the_budget_is_in_renders(steps: int, gradients: int, evaluations: int) -> None:
+    """Six numbers by central differences: 13 renders for each evaluation with a gradient. One after which no render
+    would be left is not asked for."""
+    domain = Domain(DOMAIN.start, DOMAIN.blocks, gradient_cost=12)
+    asked: list[tuple[int, bool | str]] = []
+    script = Script(tuple(at(0.0) for _ in range(100)), gradient=True)
+    result = search(priced(12, asked), domain, script, steps=steps, seed=0, candidates=2, repeats=3)
+    assert [g for _, g in asked[: len(result.history)]] == [True] * gradients + [False] * (evaluations - gradients)
+    assert len(result.history) == evaluations
+    assert result.gradients == gradients
+    assert result.history[-1].renders == steps
+    assert result.renders == result.ranking[-1].renders == steps + 3 == sum(1 + 12 * (g is True) for _, g in asked)
+    assert result.renders <= planned_renders(steps, 2, 3)
+    assert max(i for i, _ in asked[:evaluations]) < steps == min(i for i, _ in asked[evaluations:])
+
+
+def test_what_is_free_costs_nothing() -> None:
+    domain = Domain(DOMAIN.start, DOMAIN.blocks, gradient_cost=12, partial_gradients=True)
+    asked: list[tuple[int, bool | str]] = []
+    script = Script(tuple(at(0.01 * k) for k in range(9)), gradient="free")  # type: ignore[arg-type]
+    result = search(priced(12, asked), domain, script, steps=5, seed=0, candidates=0)
+    assert [g for _, g in asked] == ["free"] * 4 + [False]
+    assert (result.renders, result.gradients) == (5, 4)
+    assert [r.renders for r in result.history] == [1, 2, 3, 4, 5]
+
+
+def test_an_interrupt_counts_what_was_rendered() -> None:
+    domain = Domain(DOMAIN.start, DOMAIN.blocks, gradient_cost=12)
+
+    def stop(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
+        if record.step == 1:
+            raise KeyboardInterrupt
+
+    result = search(priced(12, []), domain, PGD(), steps=100, seed=0, on_step=stop)
+    assert result.ending is Ending.INTERRUPTED
+    assert result.renders == 26
+
+
+@pytest.mark.parametrize("cost", [0, 2])
+def test_an_evaluation_that_costs_what_nobody_said_is_a_bug(cost: int) -> None:
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        return Evaluation(0.0, torch.ones_like(u) if gradient else None, torch.zeros(2), False, cost=cost)
+
+    with pytest.raises(RuntimeError, match=f"evaluate took {cost} renders; expected 1 to 1"):
+        search(evaluate, DOMAIN, PGD(), steps=5, seed=0)
+
+
 # ---- stopping early
 
 

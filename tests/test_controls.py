@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+from advsearch import controls
+from advsearch.api import load_scene
 from advsearch.controls import CONTROLS, BoundControl, TextureControl, make_control, make_space
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import describe
@@ -164,3 +168,53 @@ def test_the_default_balls_reach_the_same_root_mean_square() -> None:
     linf, l2 = (TextureControl(norm=norm, resolution=32).bind(describe("mug")).budget for norm in ("linf", "l2"))
     assert linf.epsilon is not None and l2.epsilon is not None
     assert l2.epsilon == pytest.approx(linf.epsilon * math.sqrt(32 * 32 * 3))
+
+
+# ---- controls from elsewhere ----------------------------------------------------------------------------------------
+
+
+def worked_example() -> type:
+    """The class of the worked example in docs/controls/writing.md."""
+    page = (Path(__file__).resolve().parents[1] / "docs" / "controls" / "writing.md").read_text("utf-8")
+    source = page.split("```python\n")[1].split("```")[0]
+    namespace: dict[str, Any] = {"__name__": "worked_example"}
+    exec(compile(source, "writing.md", "exec"), namespace)
+    found = namespace["FadeControl"]
+    assert isinstance(found, type)
+    return found
+
+
+def test_the_worked_example_is_a_control_that_renders() -> None:
+    control = worked_example()
+    render = load_scene("mug").renderer([control(amount=[0, 1])], resolution=24, denoise="none")
+    with torch.no_grad():
+        plain, faded = (render(torch.tensor([share]), seed=0, spp=8) for share in (0.0, 1.0))
+    spread = [float((one.amax(dim=-1) - one.amin(dim=-1)).mean()) for one in (plain, faded)]
+    assert spread[1] < 0.8 * spread[0]
+    assert [one.estimator for one in render.plan.groups] == ["adjoint"]
+
+
+def test_an_entry_point_adds_a_control(monkeypatch: pytest.MonkeyPatch) -> None:
+    fade = worked_example()
+
+    class Point:
+        name, value = "fade", "worked_example:FadeControl"
+        loads: Any = fade
+
+        def load(self) -> Any:
+            return self.loads
+
+    point = Point()
+    monkeypatch.setattr(controls, "entry_points", lambda group: [point] if group == "advsearch.controls" else [])
+    controls._outside.cache_clear()
+    try:
+        assert list(CONTROLS)[-1] == "fade" and CONTROLS["fade"] is fade and len(CONTROLS) == len(controls.OWN) + 1
+        assert make_control("fade:pale", {"amount": [0, 0.5]}).name == "pale"
+        controls._outside.cache_clear()
+        point.loads = int
+        with pytest.raises(
+            InputError, match="entry point fade = worked_example:FadeControl of group advsearch.controls"
+        ):
+            make_control("nothing")
+    finally:
+        controls._outside.cache_clear()

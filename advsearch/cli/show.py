@@ -62,8 +62,33 @@ def _show_control(name: str, as_json: bool) -> int:
     print(f"{name}: {first_line(control)}")
     for heading, declared in (("parameters, searched or fixed", parameters), ("settings, chosen", choices)):
         if declared:
-            print(f"\n{heading}:\n{_table(declared)}")
+            print(f"\n{heading}:\n{_table([_short(one) for one in declared])}")
     return 0
+
+
+def _short(declared: Mapping[str, Any]) -> dict[str, Any]:
+    """What a person wants to read of a parameter, in few columns; a setting as it is."""
+    if "estimators" not in declared:
+        return dict(declared)
+    one = declared
+    count = " x ".join("any" if side is None else str(side) for side in one["shape"])
+    ways = ", ".join(one["estimators"]) if one["differentiable"] and one["estimators"] else "none"
+    return {
+        "name": one["name"],
+        "unit": one["unit"] + (f" ({count})" if count else ""),
+        "allowed": ", ".join(one["options"]) or f"{one['low']:g} to {one['high']:g}",
+        "searched": "if asked" if one["search"] is None else "all" if one["options"] else _range(one),
+        "default": one["default"],
+        "periodic": one["periodic"],
+        "moves outlines": one["moves_silhouettes"],
+        "derivative": ways,
+        "description": one["description"],
+    }
+
+
+def _range(one: Mapping[str, Any]) -> str:
+    low, high = one["search"]
+    return f"{low:g} to {high:g}" + (", log" if one["log"] else "")
 
 
 def facts(parameter: Any) -> dict[str, Any]:

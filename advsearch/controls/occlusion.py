@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cache
+from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
@@ -27,16 +26,15 @@ from advsearch.controls.base import NOTHING, Choice, Parameter, Value
 from advsearch.controls.numbers import BoundNumbers, NumberControl, Values
 from advsearch.controls.values import Choices, Fixed
 from advsearch.errors import InputError
-from advsearch.scene import importing, library
-from advsearch.scene.assets import Material, Mesh, ObjectAsset, normalised
+from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.coverage import Frame, Silhouette, Sweep, angle_outside, middle_axes, silhouette
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.occluders import MADE, loaded, made
 from advsearch.scene.parts import MeshPart
 
 Doubles = npt.NDArray[np.float64]
 
-MADE = ("card", "sphere")
 BUNDLED = ("book", "bottle", "vase", "chair", "banana", "hammer")
 OPTIONS = (*MADE, *BUNDLED)
 MOVING = ("secant", "differences", "forward", "simultaneous")
@@ -168,6 +166,7 @@ class OcclusionControl(NumberControl):
             )
         if "which" in self._given:
             raise InputError(f"{self.name}: object and which both say what the occluder is; leave one of them out")
+        self._given["object"] = self.chosen["object"] = str(given)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         away = _put_away(torch.from_numpy(camera_to_world(scene))).numpy()
@@ -292,7 +291,7 @@ class _Seen:
     def of(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> _Seen:
         camera = _numpy(so_far, "camera.to_world", camera_to_world(scene))
         pose = _numpy(so_far, "object.to_world", object_to_world(scene))
-        fov = float(so_far["camera.fov"]) if "camera.fov" in so_far else scene.number("camera.fov")
+        fov = float(_numpy(so_far, "camera.fov", np.array([scene.number("camera.fov")]))[0])
         shift = _numpy(so_far, "camera.shift", np.zeros(2))
         mesh = scene.object.mesh
         vertices = mesh.vertices.astype(np.float64) + _numpy(so_far, "object.offsets", np.zeros(3))
@@ -326,7 +325,7 @@ def _solved(seen: _Seen, cover: Silhouette, asked: Mapping[str, float], size: fl
     assert seen.directions is not None
     axes = middle_axes(seen.directions)
     sweep = Sweep(seen.directions, cover, axes, asked["direction"])
-    outside = angle_outside(seen.frame, cover, axes)
+    outside = angle_outside(seen.frame, cover, axes, asked["direction"])
     angle = sweep.solve(max(asked["coverage"], EASE), outside)
     if asked["coverage"] < EASE:
         angle = outside + (angle - outside) * asked["coverage"] / EASE
@@ -401,63 +400,3 @@ def _put_away(camera: Tensor) -> Tensor:
 def _affine(linear: Tensor, place: Tensor) -> Tensor:
     top = torch.cat([linear, place[:, None]], dim=1)
     return torch.cat([top, torch.tensor([[0.0, 0.0, 0.0, 1.0]]).to(linear)])
-
-
-# ---- the occluders --------------------------------------------------------------------------------------------------
-
-
-@cache
-def loaded(spec: str) -> ObjectAsset:
-    """Return a bundled object or one from a mesh file, its largest extent 1, centred on the origin.
-
-    Raises:
-        InputError: there is no such object, or the file cannot be used.
-    """
-    is_file = "/" in spec or "\\" in spec or Path(spec).suffix != ""
-    return centred(importing.import_object(Path(spec)) if is_file else library.load_object(spec))
-
-
-def centred(asset: ObjectAsset) -> ObjectAsset:
-    """Return an object with its largest extent 1 and the middle of its bounding box at the origin."""
-    mesh = normalised(asset.mesh)
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    return replace(asset, mesh=replace(mesh, vertices=(mesh.vertices - (low + high) / 2.0).astype(np.float32)))
-
-
-@cache
-def made(name: str) -> ObjectAsset:
-    """Return one of the occluders made here, one object size large around the origin: "card" or "sphere"."""
-    generator = np.random.Generator(np.random.PCG64(7))
-    if name == "card":
-        texels = np.array([0.70, 0.53, 0.36]) + generator.normal(0.0, 0.012, (64, 64, 1)) * np.ones(3)
-        texels += 0.012 * np.sin(np.arange(64) * math.pi / 2.0)[:, None, None]  # the flutes under the paper
-        return ObjectAsset(name, _card(), texels.clip(0.0, 1.0).astype(np.float32), Material(roughness=0.9))
-    grey = np.full((4, 4, 3), 0.5, dtype=np.float32)
-    return ObjectAsset(name, _sphere(24, 48), grey, Material(roughness=0.6))
-
-
-def _card() -> Mesh:
-    """A square in the y-z plane that faces +x."""
-    uvs = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)], dtype=np.float32)
-    vertices = np.concatenate([np.zeros((4, 1)), uvs - 0.5], axis=1).astype(np.float32)
-    normals = np.tile(np.array([1.0, 0.0, 0.0], dtype=np.float32), (4, 1))
-    return Mesh(vertices, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32), normals, uvs)
-
-
-def _sphere(rows: int, columns: int) -> Mesh:
-    """A sphere of diameter 1 with `rows` bands from pole to pole."""
-    v, u = (
-        one.ravel() for one in np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
-    )
-    theta, phi = math.pi * (1.0 - v), 2.0 * math.pi * u
-    normals = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], axis=1)
-    corner = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)[None, :]).ravel()
-    above = corner + columns + 1
-    lower, upper = np.stack([corner, corner + 1, above + 1], 1), np.stack([corner, above + 1, above], 1)
-    faces = np.concatenate([lower[columns:], upper[:-columns]])  # without those that are points at the poles
-    return Mesh(
-        (0.5 * normals).astype(np.float32),
-        faces.astype(np.uint32),
-        normals.astype(np.float32),
-        np.stack([u, v], axis=1).astype(np.float32),
-    )

@@ -47,10 +47,13 @@ class Space:
     def group_plans(self) -> tuple[GroupPlan, ...]:
         """Return every group as the gradient plan wants it, without an estimator yet.
 
-        Adjoints with boundary terms know neither a medium nor a backdrop, so that they are not valid beside these.
+        Adjoints with boundary terms know neither a medium nor a backdrop nor a thin lens, so that they are not valid
+        beside these.
         """
         scene = self.scene
-        unknown = scene is not None and (scene.backdrop or any(part.volumetric for part in scene.parts))
+        unknown = scene is not None and (
+            scene.backdrop or scene.thin_lens or any(part.volumetric for part in scene.parts)
+        )
         found, begin = [], 0
         for control, group in self.groups:
             valid = tuple(one for one in group.estimators if not (unknown and one in WITH_BOUNDARY))

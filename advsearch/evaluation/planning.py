@@ -56,7 +56,8 @@ def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Gr
 
     Args:
         plan: the plan so far. What was forced is not contested.
-        every: compare all that are valid; otherwise the adjoints and the first kind of differences only.
+        every: compare all that are valid; otherwise only the adjoints and the first kind of differences, and only where
+            an adjoint is preferred so far: over poses, the model's loss is so rough that none has won.
     """
     sets: dict[tuple[str, tuple[str, ...]], list[GroupPlan]] = {}
     for group in plan.groups:
@@ -72,7 +73,7 @@ def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Gr
             by_differences = [one for one in by_differences if one == "simultaneous"]
         adjoints = [one for one in usable if one in BY_ADJOINT]
         candidates = tuple(adjoints + (by_differences if every else by_differences[:1]))
-        if len(candidates) > 1 and (every or adjoints):
+        if len(candidates) > 1 and (every or valid[0] in BY_ADJOINT):
             found.append((tuple(groups), candidates))
     return found
 

@@ -26,6 +26,8 @@ SCAN = 48
 """Angles at which the coverage is looked up before the crossing is narrowed down."""
 HALVINGS = 12
 """Steps that narrow it down."""
+GRID = 24
+"""Rows and columns of the directions that stand for the whole frame."""
 NEAREST = 1e-3
 """Points nearer to the camera plane than this, or behind it, are left out of silhouettes."""
 TOLERANCE = 1e-6
@@ -48,12 +50,13 @@ class Frame:
         Args:
             fov: field of view along the larger side, degrees.
             aspect: width over height.
-            shift: of the picture, to the right in its widths and downwards in its heights.
+            shift: of the picture to the right in its widths and downwards in its heights; what it shows moves the
+                other way.
         """
         larger = math.tan(math.radians(fov) / 2.0)
         x, y = larger * min(1.0, aspect), larger * min(1.0, 1.0 / aspect)
         right, down = 2.0 * x * shift[0], 2.0 * y * shift[1]
-        return Frame(-x - right, x - right, -y + down, y + down)
+        return Frame(-x + right, x + right, -y - down, y - down)
 
     def corners(self) -> Doubles:
         """Unit directions (4, 3) to the corners."""
@@ -74,11 +77,19 @@ class Silhouette:
     window: Frame
 
     def directions(self) -> Doubles:
-        """Unit directions (N, 3) of the pixels that are covered; all stand for the same area of the picture."""
+        """Unit directions (N, 3), one in each covered pixel; all stand for the same area of the picture.
+
+        Their places within the pixels are a low-discrepancy sequence (Roberts 2018), or an upright edge would hide
+        whole columns at a time.
+        """
         row, column = np.nonzero(self.mask)
         height, width = self.mask.shape
-        x = self.window.left + (column + 0.5) * (self.window.right - self.window.left) / width
-        y = self.window.low + (row + 0.5) * (self.window.high - self.window.low) / height
+        number = np.arange(len(row))
+        x = (
+            self.window.left
+            + (column + (0.5 + 0.7548777 * number) % 1.0) * (self.window.right - self.window.left) / width
+        )
+        y = self.window.low + (row + (0.5 + 0.5698403 * number) % 1.0) * (self.window.high - self.window.low) / height
         return _unit(np.stack([x, y, np.ones_like(x)], axis=-1))
 
     def contains(self, x: Doubles, y: Doubles, forwards: Doubles) -> Mask:
@@ -213,12 +224,22 @@ def middle_axes(hidden: Doubles) -> Doubles:
     return np.stack([right, np.cross(forward, right), forward])
 
 
-def angle_outside(frame: Frame, cover: Silhouette, axes: Doubles) -> float:
-    """Return an angle in radians at which the moving thing is out of the frame, whichever side it comes from."""
-    corners = cover.window.corners()
-    radius = float(np.arccos(np.clip(corners[:, 2], -1.0, 1.0)).max())
+def angle_outside(frame: Frame, cover: Silhouette, axes: Doubles, direction: float) -> float:
+    """Return the angle in radians beyond which the moving thing is out of the frame on its side.
+
+    Args:
+        frame: what the picture shows.
+        cover: silhouette of the moving thing, straight ahead.
+        axes: see `Sweep`.
+        direction: from which side it comes, degrees.
+    """
+    whole = Silhouette(np.ones((GRID, GRID), dtype=np.bool_), frame)
+    radius = float(np.arccos(np.clip(cover.window.corners()[:, 2], -1.0, 1.0)).max())
     reach = float(np.arccos(np.clip(frame.corners() @ axes[2], -1.0, 1.0)).max())
-    return min(reach + radius + 0.02, 0.9 * math.pi)
+    angles = np.linspace(min(reach + radius + 0.02, 0.9 * math.pi), 0.0, 2 * SCAN)
+    shown = Sweep(whole.directions(), cover, axes, direction).coverage(angles)
+    inside = np.nonzero(shown > 0.0)[0]
+    return float(angles[max(int(inside[0]) - 1, 0)]) if len(inside) else float(angles[0])
 
 
 def _unit(vectors: Doubles) -> Doubles:

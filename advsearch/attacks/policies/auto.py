@@ -19,27 +19,29 @@ from advsearch.attacks.policies.surrogate import Scales, Surrogate, fit
 SCREEN, SCREEN_MIXED = 0.5, 0.25
 """Share of the renders that the screen takes, in a box alone and beside a norm ball."""
 
-UNTIL_MIXED = 0.5
-"""Share of the renders after which an ascent takes over beside a norm ball."""
+UNTIL, UNTIL_MIXED = 0.75, 0.5
+"""Share of the renders after which an ascent takes over, if there is one."""
 
 LOW = 10
-"""Up to so many box coordinates are worth the whole screen; of more it sees less and less."""
+"""Up to so many box coordinates are worth the whole screen. Of more it sees less and less, so if gradients cost nothing
+its share shrinks in proportion and the ascent follows at once."""
 
 PAYS = 4
-"""A gradient is worth its renders if so many would fit into what is left."""
+"""Beside no norm ball, a gradient is worth its renders if it brings so many numbers for each, and so many gradients fit
+into the ascent. One by differences never is: they bring half a number each, and the surrogate beats them everywhere."""
 
 REACH = 0.1
 """Length of the ascent's whole step in a box, as a share of half the diagonal: the screen has been everywhere else."""
 
 CURIOSITY = 2.0
-"""How many standard deviations of the surrogate a candidate gets on top of its mean. With less, and a noise as large
-as all differences, the search settles on a lucky point and random search beats it."""
+"""How many standard deviations of the surrogate a candidate gets on top of its mean. One does as well without noise;
+with a noise as large as all differences it settles too soon on a lucky point."""
 
 NEAR, FAR, CENTRES = 256, 128, 4
 """Candidates near the best points, candidates anywhere, and the number of best points."""
 
 REFIT = 5
-"""The surrogate's lengths and noise are fitted again after so many new points, and after each tenth more of them."""
+"""The surrogate's lengths and noise are fitted again after so many new points, or a tenth of all if that is more."""
 
 MEMORY = 100
 """The surrogate sees so many of the best points and so many of the latest."""
@@ -107,14 +109,15 @@ class Auto(Policy[AutoState]):
 
     - Norm balls alone (a texture): `PGD`, bit for bit.
     - Box coordinates alone (poses, cameras, lights, choices): the start and scrambled Sobol points take half of the
-      renders (less above `LOW` coordinates if gradients are cheap). Then a Gaussian process is fitted to all that was
-      seen, and the next point is the candidate with the largest mean plus `CURIOSITY` standard deviations, among moves
-      of the best points, points anywhere, and the best point itself (Srinivas et al. 2010, GP-UCB). It models the
-      noise, so a lucky value does not pass for a peak, and rendering the best point again is one of its choices.
-      Where there are many coordinates and gradients cost little, `PGD` with small steps ends it.
-    - Both: screen and surrogate over the box coordinates with the balls at their start take half of the renders,
-      `PGD` over everything the rest. If the box coordinates' gradient costs too much, PGD follows the balls' alone, and
-      every second evaluation tries a random move of the box coordinates, which is taken back if the objective falls.
+      renders. Then a Gaussian process is fitted to all that was seen, and the next point is the candidate with the
+      largest mean plus `CURIOSITY` standard deviations (GP-UCB, Srinivas et al. 2010), among moves of the best points,
+      points anywhere, and the best point itself. The process models the noise, so a lucky value does not pass for a
+      peak, and rendering the best point again is one of its choices. Where gradients cost no renders (adjoints), `PGD`
+      with small steps takes the last quarter; with more than `LOW` coordinates it begins right after a shorter screen.
+    - Both: screen and surrogate over the box coordinates, with the balls at their start, take half of the renders and
+      `PGD` over everything the rest. If the box coordinates' gradient costs renders and can be left out
+      (`Domain.partial_gradients`), PGD follows what is free, and every second evaluation tries a random move of the
+      box coordinates, which is taken back if the objective falls.
     """
 
     name: ClassVar[str] = "auto"
@@ -158,14 +161,14 @@ def make_plan(domain: Domain, box: Coordinates, steps: int) -> Plan:
         return Plan(steps, 0, 0, True)
     if box.count < domain.dim:
         screen, until = math.ceil(SCREEN_MIXED * steps), math.ceil(UNTIL_MIXED * steps)
-        pays = PAYS * domain.gradient_cost <= steps - until or not domain.partial_gradients
-        return Plan(steps, screen, until, True if pays else "free")
-    screen = math.ceil(SCREEN * steps)
+        return Plan(steps, screen, until, "free" if domain.gradient_cost and domain.partial_gradients else True)
     ways = int((box.options == 0).sum())
-    seen = math.ceil(screen * LOW / max(ways, LOW))
-    if ways > LOW and PAYS * domain.gradient_cost <= steps - seen:
-        return Plan(steps, seen, seen, True)
-    return Plan(steps, screen, steps, True)
+    screen = math.ceil(SCREEN * steps * min(1.0, LOW / max(ways, 1)))
+    until = math.ceil(UNTIL * steps) if ways <= LOW else screen
+    cost = domain.gradient_cost
+    if ways and PAYS * cost <= ways and PAYS * (1 + cost) <= steps - until:
+        return Plan(steps, screen, until, True)
+    return Plan(steps, math.ceil(SCREEN * steps), steps, True)
 
 
 # ---- the surrogate --------------------------------------------------------------------------------------------------

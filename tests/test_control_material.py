@@ -1,0 +1,169 @@
+"""The material control: patterns without seams, named materials with numbers of their own, sound derivatives."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import advsearch
+from advsearch.controls.material import BASE_COLOR, NUMBERS, TINT, MaterialControl
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.formation import srgb_to_linear
+from advsearch.scene.patterns import PATTERNS, SIDE, covering, tile
+from advsearch.scene.surface_map import texel_positions
+
+AGREEMENT = 0.15
+"""Relative difference allowed between a 64-sample adjoint and a 64-sample difference of a smooth weight."""
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneDescription:
+    return describe("mug")
+
+
+# ---- patterns -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+def test_a_tile_continues_across_its_edges(name: str) -> None:
+    texels = tile(name)
+    assert texels.shape == (SIDE, SIDE, 3) and texels.dtype == np.float32
+    assert 0.0 <= float(texels.min()) and float(texels.max()) <= 1.0
+    for axis in (0, 1):
+        steps = np.abs(np.diff(texels, axis=axis)).mean(axis=(1 - axis, 2))
+        wrap = np.abs(np.take(texels, 0, axis) - np.take(texels, -1, axis)).mean()
+        assert wrap <= max(2.0 * float(steps.mean()), 1.2 * float(steps.max())), (name, axis)
+
+
+def test_a_tile_with_a_seam_would_be_noticed() -> None:
+    texels = tile("zebra")[: SIDE - 37].swapaxes(0, 1)
+    steps = np.abs(np.diff(texels, axis=1)).mean(axis=(0, 2))
+    wrap = np.abs(texels[:, 0] - texels[:, -1]).mean()
+    assert wrap > max(2.0 * float(steps.mean()), 1.2 * float(steps.max()))
+
+
+def test_patterns_differ_from_each_other() -> None:
+    colours = {name: tile(name).mean(axis=(0, 1)) for name in PATTERNS}
+    contrasts = {name: tile(name).std() for name in PATTERNS}
+    assert len({tuple(np.round(one, 2)) for one in colours.values()}) == len(PATTERNS)
+    assert all(value > 0.01 for name, value in contrasts.items() if name != "plain")
+    assert colours["grass"][1] > 1.2 * colours["grass"][0] and colours["brick"][0] > 1.5 * colours["brick"][2]
+
+
+def test_a_pattern_has_one_scale_on_the_object_whatever_its_charts(scene: SceneDescription) -> None:
+    """Texels that lie far apart in the texture and at one place on the object have one colour."""
+    mesh = scene.object.mesh
+    texels = covering(mesh, "checker", 128)
+    positions, normals, _ = texel_positions(mesh, 128)
+    flat = np.abs(normals[..., 2]) > 0.98  # seen from above only: the floor, the foot
+    cell = PATTERNS["checker"].size / 4.0
+    inside = (np.abs(positions[..., :2] / cell % 1.0 - 0.5) < 0.4).all(axis=-1) & flat
+    odd = (np.floor(positions[..., 0] / cell) + np.floor(-positions[..., 1] / cell)) % 2.0
+    assert inside.sum() > 100
+    expected = np.where(odd[inside] > 0.5, tile("checker").min(), tile("checker").max())
+    assert np.abs(texels[inside][:, 0] - expected).max() < 0.05
+
+
+# ---- from values to inputs ------------------------------------------------------------------------------------------
+
+
+def test_the_start_is_the_objects_own_surface(scene: SceneDescription) -> None:
+    bound = MaterialControl().bind(scene)
+    inputs = bound.inputs(bound.start)
+    for name in NUMBERS:
+        assert float(inputs[f"object.{name}"]) == pytest.approx(getattr(scene.material, name), abs=1e-3)
+    torch.testing.assert_close(inputs[BASE_COLOR], srgb_to_linear(torch.from_numpy(scene.object.base_color)))
+
+
+def test_only_what_varies_is_set(scene: SceneDescription) -> None:
+    bound = MaterialControl(roughness=[0, 1]).bind(scene)
+    assert set(bound.inputs(bound.start)) == {"object.roughness"} and bound.refines == frozenset()
+
+
+def test_a_tint_multiplies_reflectance_and_lies_over_a_searched_texture(scene: SceneDescription) -> None:
+    bound = MaterialControl(red=0.5, green=[0, 1], blue=1.0).bind(scene)
+    before = torch.rand(8, 8, 3)
+    tinted = bound.inputs(torch.tensor([0.25]), {BASE_COLOR: before})[BASE_COLOR]
+    factor = srgb_to_linear(torch.tensor([0.5, 0.25, 1.0]))
+    torch.testing.assert_close(tinted, before * factor)
+    assert BASE_COLOR in bound.refines
+
+
+def test_a_named_material_brings_its_numbers_and_given_ones_win(scene: SceneDescription) -> None:
+    names = ["own", "steel"]
+    bound = MaterialControl(which=names, roughness=0.77).bind(scene)
+    assert float(bound.start) == 0.25
+    own, steel = (bound.inputs(torch.tensor([share])) for share in (0.25, 0.75))
+    assert float(own["object.metallic"]) == scene.material.metallic and float(steel["object.metallic"]) == 1.0
+    assert float(own["object.roughness"]) == float(steel["object.roughness"]) == pytest.approx(0.77)
+    assert not torch.equal(own[BASE_COLOR].mean(), steel[BASE_COLOR].mean())
+    assert bound.describe(torch.tensor([0.75]))["material.which"] == {"value": "steel", "unit": "name"}
+
+
+def test_a_fixed_material_is_where_the_search_starts(scene: SceneDescription) -> None:
+    bound = MaterialControl(which="wood").bind(scene)
+    values = bound.values(bound.start)  # type: ignore[attr-defined]
+    assert float(values["roughness"]) == pytest.approx(PATTERNS["wood"].material.roughness)
+    plain = MaterialControl(which="plain", red=0.2, green=[0, 1], blue=0.9).bind(scene)
+    color = plain.inputs(torch.tensor([0.4]))[BASE_COLOR]
+    torch.testing.assert_close(color[5, 5], srgb_to_linear(torch.tensor([0.2, 0.4, 0.9])))
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_extremes_have_finite_derivatives(scene: SceneDescription, share: float) -> None:
+    bound = MaterialControl(**{name: [0, 1] for name in (*NUMBERS, *TINT)}).bind(scene)
+    u = torch.full((7,), share, requires_grad=True)
+    sum(one.sum() for one in bound.inputs(u).values()).backward()
+    assert u.grad is not None and bool(torch.isfinite(u.grad).all())
+    assert float(u.grad[:4].abs().min()) == 1.0  # moved into the range that is rendered, yet with a slope
+
+
+def test_bad_settings_are_explained() -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown material.which 'wod'. Did you mean 'wood'"):
+        MaterialControl(which="wod")
+    with pytest.raises(InputError, match=r"material\.roughness: expected a number from 0 to 1"):
+        MaterialControl(roughness=[0, 1.5])
+
+
+# ---- rendered -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["roughness", "metallic", "specular", "clearcoat"])
+def test_extremes_render_finite_with_finite_gradients(name: str) -> None:
+    """Also on an object that has no clear coat of its own."""
+    render = advsearch.load_scene("book").renderer([MaterialControl(**{name: [0, 1]})], resolution=32)
+    pictures = []
+    for value in (0.0, 1.0):
+        u = torch.tensor([value], requires_grad=True)
+        image = render(u, seed=0, spp=16)
+        (gradient,) = torch.autograd.grad(image.sum(), u)
+        assert bool(torch.isfinite(image).all()) and bool(torch.isfinite(gradient).all())
+        pictures.append(image.detach())
+    assert render.non_finite == 0
+    assert float((pictures[0] - pictures[1]).abs().max()) > 0.02
+
+
+@pytest.mark.parametrize(("name", "value"), [("roughness", 0.3), ("metallic", 0.4), ("specular", 0.5), ("green", 0.6)])
+def test_the_adjoint_agrees_with_differences(name: str, value: float) -> None:
+    material = MaterialControl(**{name: [0, 1]})
+    render = advsearch.load_scene("mug").renderer([material], resolution=32, denoise="none")
+    assert render.plan.groups[0].estimator == "adjoint"
+    weight = torch.ones(32, 32, 3)
+    weight[16:] = -0.3
+    u = torch.tensor([value], requires_grad=True)
+    samples = [torch.autograd.grad((render(u, s, 64) * weight).sum(), u)[0] for s in range(6)]
+    with torch.no_grad():
+        ends = [sum(float((render(u + h, s, 64) * weight).sum()) for s in range(4)) / 4.0 for h in (0.06, -0.06)]
+    expected = (ends[0] - ends[1]) / 0.12
+    assert float(torch.stack(samples).mean()) == pytest.approx(expected, rel=AGREEMENT)
+
+
+def test_a_material_does_not_depend_on_who_asks_first(scene: SceneDescription) -> None:
+    moved = replace(scene, object=replace(scene.object, name="other"))
+    first = MaterialControl(which=["own", "marble"]).bind(scene).inputs(torch.tensor([0.9]))[BASE_COLOR]
+    second = MaterialControl(which=["own", "marble"]).bind(moved).inputs(torch.tensor([0.9]))[BASE_COLOR]
+    assert torch.equal(first, second)

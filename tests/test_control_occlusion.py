@@ -1,0 +1,210 @@
+"""The occlusion control: the share that was asked for is the share that is hidden, and nothing else happens at zero."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import advsearch
+from advsearch.controls import make_space
+from advsearch.controls.camera import CameraControl
+from advsearch.controls.occlusion import BUNDLED, OPTIONS, OcclusionControl, Placement
+from advsearch.controls.pose import PoseControl
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.backend import mitsuba
+from advsearch.scene.coverage import Frame, Sweep, middle_axes, pixels_in, silhouette
+from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.library import list_objects
+from advsearch.scene.occluders import loaded, made
+from advsearch.scene.parts import MeshPart
+
+ACCURACY = 0.02
+"""Allowed error of a hidden share: silhouettes have 128 pixels along their longer side."""
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneDescription:
+    return describe("mug")
+
+
+def hidden(scene: SceneDescription, **settings: object) -> Placement:
+    """The placement at the upper end of the coverage's range."""
+    control = OcclusionControl(**{"coverage": [0, 0.9], **settings})
+    bound = control.bind(control.prepare(scene))
+    return control.placement(scene, bound.values(torch.ones_like(bound.start)), {})
+
+
+# ---- silhouettes ----------------------------------------------------------------------------------------------------
+
+
+def test_a_square_is_rasterised_without_gaps_or_excess() -> None:
+    corners = np.array([[(-0.5, -0.5), (9.5, -0.5), (9.5, 9.5)], [(-0.5, -0.5), (9.5, 9.5), (-0.5, 9.5)]])
+    _, row, column, weights = pixels_in(corners, (12, 14))
+    assert {(int(r), int(c)) for r, c in zip(row, column, strict=True)} == {
+        (r, c) for r in range(10) for c in range(10)
+    }
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+
+
+def test_a_silhouette_has_the_area_of_what_it_shows() -> None:
+    ball = made("sphere").mesh
+    points = ball.vertices.astype(np.float64) + np.array([0.1, -0.2, 3.0])
+    found = silhouette(points, ball.faces)
+    assert found is not None
+    share = math.pi / 4.0 * (2 * 0.5 / math.sqrt(3.0**2 - 0.5**2)) ** 2
+    window = (found.window.right - found.window.left) * (found.window.high - found.window.low)
+    assert found.mask.mean() * window == pytest.approx(share, rel=0.04)
+    behind = silhouette(points - np.array([0.0, 0.0, 6.0]), ball.faces)
+    aside = silhouette(points + np.array([9.0, 0.0, 0.0]), ball.faces, Frame.of(35.0))
+    assert behind is None and aside is None
+
+
+def test_a_card_across_a_card_hides_what_geometry_says() -> None:
+    card = made("card").mesh
+    points = np.stack([card.vertices[:, 1], card.vertices[:, 2], card.vertices[:, 0]], axis=1).astype(np.float64)
+    ahead = np.array([0.0, 0.0, 10.0])
+    seen, cover = silhouette(points + ahead, card.faces), silhouette(points * 2.0 + ahead, card.faces)
+    assert seen is not None and cover is not None
+    directions = seen.directions()
+    sweep = Sweep(directions, cover, middle_axes(directions), direction=0.0)
+    angles = np.arctan(np.array([2.0, 1.25, 1.0, 0.75, 0.0]) / 10.0)
+    np.testing.assert_allclose(sweep.coverage(angles), [0.0, 0.25, 0.5, 0.75, 1.0], atol=ACCURACY)
+    assert sweep.solve(0.3, 0.5) == pytest.approx(math.atan(0.12), abs=0.002)
+    assert sweep.solve(1.0, 0.5) < math.atan(0.06)
+
+
+# ---- the control ----------------------------------------------------------------------------------------------------
+
+
+def test_the_occluders_offered_are_there() -> None:
+    assert set(BUNDLED) <= set(list_objects())
+    for name in OPTIONS:
+        mesh = (made if name in ("card", "sphere") else loaded)(name).mesh
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        assert float((high - low).max()) == pytest.approx(1.0, abs=1e-5)
+        np.testing.assert_allclose(low + high, 0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("which", ["card", "sphere", "chair"])
+@pytest.mark.parametrize("direction", [0.0, 90.0, 200.0])
+def test_the_share_asked_for_is_hidden(scene: SceneDescription, which: str, direction: float) -> None:
+    placed = hidden(scene, which=which, direction=direction, coverage=[0, 0.3], size=0.8)
+    assert placed.hidden == pytest.approx(0.3, abs=ACCURACY)
+
+
+@pytest.mark.parametrize("which", ["sphere", "chair"])
+def test_primary_rays_find_the_same_share(scene: SceneDescription, which: str) -> None:
+    control = OcclusionControl(which=which, coverage=[0, 0.3], direction=30.0, size=0.9, turn=50.0)
+    bound = control.bind(control.prepare(scene))
+    matrix = bound.inputs(torch.ones(1))["occlusion.to_world"].double().numpy()
+    occluder = (made if which == "sphere" else loaded)(which)
+    camera = camera_to_world(scene)
+    reach = math.tan(math.radians(scene.number("camera.fov")) / 2.0) * (np.arange(200) + 0.5 - 100.0) / 100.0
+    rays = np.stack([*(one.ravel() for one in np.meshgrid(reach, reach)), np.ones(200 * 200)]).T @ camera[:3, :3].T
+    pose = object_to_world(scene)
+    object_hit = met(MeshPart("object", scene.object.mesh, pose, scene.object.base_color), camera[:3, 3], rays)
+    cover_hit = met(MeshPart("cover", occluder.mesh, matrix, occluder.base_color), camera[:3, 3], rays)
+    assert float((object_hit & cover_hit).sum()) / float(object_hit.sum()) == pytest.approx(0.3, abs=ACCURACY)
+
+
+def met(part: MeshPart, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Which rays (N, 3) from a point meet a mesh, by Mitsuba."""
+    mi = mitsuba()
+    scene = mi.load_dict({"type": "scene", **part.plugins()})
+    towards = mi.Vector3f(*(mi.Float(one.astype(np.float32)) for one in rays.T))
+    return np.array(scene.ray_test(mi.Ray3f(mi.Point3f(*origin.tolist()), towards)))
+
+
+def test_what_cannot_be_hidden_is_reported(scene: SceneDescription) -> None:
+    placed = hidden(scene, size=0.2)
+    assert 0.02 < placed.hidden < 0.3 and placed.size == pytest.approx(0.2)
+    control = OcclusionControl(coverage=[0, 0.9], size=0.2)
+    said = control.bind(control.prepare(scene)).describe(torch.ones(1))
+    assert said["occlusion.hidden"]["value"] == placed.hidden
+    assert said["occlusion.coverage"]["value"] == pytest.approx(0.9)
+
+
+def test_zero_leaves_the_scene_as_it_is() -> None:
+    asset = advsearch.load_scene("mug")
+    turning = PoseControl(yaw=[-10, 10])
+    plain = asset.renderer([turning], resolution=32, denoise="none")
+    occluded = asset.renderer([turning, OcclusionControl(which=["card", "chair"])], resolution=32, denoise="none")
+    assert torch.equal(plain(plain.start, seed=1, spp=4), occluded(occluded.start, seed=1, spp=4))
+    u = occluded.start.clone()
+    assert occluded.space.describe(u)["occlusion.hidden"]["value"] == 0.0  # type: ignore[attr-defined]
+
+
+def test_it_comes_in_without_a_jump(scene: SceneDescription) -> None:
+    control = OcclusionControl(coverage=[0, 0.4], direction=0.0)
+    bound = control.bind(control.prepare(scene))
+    places = [
+        bound.inputs(torch.tensor([share]))["occlusion.to_world"][:3, 3] for share in torch.linspace(0.002, 0.2, 60)
+    ]
+    steps = torch.stack([(b - a).norm() for a, b in itertools.pairwise(places)])
+    assert float(steps.max()) < 0.05
+
+
+def test_it_follows_the_camera_and_the_pose_whatever_the_order(scene: SceneDescription) -> None:
+    occlusion, camera, pose = (
+        OcclusionControl(coverage=[0, 0.4], direction=180.0),
+        CameraControl(azimuth=[0, 360]),
+        PoseControl(x=[-0.3, 0.3]),
+    )
+    space = make_space([occlusion, camera, pose], scene)
+    u = torch.tensor([1.0, 0.8, 0.9])
+    inputs = space.inputs(u)
+    seat = inputs["occlusion.to_world"][:3, 3] - inputs["camera.to_world"][:3, 3]
+    forward = inputs["camera.to_world"][:3, 2]
+    assert float(seat @ forward) / float(seat.norm()) > 0.9
+    assert space.describe(u)["occlusion.hidden"]["value"] == pytest.approx(0.4, abs=ACCURACY)
+    unmoved = occlusion.placement(scene, space.controls[0].values(u[:1]), {})  # type: ignore[attr-defined]
+    assert abs(unmoved.distance - space.describe(u)["occlusion.true_distance"]["value"]) > 1e-3
+
+
+@pytest.mark.parametrize("size", [0.05, 5.0])
+@pytest.mark.parametrize("distance", [0.1, 0.9])
+def test_it_swallows_neither_camera_nor_object(scene: SceneDescription, size: float, distance: float) -> None:
+    control = OcclusionControl(which="sphere", coverage=[0, 0.5], size=size, distance=distance)
+    bound = control.bind(control.prepare(scene))
+    matrix = bound.inputs(torch.ones(1))["occlusion.to_world"]
+    assert bool(torch.isfinite(matrix).all())
+    camera = camera_to_world(scene)[:3, 3]
+    radius = 0.5 * float(matrix[:3, 0].norm())
+    gap = float(np.linalg.norm(matrix[:3, 3].numpy() - camera))
+    nearest = float(np.linalg.norm(scene.base_vertices - camera, axis=1).min())
+    assert radius > 0.02 and gap - radius >= 0.05 - 1e-4 and gap + radius <= nearest + 1e-4
+
+
+def test_an_object_out_of_the_frame_needs_no_occluder(scene: SceneDescription) -> None:
+    space = make_space([OcclusionControl(coverage=[0, 0.5]), PoseControl(x=[0, 50])], scene)
+    inputs = space.inputs(torch.ones(2))
+    assert float(inputs["occlusion.to_world"][:3, 0].norm()) < 0.01
+
+
+def test_extremes_render_finite_with_finite_gradients() -> None:
+    render = advsearch.load_scene("mug").renderer([OcclusionControl()], resolution=16)
+    for share in (0.0, 1.0):
+        u = torch.full((4,), share, requires_grad=True)
+        image = render(u, seed=0, spp=2)
+        (gradient,) = torch.autograd.grad(image.mean(), u)
+        assert bool(torch.isfinite(image).all()) and bool(torch.isfinite(gradient).all())
+
+
+def test_bad_settings_are_explained(scene: SceneDescription) -> None:
+    with pytest.raises(InputError, match=r"occlusion\.coverage: expected a number from 0 to 0\.9"):
+        OcclusionControl(coverage=[0, 0.95])
+    with pytest.raises(UnknownNameError, match=r"unknown occlusion\.which 'chari'"):
+        OcclusionControl(which="chari")
+    with pytest.raises(InputError, match="object and which both say what the occluder is"):
+        OcclusionControl(which="card", object="book")
+    with pytest.raises(InputError, match=r"occlusion\.object: expected the name of a bundled object or a path"):
+        OcclusionControl(object=3)
+    with pytest.raises(UnknownNameError, match="unknown object 'boook'"):
+        OcclusionControl(object="boook").prepare(scene)
+    with pytest.raises(InputError, match="the scene has something of that name already"):
+        OcclusionControl(name="object").prepare(scene)
