@@ -167,7 +167,7 @@ class AttackConfig(BaseModel):
         "measure which valid estimator of a derivative is best on this scene; full chooses step and samples too",
         "no, quick or full",
     )
-    policy: str = _setting("pgd", "search", "the rule that proposes configurations", "the name of a policy")
+    policy: str = _setting("auto", "search", "the rule that proposes configurations", "the name of a policy")
     steps: int = _setting(
         40,
         "search",

@@ -369,3 +369,13 @@ def test_a_lens_keeps_what_it_frames() -> None:
         assert distance * math.tan(fov / 2) == pytest.approx(
             fitted_distance(scene) * math.tan(math.radians(35.0) / 2), rel=0.05
         )
+
+
+def test_the_start_is_the_scene_as_it_is_in_a_picture_that_is_not_square() -> None:
+    scene = load_scene("mug")
+    for size in ((32, 48), (48, 32)):
+        plain = scene.renderer({"environment": {"exposure": [-1, 1]}}, resolution=size, denoise="none")
+        render = scene.renderer(["camera"], resolution=size, denoise="none")
+        with torch.no_grad():
+            difference = render(render.start, seed=0, spp=32) - plain(plain.start, seed=0, spp=32)
+        assert float(difference.abs().mean()) < 2e-3

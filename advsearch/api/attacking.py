@@ -15,7 +15,7 @@ from advsearch import seeds, threads
 from advsearch.api.outcome import AttackResult, summarise
 from advsearch.api.problem import Problem
 from advsearch.api.record import Findings, Recorder, Stages
-from advsearch.api.scene import Controls, Scene, as_controls, load_scene, make_renderer
+from advsearch.api.scene import Controls, Scene, as_controls, framed, load_scene, make_renderer
 from advsearch.attacks import (
     POLICIES,
     Ending,
@@ -56,7 +56,7 @@ def attack(
     *,
     controls: Controls = ("texture",),
     objective: str | Callable[..., Tensor] = "margin",
-    policy: str | Policy[Any] = "pgd",
+    policy: str | Policy[Any] = "auto",
     run: str | Path | None = None,
     progress: Progress | None = None,
     **options: Any,
@@ -198,8 +198,9 @@ def _problem(job: _Job) -> Problem:
     config, (model, _) = job.config, job.loaded
     description = job.scene.description
     labels = _label_set(model, config, description.object.label)
-    space = make_space(job.controls, description)
     resolution = config.resolution or (model.input_size[0], model.input_size[1])
+    description = framed(description, resolution)
+    space = make_space(job.controls, description)
     renderer = make_renderer(description, space, resolution, config.denoise, config.seed, config.estimators)
     objective = get_objective(job.objective)
     return Problem(renderer, space, model, labels, objective, config.search_spp, config.seed)

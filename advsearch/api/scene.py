@@ -55,8 +55,9 @@ class Scene:
         Raises:
             InputError: a control is unknown or impossible in this scene, or an argument is out of range.
         """
-        space = make_space(as_controls(controls), self.description)
-        return make_renderer(self.description, space, resolution, denoise, seed, estimators)
+        description = framed(self.description, resolution)
+        space = make_space(as_controls(controls), description)
+        return make_renderer(description, space, resolution, denoise, seed, estimators)
 
     def with_settings(self, given: Mapping[str, float]) -> Scene:
         """Return the scene with some of its parameters fixed to other values.
@@ -87,6 +88,12 @@ def load_scene(
         InputError: a name is unknown, a file cannot be used, or a value is out of range.
     """
     return Scene(describe(object, environment, given=settings, up=up))
+
+
+def framed(description: SceneDescription, resolution: int | tuple[int, int]) -> SceneDescription:
+    """Return the scene as it is seen in a picture of this size (side, or height and width)."""
+    height, width = (resolution, resolution) if isinstance(resolution, int) else resolution
+    return replace(description, aspect=width / height)
 
 
 def make_renderer(

@@ -8,7 +8,7 @@ seeds it has not used, the same seeds for all, and believes only those renders.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torch import Tensor
 
@@ -22,9 +22,9 @@ class Candidate:
 
     Attributes:
         u: (d,) the configuration.
-        objective: its raw objective in the search, biased upwards.
+        objective: its raw objective when it was admitted, biased upwards.
         success: whether that render was a success.
-        again: objectives of its new renders; -inf for one that was not finite.
+        again: objectives of its renders since then, in the search and in the ranking; -inf for one that was not finite.
         successes: how many of these were a success.
     """
 
@@ -48,17 +48,19 @@ class Candidate:
 def admit(pool: tuple[Candidate, ...], new: Candidate, size: int) -> tuple[Candidate, ...]:
     """Return the pool with `new` in it if it belongs to the best `size` distinct ones, best first.
 
-    A success beats what is none, then the objective counts; of two that are the same configuration the better stays.
+    A success beats what is none, then the objective counts. A render of a configuration that is in the pool already is
+    a new look at it, as unbiased as those of the ranking.
     """
-    if len(pool) >= size and _raw(new) <= _raw(pool[-1]):
-        return pool
     for old in pool:
         if float((old.u - new.u).abs().amax()) < SAME:
-            if _raw(new) <= _raw(old):
-                return pool
-            pool = tuple(c for c in pool if c is not old)
-            break
+            return tuple(_looked(old, new) if c is old else c for c in pool)
+    if len(pool) >= size and _raw(new) <= _raw(pool[-1]):
+        return pool
     return tuple(sorted((*pool, new), key=_raw, reverse=True)[:size])
+
+
+def _looked(old: Candidate, new: Candidate) -> Candidate:
+    return replace(old, again=(*old.again, new.objective), successes=old.successes + new.success)
 
 
 def best(pool: tuple[Candidate, ...]) -> Candidate:

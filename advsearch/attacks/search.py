@@ -239,8 +239,9 @@ def _rank(log: _Log, first_index: int, repeats: int) -> None:
     """Render every candidate again, all with the same new seeds."""
     for candidate in log.pool:
         evaluations = [log.render(Proposal(candidate.u), first_index + r, "ranking") for r in range(repeats)]
-        again = tuple(e.objective for e in evaluations)
-        ranked = replace(candidate, again=again, successes=sum(e.success for e in evaluations))
+        again = (*candidate.again, *(e.objective for e in evaluations))
+        successes = candidate.successes + sum(e.success for e in evaluations)
+        ranked = replace(candidate, again=again, successes=successes)
         log.pool = tuple(ranked if c is candidate else c for c in log.pool)
 
 

@@ -42,6 +42,7 @@ class SceneDescription:
         parts: what controls have put into the scene beside the object, the environment and the ground.
         thin_lens: the camera has an aperture and a focus distance.
         backdrop: the environment may be hidden behind a plain colour (`backdrop.color`).
+        aspect: width over height of the picture.
     """
 
     object: ObjectAsset
@@ -53,6 +54,7 @@ class SceneDescription:
     parts: tuple[Part, ...] = ()
     thin_lens: bool = False
     backdrop: bool = False
+    aspect: float = 1.0
 
     def with_part(self, part: Part) -> SceneDescription:
         """Return the scene with one more part.

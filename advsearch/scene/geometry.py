@@ -38,7 +38,7 @@ def object_to_world(description: SceneDescription) -> Doubles:
     return matrix
 
 
-def camera_to_world(description: SceneDescription, aspect: float = 1.0) -> Doubles:
+def camera_to_world(description: SceneDescription, aspect: float | None = None) -> Doubles:
     """Return the camera's pose: on an orbit around the middle of the object in its default pose, looking at it.
 
     The camera looks along its own +z with +y up and +x to the left, as Mitsuba's sensors do. It frames the object in
@@ -46,8 +46,9 @@ def camera_to_world(description: SceneDescription, aspect: float = 1.0) -> Doubl
 
     Args:
         description: the scene.
-        aspect: width over height of the picture.
+        aspect: width over height of the picture; None takes the description's.
     """
+    aspect = description.aspect if aspect is None else aspect
     number = description.number
     vertices = description.object.mesh.vertices.astype(np.float64)
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0

@@ -22,7 +22,7 @@ from advsearch.scene.denoise import Denoiser
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.mitsuba_scene import MitsubaScene
 from advsearch.scene.motion import Motion, steps_for
-from advsearch.scene.plan import BY_ADJOINT, BY_DIFFERENCES, DIRECTIONS, GroupPlan, first_plan
+from advsearch.scene.plan import BY_ADJOINT, BY_DIFFERENCES, DIRECTIONS, TURN_STEP, GroupPlan, first_plan
 
 MAX_SPP = 65536
 
@@ -338,9 +338,13 @@ class Renderer:
             if set(group.valid) - {"adjoint", "image"} and group.size <= 64
             for number in range(group.begin, group.begin + group.size)
         ]
-        if motion is None or not moving:
-            return steps_for(torch.zeros(len(self.start)))
-        return steps_for(motion.speeds(self._assembled, self.start, moving))
+        still = torch.zeros(len(self.start))
+        speeds = still if motion is None or not moving else motion.speeds(self._assembled, self.start, moving)
+        steps = steps_for(speeds)
+        for group in groups:
+            if group.periodic and not bool(speeds[group.coordinates].any()):
+                steps[group.coordinates] = TURN_STEP
+        return steps
 
     def _find_routes(self, groups: tuple[GroupPlan, ...]) -> dict[str, frozenset[str]]:
         """Which scene inputs each group of coordinates reaches, found by autograd at a point inside the box."""
