@@ -368,7 +368,8 @@ def test_the_pool_holds_the_best_distinct_ones_and_puts_success_first() -> None:
     for value, objective, success in ((0.0, 3.0, False), (0.1, 1.0, True), (0.00001, 4.0, False), (0.2, 0.5, False)):
         pool = admit(pool, Candidate(at(value), objective, success), 2)
     assert [(round(float(c.u[0]) - 0.5, 5), c.objective) for c in pool] == [(0.1, 1.0), (0.00001, 4.0)]
-    again = admit(pool, Candidate(at(0.00002), 9.0, True), 2)
+    assert admit(pool, Candidate(at(0.00002), 3.9, False), 2) == pool
+    again = admit(pool, Candidate(at(0.00001), 9.0, True), 2)
     assert again[0] is pool[0]
     assert (again[1].objective, again[1].again, again[1].successes) == (4.0, (9.0,), 1)
 

@@ -213,7 +213,7 @@ def test_an_entry_point_adds_a_control(monkeypatch: pytest.MonkeyPatch) -> None:
         controls._outside.cache_clear()
         point.loads = int
         with pytest.raises(
-            InputError, match="entry point fade = worked_example:FadeControl of group advsearch.controls"
+            InputError, match=r"entry point fade = worked_example:FadeControl of group advsearch\.controls"
         ):
             make_control("nothing")
     finally:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
 SAME = 1e-4
@@ -48,14 +49,20 @@ class Candidate:
 def admit(pool: tuple[Candidate, ...], new: Candidate, size: int) -> tuple[Candidate, ...]:
     """Return the pool with `new` in it if it belongs to the best `size` distinct ones, best first.
 
-    A success beats what is none, then the objective counts. A render of a configuration that is in the pool already is
-    a new look at it, as unbiased as those of the ranking.
+    A success beats what is none, then the objective counts; of two that are nearly the same configuration the better
+    stays. One that is in the pool exactly as it is gets another look by it, as unbiased as those of the ranking.
     """
     for old in pool:
-        if float((old.u - new.u).abs().amax()) < SAME:
+        if torch.equal(old.u, new.u):
             return tuple(_looked(old, new) if c is old else c for c in pool)
     if len(pool) >= size and _raw(new) <= _raw(pool[-1]):
         return pool
+    for old in pool:
+        if float((old.u - new.u).abs().amax()) < SAME:
+            if _raw(new) <= _raw(old):
+                return pool
+            pool = tuple(c for c in pool if c is not old)
+            break
     return tuple(sorted((*pool, new), key=_raw, reverse=True)[:size])
 
 

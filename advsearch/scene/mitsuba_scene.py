@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import gc
 import weakref
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -204,9 +205,10 @@ class MitsubaScene:
             if self._backdrop:
                 shown = torch.cat([shown, torch.zeros_like(shown[..., :1])], dim=-1)
             arriving = mi.TensorXf(shown)
-            self._integrator(method).render_backward(
-                self._scene, self._parameters, arriving, sensor=self._sensor, seed=seed, spp=spp
-            )
+            with _fewer_warnings():
+                self._integrator(method).render_backward(
+                    self._scene, self._parameters, arriving, sensor=self._sensor, seed=seed, spp=spp
+                )
             return {name: _torch(dr.grad(value)).reshape(inputs[name].shape) for name, value in tracked.items()}
         finally:
             for name in wanted:
@@ -335,6 +337,18 @@ class MitsubaScene:
         if (what, spp) not in self._recorded:
             self._recorded[what, spp] = dr.freeze(function)
         return self._recorded[what, spp]
+
+
+@contextmanager
+def _fewer_warnings() -> Iterator[None]:
+    """Keep Mitsuba from advising a film that samples beyond its border, at every call."""
+    mi = mitsuba()
+    before = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        mi.set_log_level(before)
 
 
 def _contiguous(tensor: Tensor) -> Tensor:
