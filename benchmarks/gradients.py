@@ -1,6 +1,6 @@
 """Compares estimators of the gradient over six pose parameters at 224 x 224: squared error x time, as ratios.
 
-    python benchmarks/gradients.py [--size 224] [--repeats 6] [--guided-repeats 2]
+    python benchmarks/gradients.py [--size 224] [--repeats 6] [--guided-repeats 1]
 
 The parameters are a rotation vector and a shift of the bundled mug, the loss is linear and smooth. Each estimator gives
 several gradients with seeds of their own; its error is measured against the mean of many central differences. Mitsuba's
@@ -15,7 +15,7 @@ import argparse
 import statistics
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
@@ -47,7 +47,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--size", type=int, default=224, help="side of the picture (default 224)")
     parser.add_argument("--repeats", type=int, default=6, help="gradients of each estimator (default 6)")
-    parser.add_argument("--guided-repeats", type=int, default=2, help="gradients with guiding, half a minute each")
+    parser.add_argument(
+        "--guided-repeats", type=int, default=1, help="gradients with guiding, minutes each (default 1)"
+    )
     args = parser.parse_args(argv)
     scene = load_scene("mug")
     for name, controls, estimators in (
@@ -55,13 +57,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         ("six camera parameters", CAMERA, ("differences", "forward")),
     ):
         renderer = scene.renderer(controls, resolution=args.size, denoise="none")
-        rows = measure(renderer, estimators, args.repeats, args.guided_repeats)
-        best = min(product for _, _, _, product in rows)
         print(f"{name}, {args.size} x {args.size}, {SPP} samples a pixel")
-        print(f"{'estimator':14} {'seconds':>8} {'relative error':>15} {'error^2 x time':>15} {'times the best':>15}")
-        for estimator, seconds, error, product in rows:
-            print(f"{estimator:14} {seconds:8.2f} {error:15.3f} {product:15.3g} {product / best:15.1f}")
-        products = {estimator: product for estimator, _, _, product in rows}
+        print(f"{'estimator':14} {'seconds':>8} {'relative error':>15} {'error^2 x time':>15}")
+        rows = []
+        for estimator, seconds, error, product in measure(renderer, estimators, args.repeats, args.guided_repeats):
+            print(f"{estimator:14} {seconds:8.2f} {error:15.3f} {product:15.3g}", flush=True)
+            rows.append((estimator, product))
+        products = dict(rows)
         chosen = min(products["differences"], products.get("material", float("inf")))
         for rival, words in (("guided", "as it comes"), ("boundary", "with guiding off")):
             if rival in products:
@@ -72,13 +74,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def measure(
     renderer: Renderer, estimators: Sequence[str], repeats: int, guided_repeats: int
-) -> list[tuple[str, float, float, float]]:
-    """Return estimator, median seconds, root mean square relative error, and squared error x seconds."""
+) -> Iterator[tuple[str, float, float, float]]:
+    """Yield estimator, median seconds, root mean square relative error, and squared error x seconds."""
     loss, u = smooth_loss(renderer.formation.resolution), inside(renderer)
     names = {group.name for group in renderer.plan.groups}
     references = [estimated(renderer, loss, u, "differences", names, 1000 + number, 64) for number in range(6)]
     truth = torch.stack(references).mean(dim=0)
-    rows = []
     for estimator in estimators:
         seconds, errors = [], []
         for number in range(guided_repeats if estimator == "guided" else repeats):
@@ -87,8 +88,7 @@ def measure(
             seconds.append(time.perf_counter() - begun)
             errors.append(_squared(gradient - truth) / _squared(truth))
         mean = statistics.fmean(errors)
-        rows.append((estimator, statistics.median(seconds), mean**0.5, mean * statistics.median(seconds)))
-    return rows
+        yield estimator, statistics.median(seconds), mean**0.5, mean * statistics.median(seconds)
 
 
 def _squared(value: Tensor) -> float:

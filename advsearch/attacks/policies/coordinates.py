@@ -63,6 +63,8 @@ class Coordinates:
 
     def screen(self, seed: int, n: int) -> Tensor:
         """Return points (n, k) spread evenly: a scrambled Sobol sequence."""
+        if n == 0:
+            return torch.empty(0, self.count)
         if self.count > MOST_SOBOL:
             return self.tidy(torch.rand(n, self.count, generator=seeded(seed, 0)))
         engine = torch.quasirandom.SobolEngine(self.count, scramble=True, seed=seed)  # type: ignore[no-untyped-call]

@@ -2,15 +2,12 @@
 
 Matérn-5/2 kernel, one length for each coordinate, and a noise that stands for the renderer's and for all roughness
 finer than the points tell apart. Everything is fitted by maximum likelihood over fixed grids and every proposal is one
-of a finite set of candidates, so that the last bits of a matrix factorisation do not change an answer. All of it runs
-on one thread: then these bits are the same whatever the number of threads, and for a hundred points it is faster.
+of a finite set of candidates, so that the last bits of a matrix factorisation do not change an answer.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -35,17 +32,6 @@ EVIDENCE = 1.0
 
 MOST_OWN = 16
 """Up to so many coordinates have lengths of their own; more share one."""
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Let torch use one thread for a while; setting it costs less than a microsecond."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +63,6 @@ class Surrogate:
     mean: float
     variance: float
 
-    @one_thread()
     def predict(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and standard deviation (m,) of the noise-free objective at points (m, k)."""
         lengths = self.scales.lengths
@@ -93,7 +78,6 @@ def kernel(a: Tensor, b: Tensor) -> Tensor:
     return (1.0 + r + r.square() / 3.0) * torch.exp(-r)
 
 
-@one_thread()
 def fit(space: Coordinates, x: Tensor, y: Tensor, scales: Scales | None = None) -> Surrogate:
     """Return the process given values (n,) at points (n, k); the scales too are fitted unless they are given."""
     scales = scales or _best_scales(space, x, y)
