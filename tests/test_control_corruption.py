@@ -13,7 +13,7 @@ from PIL import Image
 from scipy import stats
 from torch import Tensor
 
-from advsearch.controls import corruption_blur, corruption_digital, corruption_noise
+from advsearch.controls import corruption_blur, corruption_digital, corruption_noise, make_space
 from advsearch.controls.corruption import NAMES, STEPPED, CorruptionControl, corrupted
 from advsearch.controls.corruption_noise import poisson
 from advsearch.controls.corruption_tools import blurred
@@ -259,7 +259,7 @@ def test_what_is_not_fixed_is_searched(scene: SceneDescription) -> None:
     assert groups(scene, which="fog") == {"severity": (0, image)}
     assert groups(scene, which="jpeg") == {"severity": (0, ())}, "a whole severity has no derivative"
     with pytest.raises(InputError, match="every parameter is fixed"):
-        CorruptionControl(which="fog", severity=2).bind(scene)
+        make_space([CorruptionControl(which="fog", severity=2)], scene)
 
 
 def test_a_bound_control_corrupts_the_picture_and_says_how(scene: SceneDescription) -> None:
