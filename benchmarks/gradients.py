@@ -28,7 +28,7 @@ from advsearch.api.scene import load_scene  # noqa: E402
 from advsearch.evaluation.gradients import estimated, inside, smooth_loss  # noqa: E402
 from advsearch.scene.renderer import Renderer  # noqa: E402
 
-POSE = {"pose": {"rotation": [-30, 30], "x": [-0.15, 0.15], "y": [-0.15, 0.15], "z": [0.05, 0.35]}}
+POSE = {"pose": {"on_ground": "no", "rotation": [-30, 30], "x": [-0.15, 0.15], "y": [-0.15, 0.15], "z": [0.05, 0.35]}}
 CAMERA = {
     "camera": {
         "azimuth": [0, 90],

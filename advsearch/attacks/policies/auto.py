@@ -147,6 +147,8 @@ class Auto(Policy[AutoState]):
                 return _climb(state, proposal)
             if state.box.count < state.domain.dim:
                 return None, state
+        if not state.values:
+            return Proposal(state.domain.start), state
         with one_thread():
             x, state = _next_point(state)
         return Proposal(state.domain.project(state.box.put(state.domain.start, x))), state
@@ -182,10 +184,8 @@ def make_plan(domain: Domain, box: Coordinates, steps: int) -> Plan:
 
 
 def _next_point(state: AutoState) -> tuple[Tensor, AutoState]:
-    """The start, then the screen, then what the surrogate likes; (k,) in the unit box."""
+    """After the start, the screen, then what the surrogate likes; (k,) in the unit box."""
     n = len(state.values)
-    if n == 0:
-        return state.box.take(state.domain.start), state
     if n <= len(state.screen):
         return state.screen[n - 1], state
     generator = seeded(state.seed, n)
