@@ -28,7 +28,7 @@ its share shrinks in proportion and the ascent follows at once."""
 
 PAYS = 4
 """Beside no norm ball, a gradient is worth its renders if it brings so many numbers for each, and so many gradients fit
-into the ascent. One by differences never is: they bring half a number each, and the surrogate beats them everywhere."""
+into the ascent. One by differences never is: half a number for each, and the surrogate was better on average."""
 
 REACH = 0.1
 """Length of the ascent's whole step in a box, as a share of half the diagonal: the screen has been everywhere else."""
