@@ -8,101 +8,53 @@ that this module stays light.
 from __future__ import annotations
 
 import math
-import shlex
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import field_validator, model_validator
 
-from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
-
-SCHEMA = 1
-"""Version of the YAML form."""
-
-HEADER = "# A run of advsearch. To repeat it: advsearch run FILE\n"
-"""First line of every `run.yaml` that advsearch writes; a run directory is recognised by it."""
-
+from advsearch.errors import InputError
+from advsearch.settings import PLACE, Config, all_finite, number_or_text, parse_assignment, setting
 
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
 
-PLACE: dict[str, Any] = {"run": None, "overwrite": False}
-"""The settings that say where a run is kept, not what it does, as a repetition has them."""
+TRIALS, TRIALS_OVER = 20, 200
+"""Fresh renders that check an answer, and one that holds for many conditions."""
+
+QUANTITIES = ("image", "gradient", "objective")
+SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
+"""What `precision` measures, and the samplers that it knows."""
 
 
-class SettingsError(InputError):
-    """One or more settings have values that are not allowed.
-
-    Attributes:
-        problems: pairs of a setting's name and what is wrong with it.
-    """
-
-    def __init__(self, problems: tuple[tuple[str, str], ...], spell: Callable[[str], str] = str) -> None:
-        super().__init__("; ".join(f"{spell(name)}: {text}" for name, text in problems))
-        self.problems = problems
-
-    def spelled(self, spell: Callable[[str], str]) -> SettingsError:
-        """Return the same error with each setting's name as `spell` writes it: ``--epsilon`` for ``epsilon``, say."""
-        return SettingsError(self.problems, spell)
-
-
-def _setting(
-    default: Any, group: str, description: str, expects: str, *, unit: str = "", otherwise: str = "", **constraints: Any
-) -> Any:
-    """Return a pydantic field.
-
-    Args:
-        default: the default, a function that makes it, or ... for none.
-        group: heading in the help.
-        description: what it is.
-        expects: completes "expected ..." in errors, and names the range in the help.
-        unit: of the value.
-        otherwise: what a default of None comes to.
-        constraints: as of `pydantic.Field`.
-    """
-    notes: dict[str, Any] = {"group": group, "expects": expects, "unit": unit, "otherwise": otherwise}
-    alias = constraints.pop("alias", None)
-    make = {"default_factory": default} if callable(default) else {"default": default}
-    return Field(**make, description=description, json_schema_extra=notes, alias=alias, **constraints)
-
-
-class AttackConfig(BaseModel):
-    """Everything that decides what `attack` does. Frozen; unknown names are refused.
+class SceneConfig(Config):
+    """What every command over a scene and a model needs to know.
 
     A file is looked for relative to the current directory. None means "choose for me", and the description says how.
-
-    Raises:
-        InputError: a value is outside its range or an unknown setting is named; the message lists every problem.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False)
-
-    object: str = _setting(
+    object: str = setting(
         ...,
         "scene",
         "what the model should recognise",
         "the name of an object or a .obj, .ply, .glb, .gltf or .stl file",
     )
-    environment: str = _setting(
-        "studio", "scene", "what lights it", "the name of an environment or a .hdr or .exr file"
-    )
-    up: Literal["y", "z"] | None = _setting(
+    environment: str = setting("studio", "scene", "what lights it", "the name of an environment or a .hdr or .exr file")
+    up: Literal["y", "z"] | None = setting(
         None, "scene", "axis of an imported object that points up", "y or z", otherwise="found from the file"
     )
-    set_: dict[str, float | str | tuple[float, ...]] = _setting(
+    set_: dict[str, float | str | tuple[float, ...]] = setting(
         dict,
         "scene",
         "fix a parameter of the scene, such as camera.azimuth=130",
         "PARAMETER=VALUE with a finite number, a name or a list of numbers",
         alias="set",
     )
-    exposure: float = _setting(
+    exposure: float = setting(
         0.0, "scene", "brightness of the picture", "a number from -10 to 10", unit="stops", ge=-10.0, le=10.0
     )
-    resolution: tuple[int, int] | None = _setting(
+    resolution: tuple[int, int] | None = setting(
         None,
         "scene",
         "size of the rendered picture",
@@ -111,16 +63,16 @@ class AttackConfig(BaseModel):
         unit="pixels",
     )
 
-    model: str = _setting(
+    model: str = setting(
         "reference",
         "model",
         "the network under test",
         "reference, a .pt2 (torch.export), .pt or .ts (TorchScript) file, package.module:callable, or torchvision:NAME",
     )
-    labels: str | None = _setting(
+    labels: str | None = setting(
         None, "model", "names of the model's classes", "a JSON or text file", otherwise="the model's own"
     )
-    label: str | None = _setting(
+    label: str | None = setting(
         None,
         "model",
         "the right answers, separated by commas",
@@ -128,23 +80,14 @@ class AttackConfig(BaseModel):
         otherwise="the object's own",
     )
 
-    controls: dict[str, dict[str, Any]] = _setting(
+    controls: dict[str, dict[str, Any]] = setting(
         lambda: {"texture": {}},
         "search",
         "what may change, separated by commas",
         "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
         min_length=1,
     )
-    epsilon: float | None = _setting(
-        None,
-        "search",
-        "how far a control may go from where it starts, in its own unit",
-        "a number greater than 0",
-        otherwise="the control's own",
-        gt=0.0,
-    )
-    norm: Literal["linf", "l2"] = _setting("linf", "search", "how that distance is measured", "linf or l2")
-    texture_resolution: int | None = _setting(
+    texture_resolution: int | None = setting(
         None,
         "search",
         "side of the searched texture",
@@ -154,38 +97,7 @@ class AttackConfig(BaseModel):
         ge=2,
         le=4096,
     )
-    estimators: dict[str, str] = _setting(
-        dict,
-        "search",
-        "force how derivatives are obtained",
-        "NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME; `advsearch plan` shows the names",
-        alias="estimator",
-    )
-    measure: Literal["no", "quick", "full"] = _setting(
-        "quick",
-        "search",
-        "measure which valid estimator of a derivative is best on this scene; full chooses step and samples too",
-        "no, quick or full",
-    )
-    policy: str = _setting("auto", "search", "the rule that proposes configurations", "the name of a policy")
-    steps: int = _setting(
-        40,
-        "search",
-        "steps of the search, its budget in renders",
-        "a whole number from 1 to 1000000",
-        ge=1,
-        le=1_000_000,
-    )
-    step_size: float | None = _setting(
-        None,
-        "search",
-        "first step of the policy as a share of epsilon",
-        "a number greater than 0",
-        otherwise="the policy's own",
-        gt=0.0,
-    )
-    objective: str = _setting("margin", "search", "what is maximised", "the name of an objective")
-    spp: int | None = _setting(
+    spp: int | None = setting(
         None,
         "search",
         "samples per pixel of a render of the search",
@@ -195,39 +107,18 @@ class AttackConfig(BaseModel):
         ge=1,
         le=65536,
     )
-    denoise: Literal["oidn", "none"] = _setting(
+    denoise: Literal["oidn", "none"] = setting(
         "oidn", "search", "denoiser of every render, in search and verification", "oidn or none"
     )
-    baseline: bool = _setting(True, "search", "run a random search with as many renders beside it", "true or false")
 
-    verify_spp: int | None = _setting(
-        None,
-        "verification",
-        "samples per pixel of the verification",
-        "a whole number from 1 to 65536",
-        otherwise="raised until noise moves nothing",
-        unit="samples",
-        ge=1,
-        le=65536,
-    )
-    trials: int = _setting(
-        20,
-        "verification",
-        "fresh renders that check the answer, and as many of the clean scene",
-        "a whole number from 1 to 100000",
-        unit="renders",
-        ge=1,
-        le=100_000,
-    )
-
-    seed: int = _setting(
+    seed: int = setting(
         0, "run", "root of every random stream", "a whole number from 0 to 2**63 - 1", ge=0, le=2**63 - 1
     )
-    threads: int | None = _setting(
+    threads: int | None = setting(
         None, "run", "processor threads", "a whole number from 1 to 1024", otherwise="all", ge=1, le=1024
     )
-    deterministic: bool = _setting(False, "run", "the same numbers bit for bit, at some cost in time", "true or false")
-    run: str | None = _setting(
+    deterministic: bool = setting(False, "run", "the same numbers bit for bit, at some cost in time", "true or false")
+    run: str | None = setting(
         None,
         "run",
         "where the run is kept",
@@ -235,23 +126,30 @@ class AttackConfig(BaseModel):
         otherwise="runs/OBJECT-CONTROL-NNN",
         min_length=1,
     )
-    overwrite: bool = _setting(False, "run", "replace a run that is there already", "true or false")
+    overwrite: bool = setting(False, "run", "replace a run that is there already", "true or false")
 
-    def __init__(self, **data: Any) -> None:
-        try:
-            super().__init__(**data)
-        except ValidationError as error:
-            raise _settings_error(error) from None
+    @property
+    def search_spp(self) -> int:
+        """Samples a pixel of the search: what was asked for, or the default for the denoiser."""
+        return self.spp if self.spp is not None else SEARCH_SPP[self.denoise]
 
-    @field_validator("*", mode="before")
-    @classmethod
-    def _no_number_from_bool(cls, value: Any, info: Any) -> Any:
-        """Refuse true for a number: YAML's `epsilon: yes` is a slip, not 1."""
-        if isinstance(value, bool) and cls.model_fields[info.field_name].annotation is not bool:
-            raise ValueError("a truth value is not accepted here")
-        return value
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """The objects by name."""
+        return split_names(self.object)
 
-    @field_validator("object", "environment", "model", "labels", "label", "policy", "objective", "run", mode="before")
+    @field_validator(
+        "object",
+        "environment",
+        "model",
+        "labels",
+        "label",
+        "run",
+        "objective",
+        "target",
+        mode="before",
+        check_fields=False,
+    )
     @classmethod
     def _as_text(cls, value: Any) -> Any:
         """Accept a path for a file, a number or a list of names for labels; refuse what can't be a name."""
@@ -262,7 +160,7 @@ class AttackConfig(BaseModel):
             raise ValueError("an empty name")
         return text
 
-    @field_validator("controls", mode="before")
+    @field_validator("controls", "over", mode="before", check_fields=False)
     @classmethod
     def _controls_from_names(cls, value: Any) -> Any:
         """Accept ``"texture"`` and ``["texture", "pose"]`` for controls with nothing set, and an empty YAML value."""
@@ -273,7 +171,7 @@ class AttackConfig(BaseModel):
             return {name: {} if given is None else given for name, given in names.items()}
         return value
 
-    @field_validator("estimators", mode="before")
+    @field_validator("estimators", mode="before", check_fields=False)
     @classmethod
     def _estimators_from_name(cls, value: Any) -> Any:
         """Accept ``differences`` for all controls."""
@@ -299,261 +197,513 @@ class AttackConfig(BaseModel):
     @classmethod
     def _numbers_from_text(cls, value: Any) -> Any:
         """Read ``1e-3`` as a number: YAML takes it for text."""
-        return {name: _number_or_text(given) for name, given in value.items()} if isinstance(value, Mapping) else value
+        return {name: number_or_text(given) for name, given in value.items()} if isinstance(value, Mapping) else value
 
     @field_validator("set_", "controls")
     @classmethod
     def _finite_inside(cls, value: Any) -> Any:
-        if not _all_finite(value):
+        if not all_finite(value):
             raise ValueError("not finite")
         return value
 
+
+class AttackConfig(SceneConfig):
+    """Everything that decides what `attack` does. Frozen; unknown names are refused."""
+
+    command: ClassVar[str] = "attack"
+
+    epsilon: float | dict[str, float] | tuple[float, ...] | None = setting(
+        None,
+        "search",
+        "how far a control may go from where it starts, in its own unit (or CONTROL=NUMBER,...; or NUMBER,NUMBER,... "
+        "for a curve)",
+        "a number greater than 0",
+        otherwise="the control's own",
+    )
+    norm: Literal["linf", "l2"] = setting("linf", "search", "how that distance is measured", "linf or l2")
+    estimators: dict[str, str] = setting(
+        dict,
+        "search",
+        "force how derivatives are obtained",
+        "NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME; `advsearch plan` shows the names",
+        alias="estimator",
+    )
+    measure: Literal["no", "quick", "full"] = setting(
+        "quick",
+        "search",
+        "measure which valid estimator of a derivative is best on this scene; full chooses step and samples too",
+        "no, quick or full",
+    )
+    policy: str | dict[str, Any] = setting(
+        "auto", "search", "the rule that proposes configurations", "the name of a policy, or NAME={OPTION: VALUE}"
+    )
+    steps: int = setting(
+        40,
+        "search",
+        "steps of the search, its budget in renders",
+        "a whole number from 1 to 1000000",
+        ge=1,
+        le=1_000_000,
+    )
+    seconds: float | None = setting(
+        None,
+        "search",
+        "time after which the search stops; the random one beside it gets as many renders",
+        "a number greater than 0",
+        otherwise="no limit",
+        unit="seconds",
+        gt=0.0,
+    )
+    step_size: float | None = setting(
+        None,
+        "search",
+        "first step of the policy as a share of epsilon",
+        "a number greater than 0",
+        otherwise="the policy's own",
+        gt=0.0,
+    )
+    objective: str = setting("margin", "search", "what is maximised", "the name of an objective")
+    target: str | None = setting(
+        None,
+        "search",
+        "the wrong answer that the model should give, or several",
+        "names of classes or their numbers, separated by commas",
+        otherwise="any wrong answer",
+    )
+    minimise: bool = setting(False, "search", "make the object easier to recognise, not harder", "true or false")
+    smallest: bool = setting(
+        False, "search", "find the smallest epsilon at which the model is wrong, up to --epsilon", "true or false"
+    )
+    over: dict[str, dict[str, Any]] = setting(
+        dict,
+        "search",
+        "controls that vary by chance: one answer has to hold for all of them",
+        "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
+    )
+    draws: int = setting(
+        4, "search", "conditions that a step of --over looks at", "a whole number from 1 to 1000", ge=1, le=1000
+    )
+    average: int = setting(
+        0,
+        "search",
+        "random configurations of the same space that say how often the model is wrong on average",
+        "a whole number from 0 to 1000000",
+        unit="renders",
+        ge=0,
+        le=1_000_000,
+    )
+    baseline: bool = setting(True, "search", "run a random search with as many renders beside it", "true or false")
+
+    verify_spp: int | None = setting(
+        None,
+        "verification",
+        "samples per pixel of the verification",
+        "a whole number from 1 to 65536",
+        otherwise="raised until noise moves nothing",
+        unit="samples",
+        ge=1,
+        le=65536,
+    )
+    trials: int | None = setting(
+        None,
+        "verification",
+        "fresh renders that check the answer, and as many of the clean scene",
+        "a whole number from 1 to 100000",
+        otherwise=f"{TRIALS}, or {TRIALS_OVER} with --over",
+        unit="renders",
+        ge=1,
+        le=100_000,
+    )
+
+    @field_validator("epsilon", mode="before")
     @classmethod
-    def from_flags(cls, data: Mapping[str, Any]) -> AttackConfig:
-        """Return the configuration for settings given as flags; errors name the flag.
+    def _epsilon_from_text(cls, value: Any) -> Any:
+        """Accept ``0.05``, ``0.01,0.02`` and ``texture=0.05,geometry=0.01``; a number greater than 0 each."""
+        if isinstance(value, str):
+            parts = [part.strip() for part in value.split(",") if part.strip()]
+            if any("=" in part for part in parts):
+                value = dict(parse_assignment(part, "--epsilon") for part in parts)
+            else:
+                value = parts[0] if len(parts) == 1 else tuple(parts)
+        if isinstance(value, list) and len(value) == 1:
+            value = value[0]
+        several = value.values() if isinstance(value, Mapping) else value if isinstance(value, (list, tuple)) else ()
+        _positive(value) if not isinstance(value, (Mapping, list, tuple, type(None))) else [*map(_positive, several)]
+        return value
 
-        Raises:
-            InputError: as for the class.
-        """
-        try:
-            return cls(**data)
-        except SettingsError as error:
-            raise error.spelled(flag) from None
-
+    @model_validator(mode="before")
     @classmethod
-    def from_yaml(cls, path: str | Path, overrides: Mapping[str, Any] | None = None) -> AttackConfig:
-        """Return the configuration that the YAML file at `path` describes, with `overrides` put over it.
+    def _policy_with_steps(cls, data: Any) -> Any:
+        """Accept ``policy: {name: pgd, steps: 80, momentum: 0.9}``, ``pgd={momentum: 0.9}`` and a name."""
+        policy = data.get("policy")
+        if isinstance(policy, str) and "=" in policy:
+            name, options = parse_assignment(policy, "--policy")
+            policy = {"name": name, **(options if isinstance(options, Mapping) else {"": options})}
+        if not isinstance(policy, Mapping):
+            return data
+        options = dict(policy)
+        steps = {"steps": options.pop("steps")} if "steps" in options else {}
+        name = options.pop("name", "auto")
+        return {**data, **steps, "policy": {"name": name, **options} if options else name}
 
-        Args:
-            path: a file with one mapping from settings to values; `schema` and `command` may stand beside them.
-            overrides: setting to value; a dotted name reaches inside: ``set.camera.azimuth``, ``controls.pose.yaw``.
-
-        Raises:
-            FileFormatError: the file is missing, empty or not such a mapping.
-            InputError: as for the class; the message names the file.
-        """
-        data = {name: value for name, value in read_yaml(path).items() if name not in ("schema", "command")}
-        for name, value in (overrides or {}).items():
-            _put(data, name, value)
-        try:
-            return cls(**data)
-        except SettingsError as error:
-            raise error.spelled(lambda name: f"{path}: {name}") from None
-
-    def to_yaml(self) -> str:
-        """Return the YAML form; `from_yaml` of it gives an equal configuration."""
-        data = {"schema": SCHEMA, "command": "attack", **self.plain()}
-        return HEADER + str(yaml.safe_dump(data, sort_keys=False))
+    @model_validator(mode="after")
+    def _together(self) -> AttackConfig:
+        """Refuse settings that exclude each other."""
+        if self.smallest and self.epsilons:
+            raise InputError("--smallest: finds one epsilon by itself; give one --epsilon as the largest, or none")
+        if self.smallest and self.over:
+            raise InputError("--smallest: cannot be combined with --over yet; leave one of them out")
+        if self.minimise and self.target:
+            raise InputError("--minimise: makes the right answer easier to give; leave --target out")
+        if self.minimise and self.smallest:
+            raise InputError("--minimise: has no smallest change; leave --smallest out")
+        twice = set(self.over) & set(self.controls)
+        if twice:
+            raise InputError(f"--over: {', '.join(sorted(twice))} is searched already; leave it out of one of the two")
+        return self
 
     @property
-    def search_spp(self) -> int:
-        """Samples a pixel of the search: what was asked for, or the default for the denoiser."""
-        return self.spp if self.spp is not None else SEARCH_SPP[self.denoise]
+    def policy_name(self) -> str:
+        """Name of the policy."""
+        return self.policy if isinstance(self.policy, str) else str(self.policy["name"])
 
-    def plain(self) -> dict[str, Any]:
-        """Return every setting by the name it has in YAML, as JSON values."""
-        return self.model_dump(by_alias=True, mode="json")
+    @property
+    def policy_options(self) -> dict[str, Any]:
+        """Options of the policy."""
+        return {} if isinstance(self.policy, str) else {k: v for k, v in self.policy.items() if k != "name"}
 
-    def recipe(self) -> AttackConfig:
-        """Return what `run.yaml` holds: no place for the run (a repetition gets its own) and files by absolute path."""
-        places = {name: _absolute(getattr(self, name)) for name in ("object", "environment", "model", "labels")}
-        return self.model_copy(update={**places, **PLACE})
+    @property
+    def epsilons(self) -> tuple[float, ...]:
+        """The several epsilons of a curve; empty where there is one."""
+        return self.epsilon if isinstance(self.epsilon, tuple) else ()
 
-    def command_line(self) -> str:
-        """Return the shell command that repeats this in a place of its own: all settings that are not the default."""
-        words = ["advsearch", "attack"]
-        for setting in settings():
-            value = getattr(self, setting.field)
-            if value != setting.default and setting.field not in PLACE:
-                words += _as_flags(setting, value)
-        return shlex.join(words)
+    @property
+    def is_study(self) -> bool:
+        """Whether it takes several attacks: over objects, or over epsilons."""
+        return bool(self.epsilons) or len(self.objects) > 1
 
+    @property
+    def trial_count(self) -> int:
+        """Trials of each group in the verification."""
+        return self.trials if self.trials is not None else TRIALS_OVER if self.over else TRIALS
 
-@dataclass(frozen=True)
-class Setting:
-    """What the help and the docs say about one setting.
-
-    Attributes:
-        field: attribute of `AttackConfig`.
-        name: its name in YAML.
-        flag: its flag on the command line.
-        group: the heading it stands under: scene, model, search, verification or run.
-        description: what it is.
-        expects: the values it takes, with their range.
-        unit: the unit of the value; may be empty.
-        default: the default; None when there is none.
-        otherwise: what a default of None comes to; may be empty.
-        required: whether it must be given.
-        is_switch: whether it is true or false.
-    """
-
-    field: str
-    name: str
-    flag: str
-    group: str
-    description: str
-    expects: str
-    unit: str
-    default: Any
-    otherwise: str
-    required: bool
-    is_switch: bool
+    def epsilon_of(self, control: str) -> float | None:
+        """The budget asked for one control by the name of its instance; None leaves it its own."""
+        if isinstance(self.epsilon, dict):
+            return self.epsilon.get(control)
+        return None if isinstance(self.epsilon, tuple) else self.epsilon
 
 
-def settings() -> tuple[Setting, ...]:
-    """Return every setting of `AttackConfig`, in the order in which they are shown."""
-    found = []
-    for field, info in AttackConfig.model_fields.items():
-        notes: Any = info.json_schema_extra
-        found.append(
-            Setting(
-                field=field,
-                name=info.alias or field,
-                flag=flag(field),
-                group=notes["group"],
-                description=info.description or "",
-                expects=notes["expects"],
-                unit=notes["unit"],
-                default=None if info.is_required() else info.get_default(call_default_factory=True),
-                otherwise=notes["otherwise"],
-                required=info.is_required(),
-                is_switch=info.annotation is bool,
-            )
-        )
-    return tuple(found)
+class GapConfig(AttackConfig):
+    """Everything that decides what `gap` does: the worst case beside the average, for each object and each control."""
+
+    command: ClassVar[str] = "gap"
+
+    average: int = setting(
+        200,
+        "search",
+        "random configurations of the same space that say how often the model is wrong on average",
+        "a whole number from 1 to 1000000",
+        unit="renders",
+        ge=1,
+        le=1_000_000,
+    )
 
 
-def flag(name: str) -> str:
-    """Return the flag of the setting `name`: ``texture_resolution`` is ``--texture-resolution``."""
-    special = {"controls": "--control", "set_": "--set", "set": "--set"}
-    special |= {"estimators": "--estimator", "estimator": "--estimator", "baseline": "--no-baseline"}
-    return special.get(name) or "--" + name.replace("_", "-")
+class RegionConfig(SceneConfig):
+    """Everything that decides what `region` does: the box around a configuration in which the verdict stays."""
+
+    command: ClassVar[str] = "region"
+
+    around: str | None = setting(
+        None,
+        "region",
+        "a run whose answer is the centre; it brings scene, model and controls with it",
+        "the name or the folder of a run",
+        otherwise="the scene as it is",
+    )
+    vary: str | None = setting(
+        None,
+        "region",
+        "the parameters in which the box grows, separated by commas",
+        "names such as pose.yaw,camera.elevation",
+        otherwise="all that the controls search, up to eight",
+    )
+    samples: int = setting(
+        200,
+        "region",
+        "fresh samples that check the box",
+        "a whole number from 1 to 1000000",
+        unit="renders",
+        ge=1,
+        le=1_000_000,
+    )
+    map: int = setting(
+        0,
+        "region",
+        "side of the map of the margin, where there are two parameters; 0 for none",
+        "a whole number from 0 to 512",
+        unit="points",
+        ge=0,
+        le=512,
+    )
+    verify_spp: int | None = setting(
+        None,
+        "region",
+        "samples per pixel",
+        "a whole number from 1 to 65536",
+        otherwise="raised until noise moves nothing",
+        unit="samples",
+        ge=1,
+        le=65536,
+    )
 
 
-def read_yaml(path: str | Path) -> dict[str, Any]:
-    """Return the mapping in the YAML file at `path`.
+class SweepConfig(SceneConfig):
+    """Everything that decides what `sweep` does: the average case over a grid, over random draws, or both."""
 
-    Raises:
-        FileFormatError: the file is missing, empty, not text, not YAML or not a mapping with names as keys.
-    """
-    try:
-        data = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise FileFormatError(f"{path}: expected a YAML file, got {error.strerror}; check the path") from None
-    except UnicodeDecodeError:
-        raise FileFormatError(f"{path}: expected a YAML file in UTF-8, got bytes that are not text") from None
-    except yaml.YAMLError as error:
-        raise FileFormatError(f"{path}: expected YAML, got {' '.join(str(error).split())}; correct the file") from None
-    if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
-        got = "an empty file" if data is None else type(data).__name__
-        raise FileFormatError(f"{path}: expected settings and values such as 'object: mug', got {got}")
-    if data.get("schema", SCHEMA) != SCHEMA:
-        raise FileFormatError(f"{path}: expected schema {SCHEMA}, got {data['schema']!r}; it is of another advsearch")
-    return data
+    command: ClassVar[str] = "sweep"
+
+    object: str = setting(
+        ...,
+        "scene",
+        "what the model should recognise; several separated by commas",
+        "names of objects or .obj, .ply, .glb, .gltf or .stl files",
+    )
+    environment: str = setting(
+        "studio",
+        "scene",
+        "what lights it; several separated by commas",
+        "names of environments or .hdr or .exr files",
+    )
+    model: str = setting(
+        "reference",
+        "model",
+        "the network under test; several separated by commas are shown the same pictures",
+        "reference, a .pt2 (torch.export), .pt or .ts (TorchScript) file, package.module:callable, or torchvision:NAME",
+    )
+    grid: dict[str, Any] = setting(
+        dict,
+        "sweep",
+        "an axis of the grid; may be repeated",
+        "PARAMETER=FIRST:LAST:COUNT, or values separated by commas",
+    )
+    controls: dict[str, dict[str, Any]] = setting(
+        dict,
+        "sweep",
+        "what is drawn by chance beside the grid, separated by commas",
+        "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
+    )
+    samples: int | None = setting(
+        None,
+        "sweep",
+        "draws of the controls at each point of the grid",
+        "a whole number from 1 to 1000000000",
+        otherwise="1, or 100 without a grid",
+        ge=1,
+        le=1_000_000_000,
+    )
+    sampler: Literal["sobol", "random"] = setting("sobol", "sweep", "how the draws are made", "sobol or random")
+    batch: int = setting(
+        16,
+        "sweep",
+        "pictures that the model sees at once, and that are stored at once",
+        "a whole number from 1 to 1024",
+        unit="pictures",
+        ge=1,
+        le=1024,
+    )
+    spp: int | None = setting(
+        None,
+        "sweep",
+        "samples per pixel of a picture",
+        "a whole number from 1 to 65536",
+        otherwise="8 with the denoiser, 16 without",
+        unit="samples",
+        ge=1,
+        le=65536,
+    )
+    trials: int = setting(
+        20,
+        "verification",
+        "fresh renders that check the worst configuration",
+        "a whole number from 0 to 100000",
+        unit="renders",
+        ge=0,
+        le=100_000,
+    )
+    verify_spp: int | None = setting(
+        None,
+        "verification",
+        "samples per pixel of these",
+        "a whole number from 1 to 65536",
+        otherwise="raised until noise moves nothing",
+        unit="samples",
+        ge=1,
+        le=65536,
+    )
+    run: str | None = setting(
+        None,
+        "run",
+        "where the run is kept",
+        "a name (kept in runs/) or the path of a folder",
+        otherwise="runs/OBJECT-sweep-NNN",
+        min_length=1,
+    )
+
+    @property
+    def environments(self) -> tuple[str, ...]:
+        """The environments by name."""
+        return split_names(self.environment)
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """The models by name."""
+        return split_names(self.model)
+
+    def recipe(self) -> SweepConfig:
+        """See `Config.recipe`; files in a list get absolute paths too."""
+        found = super().recipe()
+        lists = {"object": found.objects, "environment": found.environments, "model": found.models}
+        several = {name: ",".join(map(_absolute_file, parts)) for name, parts in lists.items() if len(parts) > 1}
+        return found.model_copy(update=several)
+
+    @field_validator("grid", mode="before")
+    @classmethod
+    def _grid_of_values(cls, value: Any) -> Any:
+        """Accept any sequence of values from Python (a range, an array), and ``a,b,c``; FIRST:LAST:COUNT stays text."""
+        if not isinstance(value, Mapping):
+            return value
+        return {str(name): _grid_values(given) for name, given in value.items()}
 
 
-def parse_assignment(text: str, where: str) -> tuple[str, Any]:
-    """Return the name and the value of ``NAME=VALUE``; the value is read as YAML, and as plain text where it is none.
+class PrecisionConfig(SceneConfig):
+    """Everything that decides what `precision` does: error against run time, for a scene, its controls and a model."""
 
-    Args:
-        text: the assignment.
-        where: what the error names: ``"--set"``, say.
+    command: ClassVar[str] = "precision"
 
-    Raises:
-        InputError: there is no ``=``, or the name is empty.
-    """
-    name, separator, value = text.partition("=")
-    if not (separator and name.strip()):
-        raise InputError(f"{where}: expected NAME=VALUE such as camera.azimuth=130, got {text!r}")
-    try:
-        return name.strip(), yaml.safe_load(value) if value.strip() else ""
-    except yaml.YAMLError:
-        return name.strip(), value.strip()
+    quantities: str = setting(
+        "image,gradient,objective",
+        "search",
+        "what is measured, separated by commas",
+        "image, gradient, objective",
+    )
+    seconds: float = setting(
+        120.0, "search", "time that all measurements may take", "a number greater than 0", unit="seconds", gt=0.0
+    )
+    error: float = setting(
+        0.05, "search", "relative error that the recommended settings should have", "a number greater than 0", gt=0.0
+    )
+    rounds: int = setting(
+        8, "search", "measurements of every setting, at most", "a whole number from 3 to 1000", ge=3, le=1000
+    )
+    samplers: str = setting(
+        "independent,stratified,multijitter,orthogonal,ldsampler",
+        "search",
+        "samplers that are compared, separated by commas",
+        "independent, stratified, multijitter, orthogonal, ldsampler",
+    )
+    depths: str = setting(
+        "2,3,4,12",
+        "search",
+        "longest light paths that are compared with the run's own, separated by commas",
+        "whole numbers from 2 to 64",
+        unit="segments",
+    )
+    loss: Literal["linear", "model"] = setting(
+        "linear",
+        "search",
+        "whose gradient is measured: a smooth linear loss of the raw picture, or the model's in its image formation",
+        "linear or model",
+    )
+    objective: str = setting("margin", "search", "what policies maximise", "the name of an objective")
+    epsilon: float | None = setting(
+        None,
+        "search",
+        "how far a control may go from where it starts, in its own unit",
+        "a number greater than 0",
+        otherwise="the control's own",
+        gt=0.0,
+    )
+    policies: str = setting(
+        "auto,random", "search", "policies that are compared, separated by commas", "names of policies"
+    )
+    steps: int = setting(
+        32, "search", "renders of each search of a policy", "a whole number from 2 to 100000", ge=2, le=100_000
+    )
+    repeats: int = setting(
+        5, "search", "searches of each policy, with other seeds", "a whole number from 1 to 1000", ge=1, le=1000
+    )
+    out: str | None = setting(
+        None,
+        "run",
+        "where the figures and the numbers go, instead of a run directory",
+        "the path of a folder",
+        min_length=1,
+    )
 
+    @field_validator("quantities", "samplers", "depths", "policies", mode="before")
+    @classmethod
+    def _names_from_list(cls, value: Any) -> Any:
+        """Accept a list of names for names separated by commas."""
+        return ",".join(str(part) for part in value) if isinstance(value, (list, tuple)) else value
 
-def _settings_error(error: ValidationError) -> AdvsearchError:
-    """Return pydantic's findings as one error of ours: one problem a setting."""
-    known = {setting.name: setting for setting in settings()} | {setting.field: setting for setting in settings()}
-    problems: dict[str, str] = {}
-    for found in error.errors(include_url=False):
-        name = str(found["loc"][0])
-        if name not in known:
-            return UnknownNameError("setting", name, {setting.name for setting in settings()})
-        got = "nothing" if found["type"] == "missing" else _shown(found["input"])
-        if known[name].field in ("set_", "controls") and len(found["loc"]) > 1:
-            got = f"{found['loc'][1]}={got}"
-        problems.setdefault(known[name].name, f"expected {known[name].expects}, got {got}")
-    return SettingsError(tuple(problems.items()))
-
-
-def _number_or_text(value: Any) -> Any:
-    if not isinstance(value, str):
+    @field_validator("quantities", "samplers")
+    @classmethod
+    def _known_names(cls, value: str, info: Any) -> str:
+        known = {"quantities": QUANTITIES, "samplers": SAMPLERS}[info.field_name]
+        if not split_names(value) or not set(split_names(value)) <= set(known):
+            raise ValueError("unknown names")
         return value
-    try:
-        return float(value)
-    except ValueError:
+
+    @field_validator("depths")
+    @classmethod
+    def _depths_in_range(cls, value: str) -> str:
+        if not all(2 <= int(part) <= 64 for part in split_names(value)):
+            raise ValueError("out of range")
         return value
 
-
-def _shown(value: Any) -> str:
-    """Return `value` for an error message: plain and not too long."""
-    text = value if isinstance(value, str) and value.strip() else repr(value)
-    return text if len(text) <= 80 else text[:77] + "..."
-
-
-def _all_finite(value: Any) -> bool:
-    if isinstance(value, Mapping):
-        return all(_all_finite(inner) for inner in value.values())
-    if isinstance(value, (list, tuple)):
-        return all(_all_finite(inner) for inner in value)
-    return not isinstance(value, float) or math.isfinite(value)
+    def as_attack(self) -> AttackConfig:
+        """Return the settings that an attack shares."""
+        shared = {name: getattr(self, name) for name in SceneConfig.model_fields if name not in PLACE}
+        return AttackConfig(**shared, objective=self.objective, epsilon=self.epsilon)
 
 
-def _put(data: dict[str, Any], name: str, value: Any) -> None:
-    """Set a dotted name in nested mappings. What follows ``set.`` is one name, since parameters have dots in theirs."""
-    first, _, rest = name.partition(".")
-    if not rest:
-        data[first] = value
-        return
-    inner = data.get(first)
-    inner = {key: None for key in inner} if isinstance(inner, list) else dict(inner) if isinstance(inner, dict) else {}
-    if first == "set":
-        inner[rest] = value
-    else:
-        _put(inner, rest, value)
-    data[first] = inner
+def _grid_values(given: Any) -> Any:
+    """The values of one axis as a list, or FIRST:LAST:COUNT as text."""
+    if isinstance(given, Mapping) and set(given) == {"choices"}:
+        given = given["choices"]
+    if isinstance(given, str):
+        text = given.strip().removeprefix("[").removesuffix("]")
+        if ":" in text and "," not in text:
+            return text
+        given = [part.strip() for part in text.split(",") if part.strip()]
+    values = _plain_values(given)
+    values = values if isinstance(values, list) else [values]
+    if not values or any(one is None or isinstance(one, (bool, list, Mapping)) for one in values):
+        raise ValueError("not values")
+    return [number_or_text(one) for one in values]
 
 
-def _absolute(value: str | None) -> str | None:
-    """Return the absolute path of `value` where it is a file, and the name it is otherwise."""
-    is_path = value is not None and ("/" in value or Path(value).suffix != "") and Path(value).is_file()
-    return str(Path(str(value)).resolve()) if is_path else value
+def _absolute_file(name: str) -> str:
+    """The absolute path of a file, and a name as it is."""
+    return str(Path(name).resolve()) if ("/" in name or Path(name).suffix) and Path(name).is_file() else name
 
 
-def _as_flags(setting: Setting, value: Any) -> list[str]:
-    """Return the words of a command line that give `setting` the value."""
-    if setting.is_switch:
-        return [setting.flag]
-    if setting.field == "set_":
-        return [word for name, given in value.items() for word in ("--set", f"{name}={_number(given)}")]
-    if setting.field == "controls":
-        plain, tuned = [name for name in value if not value[name]], [name for name in value if value[name]]
-        words = ["--control", ",".join(plain)] if plain else []
-        return words + [word for name in tuned for word in ("--control", f"{name}={_flow(value[name])}")]
-    if setting.field == "estimators":
-        return [word for name, given in value.items() for word in ("--estimator", f"{name}={given}")]
-    if setting.field == "resolution":
-        return ["--resolution", "x".join(str(side) for side in value)]
-    return [f"{setting.flag}={_number(value)}"] if str(value).startswith("-") else [setting.flag, _number(value)]
+def split_names(text: str) -> tuple[str, ...]:
+    """Return the parts of ``mug,bowl``; a file whose name has a comma is one part."""
+    if "," not in text or Path(text).is_file():
+        return (text,)
+    return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
-def _flow(value: Any) -> str:
-    """Return `value` as YAML on one line."""
-    return str(yaml.safe_dump(value, default_flow_style=True, width=10**6, sort_keys=False)).strip()
+def _plain_values(given: Any) -> Any:
+    """A sequence, a range or an array as a list of Python numbers and names; one value stays one."""
+    given = given.tolist() if hasattr(given, "tolist") else given
+    sequence = isinstance(given, (range, tuple, list))
+    return [one.item() if hasattr(one, "item") else one for one in given] if sequence else given
 
 
-def _number(value: Any) -> str:
-    """Return a value as it is typed: 130 for 130.0, [0,0,1] for a list."""
-    if isinstance(value, (list, tuple)):
-        return "[" + ",".join(_number(part) for part in value) + "]"
-    return repr(int(value)) if isinstance(value, float) and value.is_integer() and abs(value) < 1e15 else str(value)
+def _positive(value: Any) -> None:
+    if isinstance(value, bool) or not 0.0 < float(value) < math.inf:
+        raise ValueError("expected a number greater than 0")

@@ -20,9 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.cli.flags import GROUPS, help_text
-from advsearch.config import Setting, settings
+from advsearch.config import AttackConfig
 from advsearch.controls import OWN
 from advsearch.scene.settings import SETTINGS
+from advsearch.settings import Setting, settings
 
 DOCS = Path(__file__).resolve().parent
 DIAGRAM = "images/reliability.svg"
@@ -87,7 +88,7 @@ def flags(record: Record) -> str:
     parts = []
     for group, heading in GROUPS.items():
         rows = []
-        for one in settings():
+        for one in settings(AttackConfig):
             if one.group == group:
                 what, values, default = _flag_cells(one)
                 rows.append([f"`{one.flag}`", what, values, default])

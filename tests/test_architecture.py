@@ -49,7 +49,7 @@ RULES = {
     "bundled": Rule({"scene"}),
     "controls": Rule({"scene"}),
     "models": Rule(set(), {"torch", "numpy", "safetensors"}),
-    "attacks": Rule(set(), {"torch", "numpy", "scipy"}),
+    "attacks": Rule(set(), {"torch", "numpy", "scipy", "cma"}),
     "evaluation": Rule({"scene", "bundled", "controls", "models", "attacks"}),
     "runs": Rule({"config"}, {"numpy", "pydantic", "imageio", "OpenEXR", "PIL"}),
     "report": Rule({"runs", "config"}, forbidden=HEAVY),

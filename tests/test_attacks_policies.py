@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import pickle
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any, ClassVar
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -19,7 +22,9 @@ from advsearch.attacks import (
     Ending,
     Evaluation,
     Policy,
+    Proposal,
     Random,
+    StepRecord,
     get_objective,
     make_policy,
     search,
@@ -28,6 +33,7 @@ from advsearch.attacks.objectives import OBJECTIVES
 from advsearch.attacks.policies.base import seeded
 from advsearch.attacks.policies.pgd import Window
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.seeds import stream
 
 RATIO = 1.05  # an optimum counts as reached within this factor (STYLE, and the figure of adversarial-library)
 STEPS = 60
@@ -320,88 +326,265 @@ MIXED = Domain(
     torch.rand(18, generator=seeded(0, 0)),
     (Block(8, "linf", 0.1, name="texture"), Block(6, "l2", 0.2), Block(4, name="pose")),
 )
+FEW = Domain(torch.tensor([0.4, 0.5, 0.7]), (Block(1, "linf", 0.1), Block(1, "l2", 0.2), Block(1)))
+CHOOSY = Domain(
+    torch.tensor([0.1, 0.3, 0.6, 0.2, 0.7]),
+    (Block(1, options=3), Block(1, periodic=True), Block(2, low=0.1, high=0.9), Block(1, options=2)),
+    gradient_cost=2,
+)
 
-OPTIONS: dict[str, dict[str, object]] = {
+OPTIONS: dict[str, dict[str, Any]] = {
+    "adam": {"step_size": 1.0, "beta1": 0.0, "beta2": 0.99},
     "auto": {},
+    "cmaes": {"sigma": 1.0, "population": 4},
+    "grid": {"points": 2},
+    "halving": {"policy": "pgd", "eta": 2, "starts": 2},
+    "nes": {"sigma": 0.1, "population": 4},
     "pgd": {"step_size": 0.5, "momentum": 0.9, "random_start": True},
+    "portfolio": {"policies": ["pgd", "nes", {"name": "restarts", "policy": "adam", "times": 2}]},
     "random": {},
+    "restarts": {"policy": {"name": "nes", "population": 4}, "times": 3},
+    "sobol": {},
 }
+"""Every registered policy runs with its defaults and with these."""
 
 
-def every_policy() -> list[Policy[object]]:
+def every_policy() -> list[Policy[Any]]:
     assert set(OPTIONS) == set(POLICIES), "a new policy needs its options in the battery"
-    return [make_policy(name) for name in POLICIES] + [make_policy(name, **OPTIONS[name]) for name in POLICIES]
+    return [make_policy(name) for name in POLICIES] + [make_policy(n, **OPTIONS[n]) for n in POLICIES if OPTIONS[n]]
 
 
-def classifier(objective: str, nan_at: int = -1) -> Callable[..., Evaluation]:
+def label(policy: Policy[Any]) -> str:
+    return policy.name if policy == make_policy(policy.name) else f"{policy.name} with options"
+
+
+battery = pytest.mark.parametrize("policy", every_policy(), ids=label)
+
+
+def domain_for(policy: Policy[Any]) -> Domain:
+    """A grid refuses what does not fit into its renders; see its own tests."""
+    return FEW if policy.name == "grid" else MIXED
+
+
+def classifier(d: int = 18, objective: str = "margin", nan_at: int = -1, cost: int = 0) -> Callable[..., Evaluation]:
     """A small random network of u with four classes, seen through noise, as an `evaluate`."""
     rng = seeded(1, 1)
-    first, second = torch.randn(18, 12, generator=rng), torch.randn(12, 4, generator=rng)
+    first, second = torch.randn(d, 12, generator=rng), torch.randn(12, 4, generator=rng)
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
-        x = u.clone().requires_grad_(gradient)
-        noise = 0.01 * torch.randn(18, generator=seeded(7, index))
+    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+        x = u.clone().requires_grad_(bool(gradient))
+        noise = 0.01 / math.sqrt(samples) * torch.randn(d, generator=seeded(7, index))
         logits = (((x + noise) @ first).tanh() @ second)[None]
         value = get_objective(objective)(logits, torch.zeros(1, 1, 1, 3), (0, 2))[0]
         slope = torch.autograd.grad(value, x)[0] if gradient else None
         if slope is not None and index % 3 == 1:
-            slope[index % 18] = math.nan
+            slope[index % d] = math.nan
         number = math.nan if index == nan_at else float(value.detach())
-        return Evaluation(number, slope, logits[0].detach(), bool(logits.argmax() % 2))
+        price = samples * (1 + cost * (gradient is True))
+        return Evaluation(number, slope, logits[0].detach(), bool(logits.argmax() % 2), cost=price)
 
     return evaluate
 
 
+def constant(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+    return Evaluation(0.5, torch.zeros_like(u) if gradient else None, torch.zeros(2), False, cost=samples)
+
+
 @pytest.mark.parametrize("objective", sorted(OBJECTIVES))
-@pytest.mark.parametrize("policy", every_policy(), ids=lambda p: f"{p.name}-{hash(p) % 1000}")
-def test_the_battery(policy: Policy[object], objective: str) -> None:
+@battery
+def test_the_battery(policy: Policy[Any], objective: str) -> None:
     """Stays inside, keeps dtype and shape, honours the budget, survives NaN, and repeats with its seed."""
+    domain = domain_for(policy)
 
     def run(seed: int) -> list[Tensor]:
         seen: list[Tensor] = []
 
         def look(record: object, u: Tensor, evaluation: Evaluation) -> None:
-            assert (u.dtype, u.shape) == (torch.float32, (18,))
-            assert MIXED.contains(u)
+            assert (u.dtype, u.shape) == (torch.float32, (domain.dim,))
+            assert domain.contains(u)
             seen.append(u.clone())
 
-        evaluate = classifier(objective, nan_at=4)
-        result = search(evaluate, MIXED, policy, steps=15, seed=seed, candidates=2, repeats=2, on_step=look)
-        assert len(result.history) == 15
-        assert result.renders == len(seen) <= 15 + 2 * 2
-        assert (result.gradients > 0) == policy.uses_gradient
+        evaluate = classifier(domain.dim, objective, nan_at=4)
+        result = search(evaluate, domain, policy, steps=15, seed=seed, candidates=2, repeats=2, on_step=look)
+        assert result.history[-1].renders == 15 or (policy.name, result.stopped) == ("grid", Ending.STALLED)
+        assert result.renders <= 15 + 2 * 2
+        if policy.name != "portfolio":
+            assert (result.gradients > 0) == policy.uses_gradient
+        assert result.gradients == 0 or policy.uses_gradient
         assert result.non_finite_objectives == 1
         assert result.best_u.dtype == torch.float32
-        assert MIXED.contains(result.best_u)
+        assert domain.contains(result.best_u)
         assert math.isfinite(result.best_objective)
         return seen
 
     first, second, other = run(3), run(3), run(4)
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
-    if policy.name == "random" or getattr(policy, "random_start", False):
+    if policy.name in ("random", "sobol", "nes", "cmaes") or getattr(policy, "random_start", False):
         assert not torch.equal(first[0], other[0])
 
 
-@pytest.mark.parametrize("name", sorted(POLICIES))
-def test_states_are_passed_and_not_kept(name: str) -> None:
-    """Going back to an old state replays the same future."""
-    policy = make_policy(name)
-    evaluate = classifier("margin")
+@pytest.mark.parametrize("steps", [1, 2, 7, 40])
+@pytest.mark.parametrize("samples", [1, 3])
+@pytest.mark.parametrize("cost", [0, 5])
+@battery
+def test_the_budget_is_exact_with_samples_and_costly_gradients(
+    policy: Policy[Any], cost: int, samples: int, steps: int
+) -> None:
+    """Every policy inside one that asks for three times the samples; `search` itself checks what evaluations cost."""
+    domain = replace(domain_for(policy), gradient_cost=cost)
+    if policy.name == "grid" and steps < 8:
+        return
+    asked: list[int] = []
+    evaluate = classifier(domain.dim, cost=cost)
+    result = search(
+        evaluate,
+        domain,
+        Sampled(policy, samples),
+        steps=steps,
+        seed=0,
+        candidates=0,
+        on_step=lambda record, u, evaluation: asked.append(record.samples),
+    )
+    assert result.renders == steps or (policy.name == "grid" and result.stopped is Ending.STALLED)
+    if policy.name != "halving":
+        assert set(asked[:-1]) <= {samples}
+
+
+@dataclass(frozen=True)
+class Sampled(Policy[Any]):
+    """Asks for so many times the samples that another policy asks for."""
+
+    policy: Policy[Any]
+    samples: int
+    name: ClassVar[str] = "sampled"
+
+    @property
+    def uses_gradient(self) -> bool:
+        return self.policy.uses_gradient
+
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Any:
+        return self.policy.start(domain, generator, steps)
+
+    def propose(self, state: Any) -> tuple[Proposal | None, Any]:
+        proposal, state = self.policy.propose(state)
+        return proposal and replace(proposal, samples=proposal.samples * self.samples), state
+
+    def update(self, state: Any, u: Tensor, evaluation: Evaluation) -> Any:
+        return self.policy.update(state, u, evaluation)
+
+
+@battery
+def test_a_constant_objective_breaks_nothing(policy: Policy[Any]) -> None:
+    result = search(constant, domain_for(policy), policy, steps=60, seed=0)
+    assert result.best_objective == 0.5
+    assert result.stopped is Ending.BUDGET_SPENT or policy.uses_gradient or policy.name == "grid"
+
+
+@pytest.mark.parametrize("bad", [math.nan, -math.inf, math.inf])
+@battery
+def test_half_of_the_domain_cannot_be_evaluated(policy: Policy[Any], bad: float) -> None:
+    domain = domain_for(policy)
+    inner = classifier(domain.dim)
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+        evaluation = inner(u, index=index, gradient=gradient, samples=samples)
+        lost = float(u[-1]) > float(domain.start[-1]) + 1e-3 and index % 3
+        return replace(evaluation, objective=bad, gradient=u * math.nan if gradient else None) if lost else evaluation
+
+    result = search(evaluate, domain, policy, steps=40, seed=1, candidates=0)
+    assert result.stopped in (Ending.BUDGET_SPENT, Ending.STALLED)
+    assert result.non_finite_objectives < 30
+    assert math.isfinite(result.best_objective)
+
+
+@battery
+def test_choices_and_angles_are_searched_by_every_policy(policy: Policy[Any]) -> None:
+    """The best option of two choices is worth more than the numbers; angles are met on both sides of their seam."""
+    seen: list[Tensor] = []
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+        assert CHOOSY.contains(u)
+        seen.append(u)
+        first, second = min(2, int(u[0] * 3)), min(1, int(u[4] * 2))
+        value = 2.0 * (first == 2) + (second == 0) + 0.2 * math.sin(2.0 * math.pi * float(u[1])) + 0.2 * float(u[2])
+        slope = torch.tensor([0.0, 0.4 * math.pi * math.cos(2.0 * math.pi * float(u[1])), 0.2, 0.0, 0.0])
+        cost = samples * (3 if gradient else 1)
+        return Evaluation(value, slope if gradient else None, torch.zeros(2), False, cost=cost)
+
+    result = search(evaluate, CHOOSY, policy, steps=120, seed=0, candidates=0)
+    assert (int(result.best_u[0] * 3), int(result.best_u[4] * 2)) == (2, 0)
+    assert {(int(u[0] * 3), int(u[4] * 2)) for u in seen} == {(a, b) for a in range(3) for b in range(2)}
+    assert result.best_objective > 3.1
+
+
+@battery
+def test_one_number_is_enough(policy: Policy[Any]) -> None:
+    domain = Domain(torch.tensor([0.5]), (Block(1, "linf", 0.1),))
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+        return Evaluation(
+            -abs(float(u[0]) - 0.57), torch.ones(1) if gradient else None, torch.zeros(2), False, 0, samples
+        )
+
+    result = search(evaluate, domain, policy, steps=40, seed=0, candidates=0)
+    assert float(result.best_u[0]) == pytest.approx(0.57, abs=0.04)
+
+
+@battery
+def test_states_are_passed_and_not_kept(policy: Policy[Any]) -> None:
+    """Going back to an old state, or to one that was pickled, replays the same future; numpy's and torch's global
+    generators stand where they stood."""
+    domain = domain_for(policy)
+    evaluate = classifier(domain.dim)
 
     def play(state: object, steps: int, index: int) -> tuple[object, Tensor]:
-        u = MIXED.start
+        seen = []
         for k in range(index, index + steps):
             proposal, state = policy.propose(state)
             assert proposal is not None
-            u = proposal.u
-            evaluation = evaluate(u, index=3 * k, gradient=proposal.gradient)
-            state = policy.update(state, u, evaluation)
-        return state, u
+            seen.append(proposal.u)
+            evaluation = evaluate(proposal.u, index=3 * k, gradient=proposal.gradient, samples=proposal.samples)
+            state = policy.update(state, proposal.u, evaluation)
+        return state, torch.stack(seen)
 
-    middle, _ = play(policy.start(MIXED, torch.Generator().manual_seed(0), 20), 4, 0)
-    _, once = play(middle, 5, 4)
-    _, again = play(middle, 5, 4)
-    assert torch.equal(once, again)
+    before = np.random.get_state()[1].copy(), torch.random.get_rng_state()  # noqa: NPY002
+    state: object = policy.start(domain, torch.Generator().manual_seed(0), 60)
+    for middle in (3, 16):
+        if policy.name == "grid" and middle == 16:
+            break
+        state, _ = play(state, middle, 0)
+        stored = pickle.dumps(state)
+        _, once = play(state, 5, 4)
+        _, again = play(state, 5, 4)
+        _, restored = play(pickle.loads(stored), 5, 4)
+        assert torch.equal(once, again)
+        assert torch.equal(once, restored)
+    after = np.random.get_state()[1], torch.random.get_rng_state()  # noqa: NPY002
+    assert np.array_equal(before[0], after[0])
+    assert torch.equal(before[1], after[1])
+
+
+@battery
+def test_stored_evaluations_replay_a_search(policy: Policy[Any]) -> None:
+    """What a search was told, told again to a policy that starts afresh, leads to bitwise the same proposals."""
+    domain = domain_for(policy)
+    told: list[tuple[StepRecord, Tensor, Evaluation]] = []
+    search(
+        classifier(domain.dim, nan_at=4),
+        domain,
+        policy,
+        steps=50,
+        seed=11,
+        candidates=0,
+        on_step=lambda record, u, evaluation: told.append((record, u.clone(), evaluation)),
+    )
+    fresh = pickle.loads(pickle.dumps(policy))
+    state = fresh.start(domain, torch.Generator().manual_seed(stream(11, "search")), 50)
+    for record, u, evaluation in told:
+        proposal, state = fresh.propose(state)
+        assert torch.equal(proposal.u, u)
+        assert min(proposal.samples, record.samples) == record.samples
+        state = fresh.update(state, u, evaluation)
 
 
 @pytest.mark.parametrize("name", sorted(POLICIES))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import (
+    NES,
     PGD,
     Block,
     Domain,
@@ -208,7 +210,139 @@ def test_an_evaluation_that_costs_what_nobody_said_is_a_bug(cost: int) -> None:
         search(evaluate, DOMAIN, PGD(), steps=5, seed=0)
 
 
+# ---- more samples
+
+
+@dataclass(frozen=True)
+class Samples(Script):
+    """The script, with so many times the samples for each proposal."""
+
+    samples: tuple[int, ...] = ()
+
+    def propose(self, state: int) -> tuple[Proposal | None, int]:
+        if state >= len(self.us):
+            return None, state
+        return Proposal(self.us[state], self.gradient, samples=self.samples[state]), state + 1
+
+
+def sampled(log: list[tuple[bool, int]], extra: int = 0) -> Callable[..., Evaluation]:
+    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+        log.append((gradient, samples))
+        slope = torch.ones_like(u) if gradient else None
+        return Evaluation(float(u[0]), slope, torch.zeros(2), False, cost=samples * (1 + extra * gradient))
+
+    return evaluate
+
+
+def test_samples_cost_as_many_renders_and_the_last_get_what_is_left() -> None:
+    log: list[tuple[bool, int]] = []
+    script = Samples((at(0.0), at(0.1), at(0.2), at(0.05)), samples=(1, 4, 2, 50))
+    result = search(sampled(log), DOMAIN, script, steps=12, seed=0, candidates=1)
+    assert log == [(False, n) for n in (1, 4, 2, 5, 1, 1)]
+    assert [r.samples for r in (*result.history, *result.ranking)] == [1, 4, 2, 5, 1, 1]
+    assert [r.renders for r in result.history] == [1, 5, 7, 12]
+    assert torch.equal(result.best_u, at(0.2))
+
+
+def test_samples_are_only_named_where_they_are_not_one() -> None:
+    def plain(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        return Evaluation(0.0, None, torch.zeros(2), False)
+
+    assert search(plain, DOMAIN, Samples((at(0.0),), samples=(1,)), steps=1, seed=0).renders == 3
+    with pytest.raises(TypeError, match="samples"):
+        search(plain, DOMAIN, Samples((at(0.0),), samples=(2,)), steps=2, seed=0)
+
+
+def test_a_gradient_with_samples_is_asked_for_where_a_render_is_left_to_use_it() -> None:
+    """Three samples and a gradient of two renders more each: nine renders."""
+    domain = Domain(DOMAIN.start, DOMAIN.blocks, gradient_cost=2)
+    for steps, wanted in ((9, [(False, 3)] * 3), (10, [(True, 3), (False, 1)]), (21, [(True, 3)] * 2 + [(False, 3)])):
+        log: list[tuple[bool, int]] = []
+        script = Samples((at(0.0),) * 3, gradient=True, samples=(3,) * 3)
+        assert search(sampled(log, 2), domain, script, steps=steps, seed=0, candidates=0).renders == steps
+        assert log == wanted
+
+
+def test_an_evaluation_that_ignores_its_samples_is_a_bug() -> None:
+    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+        return Evaluation(0.0, None, torch.zeros(2), False)
+
+    with pytest.raises(RuntimeError, match="evaluate took 1 renders; expected 4 to 4"):
+        search(evaluate, DOMAIN, Samples((at(0.0),), samples=(4,)), steps=5, seed=0)
+    with pytest.raises(RuntimeError, match="policy 'script' proposed 0 samples; expected at least 1"):
+        search(evaluate, DOMAIN, Samples((at(0.0),), samples=(0,)), steps=5, seed=0)
+
+
+# ---- choices and distributions
+
+
+def test_a_policy_that_knows_no_choices_never_sees_one() -> None:
+    """`Steps` is what a user writes: it asserts that its domain has numbers only, and every option is tried for it."""
+
+    @dataclass(frozen=True)
+    class Steps(Policy[tuple[Domain, int]]):
+        name: ClassVar[str] = "steps"
+        uses_gradient: ClassVar[bool] = False
+
+        def start(self, domain: Domain, generator: torch.Generator, steps: int) -> tuple[Domain, int]:
+            assert [block.options for block in domain.blocks] == [0]
+            return domain, 0
+
+        def propose(self, state: tuple[Domain, int]) -> tuple[Proposal, tuple[Domain, int]]:
+            domain, count = state
+            return Proposal(domain.project(domain.begin + 0.1 * count)), (domain, count + 1)
+
+        def update(self, state: tuple[Domain, int], u: Tensor, evaluation: Evaluation) -> tuple[Domain, int]:
+            assert u.shape == (1,)
+            return state
+
+    domain = Domain(torch.tensor([0.2, 0.1, 0.9]), (Block(1, options=3), Block(1), Block(1, options=2)))
+    seen: list[tuple[int, int]] = []
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        seen.append((int(u[0] * 3), int(u[2] * 2)))
+        return Evaluation(float(seen[-1] == (1, 0)) + float(u[1]), None, torch.zeros(2), False)
+
+    result = search(evaluate, domain, Steps(), steps=60, seed=0, candidates=0)
+    assert seen[0] == (0, 1)
+    assert len(set(seen)) == 6
+    assert seen.count((1, 0)) == max(seen.count(pair) for pair in set(seen)) > 25
+    assert (int(result.best_u[0] * 3), int(result.best_u[2] * 2)) == (1, 0)
+    assert result.best_u[1] == 1.0
+    assert result.distribution is None
+
+
+def test_a_distribution_is_the_policys_answer() -> None:
+    """Configurations drawn from it are inside, and nearly as good as the best one."""
+    domain = Domain(torch.full((4,), 0.5), (Block(2, "linf", 0.2), Block(2)))
+
+    def value(u: Tensor) -> float:
+        return float(u[0] - u[1]) - 4.0 * float((u[2:] - 0.7).square().sum())
+
+    rise = objective_is(lambda u, index: value(u))
+    result = search(rise, domain, NES(), steps=300, seed=0)
+    assert result.distribution is not None
+    drawn = result.distribution.sample(torch.Generator().manual_seed(1), 20, domain)
+    assert drawn.shape == (20, 4)
+    assert all(domain.contains(u) for u in drawn)
+    assert sum(value(u) for u in drawn) / 20 > 0.9 * result.best_objective
+    assert float(result.distribution.deviation.max()) < 0.25
+    assert search(rise, domain, Random(), steps=30, seed=0).distribution is None
+
+
 # ---- stopping early
+
+
+def test_seconds_end_a_search_after_the_evaluation_that_exceeds_them() -> None:
+    def slow(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        time.sleep(0.02)
+        return Evaluation(float(u[0]), None, torch.zeros(2), False)
+
+    result = search(slow, DOMAIN, Random(), steps=10**6, seed=0, seconds=0.1, candidates=0)
+    assert 2 <= len(result.history) <= 5
+    assert result.stopped is Ending.BUDGET_SPENT
+    assert len(search(slow, DOMAIN, Random(), steps=9, seed=0, seconds=1e-9, candidates=0).history) == 1
+    assert len(search(slow, DOMAIN, Random(), steps=3, seed=0, seconds=60.0, candidates=0).history) == 3
 
 
 def test_stop_when_ends_the_search_at_its_first_hit() -> None:
@@ -353,9 +487,11 @@ def test_a_gradient_that_is_missing_or_misshapen_is_a_bug(gradient: Tensor | Non
         ({"steps": 0}, "--steps: expected at least 1, got 0"),
         ({"steps": 1, "candidates": -1}, "candidates and repeats"),
         ({"steps": 1, "repeats": 0}, "candidates and repeats"),
+        ({"steps": 1, "seconds": 0.0}, "--seconds: expected a number over 0, got 0.0"),
+        ({"steps": 1, "seconds": math.nan}, "--seconds: expected a number over 0, got nan"),
     ],
 )
-def test_impossible_budgets_are_refused(options: dict[str, int], message: str) -> None:
+def test_impossible_budgets_are_refused(options: dict[str, float], message: str) -> None:
     with pytest.raises(InputError, match=message):
         search(RISE, DOMAIN, PGD(), seed=0, **options)  # type: ignore[arg-type]
 

@@ -208,7 +208,7 @@ def test_a_real_success_is_verified() -> None:
     assert result.ending is Ending.FOUND
     assert (result.clean.successes, result.adversarial.successes, result.renders) == (20, 20, 40)
     assert result.adversarial.spp == 64
-    assert "Wrong in 20 of 20 trials, clean right in 20 of 20; 19 of each are needed." in result.reason
+    assert "A success in 20 of 20 trials, 19 are needed; clean right in 20 of 20." in result.reason
 
 
 def test_a_success_counts_only_where_the_clean_one_is_right() -> None:

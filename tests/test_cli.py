@@ -27,9 +27,10 @@ from advsearch.cli.main import COMMANDS, main
 from advsearch.cli.output import columns
 from advsearch.cli.progress import BarProgress, LineProgress, watching
 from advsearch.cli.table import answer
-from advsearch.config import AttackConfig, settings
+from advsearch.config import AttackConfig
 from advsearch.errors import InputError, StorageError
 from advsearch.progress import NullProgress, Progress
+from advsearch.settings import settings
 
 HEAVY = ("torch", "mitsuba", "drjit", "numpy", "scipy", "pydantic", "rich", "yaml", "PIL", "trimesh")
 
@@ -102,7 +103,7 @@ def test_every_command_has_help_and_json(command: str, capsys: pytest.CaptureFix
 def test_help_of_attack_shows_every_setting_with_range_and_default(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["attack", "--help"]) == 0
     text = " ".join(capsys.readouterr().out.split())
-    for setting in settings():
+    for setting in settings(AttackConfig):
         assert f"{setting.flag} " in text
         if not setting.is_switch:
             assert setting.expects in text and setting.unit in text

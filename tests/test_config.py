@@ -16,8 +16,9 @@ from hypothesis import settings as examples
 from hypothesis import strategies as st
 
 from advsearch.cli import flags
-from advsearch.config import AttackConfig, flag, parse_assignment, read_yaml, settings
+from advsearch.config import AttackConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
+from advsearch.settings import flag, parse_assignment, read_yaml, settings
 
 WRONG: dict[str, tuple[Any, str]] = {
     "object": ("", "expected the name of an object or a .obj, .ply, .glb, .gltf or .stl file, got ''"),
@@ -38,11 +39,17 @@ WRONG: dict[str, tuple[Any, str]] = {
         "expected names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}, got texture=3",
     ),
     "epsilon": ("nan", "expected a number greater than 0, got nan"),
+    "seconds": (0, "expected a number greater than 0, got 0"),
+    "target": ([3], "expected names of classes or their numbers, separated by commas, got [3]"),
+    "minimise": ("maybe", "expected true or false, got maybe"),
+    "smallest": (2, "expected true or false, got 2"),
+    "over": ({"camera": 3}, "expected names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}, got camera=3"),
+    "draws": (0, "expected a whole number from 1 to 1000, got 0"),
     "norm": ("l3", "expected linf or l2, got l3"),
     "texture_resolution": (0, "expected a whole number from 2 to 4096, got 0"),
     "estimators": ({"pose": 3}, "expected NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME"),
     "measure": ("some", "expected no, quick or full, got some"),
-    "policy": (None, "expected the name of a policy, got None"),
+    "policy": (None, "expected the name of a policy, or NAME={OPTION: VALUE}, got None"),
     "steps": (2.5, "expected a whole number from 1 to 1000000, got 2.5"),
     "step_size": (0.0, "expected a number greater than 0, got 0.0"),
     "objective": ({}, "expected the name of an objective, got {}"),
@@ -62,9 +69,12 @@ GIVEN: dict[str, Any] = {
     "object": "mug.obj", "environment": "room.hdr", "up": "y",
     "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
     "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2", "labels": "labels.json", "label": "coffee mug,cup",
-    "controls": {"texture": {}, "pose": {"yaw": [0, 90]}}, "epsilon": 0.03, "norm": "l2", "texture_resolution": 64,
+    "controls": {"texture": {}, "pose": {"yaw": [0, 90]}}, "epsilon": {"texture": 0.03, "pose": 2.0},
+    "seconds": 20.0, "target": "bowl", "minimise": False, "smallest": False, "over": {"camera": {}}, "draws": 2,
+    "norm": "l2", "texture_resolution": 64,
     "estimator": {"pose": "differences", "*": "adjoint"}, "measure": "no",
-    "policy": "random", "steps": 3, "step_size": 0.5, "objective": "cross_entropy", "spp": 4, "denoise": "none",
+    "policy": {"name": "pgd", "momentum": 0.9},
+    "steps": 3, "step_size": 0.5, "objective": "cross_entropy", "spp": 4, "denoise": "none",
     "baseline": False, "verify_spp": 32, "trials": 7, "seed": 9, "threads": 1, "deterministic": True, "run": "x/y",
     "overwrite": True,
 }  # fmt: skip
@@ -74,10 +84,10 @@ def of_command_line(line: str) -> AttackConfig:
     """Return the configuration of a shell command ``advsearch attack ...``."""
     parser = argparse.ArgumentParser(allow_abbrev=False)
     flags.add_settings(parser)
-    return flags.config_from(parser.parse_args(shlex.split(line)[2:]))
+    return flags.config_from(parser.parse_args(shlex.split(line)[2:]), AttackConfig)
 
 
-@pytest.mark.parametrize("setting", settings(), ids=lambda setting: setting.name)
+@pytest.mark.parametrize("setting", settings(AttackConfig), ids=lambda setting: setting.name)
 def test_every_wrong_value_names_its_flag_and_what_was_expected(setting: Any) -> None:
     value, message = WRONG[setting.field]
     data = {"object": "mug", setting.field: value}
@@ -90,7 +100,7 @@ def test_every_wrong_value_names_its_flag_and_what_was_expected(setting: Any) ->
 
 
 @pytest.mark.parametrize(
-    "value", [0, -1, -0.5, "nan", math.nan, math.inf, "inf", "-inf", True, "much", [0.1], "0.1,0.2"]
+    "value", [0, -1, -0.5, "nan", math.nan, math.inf, "inf", "-inf", True, "much", "0.1,0", "texture=0"]
 )
 def test_epsilon_is_a_number_greater_than_zero(value: Any) -> None:
     with pytest.raises(InputError, match=r"^--epsilon: expected a number greater than 0, got "):
@@ -120,7 +130,7 @@ def test_a_configuration_does_not_change() -> None:
 
 
 def test_every_setting_is_documented_and_has_a_flag_of_its_own() -> None:
-    known = settings()
+    known = settings(AttackConfig)
     assert {setting.field for setting in known} == set(AttackConfig.model_fields) == set(WRONG)
     assert {setting.name for setting in known} == set(GIVEN)
     assert len({setting.flag for setting in known}) == len(known)
@@ -132,7 +142,7 @@ def test_every_setting_is_documented_and_has_a_flag_of_its_own() -> None:
 
 def test_yaml_round_trip_of_everything(tmp_path: Path) -> None:
     config = AttackConfig(**GIVEN)
-    assert all(getattr(config, setting.field) == GIVEN[setting.name] for setting in settings())
+    assert all(getattr(config, setting.field) == GIVEN[setting.name] for setting in settings(AttackConfig))
     path = tmp_path / "run.yaml"
     path.write_text(config.to_yaml())
     assert AttackConfig.from_yaml(path) == config
@@ -238,3 +248,72 @@ def test_what_is_no_assignment(text: str) -> None:
 def test_the_module_stays_light() -> None:
     code = "import sys, advsearch.config; print(sorted({'torch', 'mitsuba', 'drjit', 'numpy'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ("0.05", 0.05),
+        ("0.01, 0.02", (0.01, 0.02)),
+        ([0.3], 0.3),
+        ("texture=0.05,geometry=0.01", {"texture": 0.05, "geometry": 0.01}),
+    ],
+)
+def test_epsilon_is_one_number_one_for_each_control_or_a_curve(given: Any, expected: Any) -> None:
+    config = AttackConfig(object="mug", epsilon=given)
+    assert config.epsilon == expected
+    assert of_command_line(config.command_line()) == config
+
+
+def test_a_budget_for_one_control_leaves_the_others_their_own() -> None:
+    config = AttackConfig(object="mug", epsilon="texture=0.05")
+    assert (config.epsilon_of("texture"), config.epsilon_of("pose")) == (0.05, None)
+    assert AttackConfig(object="mug", epsilon=0.1).epsilon_of("pose") == 0.1
+
+
+@pytest.mark.parametrize("given", ["pgd={momentum: 0.9, steps: 80}", {"name": "pgd", "momentum": 0.9, "steps": 80}])
+def test_a_policy_has_options_and_its_steps_are_the_runs(given: Any) -> None:
+    config = AttackConfig(object="mug", policy=given)
+    assert (config.policy_name, config.policy_options, config.steps) == ("pgd", {"momentum": 0.9}, 80)
+    assert of_command_line(config.command_line()) == config
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({"smallest": True, "epsilon": "0.1,0.2"}, "--smallest: finds one epsilon by itself"),
+        ({"smallest": True, "over": "camera"}, "--smallest: cannot be combined with --over"),
+        ({"minimise": True, "target": "bowl"}, "--minimise: makes the right answer easier to give"),
+        ({"minimise": True, "smallest": True}, "--minimise: has no smallest change"),
+        ({"controls": "pose", "over": "pose"}, "--over: pose is searched already"),
+    ],
+)
+def test_settings_that_exclude_each_other(data: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        AttackConfig(object="mug", **data)
+
+
+def test_a_file_is_laid_over_its_bases(tmp_path: Path) -> None:
+    (tmp_path / "far.yaml").write_text("object: bowl\nseed: 3\ncontrols: {pose: {yaw: [0, 90], pitch: 3}}\n")
+    (tmp_path / "near.yaml").write_text("base: far.yaml\nseed: 4\ncontrols: {pose: {yaw: [0, 45]}}\n")
+    path = tmp_path / "study.yaml"
+    path.write_text("base: [near.yaml]\nobject: mug\npolicy: pgd\n")
+    config = AttackConfig.from_yaml(path, {"policy.steps": 80, "policy.momentum": 0.9})
+    assert (config.object, config.seed, config.steps) == ("mug", 4, 80)
+    assert config.controls == {"pose": {"yaw": [0, 45], "pitch": 3}}
+    assert config.policy == {"name": "pgd", "momentum": 0.9}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("base: gone.yaml\n", r"gone\.yaml: expected a YAML file, got No such file"),
+        ("base: 3\n", r"study\.yaml: base: expected a file or a list of files, got 3"),
+        ("base: study.yaml\n", r"study\.yaml: base: the file is a base of itself"),
+    ],
+)
+def test_a_bad_base_is_named(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "study.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        AttackConfig.from_yaml(path)

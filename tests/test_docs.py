@@ -20,19 +20,21 @@ import torch
 from PIL import Image
 
 import advsearch
-from advsearch.api import attacking, outcome
-from advsearch.attacks import OBJECTIVES, POLICIES, clopper_pearson, needed, planned_renders, sample_count, trials
+from advsearch.api import outcome, stages
+from advsearch.attacks import POLICIES, clopper_pearson, needed, planned_renders, sample_count, trials
+from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.attacks.policies import pgd
 from advsearch.cli.flags import config_from
 from advsearch.cli.list import REGISTRIES
 from advsearch.cli.main import COMMANDS, _parse
-from advsearch.config import AttackConfig, parse_assignment, settings
+from advsearch.config import AttackConfig
 from advsearch.controls import CONTROLS, make_control, texture
 from advsearch.evaluation import reference_scenes
 from advsearch.models import calibration, loading, reference
 from advsearch.scene import description, environments, formation, importing, library, mitsuba_scene
 from advsearch.scene.import_images import TEXTURE_LIMIT
 from advsearch.scene.settings import SETTINGS, resolve
+from advsearch.settings import parse_assignment, settings
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -69,7 +71,7 @@ def test_every_command_has_a_section_with_an_example(command: str) -> None:
 
 def test_every_flag_of_attack_is_in_the_command_line_page() -> None:
     page = (DOCS / "command-line.md").read_text("utf-8")
-    missing = [one.flag for one in settings() if f"| `{one.flag}` |" not in page]
+    missing = [one.flag for one in settings(AttackConfig) if f"| `{one.flag}` |" not in page]
     assert not missing
 
 
@@ -86,7 +88,7 @@ def test_every_policy_has_a_page_with_an_example(name: str) -> None:
     assert f"--policy {name}" in (DOCS / "policies" / f"{name}.md").read_text("utf-8")
 
 
-@pytest.mark.parametrize("name", OBJECTIVES)
+@pytest.mark.parametrize("name", OBJECTIVE_KINDS)
 def test_every_objective_has_a_row_and_an_example(name: str) -> None:
     page = (DOCS / "objectives.md").read_text("utf-8")
     assert f"| `{name}` |" in page
@@ -157,7 +159,7 @@ def test_every_control_and_policy_with_options_has_a_made_part() -> None:
 
 
 MADE_BY_HAND = [
-    ("design.md", f"**First look**: {attacking.FIRST_LOOK} renders of the clean scene"),
+    ("design.md", f"**First look**: {stages.FIRST_LOOK} renders of the clean scene"),
     ("design.md", f"That makes `steps` + {planned_renders(0)} renders"),
     ("design.md", f"at {', '.join(map(str, sample_count.LADDER[:-1]))} and {sample_count.LADDER[-1]} samples a pixel"),
     ("design.md", f"is at most {sample_count.DRIFT} of the margin itself"),
@@ -244,7 +246,7 @@ def check_names(config: AttackConfig) -> None:
     for kind, given in config.controls.items():
         make_control(kind, given)
     resolve(config.set_)  # type: ignore[arg-type]
-    assert config.policy in POLICIES and config.objective in OBJECTIVES
+    assert config.policy in POLICIES and config.objective in OBJECTIVE_KINDS
     assert config.object in library.list_objects() or Path(config.object).suffix in importing.SUFFIXES
     assert config.environment in library.list_environments() or Path(config.environment).suffix in environments.SUFFIXES
     assert config.label is not None or config.object in library.list_objects(), "a file does not bring a label"
@@ -254,7 +256,7 @@ def check_advsearch(words: list[str], folder: Path) -> None:
     """Parse a command with the real parser, and read its settings."""
     args = _parse(words, words[0])
     if args.command == "attack":
-        check_names(config_from(args))
+        check_names(config_from(args, AttackConfig))
     if args.command == "run":
         recipe = folder / "run.yaml"
         recipe.write_text("object: mug\n", encoding="utf-8")

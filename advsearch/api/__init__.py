@@ -3,9 +3,28 @@
 from __future__ import annotations
 
 from advsearch import threads as threads  # before torch: it sets how OpenMP waits
-from advsearch.api.attacking import attack, attack_from_config
+from advsearch.api.attacking import attack, attack_from_config, resume_attack
+from advsearch.api.mapping import region_from_config
 from advsearch.api.outcome import AttackResult
 from advsearch.api.scene import Scene, load_scene
+from advsearch.api.studies import curve_from_config, gap_from_config
+from advsearch.api.sweep_loop import SweepResult
+from advsearch.api.sweeping import sweep, sweep_from_config
 from advsearch.models import Model, load_model
 
-__all__ = ["AttackResult", "Model", "Scene", "attack", "attack_from_config", "load_model", "load_scene"]
+__all__ = [
+    "AttackResult",
+    "Model",
+    "Scene",
+    "SweepResult",
+    "attack",
+    "attack_from_config",
+    "curve_from_config",
+    "gap_from_config",
+    "load_model",
+    "load_scene",
+    "region_from_config",
+    "resume_attack",
+    "sweep",
+    "sweep_from_config",
+]

@@ -166,7 +166,9 @@ def _rows(
     u = inside(renderer)
     found = []
     for group in _sets(probes(renderer, loss, u, seed, spp)):
-        references = [reference(renderer, loss, u, one, seed=seed, spp=max(spp, REFERENCE_SPP)) for one in group]
+        on_picture = group[0].group.estimator == "image"  # clips: its mean depends on the noise, so both get the same
+        high = spp if on_picture else max(spp, REFERENCE_SPP)
+        references = [reference(renderer, loss, u, one, seed=seed, spp=high) for one in group]
         forced = "forced" in group[0].group.reason
         wanted = [group[0].group.estimator] if forced else [one for one in group[0].group.valid if one not in EXPENSIVE]
         for estimator in wanted:

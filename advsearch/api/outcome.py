@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,9 +13,12 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
+from advsearch.api.memory import ANSWER, MOST_NUMBERS
 from advsearch.api.problem import Problem
 from advsearch.api.record import Findings, Recorder, Stages
 from advsearch.attacks import Ending, SearchResult, Trial, Trials, Verification, already_wrong, count_right, typical
+from advsearch.attacks.distribution import Distribution
+from advsearch.attacks.smallest import Bracket
 from advsearch.config import AttackConfig
 from advsearch.report.page import write_report
 from advsearch.runs import images
@@ -65,14 +69,15 @@ def summarise(
     noise = seeds.stream(config.seed, "pictures")
     with torch.no_grad():
         linear = {
-            "clean": problem.renderer.radiance(start, noise, spp),
-            "adversarial": problem.renderer.radiance(u, noise, spp),
+            "clean": problem.renderer.radiance(problem.whole(start), noise, spp),
+            "adversarial": problem.renderer.radiance(problem.whole(u), noise, spp),
         }
     clean, adversarial = (
-        to_8_bit(problem.space.picture(at, problem.renderer.formation.display(radiance)))
+        to_8_bit(problem.space.picture(problem.whole(at), problem.renderer.formation.display(radiance)))
         for at, radiance in zip((start, u), linear.values(), strict=True)
     )
-    artifacts = problem.space.artifacts(u)
+    space = problem.searched_space
+    artifacts = space.artifacts(u)
     answers = _answers(config, problem, findings, clean, adversarial)
     run = recorder.run
     costs = _costs(findings, stages)
@@ -82,11 +87,15 @@ def summarise(
     if run is not None:
         _write_pictures(run, problem, findings, linear, clean, adversarial)
         _write_artifacts(run, artifacts)
-        for name, data in problem.space.files(u).items():
+        for name, data in space.files(u).items():
             write_bytes(run.path / "artifacts" / name, data)
         summary["seconds"]["total"] = stages.total
+        if u.numel() <= MOST_NUMBERS:
+            run.store.set_note(ANSWER, json.dumps(u.tolist()))
         run.write_summary(summary)
         write_report(run.path)
+        if not findings.interrupted:
+            run.finish()
     return AttackResult(summary, None if run is None else run.path, u, clean, adversarial, artifacts, search)
 
 
@@ -100,22 +109,24 @@ def _answers(
     clean_trial = typical(findings.clean) if findings.clean else _look(problem, clean)
     found = typical(verification.adversarial_trials) if verification else _look(problem, adversarial)
     control = count_right(findings.clean, findings.spp) if findings.clean else None
-    budgets = [bound.budget for bound in problem.space.controls]
+    controls = problem.searched_space.controls
+    budgets = [bound.budget for bound in controls]
     summary: dict[str, Any] = {
         "object": config.object,
         "model": problem.model.name,
         "environment": config.environment,
-        "controls": [bound.name for bound in problem.space.controls],
-        "policy": config.policy,
+        "controls": [bound.name for bound in controls],
+        "policy": config.policy_name,
         "objective": config.objective,
-        "epsilon": budgets[0].epsilon
-        if len(budgets) == 1
-        else {b.name: b.budget.epsilon for b in problem.space.controls},
-        "norm": budgets[0].norm if len(budgets) == 1 else {b.name: b.budget.norm for b in problem.space.controls},
+        "epsilon": budgets[0].epsilon if len(budgets) == 1 else {b.name: b.budget.epsilon for b in controls},
+        "norm": budgets[0].norm if len(budgets) == 1 else {b.name: b.budget.norm for b in controls},
         "label_set": list(problem.labels.names),
-        "ending": _ending(findings).value,
+        "goal": problem.goal.rule,
+        "target": [problem.model.labels[index] for index in problem.goal.targets] or None,
+        "over": [bound.name for bound in problem.space.controls[len(controls) :]],
+        "ending": _ending(findings, problem).value,
         "image_formation": problem.renderer.formation.summary(),
-        "gradient_plan": problem.renderer.plan.to_dict(),
+        "gradient_plan": problem.plan.to_dict(),
         "clean": {
             **_named(clean_trial, labels),
             "correct": clean_trial.predicted in problem.labels.indices,
@@ -130,6 +141,12 @@ def _answers(
             "renders": findings.baseline.renders,
             "verified": _verified(findings.baseline_verification, labels),
         }
+    if findings.average:
+        summary["average"] = _average(findings, problem)
+    if findings.smallest is not None:
+        summary["smallest"] = _smallest(findings.smallest, problem)
+    if findings.search is not None and findings.search.distribution is not None:
+        summary["distribution"] = _distribution(findings.search.distribution, problem)
     if findings.sample_count is not None:
         summary["sample_count"] = {"spp": findings.sample_count.spp, "converged": findings.sample_count.converged}
     if findings.search is not None:
@@ -138,16 +155,53 @@ def _answers(
             "re_evaluated": findings.search.best_objective,
             "success_rate": findings.search.success_rate,
         }
-        summary["configuration"] = problem.space.describe(problem.domain.project(findings.search.best_u))
+        summary["configuration"] = problem.describe(problem.domain.project(findings.search.best_u))
     return summary
 
 
-def _ending(findings: Findings) -> Ending:
+def _average(findings: Findings, problem: Problem) -> dict[str, Any]:
+    """How often the model is right over configurations drawn from the whole space."""
+    counted = Trials(sum(trial.right for trial in findings.average), len(findings.average), findings.spp)
+    margins = [trial.margin for trial in findings.average]
+    return {
+        "configurations": counted.trials,
+        "correct": counted.successes,
+        "accuracy": counted.rate,
+        "interval": list(counted.interval),
+        "margin": sum(margins) / len(margins),
+        "worst_margin": max(margins),
+    }
+
+
+def _smallest(bracket: Bracket, problem: Problem) -> dict[str, Any]:
+    """The bracket of the smallest epsilon, in the unit of each control."""
+    budgets = {bound.name: float(bound.budget.epsilon or 0.0) for bound in problem.searched_space.controls}
+    flips = bracket.u is not None
+    return {
+        "epsilon": {name: bracket.high * epsilon for name, epsilon in budgets.items()} if flips else None,
+        "not_found_at": {name: bracket.low * epsilon for name, epsilon in budgets.items()} if bracket.low else None,
+        "closed": bracket.closed,
+        "searches": bracket.searches,
+        "checks": bracket.checks,
+    }
+
+
+def _distribution(found: Distribution, problem: Problem) -> dict[str, Any] | None:
+    """Mean and spread of a distribution of configurations, where there are few numbers."""
+    if found.mean.numel() > MOST_NUMBERS:
+        return None
+    return {
+        "mean": problem.describe(problem.domain.project(found.mean)),
+        "deviation": found.deviation.tolist(),
+    }
+
+
+def _ending(findings: Findings, problem: Problem) -> Ending:
     if findings.interrupted:
         return Ending.INTERRUPTED
     if findings.verification is not None:
         return findings.verification.ending
-    if findings.clean and already_wrong(count_right(findings.clean, findings.spp)):
+    if findings.clean and not problem.goal.minimise and already_wrong(count_right(findings.clean, findings.spp)):
         return Ending.ALREADY_WRONG
     return Ending.INTERRUPTED
 

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Block, Domain, Evaluate, Evaluation, Objective, Trial, margin, succeeded
+from advsearch.attacks import Block, Domain, Evaluate, Evaluation, Objective, Trial
 from advsearch.attacks.evaluation import Wanted
+from advsearch.attacks.goal import Goal
 from advsearch.controls import Group, Space
+from advsearch.controls.base import BoundControl, Value
 from advsearch.models import LabelSet, Model
 from advsearch.scene.formation import to_8_bit
+from advsearch.scene.plan import GradientPlan
 from advsearch.scene.renderer import Renderer
 
 OnImage = Callable[[int, Tensor], None]
 """Called with the index and the picture of every evaluation."""
+
+BY_CHANCE = "forced: it varies by chance, so nobody asks for its derivative"
 
 
 @dataclass
@@ -25,14 +31,19 @@ class Problem:
     """The joint of rendering, model and search.
 
     Attributes:
-        renderer: `render(u, seed, spp)`.
-        space: the controls behind u.
+        renderer: `render(u, seed, spp)` of the whole space.
+        space: the controls behind the whole of u: those that are searched, then those that vary by chance.
         model: the network under test.
         labels: the right answers.
         objective: what is maximised.
+        goal: what counts as success.
         spp: samples a pixel while searching.
         seed: root of every stream.
-        domain: where a search may look.
+        searched: how many of the controls are searched; None for all. The others are the conditions: drawn anew from
+            their whole range for every picture.
+        draws: conditions that one evaluation looks at, where there are any; the objective is their mean.
+        domain: where a search may look: the searched controls.
+        conditions: where the others are drawn from; None where there are none.
     """
 
     renderer: Renderer
@@ -40,50 +51,135 @@ class Problem:
     model: Model
     labels: LabelSet
     objective: Objective
+    goal: Goal
     spp: int
     seed: int
+    searched: int | None = None
+    draws: int = 1
     domain: Domain = field(init=False)
+    conditions: Domain | None = field(init=False)
 
     def __post_init__(self) -> None:
-        self.refresh()
+        self.plan = self.renderer.plan
 
-    def refresh(self) -> None:
-        """Make the domain anew, after the gradient plan has changed."""
-        blocks = tuple(_block(control.name, group) for control, group in self.space.groups)
-        self.domain = Domain(self.space.start, blocks, gradient_cost=self.renderer.plan.renders, partial_gradients=True)
+    @property
+    def plan(self) -> GradientPlan:
+        """How derivatives are obtained."""
+        return self.renderer.plan
+
+    @plan.setter
+    def plan(self, plan: GradientPlan) -> None:
+        """Take a plan: nothing is computed for the conditions, and the domain's cost follows."""
+        names = {control.name for control in self.space.controls[self.searched :]} if self._over else set()
+        none = {group.name: "none" for group in plan.groups if group.control in names}
+        self.renderer.plan = plan.with_estimator(none, BY_CHANCE)
+        controls = self.space.controls
+        self.domain = _domain(controls[: self.searched], gradient_cost=self.renderer.plan.renders)
+        self.conditions = _domain(controls[self.searched :]) if self._over else None
+
+    @property
+    def _over(self) -> bool:
+        return self.searched is not None and self.searched < len(self.space.controls)
+
+    @property
+    def searched_space(self) -> Space:
+        """The controls that are searched, as a space of their own: it describes and keeps what was found."""
+        return replace(self.space, controls=self.space.controls[: self.searched])
+
+    # ---- pictures ---------------------------------------------------------------------------------------------------
+
+    def whole(self, u: Tensor, draw: int | None = None) -> Tensor:
+        """Return the configuration of the whole space: u, and the conditions of one draw.
+
+        Args:
+            u: (d,) of the searched controls.
+            draw: seed of the conditions; None for those that leave the scene as it is.
+        """
+        if self.conditions is None:
+            return u
+        if draw is None:
+            return torch.cat([u, self.conditions.start])
+        generator = torch.Generator().manual_seed(seeds.stream(draw, "conditions"))
+        return torch.cat([u, self.conditions.sample(generator)[0]])
+
+    def picture(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True) -> Tensor:
+        """Render a configuration as a file would hold it: (H, W, 3) sRGB in [0, 1], rounded to 8 bits.
+
+        Args:
+            u: (d,) of the searched controls.
+            seed: of the noise, and of the conditions where there are any.
+            spp: samples a pixel.
+            drawn: whether the conditions are drawn; otherwise the scene has those it comes with.
+        """
+        with torch.no_grad():
+            return to_8_bit(self.renderer(self.whole(u, seed if drawn else None), seed=seed, spp=spp))
+
+    def trial(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True) -> Trial:
+        """Render, round to 8 bits, classify: one trial of a verification; arguments as for `picture`."""
+        with torch.no_grad():
+            logits = self.model(self.picture(u, seed, spp, drawn=drawn))
+        probabilities = logits[0].softmax(dim=0)
+        predicted = int(probabilities.argmax())
+        score, right = float(self.goal.score(logits)[0]), bool(self.goal.right(logits)[0])
+        return Trial(score, predicted, float(probabilities[predicted]), right)
+
+    def describe(self, u: Tensor) -> dict[str, Value]:
+        """Say a configuration of the searched controls in named values with units."""
+        return self.searched_space.describe(u)
+
+    def conditions_of(self, seed: int) -> dict[str, Value]:
+        """Say the conditions of a draw in named values with units; empty where there are none."""
+        if self.conditions is None:
+            return {}
+        others = replace(self.space, controls=self.space.controls[self.searched :])
+        return others.describe(self.whole(torch.zeros(0), seed))
+
+    # ---- evaluations ------------------------------------------------------------------------------------------------
 
     def evaluator(self, stream: str, on_image: OnImage | None = None) -> Evaluate:
         """Return the evaluation of configurations whose noise comes from one stream of seeds."""
 
-        def evaluate(u: Tensor, *, index: int, gradient: Wanted) -> Evaluation:
+        def evaluate(u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
             noise = seeds.stream(self.seed, stream, index)
-            before, renders = self.renderer.non_finite, self.renderer.renders
-            seen: list[tuple[Tensor, Tensor]] = []
-
-            def loss(image: Tensor) -> Tensor:
-                value, logits = self._judge(image)
-                seen.append((image.detach(), logits.detach()))
-                return value
-
-            if gradient:
-                value, derivative = self.renderer.gradient(loss, u, noise, self.spp, free=gradient == "free")
-            else:
-                derivative = None
-                with torch.no_grad():
-                    value = loss(self.renderer(u, seed=noise, spp=self.spp))
-            image, logits = seen[0]
+            if self.conditions is None:
+                return self._evaluate(u, noise, index, gradient, samples, on_image)
+            draws = [seeds.stream(noise, "draw", number) for number in range(self.draws)]
+            found = [self._evaluate(self.whole(u, d), d, index, gradient, samples, None) for d in draws]
             if on_image is not None:
-                on_image(index, image)
-            return Evaluation(
-                objective=float(value),
-                gradient=derivative,
-                logits=logits[0],
-                success=bool(succeeded(logits, self.labels.indices)[0]),
-                non_finite=self.renderer.non_finite - before,
-                cost=self.renderer.renders - renders,
-            )
+                on_image(index, self.picture(u, noise, self.spp, drawn=False))
+            return _mean(found, u.numel())
 
         return evaluate
+
+    def _evaluate(
+        self, whole: Tensor, noise: int, index: int, gradient: Wanted, samples: int, on_image: OnImage | None
+    ) -> Evaluation:
+        """One picture of the whole space, classified, with the derivative that is wanted."""
+        before, renders = self.renderer.non_finite, self.renderer.renders
+        seen: list[tuple[Tensor, Tensor]] = []
+
+        def loss(image: Tensor) -> Tensor:
+            value, logits = self._judge(image)
+            seen.append((image.detach(), logits.detach()))
+            return value
+
+        spp, derivative = self.spp * samples, None
+        if gradient:
+            value, derivative = self.renderer.gradient(loss, whole, noise, spp, free=gradient == "free")
+        else:
+            with torch.no_grad():
+                value = loss(self.renderer(whole, seed=noise, spp=spp))
+        image, logits = seen[0]
+        if on_image is not None:
+            on_image(index, image)
+        return Evaluation(
+            objective=float(value),
+            gradient=derivative,
+            logits=logits[0],
+            success=bool(self.goal.score(logits)[0] > 0.0),
+            non_finite=self.renderer.non_finite - before,
+            cost=(self.renderer.renders - renders) * samples,
+        )
 
     def _judge(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """The objective of a picture (H, W, 3), and the logits (1, C) behind it."""
@@ -94,20 +190,25 @@ class Problem:
         """The objective of a picture (H, W, 3) sRGB, as a number with a graph."""
         return self._judge(image)[0]
 
-    def picture(self, u: Tensor, seed: int, spp: int) -> Tensor:
-        """Render a configuration as a file would hold it: (H, W, 3) sRGB in [0, 1], rounded to 8 bits."""
-        with torch.no_grad():
-            return to_8_bit(self.renderer(u, seed=seed, spp=spp))
 
-    def trial(self, u: Tensor, seed: int, spp: int) -> Trial:
-        """Render, round to 8 bits, classify: one trial of a verification."""
-        with torch.no_grad():
-            image = self.picture(u, seed, spp)
-            logits = self.model(image)
-        worst = float(margin(logits, image[None], self.labels.indices)[0])
-        probabilities = logits[0].softmax(dim=0)
-        predicted = int(probabilities.argmax())
-        return Trial(worst, predicted, float(probabilities[predicted]))
+def _mean(found: Sequence[Evaluation], size: int) -> Evaluation:
+    """The mean over conditions. Its cost is counted in evaluations, each of which takes a picture a draw."""
+    count = len(found)
+    gradients = [one.gradient[:size] for one in found if one.gradient is not None]
+    return Evaluation(
+        objective=sum(one.objective for one in found) / count,
+        gradient=torch.stack(gradients).mean(dim=0) if gradients else None,
+        logits=torch.stack([one.logits for one in found]).mean(dim=0),
+        success=sum(one.success for one in found) * 10 >= 9 * count,
+        non_finite=sum(one.non_finite for one in found),
+        cost=max(one.cost for one in found),
+    )
+
+
+def _domain(controls: Sequence[BoundControl], **more: Any) -> Domain:
+    blocks = tuple(_block(control.name, group) for control in controls for group in control.groups)
+    start = torch.cat([control.start for control in controls]) if controls else torch.zeros(0)
+    return Domain(start, blocks, partial_gradients=True, **more)
 
 
 def _block(name: str, group: Group) -> Block:

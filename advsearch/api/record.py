@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from torch import Tensor
 
 from advsearch import seeds
+from advsearch.api.memory import Memory
 from advsearch.api.problem import Problem
 from advsearch.attacks import Evaluation, SampleCount, SearchResult, StepRecord, Trial, Verification
+from advsearch.attacks.smallest import Bracket
 from advsearch.progress import Progress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
@@ -28,6 +31,8 @@ class Findings:
         clean: the control group's trials.
         verification: of the policy's answer.
         baseline_verification: of the random search's.
+        average: trials of configurations drawn from the whole space.
+        smallest: the least epsilon, where it was asked for.
         frames: pictures of the search as 8-bit values in [0, 1], for the animation.
         interrupted: somebody pressed Ctrl-C.
         verification_renders: renders spent on choosing the sample count and on trials.
@@ -40,6 +45,8 @@ class Findings:
     clean: tuple[Trial, ...] = ()
     verification: Verification | None = None
     baseline_verification: Verification | None = None
+    average: tuple[Trial, ...] = ()
+    smallest: Bracket | None = None
     frames: list[Any] = field(default_factory=list)
     interrupted: bool = False
     verification_renders: int = 0
@@ -96,15 +103,20 @@ class Recorder:
     Args:
         run: the open run directory, or None.
         problem: names labels and describes configurations.
+        memory: what the store has already, which is not written again.
     """
 
-    def __init__(self, run: RunDirectory | None, problem: Problem) -> None:
+    def __init__(self, run: RunDirectory | None, problem: Problem, memory: Memory) -> None:
         self.run = run
         self._problem = problem
+        self._memory = memory
+        self._renders: dict[str, int] = {}
 
     def step(self, kind: str, record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
         """Keep one evaluation of a search."""
-        if self.run is None:
+        renders = record.renders - self._renders.get(kind, 0)
+        self._renders[kind] = record.renders
+        if self.run is None or self._memory.holds(kind, record.step):
             return
         problem = self._problem
         probabilities = evaluation.logits.softmax(dim=0)
@@ -120,25 +132,39 @@ class Recorder:
                 label=problem.model.labels[predicted],
                 label_index=predicted,
                 probability=float(probabilities[predicted]),
-                values=problem.space.describe(u),
+                values=problem.describe(u),
                 seconds=record.seconds,
+                renders=renders,
             )
         )
 
-    def trial(self, kind: str, number: int, spp: int, trial: Trial) -> None:
-        """Keep one trial of a verification."""
-        if self.run is None:
+    def trial(
+        self, kind: str, number: int, spp: int, trial: Trial, seed: int, values: Mapping[str, Any] | None = None
+    ) -> None:
+        """Keep one trial.
+
+        Args:
+            kind: what it is for.
+            number: within its kind.
+            spp: samples a pixel.
+            trial: what came out.
+            seed: of its render.
+            values: the configuration, where it is not the same in all trials of the kind.
+        """
+        if self.run is None or self._memory.holds(kind, number):
             return
         self.run.record(
             Row(
                 kind=kind,
                 step=number,
-                seed=seeds.stream(self._problem.seed, "verification", number),
+                seed=seed,
                 spp=spp,
                 objective=trial.margin,
                 success=trial.wrong,
                 label=self._problem.model.labels[trial.predicted],
                 label_index=trial.predicted,
                 probability=trial.probability,
+                values={**(values or {}), **self._problem.conditions_of(seed)},
+                renders=1,
             )
         )

@@ -1,7 +1,8 @@
-"""Objectives, domains, policies, the one search loop and verification. Torch, numpy and scipy only: no renderer."""
+"""Objectives, domains, policies, the one search loop and verification. No renderer."""
 
 from __future__ import annotations
 
+from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Block, Domain
 from advsearch.attacks.ending import Ending
 from advsearch.attacks.evaluation import Evaluate, Evaluation, Wanted
@@ -15,13 +16,25 @@ from advsearch.attacks.objectives import (
     succeeded,
 )
 from advsearch.attacks.policies import (
+    CMAES,
+    NES,
     PGD,
     POLICIES,
+    Adam,
     Auto,
+    Choices,
+    Distributional,
+    Grid,
+    Halving,
     Policy,
+    Portfolio,
     Proposal,
     Random,
+    Restarts,
+    Sobol,
+    draw_seed,
     make_policy,
+    seeded,
 )
 from advsearch.attacks.sample_count import Rung, SampleCount, choose_spp
 from advsearch.attacks.search import SearchResult, StepRecord, planned_renders, search
@@ -39,22 +52,33 @@ from advsearch.attacks.verification import (
 )
 
 __all__ = [
+    "CMAES",
+    "NES",
     "OBJECTIVES",
     "PGD",
     "POLICIES",
+    "Adam",
     "Auto",
     "Block",
+    "Choices",
+    "Distribution",
+    "Distributional",
     "Domain",
     "Ending",
     "Evaluate",
     "Evaluation",
+    "Grid",
+    "Halving",
     "Objective",
     "Policy",
+    "Portfolio",
     "Proposal",
     "Random",
+    "Restarts",
     "Rung",
     "SampleCount",
     "SearchResult",
+    "Sobol",
     "StepRecord",
     "Trial",
     "Trials",
@@ -65,6 +89,7 @@ __all__ = [
     "clopper_pearson",
     "count_right",
     "cross_entropy",
+    "draw_seed",
     "get_objective",
     "make_policy",
     "margin",
@@ -72,6 +97,7 @@ __all__ = [
     "planned_renders",
     "run_trials",
     "search",
+    "seeded",
     "stop_at_margin",
     "succeeded",
     "typical",

@@ -108,16 +108,20 @@ class Domain:
             for each number with central differences.
         partial_gradients: whether `evaluate` understands `gradient="free"`, the part of the gradient that costs
             nothing.
+        first: (d,) where a policy should begin, if not at the start; it moves no ball. For wrappers that begin
+            several times.
         lower, upper: (d,) float32 bounds; those of an l-infinity ball are cut into them already.
 
     Raises:
-        InputError: sizes do not add up, a cost is under 0, or the start is not finite or outside the bounds.
+        InputError: sizes do not add up, a cost is under 0, the start is not finite or outside the bounds, or `first`
+            lies outside.
     """
 
     start: Tensor
     blocks: tuple[Block, ...]
     gradient_cost: int = 0
     partial_gradients: bool = False
+    first: Tensor | None = None
     lower: Tensor = field(init=False, repr=False)
     upper: Tensor = field(init=False, repr=False)
 
@@ -146,6 +150,13 @@ class Domain:
             if block.norm == "linf" and block.epsilon is not None:
                 lower[part].clamp_(min=start[part] - block.epsilon)
                 upper[part].clamp_(max=start[part] + block.epsilon)
+        if self.first is not None and not self.contains(self.first):
+            raise InputError("first: expected a configuration of the domain; project it")
+
+    @property
+    def begin(self) -> Tensor:
+        """(d,) where a policy should begin: `first`, or else the start."""
+        return self.start if self.first is None else self.first
 
     @property
     def dim(self) -> int:

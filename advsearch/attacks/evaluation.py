@@ -24,8 +24,8 @@ class Evaluation:
         logits: (C,) float32 output of the model.
         success: the model's answer lies outside the label set. Never derived from the objective.
         non_finite: gradient elements that were NaN or infinite and were set to zero where they arose.
-        cost: pictures that were rendered for it, at least 1: one, and those that differences took. An adjoint is not
-            a picture and counts 0; `SearchResult.gradients` counts it.
+        cost: pictures that were rendered for it, at least 1: one, and those that differences took, each times
+            `samples`. An adjoint is not a picture and counts 0; `SearchResult.gradients` counts it.
     """
 
     objective: float
@@ -44,7 +44,7 @@ class Evaluation:
 class Evaluate(Protocol):
     """Renders a configuration and classifies it; supplied by whoever owns the scene."""
 
-    def __call__(self, u: Tensor, *, index: int, gradient: Wanted) -> Evaluation:
+    def __call__(self, u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
         """Evaluate u.
 
         Args:
@@ -53,6 +53,9 @@ class Evaluate(Protocol):
                 ones.
             gradient: whether the derivative is wanted. "free" only ever comes where the domain has
                 `partial_gradients`.
+            samples: how many times the search's own samples per pixel to render with, at least 1. The evaluation
+                costs as many times its renders: samples * (1 + gradient_cost) with a gradient, samples without. Only
+                passed where it is not 1, so an evaluation that no policy asks for more need not know it.
         """
         ...
 

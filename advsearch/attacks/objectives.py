@@ -1,6 +1,6 @@
-"""What a search maximises, from logits; and what counts as success, which is another thing (DESIGN 4.2).
+"""What a search maximises; what counts as success is another thing (`advsearch.attacks.goal`, DESIGN 4.2).
 
-An objective is a callable `(logits, images, labels) -> values`, the larger the worse for the model:
+An objective is a callable `(logits, images, labels) -> values`, the larger the nearer to what the search is after:
 
 - logits: (N, C) float32 output of the model;
 - images: (N, H, W, 3) float32 that the model saw, display-referred sRGB in [0, 1];
@@ -10,51 +10,143 @@ An objective is a callable `(logits, images, labels) -> values`, the larger the 
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Protocol, final
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from advsearch.attacks.evaluation import Evaluation, StopWhen
+from advsearch.attacks.feature_distance import ReadFeatures, feature_distance
+from advsearch.attacks.logit_objectives import (
+    Labels,
+    cross_entropy,
+    dlr,
+    log_odds,
+    margin,
+    targeted_cross_entropy,
+    targeted_dlr,
+    targeted_log_odds,
+    targeted_margin,
+)
 from advsearch.errors import InputError, UnknownNameError
 
-Labels = tuple[int, ...]
+__all__ = [
+    "OBJECTIVES",
+    "OBJECTIVE_KINDS",
+    "Labels",
+    "Objective",
+    "ObjectiveKind",
+    "check_objective",
+    "checked",
+    "cross_entropy",
+    "dlr",
+    "feature_distance",
+    "get_objective",
+    "log_odds",
+    "margin",
+    "negated",
+    "objective_summaries",
+    "stop_at_margin",
+    "succeeded",
+    "targeted_margin",
+]
 
 
 class Objective(Protocol):
-    """The signature of an objective; see the module's docstring."""
+    """The signature of an objective, called by position; see the module's docstring."""
 
-    def __call__(self, logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
+    def __call__(self, logits: Tensor, images: Tensor, labels: Labels, /) -> Tensor:
         """Return (N,) values to maximise."""
         ...
 
 
-def margin(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
-    """max over j not in Y of z_j, minus max over y in Y of z_y: over 0 exactly where the model answers wrongly.
+@final
+@dataclass(frozen=True)
+class ObjectiveKind:
+    """What is known about a named objective.
 
-    In logits (log-odds), unbounded, and with a gradient of one at every confidence (Carlini and Wagner 2017, f_6
-    without its hinge). Ties share the gradient.
+    Args:
+        name: its name.
+        summary: one line about it.
+        unit: of its values.
+        plain: the function of the right answers; None for one that has to be made from the model's features.
+        targeted: the same, of a target; None if it has no such form.
+        rivals: how many classes there must be beside the label set.
     """
-    right = _membership(logits, labels)
-    wrong = logits.masked_fill(right, -torch.inf).amax(dim=1)
-    return wrong - logits.masked_fill(~right, -torch.inf).amax(dim=1)
+
+    name: str
+    summary: str
+    unit: str
+    plain: Objective | None = None
+    targeted: Objective | None = None
+    rivals: int = 1
+
+    @property
+    def needs_features(self) -> bool:
+        """Whether it is made from the model's features and a clean picture."""
+        return self.plain is None
+
+    def form(self, *, targeted: bool) -> Objective:
+        """Return the plain or the targeted function."""
+        found = self.targeted if targeted else self.plain
+        if found is None:
+            raise InputError(f"objective {self.name!r}: expected one of logits alone; it needs the model's features")
+        return found
 
 
-def cross_entropy(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
-    """-log of the total probability of Y, computed as softplus(logsumexp over j not in Y - logsumexp over Y).
+OBJECTIVE_KINDS: dict[str, ObjectiveKind] = {
+    kind.name: kind
+    for kind in (
+        ObjectiveKind(
+            "margin",
+            "the largest wrong logit minus the largest right one",
+            "logits (log-odds)",
+            margin,
+            targeted_margin,
+        ),
+        ObjectiveKind(
+            "log_odds",
+            "the log-odds of a wrong answer, over all classes",
+            "logits (log-odds)",
+            log_odds,
+            targeted_log_odds,
+        ),
+        ObjectiveKind(
+            "cross_entropy",
+            "minus the logarithm of the probability of the right answers",
+            "nats",
+            cross_entropy,
+            targeted_cross_entropy,
+        ),
+        ObjectiveKind(
+            "dlr",
+            "the margin over a distance between logits: independent of their scale",
+            "none (a ratio)",
+            dlr,
+            targeted_dlr,
+            rivals=2,
+        ),
+        ObjectiveKind(
+            "feature_distance",
+            "how far the features lie from those of the clean picture",
+            "lengths of the clean features",
+        ),
+    )
+}
+"""Every objective that has a name."""
 
-    That form neither overflows for logits of thousands nor cancels where the probability is near 1. The gradient does
-    fade with the probability of a wrong answer, and float32 rounds it to nothing once the model is surer than
-    1 - 1e-45 (log-odds of about 100); `margin` has no such limit.
-    """
-    right = _membership(logits, labels)
-    wrong = logits.masked_fill(right, -torch.inf).logsumexp(dim=1)
-    return functional.softplus(wrong - logits.masked_fill(~right, -torch.inf).logsumexp(dim=1))
+OBJECTIVES: dict[str, Objective] = {
+    name: kind.plain for name, kind in OBJECTIVE_KINDS.items() if kind.plain is not None
+}
+"""Those that need nothing but logits, in their plain form."""
 
 
-OBJECTIVES: dict[str, Objective] = {"margin": margin, "cross_entropy": cross_entropy}
+def objective_summaries() -> dict[str, str]:
+    """Return one line about every objective that has a name."""
+    return {name: kind.summary for name, kind in OBJECTIVE_KINDS.items()}
 
 
 def succeeded(logits: Tensor, labels: Labels) -> Tensor:
@@ -75,21 +167,106 @@ def stop_at_margin(threshold: float, labels: Labels) -> StopWhen:
     return reached
 
 
-def get_objective(objective: str | Callable[..., Tensor]) -> Objective:
-    """Return the objective of that name, or the user's own callable wrapped so that its mistakes are explained.
+# ---- from names and functions to objectives -------------------------------------------------------------------------
+
+
+def get_objective(
+    objective: str | Callable[..., Tensor],
+    *,
+    target: Labels = (),
+    minimise: bool = False,
+    features: ReadFeatures | None = None,
+    clean: Tensor | None = None,
+) -> Objective:
+    """Return the objective of that name, or the user's own function wrapped so that its mistakes are explained.
+
+    What comes back is called with the right answers, whatever the search is after. With a target, a named objective
+    takes its targeted form, and the user's function gets the target's indices in place of the right answers'. To
+    minimise, either is negated.
+
+    Args:
+        objective: a name, or a function of (logits, images, labels).
+        target: indices of the answers to lead to; empty for any wrong one.
+        minimise: make the object easier to recognise.
+        features: for an objective that `needs_features`: `advsearch.models.features.features_of(model)`.
+        clean: likewise: the clean picture (H, W, 3), or renders of it (N, H, W, 3).
+
+    Raises:
+        UnknownNameError, InputError: as for `check_objective`; no features.
+    """
+    check_objective(objective, targeted=bool(target), minimise=minimise)
+    kind = _kind_of(objective)
+    if kind is None:
+        found = checked(objective)  # type: ignore[arg-type]
+    elif kind.needs_features:
+        if features is None or clean is None:
+            raise InputError(
+                f"objective {kind.name!r}: expected the model's features and a clean picture, got none; use "
+                "get_objective(name, features=advsearch.models.features.features_of(model), clean=picture)"
+            )
+        found = feature_distance(features, clean)
+    else:
+        found = kind.form(targeted=bool(target))
+    found = _aimed(found, target) if target else found
+    return negated(found) if minimise else found
+
+
+def check_objective(objective: object, *, targeted: bool = False, minimise: bool = False) -> None:
+    """Check, before anything is loaded, that there is such an objective and that it can do what is asked.
 
     Raises:
         UnknownNameError: no such name.
-        InputError: neither a name nor callable.
+        InputError: neither a name nor a function of three arguments; a target to minimise; an objective of features
+            with either of them.
     """
-    if isinstance(objective, str):
-        if objective not in OBJECTIVES:
-            hint = "From Python, objective= also takes a function (logits, images, labels)."
-            raise UnknownNameError("objective", objective, OBJECTIVES, hint)
-        return OBJECTIVES[objective]
-    if not callable(objective):
+    if targeted and minimise:
+        raise InputError(
+            "--minimise: expected no --target beside it; to make the object easier to recognise as something else, "
+            "give that as --label"
+        )
+    if isinstance(objective, str) and objective not in OBJECTIVE_KINDS:
+        hint = "From Python, objective= also takes a function (logits, images, labels)."
+        raise UnknownNameError("objective", objective, OBJECTIVE_KINDS, hint)
+    if not isinstance(objective, str) and not callable(objective):
         raise InputError(f"objective: expected a name or a function (logits, images, labels), got {objective!r}")
-    return objective if objective in OBJECTIVES.values() else checked(objective)
+    kind = _kind_of(objective)
+    if kind is None:
+        _check_signature(objective)  # type: ignore[arg-type]
+    elif kind.needs_features and (targeted or minimise):
+        flag, reason = "--minimise", "it is least at the start already"
+        if targeted:
+            flag, reason = "--target", "it leads away from the clean picture, to no class in particular"
+        expected = f"expected --objective {' or '.join(OBJECTIVES)}"
+        raise InputError(f"{flag}: {expected}, got {kind.name}; {reason}")
+
+
+def _kind_of(objective: object) -> ObjectiveKind | None:
+    """Return the kind of a name, or of a function that has one; None for the user's own."""
+    if isinstance(objective, str):
+        return OBJECTIVE_KINDS[objective]
+    return next((kind for kind in OBJECTIVE_KINDS.values() if kind.plain is objective), None)
+
+
+def _aimed(objective: Objective, target: Labels) -> Objective:
+    """Wrap an objective of a target so that it is called with the right answers, like any other."""
+
+    def aimed(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
+        both = sorted(set(labels) & set(target))
+        if both:
+            listed = ", ".join(f"#{index}" for index in both)
+            raise InputError(f"--target: expected classes that are wrong, got {listed}, which --label names as right")
+        return objective(logits, images, target)
+
+    return aimed
+
+
+def negated(objective: Objective) -> Objective:
+    """Wrap an objective so that what is maximised is its negative: easier to recognise instead of harder."""
+
+    def negative(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
+        return -objective(logits, images, labels)
+
+    return negative
 
 
 def checked(function: Callable[..., Tensor]) -> Objective:
@@ -97,8 +274,12 @@ def checked(function: Callable[..., Tensor]) -> Objective:
 
     The function gets (logits, images, labels) as the module's docstring says and returns (N,), or a scalar for one
     image. What it raises itself passes through. NaN values pass too: a search has a rule for them.
+
+    Raises:
+        InputError: the function does not take three arguments.
     """
-    name = getattr(function, "__name__", type(function).__name__)
+    name = _name_of(function)
+    _check_signature(function)
 
     def objective(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
         values = function(logits, images, labels)
@@ -131,15 +312,17 @@ def checked(function: Callable[..., Tensor]) -> Objective:
     return objective
 
 
-def _membership(logits: Tensor, labels: Labels) -> Tensor:
-    """Return (C,) bool, true for the classes of the label set; checks the logits and the labels."""
-    if logits.ndim != 2:
-        raise InputError(f"model output: expected logits of shape (N, classes), got {tuple(logits.shape)}")
-    classes = logits.shape[1]
-    if not labels or not all(0 <= label < classes for label in labels):
-        raise InputError(f"--label: expected class indices from 0 to {classes - 1}, got {tuple(labels)}")
-    right = torch.zeros(classes, dtype=torch.bool, device=logits.device)
-    right[list(labels)] = True
-    if bool(right.all()):
-        raise InputError(f"--label: the label set holds all {classes} classes, so no answer could be wrong")
-    return right
+def _name_of(function: Callable[..., Tensor]) -> str:
+    return getattr(function, "__name__", type(function).__name__)
+
+
+def _check_signature(function: Callable[..., Tensor]) -> None:
+    try:
+        inspect.signature(function).bind(None, None, None)
+    except ValueError:  # built in: nothing to look at
+        return
+    except TypeError as error:
+        raise InputError(
+            f"objective {_name_of(function)!r}: expected a function that takes (logits, images, labels), by position: "
+            f"{error}"
+        ) from None

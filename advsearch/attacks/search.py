@@ -6,16 +6,19 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import torch
 from torch import Tensor
 
 from advsearch.attacks.candidates import Candidate, admit, best
+from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import TOLERANCE, Domain
 from advsearch.attacks.ending import Ending
 from advsearch.attacks.evaluation import Evaluate, Evaluation, StopWhen, usable
-from advsearch.attacks.policies.base import Policy, Proposal
+from advsearch.attacks.policies.base import Policy, Proposal, affordable, answer_of
+from advsearch.attacks.policies.choices import with_choices
 from advsearch.errors import InputError
 from advsearch.seeds import stream
 
@@ -41,6 +44,7 @@ class StepRecord:
         non_finite: gradient elements that had to be set to zero.
         seconds: time the evaluation took.
         renders: pictures that all evaluations so far took together, this one included.
+        samples: times the search's own samples per pixel that it was rendered with.
     """
 
     step: int
@@ -54,6 +58,7 @@ class StepRecord:
     non_finite: int
     seconds: float
     renders: int = 0
+    samples: int = 1
 
 
 OnStep = Callable[[StepRecord, Tensor, Evaluation], None]
@@ -79,6 +84,7 @@ class SearchResult:
         non_finite_objectives: evaluations whose objective was NaN or infinite.
         non_finite_elements: gradient elements that were set to zero, over all evaluations.
         seconds: total time, evaluations included.
+        distribution: what the policy answers beside `best_u`, if it is one that answers with a distribution.
     """
 
     best_u: Tensor
@@ -94,6 +100,7 @@ class SearchResult:
     non_finite_objectives: int
     non_finite_elements: int
     seconds: float
+    distribution: Distribution | None = None
 
 
 def planned_renders(steps: int, candidates: int = 4, repeats: int = 2) -> int:
@@ -112,16 +119,20 @@ def search(
     repeats: int = 2,
     stop_when: StopWhen | None = None,
     on_step: OnStep | None = None,
+    seconds: float | None = None,
 ) -> SearchResult:
     """Run one policy on one domain and return the worst configuration it found.
 
     1. Until `steps` renders are spent: the policy proposes; the proposal is checked against the domain; it is evaluated
        with the seed index of its step (a new one every time, DESIGN 4.4); the policy is told. An evaluation costs one
-       render, and a gradient by differences `Domain.gradient_cost` more. A gradient after which no render would be
-       left to use it is not asked for: never in the last evaluation, and with differences in none of the last few.
+       render, and a gradient by differences `Domain.gradient_cost` more, all times the `samples` of the proposal. What
+       cannot be paid is not asked for (`affordable`): no more samples than there are renders left, and no gradient
+       after which none would be left to use it, so never in the last evaluation.
     2. The `candidates` best distinct configurations are each evaluated `repeats` times more, with new seed indices
        that are the same for all, without gradient. The best by these renders is the answer (see `candidates`). With
        `candidates=0`, for an objective without noise, the raw best is the answer.
+
+    A policy that does not handle discrete choices is wrapped in `Choices` where the domain has some.
 
     A non-finite objective is counted, is never best, and reaches the policy as -inf; `NON_FINITE_LIMIT` in a row end
     the search. KeyboardInterrupt, wherever it strikes, ends it with what there is. Every other exception passes
@@ -137,19 +148,24 @@ def search(
         candidates, repeats: see above; together they cost `candidates * repeats` renders on top of `steps`.
         stop_when: ends step 1 early where it returns true, e.g. `stop_at_margin(1.0, labels)`.
         on_step: called after every evaluation.
+        seconds: end step 1 after the first evaluation that is done later than this, over 0; None for no limit. There
+            is always one evaluation, and step 2 comes on top. Policies still plan for `steps`.
 
     Raises:
-        InputError: steps, candidates or repeats out of range.
+        InputError: steps, candidates, repeats or seconds out of range, or the policy cannot search this domain.
         RuntimeError: the policy left the domain or `evaluate` broke its contract; a bug.
     """
     if steps < 1:
         raise InputError(f"--steps: expected at least 1, got {steps}")
     if candidates < 0 or repeats < 1:
         raise InputError(f"candidates and repeats: expected at least 0 and 1, got {candidates} and {repeats}")
+    if seconds is not None and not seconds > 0.0:
+        raise InputError(f"--seconds: expected a number over 0, got {seconds}")
     begun = time.perf_counter()
     log = _Log(evaluate, domain, on_step, max(1, candidates))
     try:
-        stopped = _explore(log, policy, steps, seed, stop_when)
+        until = math.inf if seconds is None else begun + seconds
+        stopped = _explore(log, policy, steps, seed, stop_when, until)
         if candidates:
             _rank(log, steps, repeats)
     except KeyboardInterrupt:
@@ -171,11 +187,13 @@ class _Log:
     gradients: int = 0
     non_finite: int = 0
     renders: int = 0
+    answer: Callable[[], Distribution | None] = lambda: None
 
     def render(self, proposal: Proposal, index: int, phase: Phase) -> Evaluation:
         """Evaluate one proposal and take note of it."""
         begun = time.perf_counter()
-        raw = self.evaluate(proposal.u, index=index, gradient=proposal.gradient)
+        more = {} if proposal.samples == 1 else {"samples": proposal.samples}
+        raw = self.evaluate(proposal.u, index=index, gradient=proposal.gradient, **more)
         seconds = time.perf_counter() - begun
         _check_gradient(raw, proposal)
         _check_cost(raw, proposal, self.domain)
@@ -200,6 +218,7 @@ class _Log:
             non_finite=evaluation.non_finite,
             seconds=seconds,
             renders=self.renders,
+            samples=proposal.samples,
         )
         self.records.append(record)
         if self.on_step is not None:
@@ -207,9 +226,10 @@ class _Log:
         return evaluation
 
 
-def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, stop_when: StopWhen | None) -> Ending:
+def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, stop_when: StopWhen | None, until: float) -> Ending:
     """Let the policy propose until the budget is spent or something ends it sooner; return what."""
     generator = torch.Generator().manual_seed(stream(seed, "search"))
+    name, policy = policy.name, with_choices(policy, log.domain)
     state = policy.start(log.domain, generator, steps)
     in_a_row = 0
     while log.renders < steps:
@@ -217,8 +237,8 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, stop_when: S
         proposal, state = policy.propose(state)
         if proposal is None:
             return Ending.STALLED
-        _check_inside(proposal.u, log.domain, policy.name)
-        evaluation = log.render(_affordable(proposal, log.domain, steps - log.renders), step, "search")
+        _check_inside(proposal, log.domain, name)
+        evaluation = log.render(affordable(proposal, log.domain, steps - log.renders), step, "search")
         in_a_row = 0 if evaluation.finite else in_a_row + 1
         if in_a_row == NON_FINITE_LIMIT:
             return Ending.NON_FINITE
@@ -226,13 +246,10 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, stop_when: S
             return Ending.FOUND
         if log.renders < steps:
             state = policy.update(state, proposal.u, evaluation)
+            log.answer = partial(answer_of, policy, state)
+        if time.perf_counter() >= until:
+            break
     return Ending.BUDGET_SPENT
-
-
-def _affordable(proposal: Proposal, domain: Domain, left: int) -> Proposal:
-    """Return the proposal without its gradient unless renders are left to use it."""
-    extra = domain.gradient_cost if proposal.gradient is True else 0
-    return proposal if 1 + extra < left else replace(proposal, gradient=False)
 
 
 def _rank(log: _Log, first_index: int, repeats: int) -> None:
@@ -268,11 +285,15 @@ def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
         non_finite_objectives=log.non_finite,
         non_finite_elements=sum(r.non_finite for r in log.records),
         seconds=seconds,
+        distribution=log.answer(),
     )
 
 
-def _check_inside(u: Tensor, domain: Domain, name: str) -> None:
-    """Raise RuntimeError unless u is a configuration of the domain; a policy that leaves it has a bug."""
+def _check_inside(proposal: Proposal, domain: Domain, name: str) -> None:
+    """Raise RuntimeError unless a configuration of the domain was proposed; a policy that leaves it has a bug."""
+    u = proposal.u
+    if proposal.samples < 1:
+        raise RuntimeError(f"policy {name!r} proposed {proposal.samples} samples; expected at least 1")
     if u.shape != domain.start.shape or u.dtype != torch.float32:
         raise RuntimeError(
             f"policy {name!r} proposed {u.dtype} of shape {tuple(u.shape)}; expected torch.float32 of shape "
@@ -285,10 +306,11 @@ def _check_inside(u: Tensor, domain: Domain, name: str) -> None:
 
 def _check_cost(evaluation: Evaluation, proposal: Proposal, domain: Domain) -> None:
     """Raise RuntimeError unless an evaluation cost what the domain said it would; a budget rests on that."""
-    most = 1 + (domain.gradient_cost if proposal.gradient is True else 0)
-    if not 1 <= evaluation.cost <= most:
+    least, most = proposal.samples, proposal.cost(domain)
+    if not least <= evaluation.cost <= most:
         raise RuntimeError(
-            f"evaluate took {evaluation.cost} renders; expected 1 to {most}, by the domain's gradient_cost"
+            f"evaluate took {evaluation.cost} renders; expected {least} to {most}, by the proposal's samples and the "
+            "domain's gradient_cost"
         )
 
 

@@ -23,29 +23,63 @@ from advsearch.seeds import stream
 PASS_PERCENT = 95
 """What a claim must hold in, in per cent of the trials, and what the clean control must pass: 19 of 20."""
 
+PASS_PERCENT_OVER = 90
+"""What a claim over many conditions must hold in, in per cent of those in which the clean configuration is right."""
+
 
 class Trial(NamedTuple):
     """One render and its verdict.
 
     Attributes:
-        margin: largest logit outside the label set minus largest inside; over 0 means that the model is wrong.
+        margin: `Goal.score`: over 0 means success. Without a target, the largest logit outside the label set minus the
+            largest inside.
         predicted: index of the class the model answers.
         probability: the probability it gives that class.
+        correct: whether that answer is right; None where the margin says it: it is at most 0.
     """
 
     margin: float
     predicted: int
     probability: float
+    correct: bool | None = None
 
     @property
     def wrong(self) -> bool:
-        """Whether the model answers outside the label set. A margin of 0 or NaN is not wrong."""
+        """Whether the answer is the one that is wanted: outside the label set, or a target. A margin of 0 or NaN is
+        not."""
         return self.margin > 0.0
 
     @property
     def right(self) -> bool:
         """Whether the model answers inside the label set. NaN is not right either."""
-        return self.margin <= 0.0
+        return self.margin <= 0.0 if self.correct is None else self.correct
+
+
+@dataclass(frozen=True)
+class Rule:
+    """When a claim counts as verified.
+
+    Attributes:
+        percent: of the trials in which it must hold.
+        control: a success counts only where the clean configuration is right, which it has to be in as many per cent.
+        conditional: the percentage is one of the trials in which the clean configuration is right, and it has to be
+            right in half of all: for conditions that vary, and may be hard ones by themselves.
+    """
+
+    percent: int = PASS_PERCENT
+    control: bool = True
+    conditional: bool = False
+
+    def needed(self, trials: int) -> int:
+        """Return how many of `trials` must succeed."""
+        return -(-self.percent * trials // 100)
+
+
+WORST_CASE = Rule()
+OVER_CONDITIONS = Rule(PASS_PERCENT_OVER, conditional=True)
+EASIER = Rule(control=False)
+"""For `--minimise`: the clean configuration may be wrong, so there is no control group to pass; but a success has to be
+recognised better than the clean one with the same seed."""
 
 
 RenderMargin = Callable[[Tensor, int, int], Trial]
@@ -81,25 +115,28 @@ class Verification:
 
 def needed(trials: int) -> int:
     """Return how many of `trials` must succeed: ceil of 95 %, so 19 of 20."""
-    return -(-PASS_PERCENT * trials // 100)
+    return WORST_CASE.needed(trials)
 
 
-def verdict(search: Ending, clean: Trials, adversarial: Trials) -> Ending:
+def verdict(search: Ending, clean: Trials, adversarial: Trials, rule: Rule = WORST_CASE) -> Ending:
     """Return the run's ending from the search's ending and the trials of both groups.
 
     In this order:
 
     1. INTERRUPTED stays interrupted.
-    2. The control group is right in less than half of its trials: ALREADY_WRONG. There was nothing to attack.
-    3. Control group and successes both reach `needed`: FOUND, whatever the search itself believed.
+    2. The control group is right in less than half of its trials: ALREADY_WRONG. There was nothing to attack. (Not
+       where the rule has no control group.)
+    3. Control group and successes both reach what the rule needs: FOUND, whatever the search itself believed.
     4. The search claimed FOUND: NOT_VERIFIED.
     5. Else what the search ended with.
     """
     if search is Ending.INTERRUPTED:
         return search
-    if already_wrong(clean):
+    if rule.control and already_wrong(clean):
         return Ending.ALREADY_WRONG
-    if clean.successes >= needed(clean.trials) and adversarial.successes >= needed(adversarial.trials):
+    enough = adversarial.trials > 0 and adversarial.successes >= rule.needed(adversarial.trials)
+    control = not rule.control or rule.conditional or clean.successes >= rule.needed(clean.trials)
+    if control and enough:
         return Ending.FOUND
     return Ending.NOT_VERIFIED if search is Ending.FOUND else search
 
@@ -154,6 +191,7 @@ def verify(
     seed: int,
     trials: int = 20,
     clean: Sequence[Trial] | None = None,
+    rule: Rule = WORST_CASE,
     on_trial: OnTrial | None = None,
 ) -> Verification:
     """Check a search's answer in fresh trials against the clean configuration as control group.
@@ -172,6 +210,7 @@ def verify(
         trials: per group.
         clean: trials of the clean configuration, where `run_trials` has run them with the same spp, seed and count
             (one control group serves the attack and its baseline).
+        rule: when the claim counts.
         on_trial: called after every trial.
 
     Raises:
@@ -193,12 +232,14 @@ def verify(
     u = domain.project(u)
     adversarial = run_trials(render_margin, u, spp=spp, seed=seed, trials=trials, on_trial=on_trial)
     control = count_right(clean, spp)
-    successes = sum(bad.wrong and good.right for bad, good in zip(adversarial, clean, strict=True))
-    verified = Trials(successes, trials, spp)
-    ending = verdict(claim, control, verified)
+    pairs = list(zip(adversarial, clean, strict=True))
+    successes = sum(bad.wrong and (good.right if rule.control else bad.margin > good.margin) for bad, good in pairs)
+    counted = max(1, control.successes) if rule.conditional else trials
+    verified = Trials(successes, counted, spp)
+    ending = verdict(claim, control, verified, rule)
     reason = (
-        f"{ending.explanation} Wrong in {successes} of {trials} trials, clean right in {control.successes} of "
-        f"{trials}; {needed(trials)} of each are needed."
+        f"{ending.explanation} A success in {successes} of {counted} trials, {rule.needed(counted)} are needed; clean "
+        f"right in {control.successes} of {trials}."
     )
     return Verification(ending, reason, u, control, verified, tuple(clean), adversarial, renders)
 
@@ -211,5 +252,5 @@ def typical(trials: Sequence[Trial]) -> Trial:
         counts[trial.predicted] = counts.get(trial.predicted, 0) + 1
     predicted = min(counts, key=lambda i: (-counts[i], i))
     chosen = [trial for trial in trials if trial.predicted == predicted]
-    mean = [math.fsum(values) / len(chosen) for values in zip(*chosen, strict=True)]
-    return Trial(mean[0], predicted, mean[2])
+    margin = math.fsum(trial.margin for trial in chosen) / len(chosen)
+    return Trial(margin, predicted, math.fsum(trial.probability for trial in chosen) / len(chosen), chosen[0].correct)

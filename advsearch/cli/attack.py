@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 from advsearch.cli import output
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from advsearch.config import AttackConfig
 
 HELP = "find the configuration of a scene that the model gets wrong most badly"
@@ -37,25 +39,31 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
 def run(args: argparse.Namespace) -> int:
     """Search, verify, print the answer; 0 also when nothing was found."""
     from advsearch.cli.flags import config_from
+    from advsearch.config import AttackConfig
 
-    return attack(config_from(args), as_json=args.json, quiet=args.quiet)
+    return carry_out(config_from(args, AttackConfig), as_json=args.json, quiet=args.quiet)
 
 
-def attack(config: AttackConfig, *, as_json: bool, quiet: bool) -> int:
-    """Run the attack that `config` describes, print its answer and return the exit status."""
+def carry_out(config: AttackConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
+    """Run the attack that `config` describes, or go on with it; print its answer and return the exit status."""
     from contextlib import nullcontext
 
     from advsearch.cli.main import INTERRUPTED, OK
     from advsearch.cli.progress import watching
 
     with output.output_kept_clean() if as_json else nullcontext(), watching(quiet=quiet) as progress:
-        from advsearch.api import attack_from_config
+        from advsearch.api import attack_from_config, curve_from_config, resume_attack
 
-        result = attack_from_config(config, progress=progress)
+        if config.is_study:
+            summary = curve_from_config(config, progress=progress, resumed=resumed)
+        elif resumed is not None:
+            summary = resume_attack(resumed, progress=progress).summary
+        else:
+            summary = attack_from_config(config, progress=progress).summary
     if as_json:
-        output.print_json(result.summary)
+        output.print_json(summary)
     else:
-        from advsearch.cli.table import answer
+        from advsearch.cli import studies, table
 
-        print(answer(result.summary))
-    return INTERRUPTED if result.summary.get("ending") == "interrupted" else OK
+        print((studies if config.is_study else table).answer(summary))
+    return INTERRUPTED if summary.get("ending") == "interrupted" else OK

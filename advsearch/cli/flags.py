@@ -7,23 +7,32 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
-from advsearch.config import AttackConfig, Setting, parse_assignment, settings
+from advsearch.config import AttackConfig
+from advsearch.settings import Config, Setting, parse_assignment, settings
 
 GROUPS = {
     "scene": "scene",
     "model": "model",
     "search": "search",
+    "sweep": "sweep",
+    "region": "region",
     "verification": "verification",
     "run": "run",
 }
 
-_LISTS = ("controls", "set_", "estimators")
+_LISTS = ("controls", "over", "set_", "estimators", "grid")
+
+Given = TypeVar("Given", bound=Config)
 
 
 def add_settings(
-    parser: argparse.ArgumentParser, groups: Sequence[str] = tuple(GROUPS), fields: Sequence[str] = ()
+    parser: argparse.ArgumentParser,
+    groups: Sequence[str] = tuple(GROUPS),
+    fields: Sequence[str] = (),
+    config: type[Config] = AttackConfig,
+    without: Sequence[str] = (),
 ) -> None:
     """Add flags for settings, under the headings of their groups.
 
@@ -31,8 +40,11 @@ def add_settings(
         parser: gets them.
         groups: all settings of these groups.
         fields: and these settings.
+        config: whose settings.
+        without: but not these settings.
     """
-    wanted = [one for one in settings() if one.group in groups or one.field in fields]
+    asked = [one for one in settings(config) if one.group in groups or one.field in fields]
+    wanted = [one for one in asked if one.field not in without]
     headings = {one.group: parser.add_argument_group(GROUPS[one.group]) for one in wanted}
     for setting in wanted:
         group = headings[setting.group]
@@ -56,26 +68,30 @@ def add_settings(
             )
 
 
-def config_from(args: argparse.Namespace, **otherwise: Any) -> AttackConfig:
+def config_from(args: argparse.Namespace, config: type[Given], **otherwise: Any) -> Given:
     """Return the configuration that the flags describe.
 
     Args:
         args: parsed flags.
+        config: of which kind.
         **otherwise: values for settings that were not given.
 
     Raises:
         InputError: a value is not allowed; the message names the flag.
     """
-    known = {setting.field for setting in settings()}
+    known = {setting.field for setting in settings(config)}
     data: dict[str, Any] = {**otherwise, **{name: value for name, value in vars(args).items() if name in known}}
-    if "controls" in data:
-        data["controls"] = _controls(data["controls"])
-    if "set_" in data:
-        data["set_"] = dict(parse_assignment(text, "--set") for text in data["set_"])
+    for name, flag in (("controls", "--control"), ("over", "--over")):
+        if name in data:
+            data[name] = _controls(data[name], flag)
+    for name, flag in (("set_", "--set"), ("grid", "--grid")):
+        if name in data:
+            data[name] = dict(parse_assignment(text, flag) for text in data[name])
     if "estimators" in data:
         pairs = [text if "=" in text else f"*={text}" for text in data["estimators"]]
         data["estimators"] = dict(parse_assignment(text, "--estimator") for text in pairs)
-    return AttackConfig.from_flags(data)
+    made: Given = config.from_flags(data)
+    return made
 
 
 def help_text(setting: Setting) -> str:
@@ -89,7 +105,7 @@ def help_text(setting: Setting) -> str:
     return text.replace("%", "%%")
 
 
-def _controls(given: Sequence[str]) -> dict[str, Any]:
+def _controls(given: Sequence[str], flag: str) -> dict[str, Any]:
     """Return control to settings from ``texture,pose``, ``texture={resolution: 64}`` and ``pose,texture={...}``."""
     found: dict[str, Any] = {}
     for text in given:
@@ -98,7 +114,7 @@ def _controls(given: Sequence[str]) -> dict[str, Any]:
         if equals:
             last = plain.pop() if plain else ""
             found.update({name: {} for name in plain})
-            name, parameters = parse_assignment(f"{last}={settings_text}", "--control")
+            name, parameters = parse_assignment(f"{last}={settings_text}", flag)
             found[name] = parameters
         else:
             found.update({name: {} for name in plain})
@@ -106,7 +122,14 @@ def _controls(given: Sequence[str]) -> dict[str, Any]:
 
 
 def _metavar(setting: Setting) -> str:
-    names = {"set_": "PARAMETER=VALUE", "controls": "NAME", "labels": "FILE", "estimators": "NAME"}
+    names = {
+        "set_": "PARAMETER=VALUE",
+        "controls": "NAME",
+        "over": "NAME",
+        "grid": "PARAMETER=VALUES",
+        "labels": "FILE",
+        "estimators": "NAME",
+    }
     return names.get(setting.field, setting.field.rpartition("_")[2].upper())
 
 

@@ -17,7 +17,7 @@ REGISTRIES = {
     "environments": "advsearch.scene.library:list_environments",
     "controls": "advsearch.controls:CONTROLS",
     "policies": "advsearch.attacks:POLICIES",
-    "objectives": "advsearch.attacks:OBJECTIVES",
+    "objectives": "advsearch.attacks.objectives:objective_summaries",
     "models": "advsearch.cli.list:MODELS",
 }
 """Where the names of each kind are: a mapping from them, or a function that returns them."""

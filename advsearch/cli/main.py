@@ -23,9 +23,16 @@ from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 
 COMMANDS = {
     "attack": "advsearch.cli.attack",
+    "sweep": "advsearch.cli.sweep",
     "run": "advsearch.cli.run",
+    "gap": "advsearch.cli.gap",
+    "region": "advsearch.cli.region",
+    "resume": "advsearch.cli.resume",
+    "runs": "advsearch.cli.runs",
+    "export": "advsearch.cli.export",
     "check": "advsearch.cli.check",
     "plan": "advsearch.cli.plan",
+    "precision": "advsearch.cli.precision",
     "list": "advsearch.cli.list",
     "show": "advsearch.cli.show",
     "doctor": "advsearch.cli.doctor_command",

@@ -33,8 +33,9 @@ def run(args: argparse.Namespace) -> int:
 
     from advsearch.cli.flags import config_from
     from advsearch.cli.progress import watching
+    from advsearch.config import AttackConfig
 
-    config = config_from(args, object="mug")
+    config = config_from(args, AttackConfig, object="mug")
     with output.output_kept_clean() if args.json else nullcontext(), watching(quiet=args.quiet) as progress:
         from advsearch.api.checking import plan
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import importlib
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from advsearch.cli import output
@@ -10,8 +13,8 @@ from advsearch.errors import UnknownNameError
 
 HELP = "do what a YAML file describes: a run.yaml repeats its run"
 
-COMMANDS = ("attack",)
-"""What the `command` of a file may say."""
+COMMANDS = {"attack": "AttackConfig", "sweep": "SweepConfig", "gap": "GapConfig", "region": "RegionConfig"}
+"""What the `command` of a file may say, and the configuration that it is."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
@@ -26,15 +29,36 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read the file, put the changes over it and do what it says."""
-    from advsearch.cli.attack import attack
-    from advsearch.config import AttackConfig, parse_assignment, read_yaml
+    from advsearch.settings import parse_assignment, read_yaml
 
-    command = read_yaml(args.file).get("command", "attack")
-    if command not in COMMANDS:
-        raise UnknownNameError("command", str(command), COMMANDS, f"It stands in {args.file}.")
+    command = str(read_yaml(args.file).get("command", "attack"))
     changes = dict(parse_assignment(text, text) for text in args.change)
     if args.run is not None:
         changes["run"] = args.run
     if args.overwrite:
         changes["overwrite"] = True
-    return attack(AttackConfig.from_yaml(args.file, changes), as_json=args.json, quiet=args.quiet)
+    return carry_out(command, args.file, changes, args)
+
+
+def carry_out(
+    command: str, file: str | Path, changes: Mapping[str, Any], args: argparse.Namespace, resumed: Path | None = None
+) -> int:
+    """Do what a file describes.
+
+    Args:
+        command: what the file says it is.
+        file: YAML.
+        changes: put over it.
+        args: with `json` and `quiet`.
+        resumed: the folder of the run to go on with, if the file is a run's own.
+
+    Raises:
+        UnknownNameError: there is no such command.
+    """
+    from advsearch import config
+
+    if command not in COMMANDS:
+        raise UnknownNameError("command", command, COMMANDS, f"It stands in {file}.")
+    described = getattr(config, COMMANDS[command]).from_yaml(file, changes)
+    module = importlib.import_module(f"advsearch.cli.{command}")
+    return int(module.carry_out(described, as_json=args.json, quiet=args.quiet, resumed=resumed))

@@ -30,16 +30,21 @@ def run(args: argparse.Namespace) -> int:
         case ["control", name]:
             return _show_control(name, args.json)
         case [name]:
-            return _show_run(name, args.json)
+            return show_run(name, args.json)
     raise InputError(f"expected the name of a run, or: control NAME, got {' '.join(args.what)!r}")
 
 
-def _show_run(name: str, as_json: bool) -> int:
-    from advsearch.cli.table import answer
+def show_run(name: str, as_json: bool) -> int:
+    """Print the answer of a run."""
+    import importlib
+
     from advsearch.runs.directory import find_run
     from advsearch.runs.summary import read_summary
 
     summary = read_summary(find_run(name))
+    tables = {"sweep": "advsearch.cli.sweep_table", "gap": "advsearch.cli.studies", "region": "advsearch.cli.region"}
+    kind = "gap" if "parts" in summary else summary.get("command")
+    answer = importlib.import_module(tables.get(str(kind), "advsearch.cli.table")).answer
     if as_json:
         output.print_json(summary)
     else:

@@ -26,6 +26,8 @@ FACTORS = (1.0, 3.0)
 """Steps that are tried, as multiples of the one that moves an outline by a pixel."""
 COUNTS = (8, 16, 32, 64)
 """Sample counts that are tried."""
+ADJOINT_RENDERS = 3.0
+"""Renders that take about as long as an adjoint."""
 CONVERGED = 128
 """Samples a pixel of a gradient that counts as converged."""
 
@@ -79,7 +81,15 @@ def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Gr
 
 
 def measured_plan(
-    renderer: Renderer, loss: Loss, u: Tensor, *, seed: int, spp: int, repeats: int = 3, every: bool = False
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    *,
+    seed: int,
+    spp: int,
+    repeats: int = 3,
+    every: bool = False,
+    counted: bool = False,
 ) -> GradientPlan:
     """Return the renderer's plan with every contested choice made by measurement at u.
 
@@ -91,13 +101,16 @@ def measured_plan(
         spp: samples a pixel.
         repeats: gradients of each estimator, at least 2.
         every: see `contested`.
+        counted: take the renders that an estimator needs for its time (an adjoint for `ADJOINT_RENDERS`), so that the
+            choice is the same on a busy machine.
     """
     plan = renderer.plan
     for groups, candidates in contested(plan, every=every):
-        scores = _scores(renderer, loss, u, groups, candidates, seed, spp, repeats)
+        scores = _scores(renderer, loss, u, groups, candidates, seed, spp, repeats, counted)
         best = min(scores, key=lambda name: scores[name])
         others = ", ".join(f"{name} {score / scores[best]:.3g}" for name, score in scores.items() if name != best)
-        reason = f"least squared error x time, measured at {spp} samples (others, as multiples of it: {others})"
+        time = "renders" if counted else "time"
+        reason = f"least squared error x {time}, measured at {spp} samples (others, as multiples of it: {others})"
         names = {group.name for group in groups}
         plan = replace(
             plan,
@@ -118,6 +131,7 @@ def _scores(
     seed: int,
     spp: int,
     repeats: int,
+    counted: bool,
 ) -> dict[str, float]:
     """Squared error x seconds of each candidate. The reference is the mean of the differences among them, whose own
     noise is taken off the others' errors."""
@@ -131,7 +145,9 @@ def _scores(
             noise = seeds.stream(seed, "plan", number)
             found.append(estimated(renderer, loss, u, estimator, names, noise, spp))
             times.append(time.perf_counter() - begun)
-        gradients[estimator], seconds[estimator] = torch.stack(found), statistics.median(times)
+        cost = 1.0 + sum(replace(group, estimator=estimator).renders for group in groups)
+        cost += ADJOINT_RENDERS if estimator in BY_ADJOINT else 0.0
+        gradients[estimator], seconds[estimator] = torch.stack(found), cost if counted else statistics.median(times)
     judge = next((one for one in candidates if one in BY_DIFFERENCES), candidates[0])
     truth = gradients[judge].mean(dim=0)
     spread = float((gradients[judge] - truth).square().sum() / max(1, repeats - 1))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, final
 
@@ -81,8 +81,7 @@ class Model:
             ModelError: the network's answer is not (N, classes).
         """
         images = checked_images(images)
-        low, high = self.batch_limits
-        parts = [self._logits(part, low) for part in torch.split(images, high)]
+        parts = [self.ask(x)[:count] for x, count in self.batches(images)]
         logits = parts[0] if len(parts) == 1 else torch.cat(parts)
         return logits.to(images.device)
 
@@ -90,13 +89,21 @@ class Model:
         """Return the classes that `text` names, e.g. ``"coffee mug,cup"`` or ``"#504"``; see `find_label_set`."""
         return find_label_set(text, self.labels, named=self.named)
 
-    def _logits(self, images: Tensor, fewest: int) -> Tensor:
-        """Return the logits of a batch that is at most as large as the network takes."""
-        count = len(images)
-        if count < fewest:
-            images = torch.cat([images, images[-1:].expand(fewest - count, -1, -1, -1)])
-        x = self.preprocessing(images.to(device=self.device, dtype=torch.float32)).to(self.dtype)
-        logits = logits_of(self.module(x), len(images), self.classes, self.name)[:count]
+    def batches(self, images: Tensor) -> Iterator[tuple[Tensor, int]]:
+        """Yield what the network is given for images (N, H, W, 3), and how many rows of each part count.
+
+        Parts are within `batch_limits`, preprocessed, and of the network's type and device. A part that is too small is
+        padded with its last image.
+        """
+        fewest, most = self.batch_limits
+        for part in torch.split(images, most):
+            missing = fewest - len(part)
+            full = torch.cat([part, part[-1:].expand(missing, -1, -1, -1)]) if missing > 0 else part
+            yield self.preprocessing(full.to(device=self.device, dtype=torch.float32)).to(self.dtype), len(part)
+
+    def ask(self, x: Tensor) -> Tensor:
+        """Return the logits (N, classes), float32, for a batch as `batches` yields it."""
+        logits = logits_of(self.module(x), len(x), self.classes, self.name)
         return logits.clamp_min(SMALLEST_PROBABILITY).log() if self.probabilities else logits
 
 

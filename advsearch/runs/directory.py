@@ -13,13 +13,13 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
-from advsearch.runs import images, lock, store, summary
+from advsearch.runs import images, lock, replay, store, summary
 from advsearch.runs.files import PART, replacing, storage_errors, write_text
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
-    from advsearch.config import AttackConfig
+    from advsearch.config import SceneConfig
 
 HOME = Path("runs")
 """Where runs live that are called by name, in the current directory."""
@@ -28,6 +28,8 @@ CONFIG = "run.yaml"
 REPORT = "report.html"
 IMAGES = "images"
 ARTIFACTS = "artifacts"
+PARTS = "parts"
+"""Runs that a study consists of."""
 
 CONTENTS = (
     CONFIG,
@@ -35,10 +37,12 @@ CONTENTS = (
     f"{store.NAME}-wal",
     f"{store.NAME}-shm",
     f"{store.NAME}-journal",
+    replay.NAME,
     summary.NAME,
     REPORT,
     IMAGES,
     ARTIFACTS,
+    PARTS,
 )
 """All that a run writes. `overwrite` removes these and nothing else."""
 
@@ -58,6 +62,7 @@ class RunDirectory:
     def __init__(self, path: Path, held: lock.RunLock) -> None:
         self.path = path
         self._lock = held
+        self._replay: replay.ReplayLog | None = None
         self.store = store.Store(path / store.NAME)
 
     @classmethod
@@ -106,7 +111,7 @@ class RunDirectory:
             raise
 
     @classmethod
-    def create_for(cls, config: AttackConfig) -> RunDirectory:
+    def create_for(cls, config: SceneConfig) -> RunDirectory:
         """Make the directory that `config` asks for, with its `run.yaml`; errors as for `create`."""
         default = default_name(config.object, config.controls)
         run = cls.create(config.run, overwrite=config.overwrite, default=default)
@@ -117,7 +122,38 @@ class RunDirectory:
             raise
         return run
 
-    def write_config(self, config: AttackConfig) -> Path:
+    @classmethod
+    def resume(cls, run: str | Path) -> RunDirectory:
+        """Open and lock the directory of a run that is there, to go on with it.
+
+        Args:
+            run: its name or path, as for `find_run`.
+
+        Raises:
+            UnknownNameError: there is no such run.
+            InputError: another process works on it.
+            FileFormatError: its results cannot be read.
+        """
+        path = find_run(run)
+        held = lock.RunLock(path)
+        try:
+            return cls(path, held)
+        except BaseException:
+            held.release()
+            raise
+
+    @property
+    def replay(self) -> replay.ReplayLog:
+        """What searches were told; made when it is first asked for."""
+        if self._replay is None:
+            self._replay = replay.ReplayLog(self.path / replay.NAME)
+        return self._replay
+
+    def finish(self) -> None:
+        """Remove what only a run that goes on needs."""
+        self.replay.remove()
+
+    def write_config(self, config: SceneConfig) -> Path:
         """Write `run.yaml`, from which `advsearch run` repeats the run, and return its path."""
         return write_text(self.path / CONFIG, config.recipe().to_yaml())
 
@@ -173,11 +209,15 @@ class RunDirectory:
     def close(self) -> None:
         """Close the results and give up the lock; a second call does nothing."""
         self.store.close()
+        if self._replay is not None:
+            self._replay.close()
         self._lock.release()
 
     def discard(self) -> None:
         """Remove what this run wrote, and the directory if that leaves it empty."""
         self.store.close()
+        if self._replay is not None:
+            self._replay.close()
         with suppress(OSError):
             _clear(self.path)
             _remove_if_bare(self.path)
@@ -189,7 +229,8 @@ class RunDirectory:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if error is not None and not (self.path / summary.NAME).exists() and self.store.count() == 0:
+        kept = (summary.NAME, PARTS)
+        if error is not None and not any((self.path / name).exists() for name in kept) and self.store.count() == 0:
             self.discard()
         else:
             self.close()
@@ -226,7 +267,7 @@ def is_run(path: Path) -> bool:
     """Return whether advsearch wrote the directory: by the header of its `run.yaml` or of its `results.sqlite`."""
     if store.is_ours(path / store.NAME):
         return True
-    from advsearch.config import HEADER
+    from advsearch.settings import HEADER
 
     try:
         with (path / CONFIG).open("rb") as file:

@@ -45,6 +45,21 @@ class RunLock:
         return f"process {pid}" if pid.isdigit() else "another process"
 
 
+def is_held(folder: Path) -> bool:
+    """Whether a process works on the run in `folder`; nothing is written."""
+    try:
+        descriptor = os.open(folder / NAME, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
 def _refusal(error: OSError, folder: Path, owner: str) -> Exception:
     if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
         return InputError(f"{folder}: {owner} is working on this run; wait for it or choose another name with --run")

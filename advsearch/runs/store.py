@@ -60,6 +60,11 @@ MIGRATIONS = (
     );
     CREATE INDEX evaluations_kind ON evaluations (kind, step);
     """,
+    """
+    -- Pictures that the evaluation took: more than one where derivatives came from differences, or it was rendered
+    -- with a multiple of the samples. NULL in rows of version 1.
+    ALTER TABLE evaluations ADD COLUMN renders INTEGER;
+    """,
 )
 """What turns a file of version n into one of version n + 1. Never change one that was released; add another."""
 
@@ -80,6 +85,7 @@ class Row:
         probability: the model's probability for it, in [0, 1].
         values: parameter to ``{"value": ..., "unit": ...}``.
         seconds: that the evaluation took.
+        renders: pictures that it took; None where that was not counted.
         time: when it was written, seconds since 1970; set by the store.
         id: place in the file; set by the store.
     """
@@ -95,6 +101,7 @@ class Row:
     probability: float | None = None
     values: Mapping[str, Any] = field(default_factory=dict)
     seconds: float | None = None
+    renders: int | None = None
     time: float | None = None
     id: int | None = None
 
@@ -157,6 +164,24 @@ class Store:
         return self._db.execute(
             "SELECT step, objective FROM evaluations WHERE kind = ? ORDER BY id", (kind,)
         ).fetchall()
+
+    def counts(self) -> dict[str, int]:
+        """Return how many rows there are of each kind."""
+        return dict(self._db.execute("SELECT kind, count(*) FROM evaluations GROUP BY kind ORDER BY kind").fetchall())
+
+    def note(self, key: str) -> str | None:
+        """Return what was noted under `key`, or None."""
+        found = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
+        return None if found is None else str(found[0])
+
+    def set_note(self, key: str, value: str) -> None:
+        """Keep a text under `key`, in place of what was there.
+
+        Raises:
+            StorageError: the disk is full or can't be written.
+        """
+        with storage_errors(self.path), self._db:
+            self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (key, value))
 
     def close(self) -> None:
         """Close the file; a second call does nothing."""
@@ -226,12 +251,29 @@ def _check_version(db: sqlite3.Connection, path: Path) -> None:
         raise FileFormatError(f"{path}: expected version {len(MIGRATIONS)} of the results, got {version}; {advice}")
 
 
+_NAMES = tuple(one.name for one in fields(Row) if one.name != "id")
+_FRONT = _NAMES[: _NAMES.index("values")]
+_BACK = _NAMES[_NAMES.index("values") + 1 : -1]  # the last is the time
+_SIMPLE = frozenset({str, int, bool, type(None)})
+_JSON = json.JSONEncoder(allow_nan=False)
+
+
 def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
     """Return the row's columns but the id. Numbers of numpy and torch become Python's."""
-    values = {one.name: plain(getattr(row, one.name)) for one in fields(Row) if one.name != "id"}
-    values["values"] = json.dumps(values["values"], allow_nan=False)
-    values["time"] = stamp
-    return tuple(values.values())
+    front = [_column(getattr(row, name)) for name in _FRONT]
+    return (*front, _values(row.values), *(_column(getattr(row, name)) for name in _BACK), stamp)
+
+
+def _column(value: Any) -> Any:
+    simple = type(value) in _SIMPLE or (type(value) is float and value - value == 0.0)
+    return value if simple else plain(value)
+
+
+def _values(values: Mapping[str, Any]) -> str:
+    try:
+        return _JSON.encode(values)
+    except (TypeError, ValueError):
+        return json.dumps(plain(values), allow_nan=False)
 
 
 def _decode(values: tuple[Any, ...]) -> Row:

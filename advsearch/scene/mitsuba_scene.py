@@ -87,6 +87,8 @@ class MitsubaScene:
         filter: reconstruction filter, "box" or "gaussian".
         freeze: record primal renders once and replay them (`dr.freeze`); off only to measure what it brings.
         max_depth: longest light path in segments.
+        sampler: Mitsuba's name of the sampler; some round sample counts up, see `advsearch.api.measuring`.
+        integrator: Mitsuba's name of the path integrator of primal renders, where there is no medium.
     """
 
     def __init__(
@@ -97,8 +99,11 @@ class MitsubaScene:
         filter: str = "box",
         freeze: bool = True,
         max_depth: int = MAX_DEPTH,
+        sampler: str = "independent",
+        integrator: str = "prb",
     ) -> None:
         mi = mitsuba()
+        self._made = (description, resolution, filter, freeze)
         self.resolution = resolution
         self.assembly = Assembly(description)
         self.max_depth = max_depth
@@ -114,10 +119,11 @@ class MitsubaScene:
         parts = (object_part, *description.parts)
         self.volumetric = any(part.volumetric for part in parts)
         plugins = _scene_dict(description, resolution, filter)
+        plugins["camera"]["sampler"] = {"type": sampler}
         for part in parts:
             plugins |= part.plugins()
             plugins["camera"] |= part.sensor()
-        self._path: dict[str, Any] = {}
+        self._path: dict[str, Any] = {"type": integrator}
         for part in parts:
             self._path |= part.integrator(plugins)
         self._scene = mi.load_dict(plugins, optimize=False)
@@ -136,6 +142,15 @@ class MitsubaScene:
         self._recorded_at = 0
         _population.bury()
         _population.add(self, self._scene, self._integrators, self._parameters)
+
+    def like(self, **changes: Any) -> MitsubaScene:
+        """Return another scene made as this one was, but with another `max_depth`, `sampler` or `integrator`."""
+        description, resolution, filter, freeze = self._made
+        settings = {"max_depth": self.max_depth, **changes}
+        other = MitsubaScene(description, resolution, filter=filter, freeze=freeze, **settings)
+        for what in ("path", "guides"):
+            other._integrator(what)  # one that comes later makes the recordings of all scenes stale
+        return other
 
     def base(self, name: str) -> Tensor:
         """Return the base value of an input, as a fresh torch tensor of the input's shape."""

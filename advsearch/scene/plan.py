@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -38,7 +39,7 @@ ALWAYS_VALID = ("differences", "secant", "forward", "simultaneous", "none")
 
 DIRECTIONS = 4
 """Random directions of one `simultaneous` gradient."""
-DEFAULT_STEP, TURN_STEP = 0.05, 0.02
+DEFAULT_STEP, TURN_STEP = 0.05, 0.005
 """Half of a difference's width in u, for coordinates that move nothing in the picture: of a range, of a full turn."""
 DEFAULT_PIXELS = 1.0
 """How far the fastest point of an outline moves over half a difference, in pixels (DESIGN 5.1)."""
@@ -135,6 +136,21 @@ class GradientPlan:
         low, high = STEP_RANGE
         scaled = tuple(replace(one, step=min(high, max(low, one.step * factor))) for one in self.groups)
         return replace(self, groups=scaled)
+
+    def restored(self, stored: Mapping[str, Any]) -> GradientPlan:
+        """Return the plan with the choices that `to_dict` has stored of a plan for the same space."""
+        chosen = {f"{one['control']}.{one['parameter']}": one for one in stored["groups"]}
+        groups = tuple(
+            replace(
+                group,
+                estimator=chosen[group.name]["estimator"],
+                step=chosen[group.name]["step"],
+                reason=chosen[group.name]["reason"],
+                measured=chosen[group.name]["variance_x_seconds"],
+            )
+            for group in self.groups
+        )
+        return replace(self, groups=groups, spp=stored["spp"])
 
     def to_dict(self) -> dict[str, object]:
         """Return what a run stores of the plan."""

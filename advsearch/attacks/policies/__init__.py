@@ -2,20 +2,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
+from advsearch.attacks.policies.adam import Adam
 from advsearch.attacks.policies.auto import Auto
-from advsearch.attacks.policies.base import Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import Distributional, Policy, Proposal, answer_of, draw_seed, seeded
+from advsearch.attacks.policies.choices import Choices, with_choices
+from advsearch.attacks.policies.cmaes import CMAES
+from advsearch.attacks.policies.grid import Grid
+from advsearch.attacks.policies.halving import Halving
+from advsearch.attacks.policies.nes import NES
 from advsearch.attacks.policies.pgd import PGD
+from advsearch.attacks.policies.portfolio import Portfolio
 from advsearch.attacks.policies.random import Random
-from advsearch.errors import UnknownNameError
+from advsearch.attacks.policies.restarts import Restarts
+from advsearch.attacks.policies.sobol import Sobol
+from advsearch.errors import InputError, UnknownNameError
 
-POLICIES: dict[str, type[Policy[Any]]] = {"auto": Auto, "pgd": PGD, "random": Random}
+POLICIES: dict[str, type[Policy[Any]]] = {
+    "adam": Adam,
+    "auto": Auto,
+    "cmaes": CMAES,
+    "grid": Grid,
+    "halving": Halving,
+    "nes": NES,
+    "pgd": PGD,
+    "portfolio": Portfolio,
+    "random": Random,
+    "restarts": Restarts,
+    "sobol": Sobol,
+}
+
+Spec = str | Mapping[str, Any] | Policy[Any]
+"""A policy inside another one: its name, a mapping with its `name` and options, or the policy itself."""
 
 
 def make_policy(name: str, **options: Any) -> Policy[Any]:
     """Return the policy of that name with the given options, which are its dataclass's fields.
+
+    A wrapper's `policy` and `policies` may be given as a `Spec`, and as a list of them:
+
+        make_policy("restarts", policy="pgd", times=4)
+        make_policy("portfolio", policies=["cmaes", {"name": "pgd", "momentum": 0.9}])
 
     Raises:
         UnknownNameError: no such policy, or it has no such option.
@@ -28,17 +58,48 @@ def make_policy(name: str, **options: Any) -> Policy[Any]:
     for option in options:
         if option not in known:
             raise UnknownNameError(f"option of policy {name!r}:", option, known)
+    if options.get("policy") is not None:
+        options["policy"] = _nested(options["policy"], f"policy of {name}")
+    if "policies" in options:
+        given = options["policies"]
+        if isinstance(given, (str, Mapping)):
+            given = [given]
+        options["policies"] = tuple(_nested(one, f"policies of {name}") for one in given)
     return policy(**options)
 
 
+def _nested(spec: Spec, where: str) -> Policy[Any]:
+    """Return the policy that a wrapper is given."""
+    if isinstance(spec, Policy):
+        return spec
+    if isinstance(spec, str):
+        return make_policy(spec)
+    if not isinstance(spec, Mapping) or not isinstance(spec.get("name"), str):
+        raise InputError(f"{where}: expected a name or a mapping with a name and options, got {spec!r}")
+    return make_policy(**spec)
+
+
 __all__ = [
+    "CMAES",
+    "NES",
     "PGD",
     "POLICIES",
+    "Adam",
     "Auto",
+    "Choices",
+    "Distributional",
+    "Grid",
+    "Halving",
     "Policy",
+    "Portfolio",
     "Proposal",
     "Random",
+    "Restarts",
+    "Sobol",
+    "Spec",
+    "answer_of",
     "draw_seed",
     "make_policy",
     "seeded",
+    "with_choices",
 ]

@@ -124,6 +124,7 @@ class Auto(Policy[AutoState]):
 
     name: ClassVar[str] = "auto"
     uses_gradient: ClassVar[bool] = True
+    handles_choices: ClassVar[bool] = True
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> AutoState:
         box = box_coordinates(domain)
@@ -148,10 +149,10 @@ class Auto(Policy[AutoState]):
             if state.box.count < state.domain.dim:
                 return None, state
         if not state.values:
-            return Proposal(state.domain.start), state
+            return Proposal(state.domain.begin), state
         with one_thread():
             x, state = _next_point(state)
-        return Proposal(state.domain.project(state.box.put(state.domain.start, x))), state
+        return Proposal(state.domain.project(state.box.put(state.domain.begin, x))), state
 
     def update(self, state: AutoState, u: Tensor, evaluation: Evaluation) -> AutoState:
         state = replace(state, spent=state.spent + evaluation.cost)
@@ -222,7 +223,7 @@ def _surrogate(state: AutoState) -> tuple[Surrogate, AutoState]:
 
 def _begin_ascent(state: AutoState) -> AutoState:
     """Let PGD go on from the best of the points seen so far, with small steps in the box."""
-    x = state.box.take(state.domain.start)
+    x = state.box.take(state.domain.begin)
     if any(math.isfinite(value) for value in state.values):
         surrogate, state = _surrogate(state)
         x = surrogate.x[int(surrogate.predict(surrogate.x)[0].argmax())]
@@ -231,7 +232,7 @@ def _begin_ascent(state: AutoState) -> AutoState:
     )
     domain = replace(state.domain, blocks=blocks)
     ascent = PGD().start(domain, seeded(state.seed, 0), max(1, state.plan.steps - state.spent))
-    return replace(state, ascent=replace(ascent, u=domain.project(state.box.put(domain.start, x))))
+    return replace(state, ascent=replace(ascent, u=domain.project(state.box.put(domain.begin, x))))
 
 
 def _climb(state: AutoState, proposal: Proposal) -> tuple[Proposal, AutoState]:

@@ -11,12 +11,13 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Generic, TypeVar
 
 import torch
 from torch import Tensor
 
+from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.evaluation import Evaluation, Wanted
 from advsearch.seeds import stream
@@ -34,25 +35,43 @@ class Proposal:
             or what is "free" (only where the domain has `partial_gradients`). A wish: the last evaluations of a budget
             get none, and `update` sees None.
         step_size: the step that led here in units of each block's radius, for the log; NaN where there is none.
+        samples: render with so many times the search's samples per pixel, at least 1, for as many times the renders.
+            A wish too: the end of a budget gets what is left.
     """
 
     u: Tensor
     gradient: Wanted = False
     step_size: float = math.nan
+    samples: int = 1
+
+    def cost(self, domain: Domain) -> int:
+        """Return the renders that this takes at most."""
+        return self.samples * (1 + (domain.gradient_cost if self.gradient is True else 0))
 
 
 class Policy(ABC, Generic[State]):
-    """Proposes configurations, one at a time. Write a new one by implementing the three methods below."""
+    """Proposes configurations, one at a time. Write a new one by implementing the three methods below.
+
+    Attributes:
+        name: for messages and the log.
+        handles_choices: whether it searches discrete choices (`Block.options`) itself. `search` wraps one that does
+            not in `Choices`, so that it never sees any.
+    """
 
     name: ClassVar[str]
-    uses_gradient: ClassVar[bool]
+    handles_choices: ClassVar[bool] = False
+
+    @property
+    @abstractmethod
+    def uses_gradient(self) -> bool:
+        """Whether it ever asks for a gradient. A class with a fixed answer just sets the attribute."""
 
     @abstractmethod
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> State:
         """Return the state before the first proposal.
 
         Args:
-            domain: where to search.
+            domain: where to search; begin at `domain.begin`.
             generator: the search's source of randomness, to draw a seed from; use `seeded` for numbers later on.
             steps: how many renders there will be at most, those of gradients included: a plan for schedules, never to
                 be counted on.
@@ -71,6 +90,29 @@ class Policy(ABC, Generic[State]):
         its objective is finite or -inf, which stands for "could not be evaluated". The objective is noisy: the same u
         with another seed gives another value, and a maximum over many is biased upwards.
         """
+
+
+class Distributional(Policy[State]):
+    """A policy whose answer is, beside the best configuration it met, a distribution of them."""
+
+    @abstractmethod
+    def answer(self, state: State) -> Distribution | None:
+        """Return the distribution that the search has reached, or None if there is none (yet)."""
+
+
+def answer_of(policy: Policy[State], state: State) -> Distribution | None:
+    """Return the distribution of any policy; None if it has none."""
+    return policy.answer(state) if isinstance(policy, Distributional) else None
+
+
+def affordable(proposal: Proposal, domain: Domain, left: int) -> Proposal:
+    """Return the proposal as far as `left` renders, at least 1, allow: no more samples than these, and no gradient
+    after which no render would be left to use it."""
+    if proposal.samples > left:
+        proposal = replace(proposal, samples=left)
+    if proposal.gradient and proposal.cost(domain) >= left:
+        return replace(proposal, gradient=False)
+    return proposal
 
 
 def draw_seed(generator: torch.Generator) -> int:

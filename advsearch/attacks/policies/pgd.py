@@ -134,7 +134,7 @@ class PGD(Policy[PGDState]):
         step_size: the first step in units of each block's radius (epsilon; half the diagonal for a box), over 0, at
             most 2.
         momentum: weight of the past, in [0, 1).
-        random_start: start from a uniform sample of the domain, not from its start.
+        random_start: start from a uniform sample of the domain, not from where it begins.
 
     Raises:
         InputError: a value is outside what is said here.
@@ -157,7 +157,7 @@ class PGD(Policy[PGDState]):
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> PGDState:
         seed = draw_seed(generator)
-        u = domain.sample(seeded(seed, 0))[0] if self.random_start else domain.start
+        u = domain.sample(seeded(seed, 0))[0] if self.random_start else domain.begin
         steps = max(1, steps // (1 + domain.gradient_cost))
         window = Window(max(FEWEST, round(FIRST_WINDOW * steps)))
         return PGDState(domain, steps, seed, u, torch.zeros_like(u), self.step_size, None, window)
@@ -184,7 +184,7 @@ def _retreat(state: PGDState) -> PGDState:
     """Return to the best configuration itself with half the step size; if there is none, leave the start at random."""
     state = replace(state, step_size=state.step_size / 2)
     if state.peak is None:
-        return _step(state, state.domain.start, torch.zeros_like(state.u))
+        return _step(state, state.domain.begin, torch.zeros_like(state.u))
     return replace(state, u=state.peak.u, direction=state.peak.direction)
 
 

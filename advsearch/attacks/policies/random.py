@@ -33,6 +33,7 @@ class Random(Policy[RandomState]):
 
     name: ClassVar[str] = "random"
     uses_gradient: ClassVar[bool] = False
+    handles_choices: ClassVar[bool] = True
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> RandomState:
         return RandomState(domain, draw_seed(generator), 0)

@@ -1,0 +1,205 @@
+"""`region`: the box around a configuration in which the model's verdict stays, and a map of its margin."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.api.attacking import problem_from_config
+from advsearch.api.memory import ANSWER, Memory
+from advsearch.api.problem import Problem
+from advsearch.api.record import Recorder, Stages
+from advsearch.api.stages import Attack
+from advsearch.attacks import make_policy
+from advsearch.attacks.region import Region, grow
+from advsearch.config import AttackConfig, RegionConfig, SceneConfig, split_names
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.progress import NullProgress, Progress
+from advsearch.report.studies import map_figure
+from advsearch.runs.directory import RunDirectory, find_run
+from advsearch.runs.files import write_bytes
+from advsearch.runs.store import NAME, Store
+
+MOST = 8
+"""A box is grown in at most so many parameters."""
+
+AT_CENTRE = 20
+"""Trials of the centre."""
+
+
+@dataclass(frozen=True, eq=False)
+class Varied:
+    """The parameters in which the box grows.
+
+    Attributes:
+        names: of each.
+        places: (k,) where they lie in u.
+    """
+
+    names: tuple[str, ...]
+    places: Tensor
+
+
+def region_from_config(config: RegionConfig, *, progress: Progress | None = None, resumed: Path | None = None) -> Any:
+    """Grow the region that a configuration describes and keep it in a run directory.
+
+    Returns:
+        What `summary.json` holds: `verdict` at the centre; `box`, the range of each parameter with its unit;
+        `same`, how many fresh samples of the box had that verdict, with the 95 % interval of its share; `volume`, the
+        share of the whole space; `map`, if one was asked for.
+
+    Raises:
+        InputError: the verdict at the centre depends on the noise, the parameters do not fit, and what a scene raises.
+    """
+    stages = Stages(progress or NullProgress())
+    stages.begin("setup", "set-up")
+    as_attack = AttackConfig(**{name: getattr(config, name) for name in SceneConfig.model_fields})
+    as_attack = as_attack.model_copy(update={"measure": "no", "verify_spp": config.verify_spp})
+    problem, _ = problem_from_config(as_attack)
+    varied = _varied(problem, config)
+    centre = _centre(problem, config)
+    opened = RunDirectory.resume(resumed) if resumed is not None else RunDirectory.create_for(config)
+    with opened as run:
+        memory = Memory(run)
+        attack = Attack(problem, as_attack, make_policy("random"), Recorder(run, problem, memory), memory, stages)
+        attack.choose_spp({"centre": centre})
+        verdict = _verdict(attack, centre)
+
+        def at(values: Tensor) -> Tensor:
+            u = centre.clone()
+            u[varied.places] = values
+            return u
+
+        stages.begin("search", "region", None)
+        found = grow(
+            lambda values, number: attack.one_trial("region", number, at(values)).wrong == verdict,
+            centre[varied.places],
+            seed=seeds.stream(config.seed, "region"),
+            samples=config.samples,
+        )
+        box = _box(problem, found, at, varied)
+        answer = {
+            "schema": 1,
+            "command": "region",
+            "run": str(run.path),
+            "object": config.object,
+            "environment": config.environment,
+            "model": problem.model.name,
+            "controls": [bound.name for bound in problem.space.controls],
+            "ending": "done",
+            "verdict": "wrong" if verdict else "right",
+            "box": box,
+            "same": found.same,
+            "samples": found.samples,
+            "rate": found.same / found.samples,
+            "interval": list(found.interval),
+            "volume": found.volume,
+            "spp": attack.findings.spp,
+            "image_formation": problem.renderer.formation.summary(),
+        }
+        if config.map:
+            answer["map"] = _map(attack, config.map, at, varied, box, run)
+        stages.end()
+        answer |= {
+            "renders": {"verification": attack.findings.verification_renders},
+            "seconds": {**stages.seconds, "total": stages.total},
+            "seed": config.seed,
+            "command_line": config.command_line(),
+        }
+        run.write_summary(answer)
+        return answer
+
+
+def _centre(problem: Problem, config: RegionConfig) -> Tensor:
+    """The configuration that the box grows around."""
+    if config.around is None:
+        return problem.domain.start.clone()
+    with Store(find_run(config.around) / NAME, read_only=True) as store:
+        text = store.note(ANSWER)
+    values = None if text is None else torch.tensor(json.loads(text), dtype=torch.float32)
+    if values is None or values.shape != problem.domain.start.shape:
+        raise InputError(
+            f"--around {config.around}: expected a finished run over the same controls with at most a few thousand "
+            "numbers, got another one; leave --control out so that the run's own are taken"
+        )
+    return problem.domain.project(values)
+
+
+def _varied(problem: Problem, config: RegionConfig) -> Varied:
+    """Where the parameters lie that the box grows in."""
+    places: dict[str, Tensor] = {}
+    begin = 0
+    for control, group in problem.space.groups:
+        numbers = torch.arange(begin, begin + group.size)
+        begin += group.size
+        if group.options:
+            continue
+        for number, place in enumerate(numbers):
+            places[f"{control.name}.{group.name}" + (f".{number}" if group.size > 1 else "")] = place[None]
+    names = tuple(places) if config.vary is None else split_names(config.vary)
+    for name in names:
+        if name not in places:
+            raise UnknownNameError("parameter in --vary", name, places)
+    if not 1 <= len(names) <= MOST:
+        raise InputError(f"--vary: expected 1 to {MOST} parameters, got {len(names)}; name some of {', '.join(places)}")
+    if config.map and len(names) != 2:
+        raise InputError(f"--map: expected two parameters in --vary, got {len(names)}: {', '.join(names)}")
+    return Varied(names, torch.cat([places[name] for name in names]))
+
+
+def _verdict(attack: Attack, centre: Tensor) -> bool:
+    """Whether the model is wrong at the centre.
+
+    Raises:
+        InputError: that depends on the noise.
+    """
+    wrong = sum(attack.one_trial("centre", number, centre).wrong for number in range(AT_CENTRE))
+    needed = attack.rule.needed(AT_CENTRE)
+    if AT_CENTRE - needed < wrong < needed:
+        raise InputError(
+            f"the model is wrong in {wrong} of {AT_CENTRE} trials at the centre, so its verdict there depends on the "
+            "noise; choose another centre, or more samples with --verify-spp"
+        )
+    return wrong >= needed
+
+
+def _box(problem: Problem, found: Region, at: Any, varied: Varied) -> list[dict[str, Any]]:
+    """The range of every parameter of the box in its unit."""
+    ends = [problem.describe(at(values)) for values in (found.low, found.high, found.centre)]
+    rows = []
+    for name in varied.names:
+        stem, _, number = name.rpartition(".")
+        known = name if name in ends[0] else stem
+        low, high, centre = (_number(end[known], number if known == stem else "") for end in ends)
+        unit = str(ends[0][known].get("unit", ""))
+        rows.append({"name": name, "unit": unit, "low": low, "high": high, "centre": centre})
+    return rows
+
+
+def _number(told: Any, number: str) -> float:
+    value = told["value"]
+    return float(value[int(number)] if number else value)
+
+
+def _map(attack: Attack, side: int, at: Any, varied: Varied, box: Any, run: RunDirectory) -> dict[str, Any]:
+    """The margin on a grid over two parameters, as numbers and as a picture."""
+    attack.stages.begin("map", "map", side * side)
+    steps = torch.linspace(0.0, 1.0, side) if side > 1 else torch.tensor([0.5])
+    margins = [
+        [attack.one_trial("map", row * side + column, at(torch.stack([x, y]))).margin for column, x in enumerate(steps)]
+        for row, y in enumerate(steps)
+    ]
+    ends = [attack.problem.describe(at(torch.full((2,), end))) for end in (0.0, 1.0)]
+    axes = []
+    for one in box:
+        low, high = (_number(end[one["name"]], "") for end in ends)
+        axes.append({"name": one["name"], "unit": one["unit"], "low": low, "high": high})
+    for suffix, data in map_figure(margins, axes, box).items():
+        write_bytes(run.path / "images" / f"map.{suffix}", data)
+    return {"axes": axes, "margins": margins}

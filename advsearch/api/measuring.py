@@ -1,0 +1,262 @@
+"""Error against run time of a scene as it is: what `advsearch precision` does."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.api.attacking import problem_from_config
+from advsearch.api.measuring_report import Section, figures_of, report_of
+from advsearch.api.problem import Problem
+from advsearch.attacks import make_policy
+from advsearch.config import PrecisionConfig, split_names
+from advsearch.errors import InputError
+from advsearch.evaluation.gradients import Loss, inside, smooth_loss
+from advsearch.evaluation.planning import measured_plan
+from advsearch.evaluation.precision import Budget, Rounds, in_rounds
+from advsearch.evaluation.precision_fits import UNKNOWN, Theory
+from advsearch.evaluation.precision_gradient import GradientBench, Part, parts_of, theory_of
+from advsearch.evaluation.precision_image import REFERENCE_SAMPLER, PictureBench, variants, with_formation
+from advsearch.evaluation.precision_machine import machine
+from advsearch.evaluation.precision_objective import ObjectiveBench, curve_of
+from advsearch.evaluation.precision_points import Point, Sample, Setting, point_of
+from advsearch.progress import NullProgress, Progress
+from advsearch.runs.directory import RunDirectory, check_free, default_name
+from advsearch.runs.files import write_bytes, write_text
+from advsearch.runs.summary import to_json
+
+SHARES = {"image": 0.45, "gradient": 0.3, "objective": 0.25}
+"""Of the time, by quantity; what one doesn't use is the others'."""
+REFERENCE_SHARE = 0.35
+"""Of the time of a quantity, for its reference."""
+VERIFY_SPP, VERIFY_RENDERS = 64, 4
+"""Samples a pixel, and fresh renders, that verify what a search held."""
+NUMBERS, FIGURE = "precision.json", "precision"
+
+
+def precision(config: PrecisionConfig, *, progress: Progress | None = None) -> dict[str, Any]:
+    """Measure error against run time and write figures and numbers.
+
+    Args:
+        config: scene, model, controls, what to measure and for how long.
+        progress: told how far it is.
+
+    Returns:
+        The report (DESIGN section 6), with the paths of its figures.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    progress = progress or NullProgress()
+    if config.run is not None and config.out is None:
+        check_free(config.run, overwrite=config.overwrite)
+    begun = time.perf_counter()
+    progress.stage("set-up")
+    policies = {name: make_policy(name) for name in split_names(config.policies)}
+    problem, said = problem_from_config(config.as_attack())
+    for text in said:
+        progress.message(text)
+    job = _Job(config, problem, progress, Budget(config.seconds))
+    setup = time.perf_counter() - begun
+    wanted = [name for name in ("image", "gradient", "objective") if name in split_names(config.quantities)]
+    if "gradient" in wanted and not any(group.valid for group in problem.renderer.plan.groups):
+        raise InputError(
+            f"--control {','.join(config.controls)}: has no derivative; leave gradient out of --quantities"
+        )
+    measure: dict[str, Callable[[Budget], None]] = {
+        "image": job.image,
+        "gradient": job.gradient,
+        "objective": lambda share: job.objective(share, policies),
+    }
+    try:
+        for number, name in enumerate(wanted):
+            measure[name](job.budget.share(SHARES[name] / sum(SHARES[one] for one in wanted[number:])))
+    except KeyboardInterrupt:
+        job.section.interrupted = True
+    seconds = {"budget": config.seconds, "setup": setup, "total": time.perf_counter() - begun}
+    report = report_of(_head(config, problem), job.section, config.error, seconds)
+    return _kept(config, report)
+
+
+@dataclass
+class _Job:
+    """What is measured, quantity by quantity, and what came out so far."""
+
+    config: PrecisionConfig
+    problem: Problem
+    progress: Progress
+    budget: Budget
+    section: Section = field(default_factory=Section)
+
+    @property
+    def seed(self) -> int:
+        """Root of the measurements' seeds."""
+        return seeds.stream(self.config.seed, "precision")
+
+    def image(self, budget: Budget) -> None:
+        """The picture and the model's margin."""
+        renderer, problem = self.problem.renderer, self.problem
+        depths = [int(part) for part in split_names(self.config.depths)]
+        chosen = variants(
+            split_names(self.config.samplers), depths, renderer.scene.max_depth, volumetric=renderer.scene.volumetric
+        )
+
+        def margin(picture: Tensor) -> float:
+            with torch.no_grad():
+                return -float(problem.goal.score(problem.model(picture))[0])
+
+        self.progress.stage("image: set-up")
+        bench = PictureBench(renderer, problem.whole(problem.domain.start), margin, chosen)
+        self.progress.stage("image: references")
+        bench.refer(budget.share(REFERENCE_SHARE), self.seed, self._tick)
+        for family, one in bench.pictures.items():
+            self.section.refer("image", family, "", one, bench.part_spp[family], bench.margins[family])
+        theories = {one.series: one.theory for one in chosen}
+        families = {one.series: one.family for one in chosen}
+        found = self._rounds("image", bench.settings, bench.measure, budget)
+        for measure in ("error", "margin_error"):
+            self._take(found, measure, bench.floor, lambda series: theories[series])
+        self.section.families |= {("image", "", series): family for series, family in families.items()}
+
+    def gradient(self, budget: Budget) -> None:
+        """Every control's gradient."""
+        config, problem, renderer = self.config, self.problem, self.problem.renderer
+        loss: Loss = problem.loss
+        if config.loss == "linear":
+            renderer = with_formation(renderer, denoiser="none", transfer="linear")
+            loss = smooth_loss(renderer.formation.resolution, config.seed)
+        u = inside(renderer)
+        exact = with_formation(renderer, renderer.scene.like(sampler=REFERENCE_SAMPLER))
+        parts = parts_of(renderer.plan.groups, linear=config.loss == "linear")
+        for number, part in enumerate(parts):
+            bench = GradientBench(renderer, loss, u, part, exact)
+            self._one_gradient(bench, part, budget.share(1.0 / (len(parts) - number)))
+
+    def _one_gradient(self, bench: GradientBench, part: Part, budget: Budget) -> None:
+        self.progress.stage(f"gradient of {part.name}: reference")
+        bench.refer(budget.share(REFERENCE_SHARE), self.seed, self._tick)
+        if bench.reference is None:
+            return
+        self.section.refer("gradient", bench.by, part.name, bench.reference, bench.part_spp)
+        said = bench.bias(budget, self.seed)
+        self.section.warnings += [said] if said else []
+        found = self._rounds(f"gradient of {part.name}", bench.settings, bench.measure, budget)
+        linear = self.config.loss == "linear"
+        self._take(found, "error", bench.floor, theory_of if linear else lambda series: UNKNOWN)
+
+    def objective(self, budget: Budget, policies: dict[str, Any]) -> None:
+        """The best verified objective of each policy."""
+        problem, config = self.problem, self.config
+        if any(policy.uses_gradient for policy in policies.values()):
+            self.progress.stage("gradient plan")
+            at, seed = inside(problem.renderer), seeds.stream(config.seed, "measure")
+            problem.plan = measured_plan(problem.renderer, problem.loss, at, seed=seed, spp=problem.spp, counted=True)
+        bench = ObjectiveBench(problem.evaluator, problem.domain, policies, config.steps, self._verified, budget)
+        self.section.start = self._verified(problem.domain.start)
+        settings = bench.settings(problem.spp)
+        self.progress.stage("objective", len(settings) * config.repeats)
+        found = in_rounds(
+            settings,
+            bench.measure,
+            budget,
+            rounds=config.repeats,
+            seed=self.seed,
+            least=1,
+            warm_up=0,
+            on_done=lambda setting: self.progress.advance(1, policy=setting.series),
+        )
+        self.section.left_out += found.left_out
+        for setting, taken in found.results.items():
+            self.section.curves.append((setting, curve_of(setting.series, [marks for marks, _ in taken if marks])))
+
+    def _verified(self, u: Tensor) -> float:
+        """The mean objective of a configuration over fresh renders, rounded to 8 bits; the same seeds for all."""
+        u = self.problem.domain.project(u)
+        values = []
+        for number in range(VERIFY_RENDERS):
+            seed = seeds.stream(self.config.seed, "precision verification", number)
+            with torch.no_grad():
+                values.append(float(self.problem.loss(self.problem.picture(u, seed, VERIFY_SPP))))
+        return sum(values) / len(values)
+
+    # ---- inside -----------------------------------------------------------------------------------------------------
+
+    def _rounds(self, name: str, settings: Sequence[Setting], measure: Any, budget: Budget) -> Rounds[dict[str, float]]:
+        self.progress.stage(name, len(settings) * self.config.rounds)
+        found: Rounds[dict[str, float]] = in_rounds(
+            settings,
+            measure,
+            budget,
+            rounds=self.config.rounds,
+            seed=self.seed,
+            on_done=lambda setting: self.progress.advance(1, now=setting.series, samples=setting.spp),
+        )
+        self.section.left_out += found.left_out
+        return found
+
+    def _take(
+        self,
+        found: Rounds[dict[str, float]],
+        measure: str,
+        floor: Callable[[Setting, str], float],
+        theory: Callable[[str], Theory],
+    ) -> None:
+        """Make points of what was measured."""
+        lines: dict[tuple[str, str, str], list[Point]] = {}
+        for setting, taken in found.results.items():
+            samples = [Sample(numbers, seconds) for numbers, seconds in taken]
+            point = point_of(setting, samples, measure, floor(setting, measure))
+            lines.setdefault(setting.line, []).append(point)
+        for line, points in lines.items():
+            self.section.add(line, points, theory(line[2]))
+
+    def _tick(self) -> None:
+        self.progress.advance(1)
+
+
+def _head(config: PrecisionConfig, problem: Problem) -> dict[str, Any]:
+    return {
+        "schema": 1,
+        "command": "precision",
+        "run": None,
+        "object": config.object,
+        "model": problem.model.name,
+        "environment": config.environment,
+        "controls": list(config.controls),
+        "image_formation": problem.renderer.formation.summary(),
+        "depth": problem.renderer.scene.max_depth,
+        "loss": config.loss,
+        "objective": config.objective,
+        "spp": problem.spp,
+        "seed": config.seed,
+        "machine": machine(),
+    }
+
+
+def _kept(config: PrecisionConfig, report: dict[str, Any]) -> dict[str, Any]:
+    """Write the figures and the numbers into `--out` or a run directory, and return the report with their paths."""
+    if config.out is not None:
+        folder = Path(config.out).expanduser()
+        report["figures"] = _write(folder, report)
+        write_text(folder / NUMBERS, to_json(report) + "\n")
+        return report
+    default = default_name(config.object, ("precision",))
+    with RunDirectory.create(config.run, overwrite=config.overwrite, default=default) as kept:
+        kept.write_config(config)
+        report["run"] = str(kept.path)
+        report["figures"] = _write(kept.path / "images", report)
+        kept.write_summary(report)
+    return report
+
+
+def _write(folder: Path, report: dict[str, Any]) -> list[str]:
+    folder.mkdir(parents=True, exist_ok=True)
+    figures = figures_of(report)
+    return [str(write_bytes(folder / f"{FIGURE}.{kind}", data)) for kind, data in figures.items()]

@@ -1,0 +1,317 @@
+"""The stages of an attack, one after the other: first look, search, random search beside it, verification."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.api.memory import PLAN, Frames, Memory
+from advsearch.api.problem import Problem
+from advsearch.api.record import Findings, Recorder, Stages
+from advsearch.attacks import (
+    Domain,
+    Ending,
+    Evaluation,
+    Policy,
+    SearchResult,
+    StepRecord,
+    Trial,
+    Verification,
+    already_wrong,
+    choose_spp,
+    count_right,
+    make_policy,
+    planned_renders,
+    run_trials,
+)
+from advsearch.attacks import search as run_search
+from advsearch.attacks import verify as run_verify
+from advsearch.attacks.sample_count import LADDER
+from advsearch.attacks.smallest import scaled, smallest
+from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
+from advsearch.config import AttackConfig
+from advsearch.evaluation.gradients import inside
+from advsearch.evaluation.planning import cosines, measured_plan, tuned
+
+FIRST_LOOK = 4
+"""Renders of the clean configuration before the search; wrong in all of them, it goes through the full trials first."""
+
+MANY = 64
+"""Of a configuration with more numbers than this, a trial's row does not hold the values."""
+
+
+@dataclass
+class Attack:
+    """One search on one problem with its verification; what is known so far is in `findings`.
+
+    Attributes:
+        problem: what is attacked.
+        config: how.
+        policy: what proposes.
+        recorder: keeps rows.
+        memory: what the run has stored already.
+        stages: told which stage runs.
+        findings: filled by `carry_out`.
+    """
+
+    problem: Problem
+    config: AttackConfig
+    policy: Policy[Any]
+    recorder: Recorder
+    memory: Memory
+    stages: Stages
+    findings: Findings = field(default_factory=Findings)
+
+    def carry_out(self) -> Findings:
+        """Do everything; what an interrupt leaves undone is missing from the findings."""
+        try:
+            self.plan()
+            if self.worth_attacking():
+                if self.config.smallest:
+                    find_smallest(self)
+                else:
+                    self.search()
+                self.verify()
+            if self.config.average:
+                self.average()
+        except KeyboardInterrupt:
+            self.findings.interrupted = True
+        self.stages.end()
+        return self.findings
+
+    @property
+    def rule(self) -> Rule:
+        """When the answer counts as verified."""
+        if self.problem.goal.minimise:
+            return EASIER
+        return WORST_CASE if self.problem.conditions is None else OVER_CONDITIONS
+
+    # ---- before the search ------------------------------------------------------------------------------------------
+
+    def plan(self) -> None:
+        """Measure the gradient plan, or take the one that the run was begun with."""
+        problem, stored = self.problem, self.memory.note(PLAN)
+        if stored is None:
+            self._measure()
+            self.memory.set_note(PLAN, {"plan": problem.plan.to_dict(), "spp": problem.spp})
+            return
+        problem.plan = problem.plan.restored(stored["plan"])
+        problem.spp = stored["spp"]
+
+    def _measure(self) -> None:
+        """Replace the first gradient plan by a measured one, as far as the configuration wants that."""
+        problem, config = self.problem, self.config
+        if config.measure == "no" or not self.policy.uses_gradient:
+            return
+        renderer, full = problem.renderer, config.measure == "full"
+        u, seed = inside(renderer), seeds.stream(config.seed, "measure")
+        problem.plan = measured_plan(
+            renderer, problem.loss, u, seed=seed, spp=problem.spp, every=full, counted=not full or config.deterministic
+        )
+        if full:
+            plan, spp = tuned(problem.plan, cosines(renderer, problem.loss, u, seed=seed))
+            problem.plan = plan
+            problem.spp = problem.spp if config.spp is not None or spp is None else spp
+
+    def worth_attacking(self) -> bool:
+        """Look at the clean configuration; one that is wrong in every look goes through the full trials at once."""
+        problem, config, findings = self.problem, self.config, self.findings
+        seed, start = seeds.stream(config.seed, "first look"), problem.domain.start
+        findings.first_look = run_trials(problem.trial, start, spp=config.search_spp, seed=seed, trials=FIRST_LOOK)
+        if not self.rule.control or any(trial.right for trial in findings.first_look):
+            return True
+        self.choose_spp({"clean": start})
+        self.stages.begin("verification", "verification", config.trial_count)
+        self.clean_trials()
+        return not already_wrong(count_right(findings.clean, findings.spp))
+
+    # ---- searching --------------------------------------------------------------------------------------------------
+
+    def search(self) -> None:
+        """The search, and the random one beside it, with as many renders."""
+        config, findings = self.config, self.findings
+        frames = Frames(config.steps)
+        findings.frames = frames.pictures
+        self.stages.begin("search", "search", planned_renders(config.steps))
+        findings.search = self.one_search("search", self.policy, config.steps, config.seed, frames, config.seconds)
+        if not config.baseline or self.policy.name == "random":
+            return
+        steps = config.steps if config.seconds is None else max(1, findings.search.history[-1].renders)
+        self.stages.begin("baseline", "random baseline", planned_renders(steps))
+        seed = seeds.stream(config.seed, "baseline")
+        findings.baseline = self.one_search("baseline", make_policy("random"), steps, seed)
+
+    def one_search(
+        self,
+        kind: str,
+        policy: Policy[Any],
+        steps: int,
+        seed: int,
+        frames: Frames | None = None,
+        seconds: float | None = None,
+        domain: Domain | None = None,
+    ) -> SearchResult:
+        """Search, reading back what is stored already.
+
+        Raises:
+            KeyboardInterrupt: the search was interrupted; the result of an interrupted main search is kept before.
+        """
+
+        def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
+            self.recorder.step(kind, record, u, evaluation)
+            self.stages.progress.advance(1, best=record.best)
+
+        found = run_search(
+            self.memory.evaluator(kind, lambda tell: self.problem.evaluator(kind, tell), frames),
+            self.problem.domain if domain is None else domain,
+            policy,
+            steps=steps,
+            seed=seed,
+            seconds=None if seconds is None else max(1e-9, seconds - self.memory.spent(kind)),
+            on_step=on_step,
+        )
+        if found.ending is Ending.INTERRUPTED:
+            self.findings.search = self.findings.search or found
+            raise KeyboardInterrupt
+        return found
+
+    # ---- verification -----------------------------------------------------------------------------------------------
+
+    def verify(self) -> None:
+        """Choose the sample count, then try the clean configuration, the answer and the baseline's with equal seeds."""
+        findings, problem = self.findings, self.problem
+        found, baseline = findings.search, findings.baseline
+        if found is None:
+            raise RuntimeError("nothing was searched, so there is nothing to verify")
+        answer = problem.domain.project(found.best_u)
+        self.choose_spp({"clean": problem.domain.start, "adversarial": answer})
+        groups = 2 + (baseline is not None)
+        self.stages.begin("verification", "verification", groups * self.config.trial_count)
+        self.clean_trials()
+        findings.verification = self.verified("verification", found)
+        if baseline is not None:
+            findings.baseline_verification = self.verified("baseline verification", baseline)
+
+    def choose_spp(self, candidates: dict[str, Tensor]) -> None:
+        """Raise the samples until no margin drifts, under the conditions that the scene comes with."""
+
+        def margin_of(u: Tensor) -> Callable[[int, int], float]:
+            def margin(spp: int, seed: int) -> float:
+                self.stages.progress.advance(1, samples=spp)
+                return self.problem.trial(u, seed, spp, drawn=False).margin
+
+            return margin
+
+        ladder = LADDER if self.config.verify_spp is None else (self.config.verify_spp,)
+        self.stages.begin("verification", "sample count")
+        margins = {name: margin_of(u) for name, u in candidates.items()}
+        self.findings.sample_count = choose_spp(margins, seed=self.config.seed, ladder=ladder)
+        self.findings.verification_renders += self.findings.sample_count.renders
+
+    def clean_trials(self) -> None:
+        """The control group: the clean configuration under the seeds that every other group gets."""
+        self.findings.clean = run_trials(
+            self._trial("control"),
+            self.problem.domain.start,
+            spp=self.findings.spp,
+            seed=self.config.seed,
+            trials=self.config.trial_count,
+            group="clean",
+            on_trial=self._teller("control"),
+        )
+
+    def verified(self, kind: str, found: SearchResult) -> Verification:
+        """Verify one search's answer against the control group."""
+        return run_verify(
+            self._trial(kind),
+            self.problem.domain,
+            found.best_u,
+            claim=found.ending,
+            spp=self.findings.spp,
+            seed=self.config.seed,
+            trials=self.config.trial_count,
+            clean=self.findings.clean,
+            rule=self.rule,
+            on_trial=self._teller(kind),
+        )
+
+    def _trial(self, kind: str) -> Callable[[Tensor, int, int], Trial]:
+        """Trials of one kind, one after the other; those that are stored are read back."""
+        count = 0
+
+        def trial(u: Tensor, seed: int, spp: int) -> Trial:
+            nonlocal count
+            number, count = count, count + 1
+            return self.memory.trial(kind, number, self.problem.goal) or self.problem.trial(u, seed, spp)
+
+        return trial
+
+    def one_trial(self, kind: str, number: int, u: Tensor) -> Trial:
+        """One trial of a configuration of its own, with a seed of its own; read back if it is stored."""
+        seed, spp = seeds.stream(self.config.seed, kind, number), self.findings.spp
+        trial = self.memory.trial(kind, number, self.problem.goal) or self.problem.trial(u, seed, spp)
+        values = {} if self.problem.domain.dim > MANY else self.problem.describe(u)
+        self.recorder.trial(kind, number, spp, trial, seed, values)
+        self.findings.verification_renders += 1
+        self.stages.progress.advance(1)
+        return trial
+
+    def average(self) -> None:
+        """Try configurations drawn from the whole space and budget: how often the model is wrong on average."""
+        if self.findings.sample_count is None:
+            self.choose_spp({"clean": self.problem.domain.start})
+        self.stages.begin("average", "average case", self.config.average)
+        found: list[Trial] = []
+        for number in range(self.config.average):
+            generator = torch.Generator().manual_seed(seeds.stream(self.config.seed, "draw", number))
+            u = self.problem.domain.sample(generator)[0]
+            found.append(self.one_trial("average", number, u))
+        self.findings.average = tuple(found)
+
+    def _teller(self, kind: str) -> Callable[[str, int, Trial], None]:
+        def on_trial(group: str, number: int, trial: Trial) -> None:
+            seed = seeds.stream(self.config.seed, "verification", number)
+            self.recorder.trial(kind, number, self.findings.spp, trial, seed)
+            self.findings.verification_renders += 1
+            self.stages.progress.advance(1)
+
+        return on_trial
+
+
+# ---- the smallest change --------------------------------------------------------------------------------------------
+
+
+def find_smallest(attack: Attack) -> None:
+    """Bracket the smallest epsilon; every claim on the way goes through trials with seeds of its own.
+
+    What is verified at the end is the configuration at the upper end of the bracket.
+    """
+    problem, config, findings = attack.problem, attack.config, attack.findings
+    attack.choose_spp({"clean": problem.domain.start})
+    results: list[SearchResult] = []
+
+    def found(inside: Domain, number: int) -> Tensor:
+        attack.stages.begin("search", f"search {number + 1}", planned_renders(config.steps))
+        kind, seed = f"search {number}" if number else "search", seeds.stream(config.seed, "smallest", number)
+        results.append(attack.one_search(kind, attack.policy, config.steps, seed, domain=inside))
+        return results[-1].best_u
+
+    def passes(u: Tensor, check: int) -> bool:
+        failures, allowed = 0, config.trial_count - attack.rule.needed(config.trial_count)
+        for number in range(config.trial_count):
+            failures += not attack.one_trial(f"check {check}", number, u).wrong
+            if failures > allowed:
+                return False
+        return True
+
+    bracket = smallest(found, passes, scaled(problem.domain, 1.0))
+    renders, gradients = sum(one.renders for one in results), sum(one.gradients for one in results)
+    answer = results[0].best_u if bracket.u is None else bracket.u
+    ending = results[0].ending if bracket.u is None else Ending.FOUND
+    findings.smallest = bracket
+    findings.search = replace(results[-1], best_u=answer, ending=ending, renders=renders, gradients=gradients)

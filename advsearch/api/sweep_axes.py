@@ -1,0 +1,238 @@
+"""Axes of a grid: which parameter they move, and over which values.
+
+An axis makes its parameter a discrete choice among its values, so a point of the grid is a point of an ordinary space.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from advsearch.controls import CONTROLS, Control, NumberControl, Parameter
+from advsearch.controls.values import Choices, Number, read
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.description import SceneDescription
+
+MOST_VALUES = 100_000
+"""Values of one axis, at most; more are for draws."""
+
+TURN = 360.0
+"""Degrees after which a periodic parameter is the same again."""
+
+_OUTER = {"object": "--object mug,bowl", "environment": "--environment studio,noon", "model": "--model a.pt2,b.pt2"}
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One parameter and its values.
+
+    Attributes:
+        control: the kind of the control.
+        instance: the name of its instance; the kind unless said otherwise.
+        parameter: what it declares.
+        values: at least one, all different.
+    """
+
+    control: str
+    instance: str
+    parameter: Parameter
+    values: tuple[Number, ...]
+
+    @property
+    def name(self) -> str:
+        """How it is stored: ``pose.yaw``, or ``key.power`` of a light called key."""
+        return f"{self.instance}.{self.parameter.name}"
+
+    @property
+    def unit(self) -> str:
+        """Unit of the values."""
+        return "name" if self.parameter.options else self.parameter.unit
+
+
+# ---- reading --------------------------------------------------------------------------------------------------------
+
+
+def read_axes(grid: Mapping[str, Any], controls: Sequence[Control]) -> tuple[Axis, ...]:
+    """Return the axes of a grid.
+
+    Args:
+        grid: name to values: ``"FIRST:LAST:COUNT"``, or a list. A name is KIND.PARAMETER, INSTANCE.PARAMETER of one of
+            `controls`, or KIND:INSTANCE.PARAMETER.
+        controls: what is drawn by chance.
+
+    Raises:
+        UnknownNameError: no such control or parameter.
+        InputError: values that cannot be an axis, two axes for one parameter, or one that is drawn as well.
+    """
+    instances = {control.name: control for control in controls}
+    found: dict[str, Axis] = {}
+    for name, given in grid.items():
+        axis = _read_axis(name, given, instances)
+        if axis.name in found:
+            raise InputError(f"--grid {name}: {axis.name} is an axis already; leave one of the two out")
+        drawn = instances.get(axis.instance)
+        if isinstance(drawn, NumberControl) and axis.parameter.name in drawn.specs:
+            raise InputError(
+                f"--grid {name}: --control {axis.instance} says what {axis.parameter.name} is already; leave it out of "
+                "one of the two"
+            )
+        found[axis.name] = axis
+    return tuple(found.values())
+
+
+def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
+    """Find the parameter of one axis and read its values."""
+    head, dot, rest = name.partition(".")
+    parameter_name, colon, late = rest.partition(":")
+    kind, early_colon, early = head.partition(":")
+    instance = late or early or kind
+    if head in _OUTER and not dot:
+        raise InputError(f"--grid {name}: several of them are given as a list: {_OUTER[head]}")
+    control: Any = type(instances[instance]) if instance in instances else CONTROLS.get(kind)
+    if control is None:
+        hint = f"It stands in --grid {name}; write --grid CONTROL.PARAMETER=VALUES, such as pose.yaw=0:360:24."
+        raise UnknownNameError("control", kind, {*CONTROLS, *instances}, hint)
+    known = [one.name for one in control.parameters]
+    if not parameter_name:
+        raise InputError(
+            f"--grid {name}: expected CONTROL.PARAMETER, got no parameter; choose one of {', '.join(known)}"
+        )
+    if (colon or early_colon) and not instance.isidentifier():
+        raise InputError(f"--grid {name}: expected a name of letters, digits and _ after the colon, got {instance!r}")
+    if parameter_name not in known:
+        raise UnknownNameError(f"parameter of control {control.kind}", parameter_name, known, f"In --grid {name}.")
+    parameter = control.parameters[known.index(parameter_name)]
+    if not issubclass(control, NumberControl) or parameter.shape != ():
+        raise InputError(
+            f"--grid {name}: expected a parameter that is one number or name, got one that is many numbers; draw it "
+            f"by chance with --control {instance} --samples 100"
+        )
+    return Axis(control.kind, instance, parameter, axis_values(f"--grid {name}", parameter, given))
+
+
+def axis_values(where: str, parameter: Parameter, given: Any) -> tuple[Number, ...]:
+    """Return the values of an axis, checked.
+
+    ``"FIRST:LAST:COUNT"`` is COUNT values evenly spaced from FIRST to LAST, both included; of a periodic parameter over
+    a whole turn, LAST would repeat FIRST and is left out.
+
+    Args:
+        where: what errors name: ``"--grid pose.yaw"``.
+        parameter: says what is allowed.
+        given: the text, a value, or a list of values.
+
+    Raises:
+        InputError: no such form, a value outside the parameter's range, or one that comes twice.
+    """
+    values: Sequence[Any]
+    if isinstance(given, str) and ":" in given and not parameter.options:
+        values = _spaced(where, parameter, given)
+    else:
+        values = given if isinstance(given, (list, tuple)) else [given]
+    if not values:
+        raise InputError(f"{where}: expected at least one value, got none; write FIRST:LAST:COUNT or a list")
+    if len(values) > MOST_VALUES:
+        raise InputError(_too_many(where, len(values)))
+    plain = [one.item() if hasattr(one, "item") else one for one in values]
+    spec = read(where, parameter, {"choices": plain})
+    assert isinstance(spec, Choices)
+    _check_different(where, parameter, spec.values)
+    return spec.values
+
+
+def _spaced(where: str, parameter: Parameter, text: str) -> list[float]:
+    """Read FIRST:LAST:COUNT."""
+    expected = f"{where}: expected FIRST:LAST:COUNT such as 0:360:24, or values separated by commas, got {text!r}"
+    parts = text.split(":")
+    if len(parts) != 3:
+        raise InputError(expected)
+    try:
+        first, last, count = float(parts[0]), float(parts[1]), int(parts[2])
+    except ValueError:
+        raise InputError(f"{expected}; FIRST and LAST are numbers and COUNT is a whole number") from None
+    if not (math.isfinite(first) and math.isfinite(last)):
+        raise InputError(f"{expected}; FIRST and LAST have to be finite")
+    if count < 1:
+        raise InputError(f"{where}: expected a COUNT of at least 1, got {count} in {text!r}")
+    if count > MOST_VALUES:
+        raise InputError(_too_many(where, count))
+    if last < first:
+        raise InputError(f"{where}: the range {text!r} is reversed; write {last:g}:{first:g}:{count}")
+    if first == last and count > 1:
+        raise InputError(f"{where}: FIRST and LAST are the same in {text!r}; write {first:g} for the one value")
+    turns = parameter.periodic and parameter.unit == "degrees"
+    if turns and last - first > TURN:
+        raise InputError(
+            f"{where}: {text!r} is more than a whole turn, so that values would repeat; write "
+            f"{first:g}:{first + TURN:g}:{count}"
+        )
+    whole = turns and last - first == TURN
+    return [float(value) for value in np.linspace(first, last, count, endpoint=not whole)]
+
+
+def _too_many(where: str, count: int) -> str:
+    return (
+        f"{where}: expected at most {MOST_VALUES} values on an axis, got {count}; draw the parameter by chance "
+        "instead, with --control and --samples"
+    )
+
+
+def _check_different(where: str, parameter: Parameter, values: Sequence[Number]) -> None:
+    seen: dict[Number, Number] = {}
+    for value in values:
+        same = value
+        if parameter.periodic and parameter.unit == "degrees" and not isinstance(value, str):
+            same = round(value % TURN, 9) % TURN
+        if same in seen:
+            first, again = seen[same], value
+            what = f"{_said(again)} twice" if first == again else f"{_said(first)} and {_said(again)}, the same angle"
+            raise InputError(f"{where}: expected different values, got {what}; leave one of them out")
+        seen[same] = value
+    if parameter.options or any(isinstance(value, str) for value in values):
+        return
+    singles = sorted(np.float32(value) for value in values)
+    if any(low == high for low, high in pairwise(singles)):
+        raise InputError(
+            f"{where}: expected values that differ in single precision, which scenes have; space them wider"
+        )
+
+
+def _said(value: Number) -> str:
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+# ---- putting them into controls -------------------------------------------------------------------------------------
+
+
+def on_grid(controls: Sequence[Control], axes: Sequence[Axis], scene: SceneDescription) -> tuple[Control, ...]:
+    """Return the controls with the axes among their parameters as discrete choices.
+
+    The other parameters of a control that is drawn keep being drawn; those of one that is only in the grid stay as the
+    scene has them.
+    """
+    found = {control.name: control for control in controls}
+    for instance in dict.fromkeys(axis.instance for axis in axes):
+        mine = {axis.parameter.name: axis for axis in axes if axis.instance == instance}
+        drawn = found.get(instance)
+        kind: Any = CONTROLS[next(iter(mine.values())).control] if drawn is None else type(drawn)
+        given = _ranges(drawn, scene) if isinstance(drawn, NumberControl) else {}
+        given |= {name: {"choices": list(axis.values)} for name, axis in mine.items()}
+        found[instance] = kind(name=instance, **given)
+    return tuple(found.values())
+
+
+def _ranges(control: NumberControl, scene: SceneDescription) -> dict[str, object]:
+    """Settings of a control with the ranges spelled out that it has by default."""
+    given = {name: value for name, value in control.settings().items() if name not in ("kind", "name")}
+    if control.asked:
+        return given
+    for parameter in control.parameters:
+        reach = control.search_range(scene, parameter)
+        if parameter.name not in control.specs and reach is not None:
+            given[parameter.name] = {"choices": list(parameter.options)} if parameter.options else list(reach)
+    return given

@@ -1,0 +1,254 @@
+"""`sweep`: the average case of a scene over a grid, over draws by chance, or both."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torch import nn
+
+from advsearch import threads
+from advsearch.api.scene import Controls, Scene, as_controls, load_scene
+from advsearch.api.sweep_axes import read_axes
+from advsearch.api.sweep_job import Job, Place
+from advsearch.api.sweep_loop import SweepResult, carry_out
+from advsearch.config import SweepConfig, split_names
+from advsearch.errors import InputError
+from advsearch.models import Model, ModelWarning, load_model
+from advsearch.progress import NullProgress, Progress
+from advsearch.runs.directory import CONFIG, RunDirectory, check_free, default_name, find_run, is_run, run_path
+from advsearch.runs.summary import NAME as SUMMARY
+from advsearch.runs.summary import read_summary
+from advsearch.scene.settings import SETTINGS
+
+SAMPLES = 100
+"""Draws where there is no grid and nothing is said."""
+
+AnyScene = Scene | str | Path
+AnyModel = Model | nn.Module | str | Path
+
+
+def sweep(
+    scene: AnyScene | Sequence[AnyScene],
+    model: AnyModel | Sequence[AnyModel] = "reference",
+    grid: Mapping[str, Any] | None = None,
+    *,
+    samples: int | None = None,
+    controls: Controls = (),
+    run: str | Path | None = None,
+    progress: Progress | None = None,
+    **options: Any,
+) -> SweepResult:
+    """Render every configuration of a grid, and draws by chance, and say how often the model is right.
+
+    With `run` naming a sweep of the same settings that was stopped, it goes on where that was stopped.
+
+    Args:
+        scene: from `load_scene`, or what that takes; or several.
+        model: from `load_model`, or what that takes; or several, which are shown the same pictures.
+        grid: parameter to its values: a list, a range, or "FIRST:LAST:COUNT".
+        samples: draws of `controls` at each point of the grid; by default 1, or 100 without a grid.
+        controls: what is drawn by chance, as for `attack`.
+        run: folder to keep the run in; None keeps it in memory, which then grows with every configuration.
+        progress: told how far it is.
+        **options: any other field of `advsearch.config.SweepConfig` by name: `environment`, `label`, `spp`,
+            `resolution`, `sampler`, `batch`, `trials`, `seed`, ...
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    scenes = _several(scene)
+    networks = _several(model)
+    names = [split_names(one) if isinstance(one, str) else (str(one),) for one in scenes if not isinstance(one, Scene)]
+    if names and len(names) < len(scenes):
+        raise InputError("scene: expected scenes from load_scene or names of objects, got some of each")
+    described: dict[str, Any] = {
+        "model": ",".join(_model_name(one) for one in networks),
+        "controls": {one.name: one.settings() for one in as_controls(controls)},
+        "grid": dict(grid or {}),
+        "samples": samples,
+    }
+    loaded = tuple(_place(one) for one in scenes if isinstance(one, Scene))
+    if loaded:
+        described |= _described(loaded)
+    else:
+        described["object"] = ",".join(name for some in names for name in some)
+    config = SweepConfig(**{**described, **options, "run": None if run is None else str(run)})
+    progress = progress or NullProgress()
+    resumed = _stopped(config)
+    if config.run is not None and resumed is None:
+        check_free(config.run, overwrite=config.overwrite)
+    asked = [name for one in networks for name in (split_names(one) if isinstance(one, str) else (one,))]
+    job = _job(config, loaded or _places(config), asked, controls)
+    return _kept(job, progress, resumed) if config.run is not None else carry_out(job, None, progress)
+
+
+def sweep_from_config(config: SweepConfig, *, progress: Progress | None = None) -> SweepResult:
+    """Do what a configuration describes and keep it in a run directory; see `sweep`."""
+    if config.run is not None:
+        check_free(config.run, overwrite=config.overwrite)
+    progress = progress or NullProgress()
+    progress.stage("set-up")
+    return _kept(_job_of(config), progress, None)
+
+
+def resume_sweep(run: str | Path, *, progress: Progress | None = None) -> SweepResult:
+    """Go on with a sweep that was stopped; what is stored is not rendered again.
+
+    Args:
+        run: its name or path.
+        progress: told how far it is.
+
+    Raises:
+        UnknownNameError: there is no such run.
+        InputError: another process works on it, or what it names is no longer there.
+    """
+    progress = progress or NullProgress()
+    path = find_run(run)
+    progress.stage("set-up")
+    return _kept(_job_of(SweepConfig.from_yaml(path / CONFIG)), progress, path)
+
+
+# ---- from names to things -------------------------------------------------------------------------------------------
+
+
+def _several(given: Any) -> list[Any]:
+    found = list(given) if isinstance(given, (list, tuple)) else [given]
+    if not found:
+        raise InputError("scene and model: expected at least one of each, got an empty list")
+    return found
+
+
+def _model_name(model: AnyModel) -> str:
+    if isinstance(model, (str, Path)):
+        return str(model)
+    return str(getattr(model, "name", None) or type(model).__name__)
+
+
+def _place(scene: Scene) -> Place:
+    described = scene.description
+    object_name = described.object_spec or described.object.name
+    return Place(object_name, described.environment_spec or described.environment.name, scene)
+
+
+def _described(places: Sequence[Place]) -> dict[str, Any]:
+    """Settings that say what loaded scenes are."""
+    first = places[0].scene.description
+    given = {name: value for name, value in first.values.items() if value not in (None, SETTINGS[name].default)}
+    return {
+        "object": ",".join(dict.fromkeys(place.object for place in places)),
+        "environment": ",".join(dict.fromkeys(place.environment for place in places)),
+        "up": first.up,
+        "set": given if len(places) == 1 else {},
+    }
+
+
+def _job_of(config: SweepConfig) -> Job:
+    """Find and load everything that a configuration names."""
+    fixed = sorted(set(config.grid) & set(config.set_))
+    if fixed:
+        raise InputError(f"--grid {fixed[0]}: --set fixes it already; leave it out of one of the two")
+    return _job(config, _places(config), config.models, config.controls)
+
+
+def _job(config: SweepConfig, places: Sequence[Place], models: Sequence[AnyModel], controls: Controls) -> Job:
+    drawn = as_controls(_with_texture_size(controls, config))
+    axes = read_axes(config.grid, drawn)
+    if config.samples is not None and not drawn:
+        raise InputError(
+            "--samples: expected --control beside it, which says what is drawn by chance; add --control pose, say, or "
+            "leave --samples out"
+        )
+    if not axes and not drawn and len(places) * len(models) == 1:
+        raise InputError(
+            "--grid: expected something that varies, got nothing; add an axis such as --grid pose.yaw=0:360:24, or "
+            "--control pose --samples 100"
+        )
+    samples = config.samples or (SAMPLES if drawn and not axes else 1)
+    networks, said = _models(models, config)
+    for place in places:
+        said += [*place.scene.description.object.warnings, *place.scene.description.environment.warnings]
+    return Job(config, tuple(places), networks, drawn, axes, samples, tuple(dict.fromkeys(said)))
+
+
+def _with_texture_size(controls: Controls, config: SweepConfig) -> Controls:
+    """Give `--texture-resolution` to a texture that says nothing about it."""
+    if config.texture_resolution is None or not isinstance(controls, Mapping):
+        return controls
+    return {
+        name: {"resolution": config.texture_resolution, **given} if name == "texture" else given
+        for name, given in controls.items()
+    }
+
+
+def _places(config: SweepConfig) -> tuple[Place, ...]:
+    """Every object under every environment; each is loaded once."""
+    given: dict[str, Any] = dict(config.set_)
+    if config.exposure:
+        if "camera.exposure" in given:
+            raise InputError("--exposure and --set camera.exposure say the same thing; leave one of them out")
+        given["camera.exposure"] = config.exposure
+    objects, environments = _different(config.objects, "--object"), _different(config.environments, "--environment")
+    firsts = {name: load_scene(name, environments[0], up=config.up, settings=given) for name in objects}
+    lights = {environments[0]: firsts[objects[0]].description.environment}
+    for name in environments[1:]:
+        lights[name] = load_scene(firsts[objects[0]].description.object, name).description.environment
+    return tuple(
+        Place(name, light, load_scene(firsts[name].description.object, lights[light], settings=given))
+        for name in objects
+        for light in environments
+    )
+
+
+def _different(names: Sequence[str], flag: str) -> Sequence[str]:
+    twice = [name for name in names if names.count(name) > 1]
+    if twice or not names:
+        raise InputError(f"{flag}: expected different names, got {','.join(names)!r}; leave {', '.join(twice[:1])} out")
+    return names
+
+
+def _models(models: Sequence[AnyModel], config: SweepConfig) -> tuple[tuple[Model, ...], list[str]]:
+    """Load the models; their warnings become sentences of the run."""
+    threads.configure(1 if config.deterministic else config.threads)
+    names = [_model_name(one) for one in models]
+    if len(set(names)) < len(names):
+        raise InputError(
+            f"--model: expected models with different names, got {', '.join(names)}; from Python, "
+            "load_model(..., name=...) gives one"
+        )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", ModelWarning)
+        loaded = tuple(load_model(one, labels=config.labels) for one in models)
+    said = [str(one.message) for one in caught if issubclass(one.category, ModelWarning)]
+    for one in caught:
+        if not issubclass(one.category, ModelWarning):
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+    return loaded, said
+
+
+# ---- where it is kept -----------------------------------------------------------------------------------------------
+
+
+def _stopped(config: SweepConfig) -> Path | None:
+    """The folder of a sweep of the same settings that was stopped, if `run` names one."""
+    if config.run is None or config.overwrite or not is_run(run_path(config.run)):
+        return None
+    path = run_path(config.run)
+    ended = (path / SUMMARY).is_file() and read_summary(path).get("ending") != "interrupted"
+    recipe = path / CONFIG
+    same = recipe.is_file() and recipe.read_text(encoding="utf-8") == config.recipe().to_yaml()
+    return path if same and not ended else None
+
+
+def _kept(job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
+    """Sweep in a run directory: a new one, or one that was begun."""
+    if resumed is not None:
+        with RunDirectory.resume(resumed) as run:
+            return carry_out(job, run, progress)
+    config = job.config
+    stem = "-".join(Path(name).stem for name in config.objects)
+    with RunDirectory.create(config.run, overwrite=config.overwrite, default=default_name(stem, ["sweep"])) as run:
+        run.write_config(config)
+        return carry_out(job, run, progress)

@@ -1,0 +1,114 @@
+"""Draws from the unit cube that can be reached in any order: number n is the same point whoever asks for it when.
+
+- "sobol": scrambled Sobol points (Owen 1998; Joe and Kuo 2008) in nets of 65,536, each scrambled by a seed of its own,
+  so that no draw is far from the beginning of its net;
+- "random": independent uniform points, in blocks with a seed of their own.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+
+from advsearch.errors import InputError
+from advsearch.seeds import stream
+
+Sampler = Literal["sobol", "random"]
+SAMPLERS: tuple[str, ...] = get_args(Sampler)
+
+NET = 1 << 16
+"""Points of one scrambled net."""
+
+BLOCK_NUMBERS = 1 << 18
+"""Numbers that are drawn at once, at most (unless one point has more)."""
+
+SEEDS = 1024
+"""Seeds that are made at once."""
+
+Doubles = NDArray[np.float64]
+
+
+class Draws:
+    """Points of [0, 1)^dimensions by number.
+
+    Args:
+        dimensions: numbers of a point; 0 is fine.
+        sampler: "sobol" or "random".
+        seed: root; the streams are called `name`.
+        name: of the streams.
+
+    Raises:
+        InputError: no such sampler, or more dimensions than Sobol points have.
+    """
+
+    def __init__(self, dimensions: int, sampler: str, seed: int, name: str = "draws") -> None:
+        if sampler not in SAMPLERS:
+            raise InputError(f"--sampler: expected one of {', '.join(SAMPLERS)}, got {sampler!r}")
+        if sampler == "sobol" and dimensions > qmc.Sobol.MAXDIM:
+            raise InputError(
+                f"--sampler sobol: expected at most {qmc.Sobol.MAXDIM} numbers to draw, got {dimensions}; use "
+                "--sampler random"
+            )
+        self.dimensions = dimensions
+        self._sampler, self._seed, self._name = sampler, seed, name
+        rows = max(1, min(NET, BLOCK_NUMBERS // max(1, dimensions)))
+        self._rows = 1 << (rows.bit_length() - 1)
+        self._number, self._block = -1, np.empty((0, dimensions))
+        self._engine: Any = None
+        self._net, self._drawn = -1, 0
+
+    def points(self, first: int, count: int) -> Doubles:
+        """Return the draws with the numbers from `first` on: (count, dimensions) float64 in [0, 1)."""
+        if not self.dimensions or count < 1:
+            return np.empty((max(0, count), self.dimensions))
+        parts, end = [], first + count
+        while first < end:
+            number, begin = divmod(first, self._rows)
+            size = min(self._rows - begin, end - first)
+            parts.append(self._block_of(number)[begin : begin + size])
+            first += size
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def _block_of(self, number: int) -> Doubles:
+        if number != self._number:
+            self._block = self._sobol(number) if self._sampler == "sobol" else self._random(number)
+            self._number = number
+        return self._block
+
+    def _random(self, number: int) -> Doubles:
+        return np.random.default_rng(stream(self._seed, self._name, number)).random((self._rows, self.dimensions))
+
+    def _sobol(self, number: int) -> Doubles:
+        net, within = divmod(number * self._rows, NET)
+        if net != self._net or self._engine is None or within < self._drawn:
+            seed = stream(self._seed, self._name, net)
+            self._engine, self._net, self._drawn = qmc.Sobol(self.dimensions, scramble=True, seed=seed), net, 0
+        if within > self._drawn:
+            self._engine.fast_forward(within - self._drawn)
+        self._drawn = within + self._rows
+        return np.asarray(self._engine.random(self._rows))
+
+
+class Seeds:
+    """Seeds of one stream by number, many at once: much faster than `advsearch.seeds.stream` for every one.
+
+    Args:
+        root: the run's root seed.
+        name: of the stream.
+    """
+
+    def __init__(self, root: int, name: str) -> None:
+        self._root, self._name = root, name
+        self._number = -1
+        self._block: NDArray[Any] = np.empty(0, dtype=np.uint32)
+
+    def __call__(self, index: int) -> int:
+        """Return seed number `index`, in [0, 2**32)."""
+        number, place = divmod(index, SEEDS)
+        if number != self._number:
+            sequence = np.random.SeedSequence(stream(self._root, self._name, number))
+            self._number, self._block = number, sequence.generate_state(SEEDS, dtype=np.uint32)
+        return int(self._block[place])

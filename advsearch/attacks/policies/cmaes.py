@@ -1,0 +1,241 @@
+"""Covariance matrix adaptation: learns where to look from ranks alone, without gradients."""
+
+from __future__ import annotations
+
+import copy
+import math
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from advsearch.attacks.distribution import Distribution
+from advsearch.attacks.domain import Domain
+from advsearch.attacks.evaluation import Evaluation
+from advsearch.attacks.policies.base import Distributional, Proposal, draw_seed, one_thread, seeded
+from advsearch.attacks.policies.scaling import half_widths, wraps
+from advsearch.errors import InputError
+from advsearch.seeds import stream
+
+FULL = 80
+"""Up to so many numbers have a full covariance matrix; more have its diagonal (Ros and Hansen 2008). Also about the
+size from which the linear algebra would use several threads, whose last bits may differ."""
+
+MOST = 10_000
+"""More numbers are refused: a generation would take longer than renders, and the ascent along a gradient is far ahead
+long before."""
+
+WIDEST, NARROWEST = 10.0, 1e-3
+"""In half ranges: the step size grows no further (it does where all objectives are equal), and a run is over when its
+largest deviation is no more than this."""
+
+Doubles = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class CMAESState:
+    """Where the search stands.
+
+    Attributes:
+        origin: (d,) where this run began.
+        scale: (d,) length of the unit of pycma's coordinates: u = P(origin + scale * x).
+        wraps: (d,) where leaving the bounds costs nothing.
+        strategy: pycma's, as it is after the latest `ask`; never written to again.
+        generation: how many generations were asked for.
+        points: (n, d) this generation's coordinates x.
+        values: objectives of the first of them.
+        outside: for each of these its squared distance from the domain, a mean over elements, in x.
+        best: the largest objective of this run.
+        before: the largest objective of the runs before, and the distribution at the end of the one that met it.
+    """
+
+    domain: Domain
+    seed: int
+    origin: Tensor
+    scale: Tensor
+    wraps: Tensor
+    strategy: Any
+    generation: int
+    points: Doubles
+    values: tuple[float, ...] = ()
+    outside: tuple[float, ...] = ()
+    best: float = -math.inf
+    before: tuple[float, Distribution] | None = None
+
+
+@dataclass(frozen=True)
+class CMAES(Distributional[CMAESState]):
+    """CMA-ES (Hansen and Ostermeier 2001; Hansen 2016, "The CMA evolution strategy: a tutorial") as pycma has it.
+
+    Each generation draws points from a normal distribution and moves its mean, its step size and its covariance towards
+    the better half. It needs ranks only, so a noisy or saturated objective does not upset it. A generation that the
+    renders cut short is lost, so it wants at least ten generations.
+
+    A point outside the domain is projected and evaluated there. Its objective is made worse by
+
+        spread * ||x - P(x)||^2 / (d sigma^2),
+
+    spread the distance between the quartiles of the generation, so that the mean does not drift away outside. Angles
+    wrap and cost nothing.
+
+    A run whose largest deviation has fallen under a thousandth of half a range has nothing more to find. The next one
+    begins at a sample of the domain with twice the population (Auger and Hansen 2005, "A restart CMA evolution strategy
+    with increasing population size"). The distribution answered is that of the run that met the largest objective.
+
+    pycma's object changes as it goes and draws from numpy's global generator. Here it is copied before every change,
+    and the generator is seeded for it and put back at once, so that states can be replayed and pickled.
+
+    Attributes:
+        sigma: first standard deviation in units of half of each number's range (half of what the ball leaves), over 0,
+            at most 2.
+        population: points a generation, at least 2; 0 for 4 + 3 ln d.
+
+    Raises:
+        InputError: a value is outside what is said here; at the start, the domain has more than 10,000 numbers.
+    """
+
+    sigma: float = 0.3
+    population: int = 0
+
+    name: ClassVar[str] = "cmaes"
+    uses_gradient: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.sigma <= 2.0:
+            raise InputError(f"sigma: expected a number in (0, 2], a share of half the range, got {self.sigma}")
+        if self.population < 0 or self.population == 1:
+            raise InputError(f"population: expected at least 2, or 0 for the default, got {self.population}")
+
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> CMAESState:
+        d = domain.dim
+        if d > MOST:
+            raise InputError(f"policy 'cmaes': expected at most {MOST} numbers, got {d}; use policy pgd, auto or nes")
+        population = self.population or 4 + int(3 * math.log(d))
+        seed = draw_seed(generator)
+        strategy = _strategy(d, self.sigma, population, seed)
+        scale, around, none = half_widths(domain), wraps(domain), np.empty((0, d))
+        return _ask(CMAESState(domain, seed, domain.begin, scale, around, strategy, 0, none))
+
+    def propose(self, state: CMAESState) -> tuple[Proposal, CMAESState]:
+        return Proposal(_projected(state, state.points[len(state.values)])[0]), state
+
+    def update(self, state: CMAESState, u: Tensor, evaluation: Evaluation) -> CMAESState:
+        outside = _projected(state, state.points[len(state.values)])[1]
+        values, best = (*state.values, evaluation.objective), max(state.best, evaluation.objective)
+        state = replace(state, values=values, outside=(*state.outside, outside), best=best)
+        if len(values) < len(state.points):
+            return state
+        state = _tell(state)
+        return _ask(state if float(_deviations(state).max()) > NARROWEST else _anew(state, self.sigma))
+
+    def answer(self, state: CMAESState) -> Distribution:
+        if state.before is not None and state.before[0] > state.best:
+            return state.before[1]
+        return _distribution(state)
+
+
+# ---- generations ----------------------------------------------------------------------------------------------------
+
+
+def _strategy(d: int, sigma: float, population: int, seed: int) -> Any:
+    """Return pycma's object for a run, before its first generation."""
+    options = {
+        "CMA_diagonal": d > FULL,
+        "popsize": population,
+        "randn": _normal,
+        "seed": math.nan,
+        "signals_filename": "",
+        "verbose": -9,
+        "verb_log": 0,
+    }
+    with _own_random(seed, 0):
+        return _pycma().CMAEvolutionStrategy(np.zeros(d), sigma, options)
+
+
+def _anew(state: CMAESState, sigma: float) -> CMAESState:
+    """Begin another run elsewhere with twice the population, and remember the better one of those that are over."""
+    before = state.before
+    if before is None or state.best > before[0]:
+        before = (state.best, _distribution(state))
+    strategy = _strategy(state.domain.dim, sigma, 2 * len(state.points), state.seed)
+    origin = state.domain.sample(seeded(state.seed, state.generation))[0]
+    return replace(state, origin=origin, strategy=strategy, best=-math.inf, before=before)
+
+
+def _deviations(state: CMAESState) -> Doubles:
+    """Return (d,) standard deviations in x."""
+    return np.asarray(state.strategy.stds, dtype=np.float64)
+
+
+def _distribution(state: CMAESState) -> Distribution:
+    """Return the distribution of this run as it stands."""
+    deviation = torch.from_numpy(_deviations(state)).float() * state.scale
+    return Distribution(_projected(state, np.asarray(state.strategy.mean))[0], deviation)
+
+
+def _projected(state: CMAESState, x: Doubles) -> tuple[Tensor, float]:
+    """Return the configuration for coordinates x, and how far outside they lie: mean square over the elements."""
+    wanted = torch.add(state.origin, state.scale * torch.from_numpy(x).float())
+    u = state.domain.project(wanted)
+    excess = ((wanted - u) / state.scale).masked_fill_(state.wraps, 0.0)
+    return u, float(torch.dot(excess, excess)) / len(x)
+
+
+def _ask(state: CMAESState) -> CMAESState:
+    """Draw a generation; the strategy belongs to nobody else yet."""
+    number = state.generation + 1
+    with _own_random(state.seed, number):
+        points = np.array(state.strategy.ask())
+    return replace(state, generation=number, points=points, values=(), outside=())
+
+
+def _tell(state: CMAESState) -> CMAESState:
+    """Let a copy of the strategy learn from a whole generation."""
+    values = np.array(state.values)
+    finite = np.isfinite(values)
+    spread = 0.0
+    if finite.any():
+        low, high = np.percentile(values[finite], (25, 75))
+        spread = float(high - low)
+        values[~finite] = values[finite].min() - spread
+    else:
+        values[:] = 0.0
+    strategy = copy.deepcopy(state.strategy)
+    penalty = spread * np.array(state.outside) / max(strategy.sigma, 1e-30) ** 2
+    with _own_random(state.seed, state.generation):
+        strategy.tell(list(state.points), list(penalty - values))
+    strategy.sigma = min(strategy.sigma, WIDEST)
+    return replace(state, strategy=strategy)
+
+
+def _normal(*shape: int) -> Doubles:
+    """Standard normal numbers from numpy's global generator. A copy of pycma's default, a method of that generator,
+    would carry a generator of its own along."""
+    return np.random.standard_normal(shape)  # noqa: NPY002
+
+
+@contextmanager
+def _own_random(seed: int, generation: int) -> Iterator[None]:
+    """Let pycma draw numbers of its own from numpy's global generator, and put that back; its warnings are not ours."""
+    before = np.random.get_state()  # noqa: NPY002
+    np.random.seed(stream(seed, "pycma", generation))  # noqa: NPY002
+    try:
+        with warnings.catch_warnings(), one_thread():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        np.random.set_state(before)  # noqa: NPY002
+
+
+def _pycma() -> Any:
+    """Import pycma, which takes most of a second and complains that there is no matplotlib."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import cma  # type: ignore[import-untyped]
+    return cma

@@ -1,0 +1,199 @@
+"""Successive halving between searches: what the wrappers share. Each round, those that reached less are left behind.
+
+Rounds get equal shares of the renders, and within a round every search that is still in gets an equal share, one after
+the other. After a round the best 1 / eta of them go on. With n searches there are 1 + ceil(log_eta n) rounds, the last
+for one alone, so it gets many times the renders of those that fell first (Karnin, Koren and Somekh 2013, "Almost
+optimal exploration in multi-armed bandits"; Jamieson and Talwalkar 2016). With eta = 1 there is one round: all get the
+same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from torch import Tensor
+
+from advsearch.attacks.distribution import Distribution
+from advsearch.attacks.domain import Domain
+from advsearch.attacks.evaluation import Evaluation
+from advsearch.attacks.policies.base import Policy, Proposal, affordable, answer_of, seeded
+
+
+@dataclass(frozen=True, eq=False)
+class Runner:
+    """One search in a race.
+
+    Attributes:
+        policy, domain: what searches where.
+        state: the policy's, None until its first turn.
+        best: the largest objective it has met.
+        lately: the largest in its latest turn.
+        over: whether it has nothing more to propose.
+    """
+
+    policy: Policy[Any]
+    domain: Domain
+    state: Any = None
+    best: float = -math.inf
+    lately: float = -math.inf
+    over: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Race:
+    """Where a race stands.
+
+    Attributes:
+        runners: all searches.
+        field: numbers of those that are in this round, in the order of their turns.
+        steps: renders in all.
+        eta: one of so many goes on after a round.
+        seed: of the searches' own generators.
+        fresh: whether a round's order rests on its own evaluations alone.
+        round, rounds: number of the round, from 0, and how many there are.
+        turn: position in `field`.
+        spent: renders so far.
+        turn_ends, round_ends: value of `spent` at which they do.
+    """
+
+    runners: tuple[Runner, ...]
+    field: tuple[int, ...]
+    steps: int
+    eta: int
+    seed: int
+    fresh: bool
+    rounds: int
+    round: int = 0
+    turn: int = 0
+    spent: int = 0
+    turn_ends: int = 0
+    round_ends: int = 0
+
+    @property
+    def running(self) -> Runner:
+        """Whose turn it is."""
+        return self.runners[self.field[self.turn]]
+
+    @property
+    def left(self) -> int:
+        """Renders left in this turn."""
+        return self.turn_ends - self.spent
+
+
+def count_rounds(runners: int, eta: int) -> int:
+    """Return how many rounds a race has: 1 + ceil(log_eta runners), one for eta = 1."""
+    rounds = 1
+    while eta > 1 and runners > 1:
+        runners, rounds = -(-runners // eta), rounds + 1
+    return rounds
+
+
+def most_runners(steps: int, eta: int, each: int, limit: int) -> int:
+    """Return how many searches, at least 1 and at most `limit`, can have `each` renders in every round."""
+    count = 1
+    while count < limit and (count + 1) * count_rounds(count + 1, eta) * each <= steps:
+        count += 1
+    return count
+
+
+def line_up(runners: tuple[Runner, ...], steps: int, seed: int, *, eta: int, fresh: bool = False) -> Race:
+    """Return a race before its first proposal."""
+    steps = max(1, steps)
+    rounds = count_rounds(len(runners), eta)
+    race = Race(runners, tuple(range(len(runners))), steps, eta, seed, fresh, rounds)
+    return _begin_turn(replace(race, round_ends=steps // rounds if rounds > 1 else steps), 0)
+
+
+def once(race: Race) -> int:
+    """Return 1: the samples that a search asks for are what it gets."""
+    return 1
+
+
+def propose(race: Race, samples: Callable[[Race], int] = once) -> tuple[Proposal | None, Race]:
+    """Return the next proposal of whoever's turn it is, as far as the turn's renders allow.
+
+    Args:
+        race: as it is; the next turn begins where this one is over.
+        samples: from the race in that turn to what the proposal's samples are multiplied with.
+    """
+    while not all(runner.over for runner in race.runners):
+        runner = race.running
+        if not runner.over and race.spent < race.turn_ends:
+            if runner.state is None:
+                generator = seeded(race.seed, race.field[race.turn])
+                runner = replace(runner, state=runner.policy.start(runner.domain, generator, _planned(race)))
+            proposal, state = runner.policy.propose(runner.state)
+            race = _with(race, replace(runner, state=state, over=proposal is None))
+            if proposal is not None:
+                proposal = replace(proposal, samples=proposal.samples * samples(race))
+                return affordable(proposal, runner.domain, race.left + (race.round + 1 < race.rounds)), race
+        race = _next_turn(race)
+    return None, race
+
+
+def update(race: Race, u: Tensor, evaluation: Evaluation) -> Race:
+    """Tell whoever's turn it is; u and the evaluation are as its own domain has them."""
+    runner = race.running
+    value = evaluation.objective
+    state = runner.policy.update(runner.state, u, evaluation)
+    runner = replace(runner, state=state, best=max(runner.best, value), lately=max(runner.lately, value))
+    return replace(_with(race, runner), spent=race.spent + evaluation.cost)
+
+
+def leader(race: Race) -> int:
+    """Return the number of the search that has met the largest objective so far, the first of equals."""
+    return max(range(len(race.runners)), key=lambda k: race.runners[k].best)
+
+
+def answer(race: Race) -> Distribution | None:
+    """Return the leader's distribution, if it has one."""
+    runner = race.runners[leader(race)]
+    return None if runner.state is None else answer_of(runner.policy, runner.state)
+
+
+# ---- turns and rounds -----------------------------------------------------------------------------------------------
+
+
+def _with(race: Race, runner: Runner) -> Race:
+    k = race.field[race.turn]
+    return replace(race, runners=(*race.runners[:k], runner, *race.runners[k + 1 :]))
+
+
+def _planned(race: Race) -> int:
+    """Return the renders that the search gets if it stays in to the end."""
+    total, count = 0.0, len(race.field)
+    for _ in range(race.round, race.rounds):
+        total += race.steps / race.rounds / count
+        count = -(-count // race.eta)
+    return max(1, int(total))
+
+
+def _begin_turn(race: Race, turn: int) -> Race:
+    """Give a search its share of what is left of the round."""
+    race = replace(race, turn=turn)
+    share = (race.round_ends - race.spent) // (len(race.field) - turn)
+    return replace(_with(race, replace(race.running, lately=-math.inf)), turn_ends=race.spent + max(1, share))
+
+
+def _next_turn(race: Race) -> Race:
+    """Go on to the next search, or to the next round with the best of this one."""
+    if race.turn + 1 < len(race.field):
+        return _begin_turn(race, race.turn + 1)
+
+    def reached(k: int) -> float:
+        return race.runners[k].lately if race.fresh else race.runners[k].best
+
+    ranked = sorted(race.field, key=reached, reverse=True)
+    able = [k for k in ranked[: -(-len(ranked) // race.eta)] if not race.runners[k].over]
+    if race.round + 1 >= race.rounds or not able:  # nobody left who can go on: the renders are for whoever still can
+        others = [k for k in range(len(race.runners)) if not race.runners[k].over]
+        able = sorted(others, key=lambda k: race.runners[k].best, reverse=True)[:1]
+    if not able:
+        return race
+    number = min(race.round + 1, race.rounds - 1)
+    last = number + 1 == race.rounds
+    ends = race.steps if last else race.spent + max(1, (race.steps - race.spent) // (race.rounds - number))
+    return _begin_turn(replace(race, field=tuple(able), round=number, round_ends=max(ends, race.spent + 1)), 0)

@@ -1,0 +1,131 @@
+"""The smallest change that flips the answer: the least epsilon, bracketed from both sides.
+
+A scale s in (0, 1] multiplies every budget of a domain at once. The answer is a bracket [low, high]: at `high` a
+configuration passed the trials; at `low` a whole search found none that did. The upper end is a fact; the lower one is
+only as good as the search.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from torch import Tensor
+
+from advsearch.attacks.domain import Domain
+from advsearch.errors import InputError
+
+RATIO = 1.05
+"""The bracket is closed once high / low is at most this."""
+
+SMALLEST_SCALE = 1e-3
+"""No smaller scale than this is tried."""
+
+Search = Callable[[Domain, int], Tensor]
+"""(domain, round) -> the best configuration a search finds there; round numbers its seeds."""
+
+Passes = Callable[[Tensor, int], bool]
+"""(u, check) -> whether a configuration passes the trials; check numbers its seeds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bracket:
+    """Where the smallest scale lies.
+
+    Attributes:
+        low: at this scale a search found nothing; 0 where none has failed.
+        high: at this scale `u` passes; infinity where nothing passed at all.
+        u: (d,) a configuration within `high`; None where nothing passed.
+        searches: how many were run.
+        checks: how often a configuration went through the trials.
+    """
+
+    low: float
+    high: float
+    u: Tensor | None
+    searches: int
+    checks: int
+
+    @property
+    def closed(self) -> bool:
+        """Whether high is within `RATIO` of low."""
+        return self.u is not None and self.high <= RATIO * (1.0 + 1e-9) * self.low
+
+
+def scaled(domain: Domain, scale: float) -> Domain:
+    """Return the domain with every budget multiplied by `scale`, in (0, 1].
+
+    Raises:
+        InputError: a block has bounds and no budget, so that there is nothing to scale.
+    """
+    bare = [block.name or "a block" for block in domain.blocks if block.epsilon is None]
+    if bare:
+        raise InputError(
+            f"--smallest: expected controls with a budget (texture, geometry, patch, ...), got {', '.join(bare)}, "
+            "whose parameters have ranges and no epsilon; leave it out"
+        )
+    blocks = tuple(replace(block, epsilon=float(block.epsilon or 0.0) * scale) for block in domain.blocks)
+    return replace(domain, blocks=blocks)
+
+
+def shrunk(domain: Domain, u: Tensor, scale: float) -> Tensor:
+    """Return the configuration moved towards the start, its change multiplied by `scale`."""
+    return domain.project(domain.start + scale * (u - domain.start))
+
+
+def smallest(search: Search, passes: Passes, domain: Domain, *, rounds: int = 12) -> Bracket:
+    """Bracket the smallest scale of the domain's budgets at which a configuration passes.
+
+    1. A search in the whole budget. If its answer fails the trials, there is nothing to shrink.
+    2. The answer is moved towards the start, by bisection in the logarithm of its length, to the shortest that passes:
+       a handful of trials, no search.
+    3. A search at half the scale reached, then at the geometric mean of the bracket's ends; each answer that passes is
+       shortened as in 2, each that fails raises the lower end; until the bracket is closed or the rounds are used up.
+
+    For a linear model and a gradient policy the first search points the right way and 2 ends within its own step of the
+    optimum, so that the result is within `RATIO` of the closed form.
+
+    Args:
+        search: finds the best configuration of a domain.
+        passes: verifies one.
+        domain: the largest budget.
+        rounds: searches at most, at least 2.
+
+    Returns:
+        The bracket; not `closed` if the rounds did not suffice.
+    """
+    u = search(domain, 0)
+    state = Bracket(0.0, math.inf, None, 1, 1)
+    if not passes(u, 0):
+        return replace(state, low=1.0)
+    state = _shorten(replace(state, high=1.0, u=u), passes, domain)
+    while state.searches < rounds and state.high > RATIO * state.low and state.high > SMALLEST_SCALE:
+        floor = state.high / 2.0 if state.low == 0.0 else math.sqrt(state.low * state.high)
+        scale = max(floor, state.high / RATIO if state.high <= RATIO**2 * state.low else floor)
+        inside = scaled(domain, scale)
+        u = search(inside, state.searches)
+        passed = passes(u, state.checks)
+        state = replace(state, searches=state.searches + 1, checks=state.checks + 1)
+        if passed:
+            state = _shorten(replace(state, high=scale, u=u), passes, domain)
+        else:
+            state = replace(state, low=scale)
+    return state
+
+
+def _shorten(state: Bracket, passes: Passes, domain: Domain) -> Bracket:
+    """Bisect the length of the configuration, down to a hundredth of the bracket's ratio."""
+    if state.u is None:
+        raise RuntimeError("there is no configuration to shorten")
+    longest, high, low = state.u, state.high, max(state.low, SMALLEST_SCALE * state.high)
+    best, checks = state.u, state.checks
+    while high > (1.0 + (RATIO - 1.0) / 5.0) * low:
+        middle = math.sqrt(high * low)
+        shorter = shrunk(scaled(domain, middle), longest, middle / state.high)
+        if passes(shorter, checks):
+            best, high = shorter, middle
+        else:
+            low = middle
+        checks += 1
+    return replace(state, high=high, u=best, checks=checks)

@@ -1,0 +1,175 @@
+"""`advsearch precision`: error against run time, as a table, JSON and diagrams."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from advsearch.cli import output
+
+HELP = "draw error against run time: of the picture, of gradients and of policies, and what follows from it"
+INTERRUPTED = 130
+
+_EXAMPLES = """examples:
+  advsearch precision --object mug --control pose
+  advsearch precision --object mug --control texture --seconds 300 --error 0.1 --out diagrams
+  advsearch precision --object bowl --control camera --quantities gradient --loss model --json
+"""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add the command."""
+    from advsearch.cli.flags import add_settings
+    from advsearch.config import PrecisionConfig
+
+    parser = subparsers.add_parser(
+        "precision",
+        help=HELP,
+        description=HELP[0].upper() + HELP[1:] + ".",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    add_settings(parser, config=PrecisionConfig)
+    output.add_flags(parser, quiet=True)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure and print; 130 if it was interrupted, after what there is."""
+    from contextlib import nullcontext
+
+    from advsearch.cli.flags import config_from
+    from advsearch.cli.progress import watching
+    from advsearch.config import PrecisionConfig
+
+    config = config_from(args, PrecisionConfig, object="mug")
+    with output.output_kept_clean() if args.json else nullcontext(), watching(quiet=args.quiet) as progress:
+        from advsearch.api.measuring import precision
+
+        report = precision(config, progress=progress)
+    if args.json:
+        output.print_json(report)
+    else:
+        print(text(report))
+    return INTERRUPTED if report["interrupted"] else 0
+
+
+def text(report: Mapping[str, Any]) -> str:
+    """Return the report as text."""
+    machine = report["machine"]
+    threads = " and ".join(f"{count} of {name}" for name, count in machine["threads"].items())
+    lines = [
+        f"{report['object']} in {report['environment']}, {report['model']}; {machine['cpu']}, "
+        f"{machine['cores']} cores, threads: {threads}; {report['seconds']['total']:.0f} s"
+    ]
+    for quantity, table in (("image", _errors), ("gradient", _errors), ("objective", _objectives)):
+        points = [one for one in report["points"] if one["quantity"] == quantity]
+        if points:
+            lines += ["", f"{quantity}:", table(points)]
+    if report["slopes"]:
+        lines += ["", "slopes (logarithm of the error against that of samples or seconds):", _slopes(report["slopes"])]
+    lines += (
+        ["", "references, with their own errors:", _references(report["references"])] if report["references"] else []
+    )
+    lines += ["", "recommended:", *(f"  {sentence(one, report['goal'])}" for one in report["recommendations"])]
+    lines += ["", "warnings:", *(f"  {one}" for one in report["warnings"])] if report["warnings"] else []
+    lines += ["", "not measured, the time was up:", *_left_out(report["left_out"])] if report["left_out"] else []
+    lines += ["", *(f"figure: {path}" for path in report["figures"])] if report["figures"] else []
+    return "\n".join(lines)
+
+
+def sentence(one: Mapping[str, Any], goal: float) -> str:
+    """Return a recommendation as a sentence."""
+    what = {"image": "the picture", "objective": "the best verified objective"}.get(one["quantity"])
+    what = what or f"the gradient of {one['control']}"
+    if one["measure"] == "margin_error":
+        what = "the margin"
+    asked = f"{100 * goal:g} % error of {what}" + (f" {one['among']}" if one["among"] else "")
+    if one["quantity"] == "objective":
+        asked = f"{100 * (1 - goal):g} % of the largest gain in the objective that was found"
+    if one["estimator"] is None:
+        return f"{asked}: not reached by anything that was measured; give it more --seconds or a larger --error"
+    if one["quantity"] == "objective":
+        return f"{asked}: policy {one['estimator']}, {one['renders']} renders, {one['seconds']:.2g} s"
+    basis = "" if one["basis"] == "interpolated" else f" ({one['basis']})"
+    return f"{asked}: {one['estimator']}, {one['spp']} samples, {one['seconds']:.2g} s{basis}"
+
+
+# ---- tables ---------------------------------------------------------------------------------------------------------
+
+
+def _errors(points: Sequence[Mapping[str, Any]]) -> str:
+    margin = any("margin_error" in one for one in points)
+    heads = ["control"] * (not margin) + ["estimator", "samples", "error", "95 %"]
+    rows = [[*heads, "margin" if margin else "cosine", "seconds", "repeats"]]
+    for one in points:
+        beside = _percent(one, "margin_error", "margin_known") if margin else f"{one.get('cosine', float('nan')):.3f}"
+        place = ([] if margin else [one.get("control", "")]) + [one["estimator"], str(one["spp"])]
+        low, high = one["interval"]
+        between = f"{100 * low:.2g} to {100 * high:.2g}" if low == low and one["known"] else ""
+        rows.append(
+            [*place, _percent(one, "error", "known"), between, beside, f"{one['seconds']:.3g}", str(one["repeats"])]
+        )
+    return output.columns(rows)
+
+
+def _objectives(points: Sequence[Mapping[str, Any]]) -> str:
+    rows = [["policy", "renders", "seconds", "objective", "quartiles", "searches"]]
+    for one in points:
+        low, high = one["quartiles"]
+        rows.append(
+            [
+                one["estimator"],
+                str(one["renders"]),
+                f"{one['seconds']:.3g}",
+                f"{one['objective']:.3g}",
+                f"{low:.3g} to {high:.3g}",
+                str(one["repeats"]),
+            ]
+        )
+    return output.columns(rows)
+
+
+def _slopes(slopes: Sequence[Mapping[str, Any]]) -> str:
+    rows = [["what", "estimator", "against", "slope", "95 %", "theory", "points", ""]]
+    for one in slopes:
+        what = one["control"] or ("margin" if one["measure"] == "margin_error" else one["quantity"])
+        theory = "" if one["theory"] is None else f"{one['theory']:g}" + (" or steeper" if one["or_steeper"] else "")
+        low, high = one["interval"]
+        verdict = {True: "agrees", False: "DISAGREES", None: "unclear" if theory else ""}[one["agrees"]]
+        rows.append(
+            [
+                what,
+                one["estimator"],
+                one["against"],
+                f"{one['slope']:.2f}",
+                f"{low:.2f} to {high:.2f}",
+                theory,
+                str(one["points"]),
+                verdict,
+            ]
+        )
+    return output.columns(rows)
+
+
+def _references(references: Sequence[Mapping[str, Any]]) -> str:
+    rows = [["what", "reference", "samples", "parts", "error", "margin"]]
+    for one in references:
+        margin = f"{one['margin']:.3g} +- {100 * one['margin_error']:.2g} %" if "margin" in one else ""
+        what = one.get("control") or one["quantity"]
+        rows.append([what, one["reference"], str(one["spp"]), str(one["parts"]), f"{100 * one['error']:.2g} %", margin])
+    return output.columns(rows)
+
+
+def _left_out(left_out: Sequence[Mapping[str, Any]]) -> list[str]:
+    """One line for each estimator, with its sample counts."""
+    counts: dict[str, list[str]] = {}
+    for one in left_out:
+        name = f"{one.get('control') or one['quantity']} by {one['estimator']}"
+        counts.setdefault(name, []).append(str(one["spp"]))
+    return [f"  {name}: {', '.join(found)} samples" for name, found in counts.items()]
+
+
+def _percent(one: Mapping[str, Any], error: str, known: str) -> str:
+    return ("" if one[known] else "< ") + f"{100 * one[error]:.3g} %"

@@ -1,0 +1,96 @@
+"""`advsearch region`: how far one can go from a configuration before the model's verdict changes."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from advsearch.cli import output
+from advsearch.errors import InputError
+
+if TYPE_CHECKING:
+    from advsearch.config import RegionConfig
+
+HELP = "grow a box around a configuration in which the model's verdict stays the same"
+
+_EXAMPLES = """examples:
+  advsearch region --object mug --control pose.yaw,camera.elevation --map 24
+  advsearch region --around mug-pose-001 --vary pose.yaw,pose.pitch
+"""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add the command."""
+    from advsearch.cli.flags import add_settings
+    from advsearch.config import RegionConfig
+
+    parser = subparsers.add_parser(
+        "region",
+        help=HELP,
+        description=f"{HELP[0].upper()}{HELP[1:]}.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    add_settings(parser, config=RegionConfig)
+    output.add_flags(parser, quiet=True)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Grow the region and print it."""
+    from advsearch.cli.flags import config_from
+    from advsearch.config import AttackConfig, RegionConfig, SceneConfig
+    from advsearch.runs.directory import CONFIG, find_run
+
+    otherwise: dict[str, Any] = {}
+    if "around" in args:
+        theirs = AttackConfig.from_yaml(find_run(args.around) / CONFIG)
+        otherwise = {
+            name: getattr(theirs, name) for name in SceneConfig.model_fields if name not in ("run", "overwrite")
+        }
+    elif "object" not in args:
+        raise InputError("advsearch region: expected --object NAME, or --around RUN; see advsearch region --help")
+    return carry_out(config_from(args, RegionConfig, **otherwise), as_json=args.json, quiet=args.quiet)
+
+
+def carry_out(config: RegionConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
+    """Do what `config` describes, or go on with it; print the region and return the exit status."""
+    from contextlib import nullcontext
+
+    from advsearch.cli.main import OK
+    from advsearch.cli.progress import watching
+
+    with output.output_kept_clean() if as_json else nullcontext(), watching(quiet=quiet) as progress:
+        from advsearch.api import region_from_config
+
+        summary = region_from_config(config, progress=progress, resumed=resumed)
+    if as_json:
+        output.print_json(summary)
+    else:
+        print(answer(summary))
+    return OK
+
+
+def answer(summary: Mapping[str, Any]) -> str:
+    """Return the box and what is known of it."""
+    from advsearch.report import wording
+
+    low = 100.0 * summary["interval"][0]
+    said = (
+        f"The model is {summary['verdict']} in {summary['same']} of {summary['samples']} fresh samples of this box: "
+        f"with 95 % confidence in at least {low:.1f} % of it."
+    )
+    rows = [["parameter", "from", "to", "centre", "unit"]]
+    rows += [
+        [one["name"], f"{one['low']:.4g}", f"{one['high']:.4g}", f"{one['centre']:.4g}", one["unit"]]
+        for one in summary["box"]
+    ]
+    facts = [
+        ["share of the space", wording.percent(summary["volume"])],
+        ["renders", str(summary["renders"]["verification"])],
+        ["time", wording.seconds_text(summary["seconds"]["total"])],
+        ["run", str(summary["run"])],
+    ]
+    return "\n\n".join([said, output.columns(rows), output.columns(facts)])

@@ -1,0 +1,44 @@
+"""`advsearch resume`: go on with a run that was stopped, however it was stopped."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from advsearch.cli import output
+from advsearch.errors import InputError
+
+HELP = "go on with a run that was stopped, where it was stopped"
+
+
+def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        "resume",
+        help=HELP,
+        description=HELP[0].upper() + HELP[1:] + "; what it has evaluated is not rendered again.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("run", metavar="RUN", help="a run's name or folder")
+    output.add_flags(parser, quiet=True)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do what is left of the run and print its answer; of a run that is done, its answer."""
+    import sys
+
+    from advsearch.cli.run import carry_out
+    from advsearch.runs.directory import CONFIG, find_run
+    from advsearch.runs.listing import finished
+    from advsearch.settings import read_yaml
+
+    path = find_run(args.run)
+    if not (path / CONFIG).is_file():
+        raise InputError(f"{path}: expected a run with its {CONFIG}, got none; it was stopped before it began")
+    if finished(path):
+        from advsearch.cli.show import show_run
+
+        print(f"advsearch: {path} is done already", file=sys.stderr)
+        return show_run(str(path), args.json)
+    command = str(read_yaml(path / CONFIG).get("command", "attack"))
+    return carry_out(command, path / CONFIG, {}, args, resumed=path)

@@ -1,0 +1,43 @@
+"""`advsearch runs`: the runs that are here, and how each ended."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from advsearch.cli import output
+from advsearch.errors import InputError
+
+HELP = "list the runs in a folder and how each ended"
+
+
+def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser("runs", help=HELP, description=HELP[0].upper() + HELP[1:] + ".", allow_abbrev=False)
+    parser.add_argument("folder", nargs="?", metavar="FOLDER", help="where to look (default: runs)")
+    output.add_flags(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print one line for each run."""
+    from advsearch.runs.directory import HOME
+    from advsearch.runs.listing import listed
+
+    folder = HOME if args.folder is None else Path(args.folder)
+    if args.folder is not None and not folder.is_dir():
+        raise InputError(f"{folder}: expected a folder with runs in it, got no such folder")
+    found = listed(folder)
+    if args.json:
+        output.print_json({"schema": 1, "command": "runs", "runs": [vars(one) for one in found]})
+        return 0
+    if not found:
+        print(f"no runs in {folder}/ yet; advsearch attack makes one")
+        return 0
+    heads = ["run", "command", "object", "controls", "rows", "state", "answer"]
+    rows = [
+        [one.name, one.command, one.object, ",".join(one.controls), str(one.rows), one.state, one.answer]
+        for one in found
+    ]
+    print(output.columns([heads, *rows]))
+    return 0

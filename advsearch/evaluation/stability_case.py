@@ -1,0 +1,152 @@
+"""What a case of the stability suite is, and what running it says. Data only; no torch, no renderer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+GROUPS: Mapping[str, str] = {
+    "radiometric": "light that is very strong, absent or impossible, and pictures at the ends of their range",
+    "materials": "surfaces at the ends of their range",
+    "geometry": "meshes, places and views that break naive code",
+    "objective": "what a model may answer: huge logits, ties, certainty, NaN, a constant, noise",
+    "stiff": "controls whose scales differ by a million",
+    "precision": "32-bit numbers, many steps, several threads",
+    "noise": "one sample a pixel, and gradients with heavy tails",
+}
+"""Every group, in the order in which they run."""
+
+OK, FELL_SHORT = "ok", "fell short"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One number that decides, and the range that it has to be in (both ends included; NaN is in no range).
+
+    Attributes:
+        what: what was measured, with its unit.
+        value: the number.
+        least, most: the range.
+    """
+
+    what: str
+    value: float
+    least: float = -math.inf
+    most: float = math.inf
+
+    @property
+    def ok(self) -> bool:
+        """Whether the number is in its range."""
+        return self.least <= self.value <= self.most
+
+    def __str__(self) -> str:
+        ends = [
+            f"{sign} {end:.4g}"
+            for sign, end in (("at least", self.least), ("at most", self.most))
+            if not math.isinf(end) and self.least != self.most
+        ]
+        wanted = f"exactly {self.most:.4g}" if self.least == self.most else " and ".join(ends)
+        return f"{self.what}: {self.value:.4g}" + (f" (expected {wanted})" if wanted else "")
+
+
+def holds(what: str, truth: bool) -> Check:
+    """Return the check that something is true: 1, else 0."""
+    return Check(what, float(truth), 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What a case found.
+
+    Attributes:
+        checks: the numbers that decide.
+        finite: every picture and every gradient was finite, and none had to be made so.
+        relative_error: of a gradient (or of what the case is about) against the reference; None where there is none.
+        ending: how the case's search ended, "refused" where the input was, or empty.
+        measured: further numbers that are worth printing.
+        rule: what handled it, where that is known only afterwards; empty for the case's own.
+    """
+
+    checks: tuple[Check, ...]
+    finite: bool = True
+    relative_error: float | None = None
+    ending: str = ""
+    measured: Mapping[str, float] = field(default_factory=dict)
+    rule: str = ""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One extreme.
+
+    Attributes:
+        name: unique; what `--case` takes.
+        group: a key of `GROUPS`.
+        what: the words of the list that asked for it.
+        holds: what must hold, in a sentence.
+        rule: what handles it.
+        find: does it.
+        control: the controls that it moves; empty where there is no scene.
+        cheap: takes about a second or less on two quiet cores, so the tests run it every time.
+    """
+
+    name: str
+    group: str
+    what: str
+    holds: str
+    rule: str
+    find: Callable[[], Findings]
+    control: str = ""
+    cheap: bool = True
+
+
+@dataclass(frozen=True)
+class Row:
+    """A case and what it found.
+
+    Attributes:
+        case: which.
+        findings: what.
+        seconds: what it took.
+    """
+
+    case: Case
+    findings: Findings
+    seconds: float
+
+    @property
+    def status(self) -> str:
+        """`OK` where everything was finite and every check holds."""
+        return OK if self.findings.finite and all(check.ok for check in self.findings.checks) else FELL_SHORT
+
+    @property
+    def decides(self) -> str:
+        """The number that decides: of the first check that fails, else of the last one."""
+        bad = [check for check in self.findings.checks if not check.ok]
+        if not self.findings.finite and not bad:
+            return "NaN or infinite values"
+        return str((bad or list(self.findings.checks[-1:]) or [""])[0])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the row as DESIGN section 6 lists it, and more."""
+        found = self.findings
+        return {
+            "case": self.case.name,
+            "group": self.case.group,
+            "control": self.case.control,
+            "finite": found.finite,
+            "relative_error": found.relative_error,
+            "ending": found.ending,
+            "rule": found.rule or self.case.rule,
+            "status": self.status,
+            "decides": self.decides,
+            "holds": self.case.holds,
+            "checks": [
+                {"what": one.what, "value": one.value, "least": one.least, "most": one.most, "ok": one.ok}
+                for one in found.checks
+            ],
+            "measured": dict(found.measured),
+            "seconds": self.seconds,
+        }

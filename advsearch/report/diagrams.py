@@ -1,0 +1,227 @@
+"""Work-precision diagrams: error against seconds, both logarithmic, as numerical analysts draw them.
+
+Filled markers are known errors; open ones with an arrow are limits: the reference is no better than that. The dashed
+line falls as independent samples do.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Points = Sequence[Mapping[str, Any]]
+
+COLORS = ("#1d5fd0", "#b4540a", "#1f7a45", "#7a3fa8", "#b3261e", "#4a7d8c", "#8a6d00", "#5c606a", "#c2488f")
+MARKERS = "osD^vP*X<"
+STYLE: dict[Any, Any] = {
+    "font.family": ["DejaVu Sans"],
+    "font.size": 9.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#5c606a",
+    "axes.labelcolor": "#1c1d20",
+    "axes.titlelocation": "left",
+    "axes.titlesize": 10.0,
+    "axes.titleweight": "bold",
+    "grid.color": "#dfe0e3",
+    "grid.linewidth": 0.7,
+    "legend.frameon": False,
+    "legend.fontsize": 8.0,
+    "svg.hashsalt": "advsearch",
+    "svg.fonttype": "none",
+}
+PANEL = (5.6, 3.9)
+"""Width and height of one diagram in inches."""
+PERCENT = 100.0
+
+
+def precision_figures(report: Mapping[str, Any]) -> dict[str, bytes]:
+    """Return the diagrams of a report as files.
+
+    Args:
+        report: of `advsearch precision`.
+
+    Returns:
+        "png" and "svg" to their content; empty where nothing was measured.
+    """
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    panels = _panels(report)
+    if not panels:
+        return {}
+    wide = min(2, len(panels))
+    tall = math.ceil(len(panels) / wide)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(PANEL[0] * wide, PANEL[1] * tall + 0.8), layout="constrained")
+        for number, (title, kind, points) in enumerate(panels):
+            axes = figure.add_subplot(tall, wide, number + 1)
+            axes.set_title(title)
+            (_gains if kind == "objective" else _errors)(axes, points, kind, report)
+        _explain(figure, report)
+        return {kind: _rendered(figure, kind) for kind in ("png", "svg")}
+
+
+def _panels(report: Mapping[str, Any]) -> list[tuple[str, str, Points]]:
+    """Title, what the vertical axis shows, and points of each diagram."""
+    image = [one for one in report["points"] if one["quantity"] == "image"]
+    found: list[tuple[str, str, Points]] = []
+    for family, title in (("raw", "picture: samplers, denoiser"), ("depth", "picture: path depth")):
+        shown = [one for one in image if (one["family"] == "depth") == (family == "depth")]
+        found += [(title, "error", shown)] if shown else []
+    margin = [one for one in image if one["family"] != "depth"]
+    found += [("margin of the model", "margin_error", margin)] if margin else []
+    gradient = [one for one in report["points"] if one["quantity"] == "gradient"]
+    for control in dict.fromkeys(one["control"] for one in gradient):
+        found.append((f"gradient: {control}", "error", [one for one in gradient if one["control"] == control]))
+    objective = [one for one in report["points"] if one["quantity"] == "objective"]
+    return found + ([("best verified objective", "objective", objective)] if objective else [])
+
+
+def _errors(axes: Axes, points: Points, measure: str, report: Mapping[str, Any]) -> None:
+    """Error against seconds, one line for each estimator."""
+    usable = [one for one in points if one[measure] is not None and 0.0 < one[measure] < math.inf]
+    for number, name in enumerate(dict.fromkeys(one["estimator"] for one in usable)):
+        line = sorted((one for one in usable if one["estimator"] == name), key=lambda one: one["spp"])
+        _line(axes, line, measure, number, _named(name, points, measure, report))
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    if usable:
+        _percent_axis(axes)
+        _theory(axes, usable, measure)
+    goal = report["goal"] * PERCENT
+    low, high = axes.get_ylim()
+    if low < goal < high:
+        axes.axhline(goal, color="#1c1d20", linewidth=0.8, linestyle=":")
+        axes.annotate(
+            f"{goal:g} %", (1.0, goal), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=8
+        )
+    axes.set_xlabel("seconds")
+    axes.set_ylabel("relative error, %")
+    axes.grid(True, which="major")
+    place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2}
+    axes.legend(**place, handlelength=1.6, title="slope against samples", title_fontsize=8, alignment="left")
+
+
+def _line(axes: Axes, line: Points, measure: str, number: int, label: str) -> None:
+    known_by = "known" if measure == "error" else "margin_known"
+    interval = "interval" if measure == "error" else "margin_interval"
+    color, marker = COLORS[number % len(COLORS)], MARKERS[number % len(MARKERS)]
+    seconds = [one["seconds"] for one in line]
+    errors = [PERCENT * one[measure] for one in line]
+    axes.plot(seconds, errors, color=color, linewidth=1.0, alpha=0.55)
+    for one, x, y in zip(line, seconds, errors, strict=True):
+        if one[known_by]:
+            low, high = (PERCENT * value if value is not None else math.nan for value in one[interval])
+            if low == low and high < 4.0 * y:
+                axes.plot([x, x], [low, high], color=color, linewidth=0.8, alpha=0.6)
+            axes.plot([x], [y], marker=marker, markersize=5, color=color)
+        else:
+            axes.plot([x], [y], marker=marker, markersize=6, markerfacecolor="white", color=color)
+            axes.annotate(
+                "",
+                (x, y * 0.72),
+                (x, y),
+                arrowprops={"arrowstyle": "-|>", "color": color, "linewidth": 0.8, "shrinkA": 3},
+            )
+    axes.plot([], [], marker=marker, markersize=5, color=color, linewidth=1.0, label=label)
+
+
+def _named(name: str, points: Points, measure: str, report: Mapping[str, Any]) -> str:
+    """An estimator with the slope of its line against samples, and theory where it disagrees with that."""
+    control = points[0].get("control")
+    for one in report["slopes"]:
+        same = one["estimator"] == name and one["control"] == control and one["quantity"] == points[0]["quantity"]
+        if same and one["measure"] == measure and one["against"] == "samples":
+            doubt = f" (not {_minus(one['theory'])})" if one["agrees"] is False else ""
+            return f"{name}  {_minus(one['slope'])}{doubt}"
+    return name
+
+
+def _minus(value: float) -> str:
+    return f"{value:.2f}".replace("-", "\N{MINUS SIGN}")
+
+
+def _theory(axes: Axes, points: Points, measure: str) -> None:
+    """A dashed line of slope -1/2 under the points."""
+    low, high = min(one["seconds"] for one in points), max(one["seconds"] for one in points)
+    if high < 1.5 * low:
+        return
+    at = PERCENT * min(one[measure] * math.sqrt(one["seconds"]) for one in points) * 0.8
+    axes.plot([low, high], [at / math.sqrt(low), at / math.sqrt(high)], color="#5c606a", linewidth=1.0, linestyle="--")
+    middle = math.sqrt(low * high)
+    axes.annotate(
+        "\N{MINUS SIGN}1/2", (middle, at / math.sqrt(middle)), fontsize=8, color="#5c606a", ha="right", va="top"
+    )
+
+
+def _percent_axis(axes: Axes) -> None:
+    """Plain numbers on both axes."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = axis.get_view_interval()
+        short = high < 30.0 * low
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if short else (1.0,)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
+
+
+def _gains(axes: Axes, points: Points, kind: str, report: Mapping[str, Any]) -> None:
+    """Objective against seconds, median and quartiles, one line for each policy."""
+    for number, name in enumerate(dict.fromkeys(one["estimator"] for one in points)):
+        line = sorted((one for one in points if one["estimator"] == name), key=lambda one: one["renders"])
+        color = COLORS[number % len(COLORS)]
+        seconds = [one["seconds"] for one in line]
+        low, high = ([one["quartiles"][side] for one in line] for side in (0, 1))
+        axes.fill_between(seconds, low, high, color=color, alpha=0.15, linewidth=0)
+        marker = MARKERS[number % len(MARKERS)]
+        label = f"{name}, {line[-1]['repeats']} searches"
+        axes.plot(seconds, [one["objective"] for one in line], marker=marker, markersize=4.5, color=color, label=label)
+        axes.annotate(
+            f"{line[-1]['renders']} renders",
+            (seconds[-1], line[-1]["objective"]),
+            fontsize=7.5,
+            color=color,
+            xytext=(4, 0),
+            textcoords="offset points",
+            va="center",
+        )
+    axes.set_xscale("log")
+    _percent_axis_x(axes)
+    axes.set_xlabel("seconds of search")
+    axes.set_ylabel(f"{report['objective']}, verified")
+    axes.grid(True, which="major")
+    axes.legend(loc="upper left")
+
+
+def _percent_axis_x(axes: Axes) -> None:
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _explain(figure: Figure, report: Mapping[str, Any]) -> None:
+    """Title, the machine, and how to read it."""
+    machine, formation = report["machine"], report["image_formation"]
+    height, width = formation["resolution"]
+    threads = ", ".join(f"{count} {name} thread" + "s" * (count != 1) for name, count in machine["threads"].items())
+    what = f"{report['object']} in {report['environment']}, {report['model']}, {width} x {height} pixels"
+    figure.suptitle(what, fontsize=11, fontweight="bold", x=0.01, ha="left")
+    place = f"{machine['cpu']}, {machine['cores']} cores, {threads}; seconds are medians of interleaved repeats."
+    key = "Filled: known, with its 95 % interval. Open, with an arrow: at most this, the reference is no better."
+    figure.supxlabel(f"{place}\n{key}", fontsize=8, color="#5c606a", x=0.01, ha="left")
+
+
+def _rendered(figure: Figure, kind: str) -> bytes:
+    held = io.BytesIO()
+    metadata = {"Date": None} if kind == "svg" else None
+    figure.savefig(held, format=kind, dpi=144, metadata=metadata)
+    return held.getvalue()

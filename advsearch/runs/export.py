@@ -1,0 +1,143 @@
+"""A run's rows as a table for other programs: CSV, JSON or Parquet.
+
+One line for each evaluated configuration, in the order in which they were evaluated. The columns of the store come
+first; then one for each value, with its unit in its name: ``pose.yaw [degrees]``. A value of several numbers has a
+column for each: ``camera.target[0]``. What a row has not is empty.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import IO, Any
+
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.runs.files import replacing
+from advsearch.runs.store import Row, Store
+
+FORMATS = ("csv", "json", "parquet")
+
+OWN = ("id", "kind", "step", "seed", "spp", "objective", "success", "label", "label_index", "probability")
+AFTER = ("renders", "seconds", "time")
+"""Columns of the store before and after the values."""
+
+GROUP = 8192
+"""Rows of a Parquet row group, and so what is held in memory at once."""
+
+
+def export(store: Store, format: str, out: Path | None, stream: IO[bytes], kind: str | None = None) -> int:
+    """Write the rows and return how many there were.
+
+    Args:
+        store: of the run.
+        format: one of `FORMATS`.
+        out: the file, written whole or not at all; None writes to the stream.
+        stream: standard output, say.
+        kind: only rows of this kind.
+
+    Raises:
+        UnknownNameError: the format or the kind is unknown.
+        InputError: Parquet is asked for and pyarrow is not installed.
+        StorageError: the file cannot be written.
+    """
+    if format not in FORMATS:
+        raise UnknownNameError("format", format, FORMATS)
+    counts = store.counts()
+    if kind is not None and kind not in counts:
+        raise UnknownNameError("kind of rows", kind, counts)
+    write = {"csv": _csv, "json": _json, "parquet": _parquet}[format]
+    names = columns(store.rows(kind))
+    if out is None:
+        write(_records(store.rows(kind)), names, stream)
+    else:
+        with replacing(out) as part, part.open("wb") as file:
+            write(_records(store.rows(kind)), names, file)
+    return counts[kind] if kind is not None else sum(counts.values())
+
+
+def columns(rows: Iterable[Row]) -> list[str]:
+    """Return the columns of a table of these rows; values in the order in which they first occur."""
+    seen: dict[str, None] = {}
+    for row in rows:
+        seen |= dict.fromkeys(_values(row.values))
+    return [*OWN, *seen, *AFTER]
+
+
+def record(row: Row) -> dict[str, Any]:
+    """Return a row as column to value."""
+    own = {one.name: getattr(row, one.name) for one in fields(row) if one.name != "values"}
+    return own | _values(row.values)
+
+
+def _records(rows: Iterable[Row]) -> Iterator[dict[str, Any]]:
+    return (record(row) for row in rows)
+
+
+def _values(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Column to number or text."""
+    found: dict[str, Any] = {}
+    for name, told in values.items():
+        value, unit = (told.get("value"), told.get("unit", "")) if isinstance(told, Mapping) else (told, "")
+        suffix = f" [{unit}]" if unit else ""
+        if isinstance(value, (list, tuple)):
+            found |= {f"{name}[{number}]{suffix}": inner for number, inner in enumerate(value)}
+        else:
+            found[f"{name}{suffix}"] = value
+    return found
+
+
+def _csv(records: Iterable[Mapping[str, Any]], names: list[str], stream: IO[bytes]) -> None:
+    text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
+    writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: _cell(value) for name, value in one.items()} for one in records)
+    text.detach()
+
+
+def _cell(value: Any) -> Any:
+    return "" if value is None else int(value) if isinstance(value, bool) else value
+
+
+def _json(records: Iterable[Mapping[str, Any]], names: list[str], stream: IO[bytes]) -> None:
+    stream.write(b"[")
+    for number, one in enumerate(records):
+        line = json.dumps({name: one.get(name) for name in names}, allow_nan=False, ensure_ascii=False)
+        stream.write((",\n " if number else "\n ").encode() + line.encode())
+    stream.write(b"\n]\n")
+
+
+def _parquet(records: Iterable[Mapping[str, Any]], names: list[str], stream: IO[bytes]) -> None:
+    try:
+        import pyarrow  # type: ignore[import-not-found, unused-ignore]
+        import pyarrow.parquet  # type: ignore[import-not-found, unused-ignore]
+    except ImportError:
+        raise InputError("--format parquet: needs pyarrow; pip install pyarrow, or choose csv or json") from None
+    rows = iter(records)
+    first = list(itertools.islice(rows, GROUP))
+    schema = pyarrow.schema([(name, _arrow_type(name, first, pyarrow)) for name in names])
+    with pyarrow.parquet.ParquetWriter(stream, schema) as writer:
+        while first:
+            told = {name: [_as(one.get(name), schema.field(name).type, pyarrow) for one in first] for name in names}
+            writer.write_table(pyarrow.table(told, schema))
+            first = list(itertools.islice(rows, GROUP))
+
+
+def _arrow_type(name: str, rows: Sequence[Mapping[str, Any]], pyarrow: Any) -> Any:
+    """Type of a column: by its name in the store, by its first values otherwise."""
+    declared = {one.name: str(one.type) for one in fields(Row)}.get(name)
+    if declared is not None:
+        kinds = (("str", pyarrow.string()), ("bool", pyarrow.bool_()), ("int", pyarrow.int64()))
+        return next((arrow for text, arrow in kinds if declared.startswith(text)), pyarrow.float64())
+    texts = any(isinstance(one.get(name), str) for one in rows)
+    return pyarrow.string() if texts else pyarrow.float64()
+
+
+def _as(value: Any, wanted: Any, pyarrow: Any) -> Any:
+    if value is None:
+        return None
+    return str(value) if wanted == pyarrow.string() else float(value) if wanted == pyarrow.float64() else value

@@ -1,0 +1,89 @@
+"""The runs in a folder at a glance."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from advsearch.errors import AdvsearchError
+from advsearch.runs import lock, store, summary
+from advsearch.runs.directory import CONFIG, is_run
+from advsearch.settings import read_yaml
+
+
+@dataclass(frozen=True)
+class Listed:
+    """One run.
+
+    Attributes:
+        name: of its folder.
+        path: of its folder.
+        command: that made it.
+        object: what the model should recognise.
+        controls: what could change.
+        rows: evaluated configurations in its store.
+        state: ``"running"`` where a process works on it, ``"stopped"`` where it can be resumed, else its ending.
+        answer: what came out, in a few words.
+    """
+
+    name: str
+    path: str
+    command: str
+    object: str
+    controls: tuple[str, ...]
+    rows: int
+    state: str
+    answer: str
+
+
+def listed(folder: Path) -> list[Listed]:
+    """Return the runs in a folder, by name; what cannot be read is shown as far as it can."""
+    if not folder.is_dir():
+        return []
+    return [_one(path) for path in sorted(folder.iterdir()) if path.is_dir() and is_run(path)]
+
+
+def finished(path: Path) -> bool:
+    """Whether a run has come to its end; one that was interrupted has not."""
+    return (path / summary.NAME).is_file() and summary.read_summary(path).get("ending") != "interrupted"
+
+
+def _one(path: Path) -> Listed:
+    config: dict[str, Any] = {}
+    answer: dict[str, Any] = {}
+    rows = 0
+    with suppress(AdvsearchError):
+        config = read_yaml(path / CONFIG)
+    with suppress(AdvsearchError):
+        answer = summary.read_summary(path)
+    with suppress(AdvsearchError), store.Store(path / store.NAME, read_only=True) as results:
+        rows = sum(results.counts().values())
+    controls = answer.get("controls") or list(config.get("controls") or {})
+    return Listed(
+        name=path.name,
+        path=str(path),
+        command=str(config.get("command") or answer.get("command") or "?"),
+        object=str(config.get("object") or answer.get("object") or "?"),
+        controls=tuple(map(str, controls)),
+        rows=rows,
+        state=_state(path, answer),
+        answer=_answer(answer),
+    )
+
+
+def _state(path: Path, answer: dict[str, Any]) -> str:
+    if lock.is_held(path):
+        return "running"
+    ending = answer.get("ending") or ("done" if answer else "interrupted")
+    return "stopped" if ending == "interrupted" else str(ending)
+
+
+def _answer(answer: dict[str, Any]) -> str:
+    verified = answer.get("verified") or {}
+    if verified.get("trials"):
+        return f"{verified['successes']}/{verified['trials']}"
+    if answer.get("accuracy") is not None:
+        return f"accuracy {answer['accuracy']:.1%}"
+    return ""

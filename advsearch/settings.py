@@ -1,0 +1,406 @@
+"""The machinery of a typed configuration: settings with one description each, read from YAML, flags and Python alike.
+
+`config` declares the settings themselves.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import shlex
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+SCHEMA = 1
+"""Version of the YAML form."""
+
+HEADER = "# A run of advsearch. To repeat it: advsearch run FILE\n"
+"""First line of every `run.yaml` that advsearch writes; a run directory is recognised by it."""
+
+PLACE: dict[str, Any] = {"run": None, "overwrite": False}
+"""The settings that say where a run is kept, not what it does, as a repetition has them."""
+
+FILES = ("object", "environment", "model", "labels")
+"""The settings that may name files."""
+
+
+class _Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
+    """YAML as its safe loader reads it, but without numbers to the base of 60: 0:360:24 is text."""
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in found if tag not in ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")]
+    for first, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:int",
+    re.compile(r"^(?:[-+]?0b[0-1_]+|[-+]?0[0-7_]*|[-+]?[1-9][0-9_]*|[-+]?0x[0-9a-fA-F_]+)$"),
+    list("-+0123456789"),
+)
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(
+        r"^(?:[-+]?[0-9][0-9_]*\.[0-9_]*(?:[eE][-+][0-9]+)?|\.[0-9][0-9_]*(?:[eE][-+][0-9]+)?"
+        r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
+    ),
+    list("-+0123456789."),
+)
+
+
+class SettingsError(InputError):
+    """One or more settings have values that are not allowed.
+
+    Attributes:
+        problems: pairs of a setting's name and what is wrong with it.
+    """
+
+    def __init__(self, problems: tuple[tuple[str, str], ...], spell: Callable[[str], str] = str) -> None:
+        super().__init__("; ".join(f"{spell(name)}: {text}" for name, text in problems))
+        self.problems = problems
+
+    def spelled(self, spell: Callable[[str], str]) -> SettingsError:
+        """Return the same error with each setting's name as `spell` writes it: ``--epsilon`` for ``epsilon``, say."""
+        return SettingsError(self.problems, spell)
+
+
+def setting(
+    default: Any, group: str, description: str, expects: str, *, unit: str = "", otherwise: str = "", **constraints: Any
+) -> Any:
+    """Return a pydantic field.
+
+    Args:
+        default: the default, a function that makes it, or ... for none.
+        group: heading in the help.
+        description: what it is.
+        expects: completes "expected ..." in errors, and names the range in the help.
+        unit: of the value.
+        otherwise: what a default of None comes to.
+        constraints: as of `pydantic.Field`.
+    """
+    notes: dict[str, Any] = {"group": group, "expects": expects, "unit": unit, "otherwise": otherwise}
+    alias = constraints.pop("alias", None)
+    make = {"default_factory": default} if callable(default) else {"default": default}
+    return Field(**make, description=description, json_schema_extra=notes, alias=alias, **constraints)
+
+
+class Config(BaseModel):
+    """What a command needs to know. Frozen; unknown names are refused. Each command's configuration is a subclass.
+
+    Raises:
+        InputError: a value is outside its range or an unknown setting is named; the message lists every problem.
+    """
+
+    command: ClassVar[str]
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False)
+
+    def __init__(self, **data: Any) -> None:
+        try:
+            super().__init__(**data)
+        except ValidationError as error:
+            raise _settings_error(type(self), error) from None
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_number_from_bool(cls, value: Any, info: Any) -> Any:
+        """Refuse true for a number: YAML's `epsilon: yes` is a slip, not 1."""
+        if isinstance(value, bool) and cls.model_fields[info.field_name].annotation is not bool:
+            raise ValueError("a truth value is not accepted here")
+        return value
+
+    @classmethod
+    def from_flags(cls, data: Mapping[str, Any]) -> Self:
+        """Return the configuration for settings given as flags; errors name the flag.
+
+        Raises:
+            InputError: as for the class.
+        """
+        try:
+            return cls(**data)
+        except SettingsError as error:
+            raise error.spelled(flag) from None
+
+    @classmethod
+    def from_yaml(cls, path: str | Path, overrides: Mapping[str, Any] | None = None) -> Self:
+        """Return the configuration that the YAML file at `path` describes, with `overrides` put over it.
+
+        Args:
+            path: a file with one mapping from settings to values; `schema`, `command` and `base` may stand beside
+                them (see `read_yaml`).
+            overrides: setting to value; a dotted name reaches inside: ``set.camera.azimuth``, ``controls.pose.yaw``.
+
+        Raises:
+            FileFormatError: the file is missing, empty or not such a mapping.
+            InputError: as for the class; the message names the file.
+        """
+        data = {name: value for name, value in read_yaml(path).items() if name not in ("schema", "command")}
+        for name, value in (overrides or {}).items():
+            _put(data, name, value)
+        try:
+            return cls(**data)
+        except SettingsError as error:
+            raise error.spelled(lambda name: f"{path}: {name}") from None
+
+    def to_yaml(self) -> str:
+        """Return the YAML form; `from_yaml` of it gives an equal configuration."""
+        data = {"schema": SCHEMA, "command": self.command, **self.plain()}
+        return HEADER + str(yaml.safe_dump(data, sort_keys=False))
+
+    def plain(self) -> dict[str, Any]:
+        """Return every setting by the name it has in YAML, as JSON values."""
+        return self.model_dump(by_alias=True, mode="json")
+
+    def recipe(self) -> Self:
+        """Return what `run.yaml` holds: no place for the run (a repetition gets its own) and files by absolute path."""
+        places = {name: _absolute(getattr(self, name)) for name in FILES if name in type(self).model_fields}
+        return self.model_copy(update={**places, **PLACE})
+
+    def command_line(self) -> str:
+        """Return the shell command that repeats this in a place of its own: all settings that are not the default."""
+        words = ["advsearch", self.command]
+        for one in settings(type(self)):
+            value = getattr(self, one.field)
+            if value != one.default and one.field not in PLACE:
+                words += _as_flags(one, value)
+        return shlex.join(words)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What the help and the docs say about one setting.
+
+    Attributes:
+        field: attribute of the configuration.
+        name: its name in YAML.
+        flag: its flag on the command line.
+        group: the heading it stands under: scene, model, search, verification or run.
+        description: what it is.
+        expects: the values it takes, with their range.
+        unit: the unit of the value; may be empty.
+        default: the default; None when there is none.
+        otherwise: what a default of None comes to; may be empty.
+        required: whether it must be given.
+        is_switch: whether it is true or false.
+    """
+
+    field: str
+    name: str
+    flag: str
+    group: str
+    description: str
+    expects: str
+    unit: str
+    default: Any
+    otherwise: str
+    required: bool
+    is_switch: bool
+
+
+def settings(config: type[Config]) -> tuple[Setting, ...]:
+    """Return every setting of a configuration, in the order in which they are shown."""
+    found = []
+    for field, info in config.model_fields.items():
+        notes: Any = info.json_schema_extra
+        found.append(
+            Setting(
+                field=field,
+                name=info.alias or field,
+                flag=flag(field),
+                group=notes["group"],
+                description=info.description or "",
+                expects=notes["expects"],
+                unit=notes["unit"],
+                default=None if info.is_required() else info.get_default(call_default_factory=True),
+                otherwise=notes["otherwise"],
+                required=info.is_required(),
+                is_switch=info.annotation is bool,
+            )
+        )
+    return tuple(found)
+
+
+def flag(name: str) -> str:
+    """Return the flag of the setting `name`: ``texture_resolution`` is ``--texture-resolution``."""
+    special = {"controls": "--control", "set_": "--set", "set": "--set"}
+    special |= {"estimators": "--estimator", "estimator": "--estimator", "baseline": "--no-baseline"}
+    return special.get(name) or "--" + name.replace("_", "-")
+
+
+def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """Return the mapping in the YAML file at `path`, laid over the files that its `base` names.
+
+    A base is a file, or a list of files of which a later one goes over an earlier one; mappings are merged.
+
+    Args:
+        path: the file.
+        above: the files that have named this one as their base.
+
+    Raises:
+        FileFormatError: the file is missing, empty, not text, not YAML or not a mapping with names as keys.
+    """
+    try:
+        data = yaml.load(Path(path).read_text(encoding="utf-8"), _Loader)
+    except OSError as error:
+        raise FileFormatError(f"{path}: expected a YAML file, got {error.strerror}; check the path") from None
+    except UnicodeDecodeError:
+        raise FileFormatError(f"{path}: expected a YAML file in UTF-8, got bytes that are not text") from None
+    except yaml.YAMLError as error:
+        raise FileFormatError(f"{path}: expected YAML, got {' '.join(str(error).split())}; correct the file") from None
+    if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
+        got = "an empty file" if data is None else type(data).__name__
+        raise FileFormatError(f"{path}: expected settings and values such as 'object: mug', got {got}")
+    if data.get("schema", SCHEMA) != SCHEMA:
+        raise FileFormatError(f"{path}: expected schema {SCHEMA}, got {data['schema']!r}; it is of another advsearch")
+    return _with_base(data, Path(path), above)
+
+
+def merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `over` laid over `under`: mappings are merged, and everything else is replaced."""
+    result = dict(under)
+    for name, value in over.items():
+        inner = result.get(name)
+        both = isinstance(inner, Mapping) and isinstance(value, Mapping)
+        result[name] = merged(inner, value) if both else value  # type: ignore[arg-type]
+    return result
+
+
+def _with_base(data: dict[str, Any], path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
+    """Lay the settings over those of the files that their `base` names, relative to the file itself."""
+    bases = data.pop("base", None) or []
+    bases = [bases] if isinstance(bases, str) else bases
+    if not isinstance(bases, list) or not all(isinstance(one, str) for one in bases):
+        raise FileFormatError(f"{path}: base: expected a file or a list of files, got {bases!r}")
+    here = path.resolve()
+    if bases and here in above:
+        raise FileFormatError(f"{path}: base: the file is a base of itself; take it out of one of them")
+    result: dict[str, Any] = {}
+    for base in bases:
+        result = merged(result, read_yaml(path.parent / base, (*above, here)))
+    return merged(result, data)
+
+
+def parse_assignment(text: str, where: str) -> tuple[str, Any]:
+    """Return the name and the value of ``NAME=VALUE``; the value is read as YAML, and as plain text where it is none.
+
+    Args:
+        text: the assignment.
+        where: what the error names: ``"--set"``, say.
+
+    Raises:
+        InputError: there is no ``=``, or the name is empty.
+    """
+    name, separator, value = text.partition("=")
+    if not (separator and name.strip()):
+        raise InputError(f"{where}: expected NAME=VALUE such as camera.azimuth=130, got {text!r}")
+    try:
+        return name.strip(), yaml.load(value, _Loader) if value.strip() else ""
+    except yaml.YAMLError:
+        return name.strip(), value.strip()
+
+
+def _settings_error(config: type[Config], error: ValidationError) -> AdvsearchError:
+    """Return pydantic's findings as one error of ours: one problem a setting."""
+    declared = settings(config)
+    known = {one.name: one for one in declared} | {one.field: one for one in declared}
+    problems: dict[str, str] = {}
+    for found in error.errors(include_url=False):
+        name = str(found["loc"][0])
+        if name not in known:
+            return UnknownNameError("setting", name, {one.name for one in declared})
+        got = "nothing" if found["type"] == "missing" else _shown(found["input"])
+        if known[name].field in ("set_", "controls", "over") and len(found["loc"]) > 1:
+            got = f"{found['loc'][1]}={got}"
+        problems.setdefault(known[name].name, f"expected {known[name].expects}, got {got}")
+    return SettingsError(tuple(problems.items()))
+
+
+def number_or_text(value: Any) -> Any:
+    if not isinstance(value, str):
+        return value
+    try:
+        return float(value)
+    except ValueError:
+        return value
+
+
+def _shown(value: Any) -> str:
+    """Return `value` for an error message: plain and not too long."""
+    text = value if isinstance(value, str) and value.strip() else repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def all_finite(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        return all(all_finite(inner) for inner in value.values())
+    if isinstance(value, (list, tuple)):
+        return all(all_finite(inner) for inner in value)
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+def _put(data: dict[str, Any], name: str, value: Any) -> None:
+    """Set a dotted name in nested mappings. What follows ``set.`` is one name, since parameters have dots in theirs."""
+    first, _, rest = name.partition(".")
+    if not rest:
+        data[first] = value
+        return
+    inner = data.get(first)
+    if isinstance(inner, list):
+        inner = {key: None for key in inner}
+    elif isinstance(inner, str):
+        inner = {"name": inner} if first == "policy" else {inner: None}
+    else:
+        inner = dict(inner) if isinstance(inner, dict) else {}
+    if first in ("set", "grid"):
+        inner[rest] = value
+    else:
+        _put(inner, rest, value)
+    data[first] = inner
+
+
+def _absolute(value: str | None) -> str | None:
+    """Return the absolute path of `value` where it is a file, and the name it is otherwise."""
+    is_path = value is not None and ("/" in value or Path(value).suffix != "") and Path(value).is_file()
+    return str(Path(str(value)).resolve()) if is_path else value
+
+
+def _as_flags(setting: Setting, value: Any) -> list[str]:
+    """Return the words of a command line that give `setting` the value."""
+    if setting.is_switch:
+        return [setting.flag]
+    if setting.field in ("set_", "grid", "estimators"):
+        return [word for name, given in value.items() for word in (setting.flag, f"{name}={_number(given)}")]
+    if setting.field in ("controls", "over"):
+        plain, tuned = [name for name in value if not value[name]], [name for name in value if value[name]]
+        words = [setting.flag, ",".join(plain)] if plain else []
+        return words + [word for name in tuned for word in (setting.flag, f"{name}={_flow(value[name])}")]
+    if setting.field == "epsilon" and isinstance(value, (dict, tuple)):
+        pairs = [f"{name}={_number(given)}" for name, given in value.items()] if isinstance(value, dict) else value
+        return [setting.flag, ",".join(str(one) for one in pairs)]
+    if setting.field == "policy" and isinstance(value, dict):
+        options = {name: given for name, given in value.items() if name != "name"}
+        return [setting.flag, f"{value['name']}={_flow(options)}"]
+    if setting.field == "resolution":
+        return ["--resolution", "x".join(str(side) for side in value)]
+    return [f"{setting.flag}={_number(value)}"] if str(value).startswith("-") else [setting.flag, _number(value)]
+
+
+def _flow(value: Any) -> str:
+    """Return `value` as YAML on one line."""
+    return str(yaml.safe_dump(value, default_flow_style=True, width=10**6, sort_keys=False)).strip()
+
+
+def _number(value: Any) -> str:
+    """Return a value as it is typed: 130 for 130.0, [0,0,1] for a list."""
+    if isinstance(value, (list, tuple)):
+        return "[" + ",".join(_number(part) for part in value) + "]"
+    return repr(int(value)) if isinstance(value, float) and value.is_integer() and abs(value) < 1e15 else str(value)

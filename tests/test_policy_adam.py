@@ -1,0 +1,90 @@
+"""The policy `adam`: steps in units of half a range, whatever the gradient's size, and what it does without one."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.attacks import Adam, Block, Domain, Ending, Evaluation, search
+from advsearch.attacks.policies.scaling import half_widths
+
+
+def path(domain: Domain, slope: Tensor, policy: Adam, steps: int) -> list[Tensor]:
+    seen: list[Tensor] = []
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        return Evaluation(float(u @ slope), slope.clone() if gradient else None, torch.zeros(2), False)
+
+    search(
+        evaluate,
+        domain,
+        policy,
+        steps=steps,
+        seed=0,
+        candidates=0,
+        on_step=lambda record, u, evaluation: seen.append(u),
+    )
+    return seen
+
+
+@pytest.mark.parametrize("size", [1e-12, 1.0, 1e12])
+def test_the_first_step_is_a_share_of_half_the_range_of_every_block(size: float) -> None:
+    """In an l2 ball the steps of the elements add up to that share of the radius, along the gradient."""
+    domain = Domain(torch.full((6,), 0.5), (Block(2, "linf", 0.1), Block(2, low=0.3, high=0.7), Block(2, "l2", 0.2)))
+    slope = size * torch.tensor([1.0, -5.0, 0.1, 2.0, 3.0, 4.0])
+    first, second = path(domain, slope, Adam(step_size=0.25), 2)
+    move = second - first
+    assert torch.equal(first, domain.start)
+    assert move[:4].tolist() == pytest.approx([0.025, -0.025, 0.05, 0.05], abs=1e-6)
+    assert float(move[4:].norm()) == pytest.approx(0.05, abs=1e-6)
+    assert float(move[5] / move[4]) == pytest.approx(4 / 3, abs=1e-4)
+
+
+def test_half_widths_are_the_units() -> None:
+    domain = Domain(
+        torch.tensor([0.5, 0.95, 0.5, 0.5, 0.5, 0.5]),
+        (Block(2, "linf", 0.1), Block(2, "l2", 0.2), Block(1, low=0.2, high=0.8), Block(1, reach=0.1)),
+    )
+    expected = [0.1, 0.075, 0.2 / math.sqrt(2), 0.2 / math.sqrt(2), 0.3, 0.1]
+    assert half_widths(domain).tolist() == pytest.approx(expected)
+
+
+def test_the_rate_falls_in_a_line() -> None:
+    domain = Domain(torch.full((2,), 0.5), (Block(2),))
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        return Evaluation(0.0, torch.ones(2) if gradient else None, torch.zeros(2), False)
+
+    history = search(evaluate, domain, Adam(step_size=0.4), steps=10, seed=0, candidates=0).history
+    assert [r.step_size for r in history] == pytest.approx([0.4 * (1 - k / 10) for k in range(10)])
+
+
+def test_without_any_gradient_it_stalls_and_leaves_a_flat_start_at_random() -> None:
+    domain = Domain(torch.full((5,), 0.5), (Block(5, "linf", 0.1),))
+
+    def never(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        return Evaluation(-1.0, torch.zeros_like(u), torch.zeros(2), False)
+
+    def later(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        slope = torch.ones_like(u) if index > 1 else torch.zeros_like(u)
+        return Evaluation(float(u.sum()), slope if gradient else None, torch.zeros(2), False)
+
+    flat = search(never, domain, Adam(), steps=60, seed=0)
+    assert flat.ending is Ending.STALLED
+    assert len(flat.history) == 5
+    assert search(later, domain, Adam(), steps=40, seed=0, candidates=0).best_objective == pytest.approx(3.0, abs=0.01)
+
+
+def test_a_non_finite_objective_sends_it_back_with_half_the_rate() -> None:
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        value = float(u[0]) if float(u[0]) < 0.55 else math.nan
+        return Evaluation(value, torch.ones(1) if gradient else None, torch.zeros(2), False)
+
+    domain = Domain(torch.tensor([0.5]), (Block(1, "linf", 0.1),))
+    result = search(evaluate, domain, Adam(step_size=1.0), steps=60, seed=0, candidates=0)
+    assert result.stopped is Ending.BUDGET_SPENT
+    assert 0 < result.non_finite_objectives < 30
+    assert float(result.best_u[0]) > 0.545

@@ -1,0 +1,141 @@
+"""What the policies state about themselves is true: budgets to a known optimum, the page about them, its example."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import re
+import sys
+from dataclasses import MISSING, fields
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.attacks import POLICIES, Block, Domain, Ending, Evaluation, Policy, make_policy, search
+from advsearch.attacks.policies.budgets import BUDGETS, DIMENSIONS, budget
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = (ROOT / "docs" / "policies" / "README.md").read_text("utf-8")
+
+CHEAP = {"auto": 200, "cmaes": 500, "portfolio": 200}
+"""Budgets up to so many renders are played, with three seeds each; up to 2,000 of a policy that is not named here."""
+
+
+def script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("closed_form", ROOT / "benchmarks" / "closed_form.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+closed_form = script()
+
+
+def stated() -> list[Any]:
+    """Every stated budget that is cheap to play."""
+    return [
+        pytest.param(name, objective, d, renders, id=f"{name}-{objective}-{d}")
+        for name in BUDGETS
+        for objective, dimensions in DIMENSIONS.items()
+        for d, renders in zip(dimensions, BUDGETS[name][objective], strict=True)
+        if renders is not None and renders <= CHEAP.get(name, 2000)
+    ]
+
+
+@pytest.mark.parametrize(("name", "objective", "d", "renders"), stated())
+def test_a_policy_reaches_the_optimum_within_its_stated_budget(name: str, objective: str, d: int, renders: int) -> None:
+    """`reached` also fails a policy that leaves the domain, or a wrong optimum."""
+    assert renders == budget(name, objective, d)
+    assert all(closed_form.reached(make_policy(name), objective, d, renders, seed) for seed in range(3))
+
+
+def test_every_policy_states_a_budget_for_every_objective() -> None:
+    assert set(BUDGETS) == set(POLICIES)
+    for rows in BUDGETS.values():
+        assert {name: len(row) for name, row in rows.items()} == {name: len(d) for name, d in DIMENSIONS.items()}
+    assert set(closed_form.OBJECTIVES) == set(DIMENSIONS)
+
+
+def test_a_gradient_pays_in_many_dimensions() -> None:
+    """In a thousand dimensions it takes tens of renders with a gradient, and thousands without one at least."""
+    for objective in ("linear, linf", "linear, l2", "quadratic, box"):
+        for name, policy in ((name, make_policy(name)) for name in POLICIES):
+            renders = budget(name, objective, 1000)
+            if policy.uses_gradient:
+                assert renders is not None and renders <= 200, name
+            else:
+                assert renders is None or renders >= 5000, name
+
+
+@pytest.mark.parametrize("objective", DIMENSIONS)
+def test_an_optimum_is_the_largest_value(objective: str) -> None:
+    """Nothing that random search or a gradient finds is larger, and the start is far from it."""
+    for d in (2, 3, 10):
+        problem = closed_form.OBJECTIVES[objective](d, 5)
+        assert problem.value(problem.domain.start) < 0.8 * problem.optimum
+        for name in ("random", "pgd"):
+            result = search(problem.evaluate, problem.domain, make_policy(name), steps=200, seed=0, candidates=0)
+            assert problem.value(result.best_u) <= problem.optimum * (1 + 1e-4)
+        u = problem.domain.start.clone().requires_grad_(True)
+        step = 1e-3 * torch.randn(d, generator=torch.Generator().manual_seed(1))
+        change = problem.value(problem.domain.start + step) - problem.value(problem.domain.start - step)
+        assert change == pytest.approx(2.0 * float(problem.gradient(u.detach()) @ step), rel=0.05, abs=1e-5)
+
+
+# ---- the page
+
+
+def test_the_page_shows_the_stated_budgets() -> None:
+    assert PAGE == closed_form.with_table(PAGE), "run python benchmarks/closed_form.py --write"
+    assert closed_form.table().count("\n") == 2 + len(POLICIES)
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_the_page_has_a_row_with_every_option_and_its_default(name: str) -> None:
+    row = re.search(rf"^\| (?:`{name}`|\[`{name}`\]\({name}\.md\)) \|.*$", PAGE, re.M)
+    assert row is not None
+    for field in fields(POLICIES[name]):  # type: ignore[arg-type]
+        stated = re.search(rf"`{field.name}` \((.*?)\)", row[0])
+        assert stated is not None, field.name
+        if field.default is not MISSING and isinstance(field.default, (int, float)):
+            assert re.search(rf"; {re.escape(str(field.default).lower())}\b|^{str(field.default).lower()}$", stated[1])
+    assert f"--policy {name}" in PAGE or (ROOT / "docs" / "policies" / f"{name}.md").exists()
+    assert ("| yes |" in row[0]) <= make_policy(name).uses_gradient
+
+
+def users_class() -> Any:
+    """The class of the page's example."""
+    block = next(b for b in re.findall(r"^```python\n(.*?)^```$", PAGE, re.M | re.S) if "class Walk(" in b)
+    module = ModuleType("walk_of_the_page")
+    sys.modules[module.__name__] = module
+    exec(compile(block, "README.md", "exec"), module.__dict__)
+    return module.__dict__["Walk"]
+
+
+def test_the_policy_of_the_page_works() -> None:
+    walk: Policy[Any] = users_class()()
+    problem = closed_form.OBJECTIVES["quadratic, box"](6, 0)
+    result = search(problem.evaluate, problem.domain, walk, steps=400, seed=0, candidates=0)
+    assert problem.value(result.best_u) > 0.9 * problem.optimum
+    assert result.stopped is Ending.BUDGET_SPENT
+    beside = make_policy("portfolio", policies=[walk, "auto"])
+    assert search(problem.evaluate, problem.domain, beside, steps=40, seed=0).best_objective > 0.0
+
+
+def test_the_policy_of_the_page_stays_in_a_ball_and_gets_choices_for_free() -> None:
+    domain = Domain(torch.tensor([0.5, 0.5, 0.5, 0.1]), (Block(3, "l2", 0.1), Block(1, options=4)))
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        assert domain.contains(u)
+        value = float(u[0] - u[1]) + (int(u[3] * 4) == 2) if index % 7 else math.nan
+        return Evaluation(value, None, torch.zeros(2), False)
+
+    result = search(evaluate, domain, users_class()(), steps=100, seed=0, candidates=0)
+    assert int(result.best_u[3] * 4) == 2
+    assert result.best_objective > 1.1

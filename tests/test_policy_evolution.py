@@ -1,0 +1,238 @@
+"""The policies `cmaes` and `nes`: ranks alone decide, bounds hold, memory and time stay those of a few vectors."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.attacks import CMAES, NES, Block, Domain, Ending, Evaluation, Policy, Random, make_policy, search, seeded
+from advsearch.attacks.policies.base import answer_of
+from advsearch.attacks.policies.nes import WIDEST, utilities
+from advsearch.errors import InputError
+
+both = pytest.mark.parametrize("policy", [CMAES(), NES()], ids=lambda policy: policy.name)
+
+
+def evaluator(value: Callable[[Tensor], float], noise: float = 0.0) -> Callable[..., Evaluation]:
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        error = noise * float(torch.randn(1, generator=seeded(5, index)))
+        return Evaluation(value(u) + error, None, torch.zeros(2), False)
+
+    return evaluate
+
+
+def bowl(centre: float) -> Callable[[Tensor], float]:
+    return lambda u: -float((u - centre).square().sum())
+
+
+@both
+def test_only_ranks_matter(policy: Policy[object]) -> None:
+    """A monotone change of the objective, however steep, changes no proposal (bitwise: ranks are the same)."""
+    domain = Domain(torch.full((4,), 0.5), (Block(4, low=0.25, high=0.75),))
+    if policy.name == "cmaes":
+        domain = Domain(torch.full((4,), 0.5), (Block(4, periodic=True),))  # no bounds, so no penalty that has a size
+
+    def played(change: Callable[[float], float]) -> Tensor:
+        seen: list[Tensor] = []
+        search(
+            evaluator(lambda u: change(bowl(0.6)(u))),
+            domain,
+            policy,
+            steps=60,
+            seed=0,
+            candidates=0,
+            on_step=lambda record, u, evaluation: seen.append(u),
+        )
+        return torch.stack(seen)
+
+    assert torch.equal(played(lambda v: v), played(lambda v: 1e6 * math.exp(50.0 * v)))
+
+
+@both
+def test_a_peak_on_the_seam_of_an_angle_is_met_from_both_sides(policy: Policy[object]) -> None:
+    domain = Domain(torch.tensor([0.6, 0.6]), (Block(1, periodic=True), Block(1)))
+
+    def value(u: Tensor) -> float:
+        return math.cos(2.0 * math.pi * float(u[0])) - (float(u[1]) - 0.5) ** 2
+
+    sides: set[bool] = set()
+    result = search(
+        evaluator(value),
+        domain,
+        policy,
+        steps=200,
+        seed=0,
+        candidates=0,
+        on_step=lambda record, u, evaluation: sides.add(float(u[0]) < 0.5) if record.step > 120 else None,
+    )
+    assert value(result.best_u) > 0.999
+    assert sides == {True, False}
+
+
+@both
+def test_through_noise_the_mean_is_better_than_the_best_that_was_seen(policy: Policy[object]) -> None:
+    """Noise of a third of the bowl's height: one lucky render says nothing, the distribution averages."""
+    domain = Domain(torch.full((6,), 0.2), (Block(6),))
+    means, lucky = [], []
+    for seed in range(4):
+        result = search(evaluator(bowl(0.7), noise=0.5), domain, policy, steps=400, seed=seed, candidates=0)
+        assert result.distribution is not None
+        means.append(bowl(0.7)(result.distribution.mean))
+        lucky.append(bowl(0.7)(result.best_u))
+    assert sum(means) > sum(lucky)
+    assert sum(means) / 4 > -0.4  # the start is at -1.5
+
+
+@both
+@pytest.mark.parametrize("norm", ["linf", "l2", "box"])
+def test_an_optimum_in_a_corner_is_reached_and_the_mean_stays_inside(policy: Policy[object], norm: str) -> None:
+    domain = Domain(torch.full((5,), 0.45), (Block(5, norm, {"linf": 0.2, "l2": 0.3, "box": None}[norm]),))  # type: ignore[arg-type]
+    w = torch.tensor([1.0, -2.0, 0.5, 1.5, -1.0])
+    far = domain.project(domain.start + 1e4 * w)
+    best = float(w @ far if norm == "l2" else w @ torch.where(w > 0, domain.upper, domain.lower))
+    result = search(evaluator(lambda u: float(w @ u)), domain, policy, steps=400, seed=0, candidates=0)
+    start = float(w @ domain.start)
+    assert result.distribution is not None
+    assert domain.contains(result.distribution.mean)
+    assert float(w @ result.best_u) - start > 0.97 * (best - start)
+    assert float(w @ result.distribution.mean) - start > 0.9 * (best - start)
+
+
+def test_a_constant_objective_does_not_blow_a_distribution_up() -> None:
+    domain = Domain(torch.full((3,), 0.5), (Block(3),))
+    for policy in (CMAES(population=4), NES(population=4)):
+        result = search(evaluator(lambda u: 1.0), domain, policy, steps=600, seed=0, candidates=0)
+        assert result.stopped is Ending.BUDGET_SPENT
+        assert result.distribution is not None
+        assert bool(torch.isfinite(result.distribution.deviation).all())
+
+
+# ---- cmaes
+
+
+def test_cmaes_leaves_numpys_generator_alone_and_needs_no_luck() -> None:
+    domain = Domain(torch.full((3,), 0.5), (Block(3),))
+    np.random.seed(3)  # noqa: NPY002
+    first = search(evaluator(bowl(0.2)), domain, CMAES(), steps=40, seed=0)
+    after = np.random.rand()  # noqa: NPY002
+    np.random.seed(3)  # noqa: NPY002
+    assert np.random.rand() == after  # noqa: NPY002
+    second = search(evaluator(bowl(0.2)), domain, CMAES(), steps=40, seed=0)
+    assert torch.equal(first.best_u, second.best_u)
+
+
+def test_cmaes_learns_a_ridge() -> None:
+    """Two numbers matter by their sum, a hundred times less by their difference; separable steps zigzag there."""
+    domain = Domain(torch.full((2,), 0.2), (Block(2),))
+
+    def ridge(u: Tensor) -> float:
+        return -100.0 * float(u[0] - u[1]) ** 2 - float(u[0] + u[1] - 1.4) ** 2
+
+    best = ridge(search(evaluator(ridge), domain, CMAES(), steps=150, seed=0, candidates=0).best_u)
+    assert best > -1e-4
+
+
+def test_cmaes_is_separable_in_many_dimensions_and_refuses_more() -> None:
+    many = Domain(torch.full((3000,), 0.5), (Block(3000, "linf", 0.1),))
+    state = CMAES().start(many, seeded(0, 0), 100)
+    assert state.points.shape[1] == 3000
+    for _ in range(len(state.points)):
+        proposal, state = CMAES().propose(state)
+        state = CMAES().update(state, proposal.u, Evaluation(float(proposal.u[0]), None, torch.zeros(2), False))
+    assert len(pickle.dumps(state)) < 200 * 8 * 3000  # a full matrix alone has 3000 x 8 x 3000
+    over = Domain(torch.full((10_001,), 0.5), (Block(10_001, "linf", 0.1),))
+    with pytest.raises(
+        InputError, match="'cmaes': expected at most 10000 numbers, got 10001; use policy pgd, auto or nes"
+    ):
+        search(evaluator(bowl(0.5)), over, CMAES(), steps=10, seed=0)
+
+
+def test_cmaes_begins_anew_when_it_has_converged_and_answers_with_its_best_run() -> None:
+    """The hill at the start is half as high as the one far away."""
+
+    def hills(u: Tensor) -> float:
+        near, far = (float((u - c).square().sum()) for c in (0.2, 0.85))
+        return math.exp(-40.0 * near) + 2.0 * math.exp(-40.0 * far)
+
+    domain = Domain(torch.tensor([0.25, 0.15]), (Block(2),))
+    once = search(evaluator(hills), domain, CMAES(sigma=0.1), steps=60, seed=0, candidates=0)
+    assert 0.9 < hills(once.best_u) < 1.1
+    result = search(evaluator(hills), domain, CMAES(), steps=2000, seed=0, candidates=0)
+    assert hills(result.best_u) > 1.99
+    assert result.distribution is not None
+    assert hills(result.distribution.mean) > 1.9
+
+
+# ---- nes
+
+
+def test_utilities_sum_to_zero_rank_and_share() -> None:
+    weights = utilities([3.0, 1.0, 2.0, -math.inf])
+    assert sum(weights) == pytest.approx(0.0, abs=1e-12)
+    assert weights[0] > weights[2] > weights[1] == weights[3] == -0.25
+    shared = utilities([1.0, 5.0, 5.0, 0.0])
+    assert shared[1] == shared[2] == pytest.approx((weights[0] + weights[2]) / 2)
+    assert utilities([2.0] * 6) == pytest.approx([0.0] * 6)
+
+
+def test_samples_come_in_mirrored_pairs() -> None:
+    domain = Domain(torch.full((3,), 0.5), (Block(3),))
+    seen: list[Tensor] = []
+    search(
+        evaluator(bowl(0.5)),
+        domain,
+        NES(sigma=0.1, population=4),
+        steps=4,
+        seed=0,
+        candidates=0,
+        on_step=lambda record, u, evaluation: seen.append(u),
+    )
+    assert torch.allclose(seen[0] + seen[1], torch.ones(3), atol=1e-6)
+    assert torch.allclose(seen[2] + seen[3], torch.ones(3), atol=1e-6)
+    assert not torch.allclose(seen[0], seen[2])
+
+
+def test_nes_narrows_on_a_peak_and_widens_on_a_slope() -> None:
+    domain = Domain(torch.full((3,), 0.5), (Block(3),))
+    narrow = search(evaluator(bowl(0.5)), domain, NES(sigma=0.5), steps=300, seed=0).distribution
+    slope = search(evaluator(lambda u: float(u[0])), domain, NES(sigma=0.02), steps=60, seed=0).distribution
+    assert narrow is not None and slope is not None
+    assert float(narrow.deviation.max()) < 0.05
+    assert 0.01 < float(slope.deviation[0]) <= 0.5 * WIDEST
+
+
+def test_a_texture_takes_a_few_vectors_of_memory_only() -> None:
+    d = 200_000
+    domain = Domain(torch.full((d,), 0.5), (Block(d, "linf", 0.1),))
+    policy = NES()
+    state = policy.start(domain, seeded(0, 0), 100)
+    for k in range(2 * state.population + 1):
+        proposal, state = policy.propose(state)
+        state = policy.update(state, proposal.u, Evaluation(float(k), None, torch.zeros(2), False))
+    own = [value for value in vars(state).values() if isinstance(value, Tensor)]
+    assert sum(value.numel() for value in own) <= 4 * d
+    assert answer_of(policy, state) is not None
+    assert answer_of(Random(), Random().start(domain, seeded(0, 0), 1)) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("cmaes", {"sigma": 0.0}, r"sigma: expected a number in \(0, 2\], a share of half the range, got 0.0"),
+        ("cmaes", {"population": 1}, "population: expected at least 2, or 0 for the default, got 1"),
+        ("nes", {"sigma": math.nan}, r"sigma: expected a number in \(0, 2\]"),
+        ("nes", {"population": 5}, "population: expected an even number of at least 4, or 0, got 5"),
+        ("adam", {"step_size": 0.0}, r"--step-size: expected a number in \(0, 2\], a share of half the range, got 0.0"),
+        ("adam", {"beta1": 1.0}, r"beta1: expected a number in \[0, 1\), got 1.0"),
+        ("adam", {"beta2": -0.1}, r"beta2: expected a number in \[0, 1\)"),
+    ],
+)
+def test_options_out_of_range_are_refused(name: str, options: dict[str, float], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        make_policy(name, **options)

@@ -1,0 +1,370 @@
+"""What wraps policies: races, `restarts`, `portfolio`, `halving`, discrete choices, and how they are named."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.attacks import (
+    CMAES,
+    NES,
+    PGD,
+    Auto,
+    Block,
+    Choices,
+    Domain,
+    Ending,
+    Evaluation,
+    Halving,
+    Policy,
+    Portfolio,
+    Proposal,
+    Random,
+    Restarts,
+    SearchResult,
+    StepRecord,
+    make_policy,
+    search,
+    seeded,
+)
+from advsearch.attacks.policies import racing
+from advsearch.attacks.policies.base import affordable
+from advsearch.attacks.policies.choices import MOST, with_choices
+from advsearch.attacks.policies.stay import Stay
+from advsearch.errors import InputError, UnknownNameError
+
+BOX = Domain(torch.tensor([0.3, 0.6]), (Block(2),))
+
+
+@dataclass(frozen=True)
+class Still(Policy[tuple[Tensor, int]]):
+    """Proposes u = (value, where it begins), `times` times; notes what it was promised in `plans`."""
+
+    value: float
+    times: int = 10**6
+    gradient: bool = False
+    plans: tuple[list[int], ...] = ()
+    name: ClassVar[str] = "still"
+    handles_choices: ClassVar[bool] = True
+
+    @property
+    def uses_gradient(self) -> bool:
+        return self.gradient
+
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> tuple[Tensor, int]:
+        for plan in self.plans:
+            plan.append(steps)
+        return torch.tensor([self.value, float(domain.begin[1])]), 0
+
+    def propose(self, state: tuple[Tensor, int]) -> tuple[Proposal | None, tuple[Tensor, int]]:
+        u, done = state
+        return (Proposal(u, self.gradient) if done < self.times else None), (u, done + 1)
+
+    def update(self, state: tuple[Tensor, int], u: Tensor, evaluation: Evaluation) -> tuple[Tensor, int]:
+        assert torch.equal(u, state[0])
+        return state
+
+
+def played(
+    policy: Policy[Any], steps: int, value: Callable[[Tensor], float], domain: Domain = BOX
+) -> tuple[SearchResult, list[Tensor]]:
+    seen: list[Tensor] = []
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+        seen.append(u.clone())
+        slope = torch.ones_like(u) if gradient else None
+        cost = samples * (1 + domain.gradient_cost * (gradient is True))
+        return Evaluation(value(u), slope, torch.zeros(2), False, cost=cost)
+
+    return search(evaluate, domain, policy, steps=steps, seed=0, candidates=0), seen
+
+
+def first(u: Tensor) -> float:
+    return float(u[0])
+
+
+# ---- races
+
+
+@pytest.mark.parametrize(("n", "eta", "rounds"), [(1, 2, 1), (2, 2, 2), (5, 2, 4), (9, 3, 3), (10, 3, 4), (7, 1, 1)])
+def test_rounds(n: int, eta: int, rounds: int) -> None:
+    assert racing.count_rounds(n, eta) == rounds
+
+
+@pytest.mark.parametrize(("steps", "each", "limit"), [(1, 1, 9), (40, 1, 999), (40, 13, 9), (1000, 1, 64), (39, 2, 8)])
+def test_as_many_run_as_can_have_a_whole_evaluation_in_every_round(steps: int, each: int, limit: int) -> None:
+    n = racing.most_runners(steps, 2, each, limit)
+    assert 1 <= n <= limit
+    assert n == 1 or n * racing.count_rounds(n, 2) * each <= steps
+    assert n == limit or (n + 1) * racing.count_rounds(n + 1, 2) * each > steps
+
+
+def test_who_reached_more_goes_on_with_an_equal_share_of_every_round() -> None:
+    """Four policies, 48 renders, three rounds of 16: 4 each, then 8 for the better two, then 16 for the best."""
+    policy = Portfolio(tuple(Still(value) for value in (0.2, 0.8, 0.4, 0.6)))
+    result, seen = played(policy, 48, first)
+    order = [round(float(u[0]), 1) for u in seen]
+    assert order == [0.2] * 4 + [0.8] * 4 + [0.4] * 4 + [0.6] * 4 + [0.8] * 8 + [0.6] * 8 + [0.8] * 16
+    assert result.stopped is Ending.BUDGET_SPENT
+
+
+def test_each_plans_for_what_it_gets_if_it_stays_in() -> None:
+    plans: list[int] = []
+    played(Portfolio(tuple(Still(value, plans=(plans,)) for value in (0.2, 0.8, 0.4, 0.6))), 48, first)
+    assert plans[:4] == [12] * 4  # the portfolio asks whether they can search here, for an equal share
+    assert plans[4:] == [28] * 4  # 4 + 8 + 16
+
+
+def test_renders_that_one_leaves_go_to_the_others() -> None:
+    result, seen = played(Portfolio((Still(0.9, times=2), Still(0.5), Still(0.1, times=1))), 30, first)
+    counts = Counter(round(float(u[0]), 1) for u in seen)
+    assert counts == {0.9: 2, 0.5: 27, 0.1: 1}
+    assert result.stopped is Ending.BUDGET_SPENT
+    stalled, _ = played(Portfolio((Still(0.9, times=2), Still(0.5, times=3))), 30, first)
+    assert (stalled.stopped, stalled.renders) == (Ending.STALLED, 5)
+
+
+def test_a_costly_gradient_does_not_overdraw_a_turn() -> None:
+    """Ten renders a turn, four a gradient: two of them and two renders without."""
+    domain = replace(BOX, gradient_cost=3)
+    asked: list[bool] = []
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+        asked.append(gradient)
+        slope = torch.ones_like(u) if gradient else None
+        return Evaluation(float(u[0]), slope, torch.zeros(2), False, cost=1 + 3 * gradient)
+
+    search(evaluate, domain, Restarts(Still(0.5, gradient=True), 2), steps=20, seed=0, candidates=0)
+    assert asked == [True, True, False, False] * 2
+
+
+def test_what_is_affordable() -> None:
+    domain = replace(BOX, gradient_cost=3)
+    wanted = Proposal(BOX.start, gradient=True, samples=2)
+    assert affordable(wanted, domain, 9) is wanted
+    assert affordable(wanted, domain, 8).gradient is False
+    assert affordable(wanted, domain, 1).samples == 1
+    free = Proposal(BOX.start, gradient="free", samples=2)
+    assert (free.cost(domain), affordable(free, domain, 3).gradient, affordable(free, domain, 2).gradient) == (
+        2,
+        "free",
+        False,
+    )
+
+
+# ---- restarts
+
+
+def test_restarts_share_the_renders_and_begin_elsewhere() -> None:
+    _, seen = played(Restarts(Still(0.5), times=3), 32, first)
+    begins = [float(u[1]) for u in seen]
+    runs = [begins[:10], begins[10:21], begins[21:]]
+    assert all(len(set(run)) == 1 for run in runs)
+    assert begins[0] == pytest.approx(0.6)
+    assert len(set(begins)) == 3
+
+
+def test_restarts_do_not_move_the_ball() -> None:
+    domain = Domain(torch.full((8,), 0.5), (Block(8, "linf", 0.1),))
+    _, seen = played(Restarts(PGD(), times=4), 40, lambda u: float(u.sum()), domain)
+    assert all(domain.contains(u) for u in seen)
+    assert len({tuple(seen[k].tolist()) for k in (0, 10, 20, 30)}) == 4
+
+
+def test_fewer_restarts_where_renders_are_few() -> None:
+    _, seen = played(Restarts(Still(0.5), times=9), 4, first)
+    assert len({float(u[1]) for u in seen}) == 4
+    _, seen = played(Restarts(PGD(), times=9), 8, first, replace(BOX, gradient_cost=3))
+    assert torch.equal(seen[0], BOX.start)
+
+
+def test_restarts_find_the_higher_of_two_hills() -> None:
+    def value(u: Tensor) -> float:
+        return math.exp(-20 * float((u - 0.2).square().sum())) + 2 * math.exp(-20 * float((u - 0.85).square().sum()))
+
+    def slope(u: Tensor) -> Tensor:
+        low, high = ((math.exp(-20 * float((u - c).square().sum())), c) for c in (0.2, 0.85))
+        return -40 * (low[0] * (u - low[1]) + 2 * high[0] * (u - high[1]))
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        return Evaluation(value(u), slope(u) if gradient else None, torch.zeros(2), False)
+
+    domain = Domain(torch.tensor([0.25, 0.15]), (Block(2),))
+    alone = search(evaluate, domain, PGD(step_size=0.1), steps=80, seed=0, candidates=0)
+    several = search(evaluate, domain, Restarts(PGD(step_size=0.1), times=8), steps=80, seed=0, candidates=0)
+    assert value(alone.best_u) < 1.1
+    assert value(several.best_u) > 1.9
+
+
+# ---- portfolio
+
+
+def test_a_portfolio_leaves_out_what_cannot_search_here() -> None:
+    domain = Domain(torch.full((30,), 0.5), (Block(30, "linf", 0.1),))
+    both = make_policy("portfolio", policies=["grid", "nes"])
+    assert played(both, 20, first, domain)[0].stopped is Ending.BUDGET_SPENT
+    with pytest.raises(InputError, match="policy 'grid': 2 values for each of 30 numbers are billions of renders"):
+        played(make_policy("portfolio", policies=["grid"]), 20, first, domain)
+
+
+def test_a_portfolio_answers_with_its_leaders_distribution() -> None:
+    result, _ = played(Portfolio((NES(), CMAES())), 80, lambda u: -float((u - 0.4).square().sum()))
+    assert result.distribution is not None
+    assert result.distribution.mean.tolist() == pytest.approx([0.4, 0.4], abs=0.05)
+    assert played(Portfolio((Random(), Still(0.2))), 20, first)[0].distribution is None
+
+
+# ---- halving
+
+
+def halved(policy: Halving, steps: int, value: Callable[[Tensor], float]) -> list[tuple[StepRecord, tuple[float, ...]]]:
+    told: list[tuple[StepRecord, tuple[float, ...]]] = []
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+        return Evaluation(value(u), None, torch.zeros(2), False, cost=samples)
+
+    search(
+        evaluate,
+        BOX,
+        policy,
+        steps=steps,
+        seed=0,
+        candidates=0,
+        on_step=lambda record, u, evaluation: told.append((record, tuple(u.tolist()))),
+    )
+    return told
+
+
+def test_survivors_are_rendered_with_more_samples() -> None:
+    """27 renders, 9 starts, three rounds of nine: 9 of one sample, 3 of three, 1 of nine."""
+    told = halved(Halving(eta=3), 27, first)
+    assert [record.samples for record, _ in told] == [1] * 9 + [3] * 3 + [9]
+    ranked = sorted((u for _, u in told[:9]), reverse=True)
+    assert [u for _, u in told[9:12]] == ranked[:3]
+    assert told[12][1] == ranked[0]
+    assert told[0][1] == tuple(BOX.start.tolist())
+
+
+def test_only_a_rounds_own_renders_count_in_it() -> None:
+    """The first look at the worst start was lucky: it goes on, is seen through with more samples, and falls."""
+    lucky = halved(Halving(eta=3), 27, first)[0][1]
+
+    def value(u: Tensor) -> float:
+        looks.append(tuple(u.tolist()))
+        return 9.0 if looks.count(lucky) == 1 and tuple(u.tolist()) == lucky else float(u[0])
+
+    looks: list[tuple[float, ...]] = []
+    told = halved(Halving(eta=3), 27, value)
+    assert told[9][1] == lucky
+    assert told[12][1] != lucky
+
+
+def test_no_evaluation_has_too_many_samples() -> None:
+    told = halved(Halving(eta=2, starts=2), 1000, first)
+    assert max(record.samples for record, _ in told) == 64
+    assert told[-1][0].renders == 1000
+
+
+def test_halving_with_a_policy_goes_on_from_each_start() -> None:
+    policy = Halving(policy=NES(population=4), eta=2, starts=4)
+    result, seen = played(policy, 200, lambda u: -float((u - 0.9).square().sum()))
+    assert result.best_objective > -5e-3
+    assert len(seen) < 200
+    assert result.distribution is not None
+
+
+# ---- choices
+
+
+def test_combinations_race_and_the_starts_is_among_them() -> None:
+    """More combinations than renders: some, each once."""
+    domain = Domain(torch.tensor([0.9, 0.9, 0.4]), (Block(1, options=50), Block(1, options=40), Block(1)))
+    result, seen = played(Choices(NES()), 200, lambda u: float(u[0] + u[1]), domain)
+    combinations = [(int(u[0] * 50), int(u[1] * 40)) for u in seen]
+    assert combinations[0] == (45, 36)
+    assert torch.equal(seen[0][:2], domain.start[:2])
+    counts = Counter(combinations)
+    assert 20 < len(counts) <= MOST
+    assert counts.most_common(1)[0][0] == (int(result.best_u[0] * 50), int(result.best_u[1] * 40))
+
+
+def test_nothing_but_choices() -> None:
+    domain = Domain(torch.tensor([0.1, 0.2]), (Block(1, options=3), Block(1, options=4)))
+    result, seen = played(PGD(), 100, lambda u: float(u[0] - u[1]), domain)
+    assert len({(int(u[0] * 3), int(u[1] * 4)) for u in seen}) == 12
+    assert (int(result.best_u[0] * 3), int(result.best_u[1] * 4)) == (2, 0)
+    assert result.gradients == 0
+
+
+def test_choices_beside_a_ball_keep_its_gradient_and_its_distribution() -> None:
+    domain = Domain(
+        torch.tensor([0.5, 0.1, 0.5, 0.5]), (Block(1, "linf", 0.1), Block(1, options=3), Block(2, "l2", 0.2))
+    )
+    w = torch.tensor([1.0, 0.0, -1.0, 1.0])
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        bonus = 0.3 * (int(u[1] * 3) == 1)
+        return Evaluation(float(w @ u) + bonus, w.clone() if gradient else None, torch.zeros(2), False)
+
+    best = search(evaluate, domain, PGD(), steps=60, seed=0, candidates=0)
+    assert best.best_u.tolist() == pytest.approx([0.6, 0.5, 0.5 - 0.02**0.5, 0.5 + 0.02**0.5], abs=1e-3)
+    spread = search(evaluate, domain, NES(), steps=200, seed=0, candidates=0).distribution
+    assert spread is not None
+    assert (float(spread.mean[1]), float(spread.deviation[1])) == (0.5, 0.0)
+    drawn = spread.sample(seeded(0, 0), 5, domain)
+    assert all(domain.contains(u) and float(u[1]) == 0.5 for u in drawn)
+
+
+def test_who_handles_choices_is_left_alone() -> None:
+    choosy = Domain(torch.tensor([0.1, 0.5]), (Block(1, options=3), Block(1)))
+    for policy in (Auto(), Random(), Stay(), Portfolio()):
+        assert with_choices(policy, choosy) is policy
+    assert with_choices(PGD(), choosy) == Choices(PGD())
+    assert with_choices(PGD(), BOX) == PGD()
+
+
+# ---- names
+
+
+def test_nested_policies_are_made_by_name() -> None:
+    assert make_policy("restarts", policy="pgd", times=4) == Restarts(PGD(), 4)
+    assert make_policy("portfolio", policies=["pgd", "cmaes"]) == Portfolio((PGD(), CMAES()))
+    assert make_policy("portfolio", policies="nes") == Portfolio((NES(),))
+    spec = {"name": "restarts", "policy": {"name": "pgd", "momentum": 0.9}, "times": 2}
+    assert make_policy("halving", policy=spec) == Halving(Restarts(PGD(momentum=0.9), 2))
+    assert make_policy("restarts", policy=NES()) == Restarts(NES())
+    assert make_policy("halving", policy=None) == Halving()
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "error", "message"),
+    [
+        ("restarts", {"policy": "pdg"}, UnknownNameError, "unknown policy 'pdg'. Did you mean 'pgd'"),
+        (
+            "restarts",
+            {"policy": {"name": "pgd", "speed": 1}},
+            UnknownNameError,
+            "unknown option of policy 'pgd': 'speed'",
+        ),
+        ("restarts", {"policy": {"momentum": 0.9}}, InputError, "policy of restarts: expected a name or a mapping"),
+        ("restarts", {"times": 0}, InputError, "times: expected at least 1, got 0"),
+        ("portfolio", {"policies": []}, InputError, "policies of portfolio: expected one policy or more"),
+        ("portfolio", {"policies": [3]}, InputError, "policies of portfolio: expected a name or a mapping"),
+        ("halving", {"eta": 1}, InputError, "eta: expected a whole number from 2 to 16, got 1"),
+        ("halving", {"starts": -1}, InputError, "starts: expected 1 to 1024, or 0 for as many as fit, got -1"),
+    ],
+)
+def test_wrong_nested_policies_say_what_is_wrong(
+    name: str, options: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        make_policy(name, **options)
+    with pytest.raises(InputError, match="policy of restarts: expected a policy, got 'pgd'; use make_policy for names"):
+        Restarts("pgd")  # type: ignore[arg-type]

@@ -1,0 +1,90 @@
+"""The smallest change and the region, on objectives whose answers are known."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.attacks import Block, Domain, Evaluation, make_policy, search
+from advsearch.attacks.region import grow
+from advsearch.attacks.smallest import RATIO, scaled, smallest
+from advsearch.errors import InputError
+
+NORMS = {"linf": lambda w: float(w.abs().sum()), "l2": lambda w: float(w.norm())}
+
+
+def linear(size: int, norm: str, share: float) -> tuple[Domain, Tensor, float]:
+    """A linear model whose smallest flipping epsilon is `share` of the domain's: the domain, weights and bias."""
+    weights = torch.randn(size, generator=torch.Generator().manual_seed(size))
+    epsilon = 0.4
+    bias = -share * epsilon * NORMS[norm](weights)  # dual norm: the most that an epsilon can gain
+    return Domain(torch.full((size,), 0.5), (Block(size, norm, epsilon),)), weights, bias
+
+
+@pytest.mark.parametrize("norm", NORMS)
+@pytest.mark.parametrize("size", [2, 30, 1000])
+@pytest.mark.parametrize("share", [0.9, 0.3, 0.03])
+def test_the_smallest_epsilon_of_a_linear_model_is_within_five_per_cent(norm: str, size: int, share: float) -> None:
+    domain, weights, bias = linear(size, norm, share)
+
+    def value(u: Tensor) -> float:
+        return float((u - domain.start) @ weights) + bias
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        return Evaluation(value(u), weights.clone(), torch.tensor([0.0, value(u)]), value(u) > 0.0)
+
+    def found(inside: Domain, number: int) -> Tensor:
+        return search(evaluate, inside, make_policy("pgd"), steps=20, seed=number).best_u
+
+    bracket = smallest(found, lambda u, _: value(u) > 0.0, domain)
+    assert bracket.u is not None and bracket.closed
+    assert scaled(domain, bracket.high).contains(bracket.u) and value(bracket.u) > 0.0
+    assert share <= bracket.high <= RATIO * share  # the closed form
+    assert bracket.low <= share
+    assert bracket.searches <= 12
+
+
+def test_without_a_flip_the_whole_budget_is_the_lower_end() -> None:
+    domain, _, _ = linear(5, "linf", 1.0)
+    bracket = smallest(lambda inside, _: inside.start, lambda u, _: False, domain)
+    assert (bracket.low, bracket.high, bracket.u, bracket.searches) == (1.0, math.inf, None, 1)
+    assert not bracket.closed
+
+
+def test_a_range_has_no_smallest_epsilon() -> None:
+    domain = Domain(torch.tensor([0.5]), (Block(1, "box", name="pose"),))
+    with pytest.raises(InputError, match=r"--smallest: expected controls with a budget .*got pose"):
+        scaled(domain, 0.5)
+
+
+def test_a_region_fills_the_box_in_which_the_answer_stays() -> None:
+    low, high = torch.tensor([0.2, 0.0, 0.3]), torch.tensor([0.7, 1.0, 0.6])
+    region = grow(lambda u, _: bool(((u >= low) & (u <= high)).all()), torch.tensor([0.5, 0.5, 0.4]), seed=1)
+    assert bool((region.low >= low).all()) and bool((region.high <= high).all())
+    assert region.volume > 0.8 * float((high - low).prod())
+    assert region.same == region.samples == 200 and region.interval[0] > 0.98
+
+
+def test_a_region_in_a_disc_keeps_what_it_promises() -> None:
+    centre = torch.tensor([0.5, 0.45])
+    region = grow(lambda u, _: float((u - 0.5).norm()) < 0.3, centre, seed=3)
+    points = torch.lerp(region.low, region.high, torch.rand(20_000, 2, generator=torch.Generator().manual_seed(9)))
+    share = float(((points - 0.5).norm(dim=1) < 0.3).float().mean())
+    assert region.interval[0] <= share + 0.01 and share > 0.95
+    assert 0.1 < region.volume < 0.2  # the largest square in the disc has 0.18
+    assert bool(((centre >= region.low) & (centre <= region.high)).all())
+
+
+def test_a_point_alone_is_its_own_region() -> None:
+    centre = torch.tensor([0.5, 0.5])
+    region = grow(lambda u, _: bool((u == centre).all()), centre, seed=0, samples=20)
+    assert region.volume == 0.0 and region.same == 20
+
+
+@pytest.mark.parametrize(("centre", "samples"), [(torch.tensor([1.5]), 10), (torch.tensor([0.5]), 0)])
+def test_a_region_refuses_what_it_cannot_do(centre: Tensor, samples: int) -> None:
+    with pytest.raises(InputError):
+        grow(lambda u, _: True, centre, seed=0, samples=samples)

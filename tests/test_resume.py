@@ -1,0 +1,258 @@
+"""A run that is killed at any moment goes on to the same rows; without the renderer, on a problem in closed form."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.api.memory import Memory
+from advsearch.api.record import Findings, Recorder, Stages
+from advsearch.api.stages import Attack
+from advsearch.attacks import Block, Domain, Evaluation, Trial, make_policy
+from advsearch.attacks.goal import Goal
+from advsearch.config import AttackConfig
+from advsearch.errors import InputError
+from advsearch.progress import NullProgress
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.replay import Entry, ReplayLog
+from advsearch.seeds import stream
+
+POLICIES = ("pgd", "auto", "random", "cmaes")
+
+
+@dataclass(frozen=True)
+class StandInPlan:
+    """A gradient plan with nothing in it."""
+
+    renders: int = 0
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"groups": []}
+
+    def restored(self, stored: dict[str, Any]) -> StandInPlan:
+        return self
+
+
+@dataclass
+class StandInProblem:
+    """A noisy quadratic where a scene, a model and an objective would be; `pause` seconds an evaluation."""
+
+    pause: float = 0.0
+    on_evaluation: Callable[[], None] = lambda: None
+    domain: Domain = field(default_factory=lambda: Domain(torch.full((6,), 0.5), (Block(4, "linf", 0.2), Block(2))))
+    conditions: None = None
+    goal: Goal = field(default_factory=lambda: Goal((0,)))
+    spp: int = 4
+    seed: int = 3
+    plan: StandInPlan = StandInPlan()
+    model: Any = field(default_factory=lambda: SimpleNamespace(labels=["mug", "bowl"]))
+
+    def _logits(self, u: Tensor, seed: int) -> Tensor:
+        noise = 0.02 * torch.randn(1, generator=torch.Generator().manual_seed(seed))
+        value = 0.05 - (u - torch.linspace(0.3, 0.8, 6)).square().sum() + noise[0]
+        return torch.stack([-value, value])
+
+    def evaluator(self, kind: str, tell: Any = None) -> Any:
+        def evaluate(u: Tensor, *, index: int, gradient: Any, samples: int = 1) -> Evaluation:
+            time.sleep(self.pause)
+            self.on_evaluation()
+            at = u.clone().requires_grad_()
+            logits = self._logits(at, stream(self.seed, kind, index))
+            value = logits[1] - logits[0]
+            slope = torch.autograd.grad(value, at)[0] if gradient else None
+            if tell is not None:
+                tell(index, torch.full((2, 2, 3), float(u.mean())))
+            return Evaluation(float(value.detach()), slope, logits.detach(), bool(value > 0), cost=samples)
+
+        return evaluate
+
+    def trial(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True) -> Trial:
+        time.sleep(self.pause)
+        logits = self._logits(u, seed)
+        return Trial(
+            float(logits[1] - logits[0]),
+            int(logits.argmax()),
+            float(logits.softmax(0).max()),
+            bool(logits.argmax() == 0),
+        )
+
+    def describe(self, u: Tensor) -> dict[str, Any]:
+        return {f"u.{number}": {"value": float(value), "unit": "1"} for number, value in enumerate(u)}
+
+    def conditions_of(self, seed: int) -> dict[str, Any]:
+        return {}
+
+
+def configuration(policy: str = "pgd", **more: Any) -> AttackConfig:
+    return AttackConfig(object="mug", policy=policy, steps=25, trials=6, average=5, measure="no", verify_spp=8, **more)
+
+
+def carry_out(folder: Path, config: AttackConfig, *, pause: float = 0.0, resume: bool = False) -> Findings:
+    """Carry out the attack in a folder, from the beginning or from where it is."""
+    problem: Any = StandInProblem(pause)
+    open_run = RunDirectory.resume if resume else RunDirectory.create
+    with open_run(folder) as run:
+        if not resume:
+            run.write_config(config)
+        memory = Memory(run)
+        stages = Stages(NullProgress())
+        attack = Attack(
+            problem, config, make_policy(config.policy_name), Recorder(run, problem, memory), memory, stages
+        )
+        findings = attack.carry_out()
+        if not findings.interrupted:
+            run.finish()
+        return findings
+
+
+def rows(folder: Path) -> list[tuple[Any, ...]]:
+    """All that is stored, but for times."""
+    with RunDirectory.resume(folder) as run:
+        return [
+            (
+                r.id,
+                r.kind,
+                r.step,
+                r.seed,
+                r.spp,
+                r.objective,
+                r.success,
+                r.label,
+                r.probability,
+                r.renders,
+                str(r.values),
+            )
+            for r in run.store.rows()
+        ]
+
+
+def kill_and_resume(folder: Path, policy: str) -> int:
+    """Carry the attack out in children of which each is killed at a random moment, and return how many were."""
+    torch.set_num_threads(1)
+    moments, kills, begun = random.Random(policy), 0, False
+    while kills < 300:
+        child = os.fork()
+        if child == 0:
+            carry_out(folder, configuration(policy), pause=0.002, resume=begun)
+            os._exit(0)
+        time.sleep(moments.uniform(0.002, 0.06) * (1.0 + kills / 6))  # a policy thinks again: that takes its time
+        if os.waitpid(child, os.WNOHANG) != (0, 0):
+            return kills
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        kills += 1
+        begun = (folder / "results.sqlite").exists() and (folder / "run.yaml").exists()
+    raise AssertionError("it does not get on")
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+def test_killed_at_random_moments_it_ends_with_the_same_rows(tmp_path: Path, policy: str) -> None:
+    carry_out(tmp_path / "whole", configuration(policy))
+    code = "import sys, test_resume as t; print(t.kill_and_resume(t.Path(sys.argv[1]), sys.argv[2]))"
+    driver = [
+        sys.executable,
+        "-c",
+        code,
+        str(tmp_path / "run"),
+        policy,
+    ]  # forks, which a process with pytest's threads must not
+    done = subprocess.run(
+        driver,
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) >= 13, "four policies make fifty"
+    assert rows(tmp_path / "run") == rows(tmp_path / "whole")
+    assert not (tmp_path / "run" / "replay.bin").exists()
+
+
+def test_what_was_evaluated_is_not_evaluated_again(tmp_path: Path) -> None:
+    config, count = configuration(), 0
+
+    def counted() -> None:
+        nonlocal count
+        count += 1
+        if count == 10:
+            raise KeyboardInterrupt
+
+    problem: Any = StandInProblem(on_evaluation=counted)
+    with RunDirectory.create(tmp_path / "run") as run:
+        run.write_config(config)
+        memory = Memory(run)
+        attack = Attack(
+            problem, config, make_policy("pgd"), Recorder(run, problem, memory), memory, Stages(NullProgress())
+        )
+        assert attack.carry_out().interrupted
+    assert (tmp_path / "run" / "replay.bin").exists()
+    found = carry_out(tmp_path / "run", config, resume=True)
+    assert found.search is not None and len(found.search.history) == 25
+    assert len(found.frames) == 25  # those from before the interrupt too
+    whole = carry_out(tmp_path / "whole", config)
+    assert whole.search is not None and torch.equal(whole.search.best_u, found.search.best_u)
+    assert rows(tmp_path / "run") == rows(tmp_path / "whole")
+
+
+def test_another_configuration_than_was_stored_is_refused(tmp_path: Path) -> None:
+    with RunDirectory.create(tmp_path / "run") as run:
+        problem: Any = StandInProblem()
+        evaluate = Memory(run).evaluator("search", lambda tell: problem.evaluator("search", tell))
+        evaluate(torch.full((6,), 0.5), index=0, gradient=False)
+        again = Memory(run).evaluator("search", lambda tell: problem.evaluator("search", tell))
+        with pytest.raises(InputError, match="cannot go on: evaluation 0 of the search is another one now"):
+            again(torch.full((6,), 0.4), index=0, gradient=False)
+
+
+def test_a_log_keeps_whole_entries_only(tmp_path: Path) -> None:
+    path = tmp_path / "replay.bin"
+    log = ReplayLog(path)
+    gradient = np.arange(5, dtype=np.float32) / 3
+    log.append(Entry("search", 0, {"objective": (0.1 + 0.2).hex()}, {"gradient": gradient}))
+    log.append(Entry("search", 1, {}, {}))
+    log.close()
+    size = path.stat().st_size
+    for cut in range(1, 40):
+        path.write_bytes(path.read_bytes()[: size - cut])
+        with path.open("r+b"):
+            log = ReplayLog(path)
+        assert ("search", 0) in log and ("search", 1) not in log
+        entry = log.read("search", 0)
+        assert np.array_equal(entry.arrays["gradient"], gradient) and entry.arrays["gradient"].dtype == np.float32
+        assert float.fromhex(entry.facts["objective"]) == 0.1 + 0.2
+        log.append(Entry("search", 1, {}, {}))
+        assert ("search", 1) in log
+        log.close()
+    log = ReplayLog(path)
+    with pytest.raises(KeyError):
+        log.read("search", 2)
+    log.remove()
+    assert not path.exists()
+
+
+def test_two_processes_on_one_run_are_refused(tmp_path: Path) -> None:
+    code = (
+        "import sys; from advsearch.runs.directory import RunDirectory\n"
+        f"try: RunDirectory.resume({str(tmp_path / 'run')!r})\n"
+        "except Exception as error: print(error); sys.exit(7)\n"
+    )
+    with RunDirectory.create(tmp_path / "run") as run:
+        run.write_config(configuration())
+        other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert other.returncode == 7 and f"process {os.getpid()} is working on this run" in other.stdout

@@ -1,0 +1,786 @@
+"""Sweeps: the product that is never built, the values that are rendered, what is counted, and what survives.
+
+The renderer is replaced by a picture that depends on the configuration and the seed, except in one test.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import re
+import shlex
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import settings as examples
+from hypothesis import strategies as st
+from torch import Tensor, nn
+
+import advsearch
+from advsearch.api import sweep_view
+from advsearch.api.sweep_axes import axis_values, on_grid, read_axes
+from advsearch.api.sweep_loop import KIND, Sweep
+from advsearch.api.sweep_points import BINS, Points, domain_of
+from advsearch.api.sweeping import _job_of, resume_sweep, sweep_from_config
+from advsearch.attacks import clopper_pearson
+from advsearch.attacks.draws import NET, Draws, Seeds
+from advsearch.attacks.product import Product, batches
+from advsearch.cli import sweep as cli_sweep
+from advsearch.cli.flags import help_text
+from advsearch.cli.main import main
+from advsearch.cli.sweep import axes_as_text
+from advsearch.cli.sweep_table import answer
+from advsearch.config import SweepConfig
+from advsearch.controls import CONTROLS, make_control, make_space
+from advsearch.controls.base import Parameter
+from advsearch.errors import InputError, RunExistsError, UnknownNameError
+from advsearch.progress import NullProgress
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.store import Row
+from advsearch.scene.formation import ImageFormation
+from advsearch.settings import settings
+
+SIZE = 16
+LABELS = ("mug", "vase")
+YAW = next(one for one in CONTROLS["pose"].parameters if one.name == "yaw")
+ELEVATION = next(one for one in CONTROLS["camera"].parameters if one.name == "elevation")
+
+NOISE = 0.05
+
+
+class FakeRenderer:
+    """A picture whose grey level is a smooth function of u plus noise that the seed decides."""
+
+    made: list[FakeRenderer]
+    stops_at: int | None = None
+    stops_with: type[BaseException] = KeyboardInterrupt
+    calls = 0
+    level: float | None = None
+
+    def __init__(self, scene: Any, space: Any, size: tuple[int, int], denoise: str, seed: int) -> None:
+        self.space, self.size, self.non_finite = space, size, 0
+        self.formation = ImageFormation(denoiser=denoise, resolution=size)
+        self.seen: list[tuple[Tensor, int, int]] = []
+        FakeRenderer.made.append(self)
+
+    def __call__(self, u: Tensor, seed: int, spp: int) -> Tensor:
+        if FakeRenderer.stops_at is not None and FakeRenderer.calls >= FakeRenderer.stops_at:
+            raise FakeRenderer.stops_with("stopped by the test")
+        FakeRenderer.calls += 1
+        assert u.dtype == torch.float32 and bool(((u >= 0) & (u <= 1)).all())
+        self.seen.append((u.clone(), seed, spp))
+        wave = float(torch.sin(u.double() * torch.arange(1.0, len(u) + 1.0)).sum()) if len(u) else 0.0
+        level = 0.5 + 0.3 * math.sin(3.0 * wave) + NOISE * (seed / 2**32 - 0.5)
+        return torch.full((*self.size, 3), level if FakeRenderer.level is None else FakeRenderer.level)
+
+
+class Brightness(nn.Module):
+    """Says "mug" while the picture is darker than a threshold."""
+
+    def __init__(self, threshold: float = 0.55) -> None:
+        super().__init__()
+        self.threshold = threshold
+
+    def forward(self, images: Tensor) -> Tensor:
+        score = 20.0 * (images.mean(dim=(1, 2, 3)) - self.threshold)
+        return torch.stack([-score, score], dim=1)
+
+
+@pytest.fixture(autouse=True)
+def fake(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is rendered, unless the test is marked so by its name."""
+    FakeRenderer.made, FakeRenderer.calls, FakeRenderer.stops_at, FakeRenderer.level = [], 0, None, None
+    FakeRenderer.stops_with = KeyboardInterrupt
+    if "really_rendered" not in request.node.name:
+        monkeypatch.setattr(sweep_view, "make_renderer", FakeRenderer)
+
+
+def model(threshold: float = 0.55, name: str = "brightness", size: int = SIZE) -> advsearch.Model:
+    return advsearch.load_model(Brightness(threshold), labels=LABELS, input_size=size, name=name)
+
+
+def rows_of(run: Path) -> list[tuple[Any, ...]]:
+    """Every stored value but the times."""
+    with RunDirectory.resume(run) as opened:
+        return [(*(getattr(row, name) for name in COMPARED), json.dumps(row.values)) for row in opened.store.rows()]
+
+
+COMPARED = ("kind", "step", "seed", "spp", "objective", "success", "label", "label_index", "probability", "renders")
+TIMES = ("seconds", "renders_per_second", "run", "command_line")
+
+
+def timeless(summary: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in summary.items() if name not in TIMES}
+
+
+GRID = {"pose.yaw": "0:360:6", "camera.elevation": [5, 20, 35]}
+
+
+# ---- the product ----------------------------------------------------------------------------------------------------
+
+
+@examples(max_examples=200, deadline=None)
+@given(sizes=st.lists(st.integers(1, 10**6), max_size=6).map(tuple), data=st.data())
+def test_digits_and_numbers_are_inverse(sizes: tuple[int, ...], data: st.DataObject) -> None:
+    product = Product(sizes)
+    assert product.count == math.prod(sizes)
+    index = data.draw(st.integers(0, product.count - 1))
+    digits = product.digits(index)
+    assert all(0 <= digit < size for digit, size in zip(digits, sizes, strict=True))
+    assert product.index(digits) == index
+
+
+def test_the_last_axis_runs_fastest() -> None:
+    assert [Product((2, 3)).digits(n) for n in range(6)] == list(itertools.product(range(2), range(3)))
+    assert Product(()).count == 1 and Product(()).digits(0) == ()
+    with pytest.raises(IndexError, match="expected a point from 0 to 5, got 6"):
+        Product((2, 3)).digits(6)
+    with pytest.raises(InputError, match="expected at least one value on each"):
+        Product((2, 0))
+
+
+@pytest.mark.parametrize("first", [0, 3, 4, 9, 10, 11])
+def test_batches_are_those_of_one_who_started_at_the_beginning(first: int) -> None:
+    whole = [list(part) for part in batches(0, 10, 4)]
+    assert whole == [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9]]
+    rest = [list(part) for part in batches(first, 10, 4)]
+    assert [n for part in rest for n in part] == list(range(first, 10))
+    assert all(part in whole for part in rest[1:])
+
+
+@pytest.mark.parametrize("sampler", ["sobol", "random"])
+def test_a_draw_is_the_same_from_wherever_it_is_asked(sampler: str) -> None:
+    numbers = [0, 1, 100, NET - 1, NET, NET + 5, 3 * NET + 7, 10**12]
+    whole = Draws(3, sampler, 7).points(0, NET + 10)
+    assert whole.shape == (NET + 10, 3) and 0.0 <= whole.min() and whole.max() < 1.0
+    ahead = {n: Draws(3, sampler, 7).points(n, 1)[0] for n in numbers}
+    back = Draws(3, sampler, 7)
+    for number in reversed(numbers):
+        np.testing.assert_array_equal(back.points(number, 1)[0], ahead[number])
+        if number < len(whole):
+            np.testing.assert_array_equal(whole[number], ahead[number])
+    assert not np.array_equal(Draws(3, sampler, 8).points(0, 4), whole[:4])
+    np.testing.assert_array_equal(Draws(3, sampler, 7).points(NET - 5, 10), whole[NET - 5 : NET + 5])
+
+
+def test_sobol_points_fill_the_cube_better_than_random_ones() -> None:
+    """The mean of a smooth function over 1,024 points: the error falls nearly as 1/n, not as 1/sqrt(n)."""
+    exact = (1.0 - math.cos(1.0)) ** 2
+    error = {
+        sampler: np.mean(
+            [abs(np.sin(Draws(2, sampler, seed).points(0, 1024)).prod(axis=1).mean() - exact) for seed in range(20)]
+        )
+        for sampler in ("sobol", "random")
+    }
+    assert error["sobol"] < error["random"] / 10
+
+
+def test_draws_say_what_is_wrong() -> None:
+    with pytest.raises(InputError, match="--sampler: expected one of sobol, random, got 'halton'"):
+        Draws(2, "halton", 0)
+    with pytest.raises(InputError, match="--sampler sobol: expected at most 21201 numbers to draw, got 30000"):
+        Draws(30_000, "sobol", 0)
+    assert Draws(0, "sobol", 0).points(5, 3).shape == (3, 0)
+
+
+def test_every_configuration_has_a_seed_of_its_own() -> None:
+    seeds = Seeds(3, "sweep")
+    first = [seeds(index) for index in range(3000)]
+    assert [Seeds(3, "sweep")(index) for index in (2999, 0, 1024)] == [first[2999], first[0], first[1024]]
+    assert len(set(first)) == 3000 and [Seeds(4, "sweep")(index) for index in range(10)] != first[:10]
+
+
+# ---- axes -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("parameter", "given", "values"),
+    [
+        (YAW, "0:360:24", [15.0 * k for k in range(24)]),
+        (YAW, "-180:180:4", [-180.0, -90.0, 0.0, 90.0]),
+        (YAW, "0:90:4", [0.0, 30.0, 60.0, 90.0]),
+        (YAW, "30:30:1", [30.0]),
+        (ELEVATION, "5:60:8", [float(v) for v in np.linspace(5, 60, 8)]),
+        (ELEVATION, [10, 30, 50], [10.0, 30.0, 50.0]),
+        (ELEVATION, [np.int64(10), np.float64(30)], [10.0, 30.0]),
+        (ELEVATION, 12, [12.0]),
+    ],
+)
+def test_values_of_an_axis(parameter: Parameter, given: Any, values: list[float]) -> None:
+    assert list(axis_values("--grid x", parameter, given)) == values
+
+
+WRONG_AXES = {
+    "0:360": r"--grid pose.yaw: expected FIRST:LAST:COUNT such as 0:360:24, or values .*, got '0:360'",
+    "0:360:2.5": r"got '0:360:2.5'; FIRST and LAST are numbers and COUNT is a whole number",
+    "a:b:3": r"got 'a:b:3'; FIRST and LAST are numbers",
+    "0:inf:3": r"FIRST and LAST have to be finite",
+    "0:nan:3": r"FIRST and LAST have to be finite",
+    "0:360:0": r"--grid pose.yaw: expected a COUNT of at least 1, got 0",
+    "0:360:-4": r"expected a COUNT of at least 1, got -4",
+    "0:360:1000000000": r"expected at most 100000 values on an axis, got 1000000000; draw the parameter by chance",
+    "360:0:24": r"the range '360:0:24' is reversed; write 0:360:24",
+    "5:5:3": r"FIRST and LAST are the same in '5:5:3'; write 5 for the one value",
+    "0:720:8": r"'0:720:8' is more than a whole turn, so that values would repeat; write 0:360:8",
+    "10:10.0000001:3": r"expected values that differ in single precision",
+    "-4000:-3900:3": r"expected a number from -3600 to 3600 \(degrees\), got -4000",
+}
+
+
+@pytest.mark.parametrize(("text", "message"), WRONG_AXES.items())
+def test_a_wrong_range_says_what_to_do(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_axes({"pose.yaw": text}, ())
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ([0, 90, 0], r"--grid pose.yaw: expected different values, got 0 twice; leave one of them out"),
+        ([0, 90, 360], r"expected different values, got 0 and 360, the same angle"),
+        ([0, math.nan], r"expected a number from -3600 to 3600 \(degrees\), got nan"),
+        ([0, math.inf], r"expected a number from -3600 to 3600 \(degrees\), got inf"),
+        ([99999], r"expected a number from -3600 to 3600 \(degrees\), got 99999"),
+        (["left"], r"expected a number in degrees, got 'left'"),
+        ([], r"expected at least one value, got none"),
+    ],
+)
+def test_a_wrong_list_says_what_to_do(values: list[Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_axes({"pose.yaw": values}, ())
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "message"),
+    [
+        ("poze.yaw", UnknownNameError, r"unknown control 'poze'. Did you mean 'pose'.*--grid poze.yaw"),
+        ("pose.yav", UnknownNameError, r"unknown parameter of control pose 'yav'. Did you mean 'yaw'"),
+        ("pose", InputError, r"--grid pose: expected CONTROL.PARAMETER, got no parameter; choose one of yaw, pitch"),
+        ("object", InputError, r"--grid object: several of them are given as a list: --object mug,bowl"),
+        ("model", InputError, r"--grid model: several of them are given as a list: --model a.pt2,b.pt2"),
+        ("pose.rotation", InputError, r"--grid pose.rotation: expected a parameter that is one number or name"),
+        ("texture.texels", InputError, r"--grid texture.texels: expected a parameter that is one number or name"),
+        ("light:9.power", InputError, r"expected a name of letters, digits and _ after the colon, got '9'"),
+    ],
+)
+def test_a_wrong_name_of_an_axis_says_what_to_do(name: str, error: type[InputError], message: str) -> None:
+    with pytest.raises(error, match=message):
+        read_axes({name: [1, 2]}, ())
+
+
+def test_a_parameter_cannot_be_asked_for_twice() -> None:
+    drawn = (make_control("pose", {"yaw": [0, 90]}),)
+    with pytest.raises(InputError, match=r"--grid pose.yaw: --control pose says what yaw is already; leave it out"):
+        read_axes({"pose.yaw": [0, 1, 2]}, drawn)
+    with pytest.raises(InputError, match=r"--grid light.power:key: key.power is an axis already"):
+        read_axes({"light:key.power": [1, 2], "light.power:key": [3, 4]}, ())
+    assert [axis.name for axis in read_axes({"pose.pitch": [0, 1]}, drawn)] == ["pose.pitch"]
+
+
+def test_names_are_values_too() -> None:
+    (axis,) = read_axes({"environment.which": ["kitchen", "noon"]}, ())
+    assert axis.values == ("kitchen", "noon") and axis.unit == "name"
+    with pytest.raises(UnknownNameError, match=r"unknown --grid environment.which 'kitchn'. Did you mean 'kitchen'"):
+        read_axes({"environment.which": ["kitchn"]}, ())
+
+
+# ---- from numbers to configurations ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scene() -> advsearch.Scene:
+    return advsearch.load_scene("mug")
+
+
+def points_of(scene: advsearch.Scene, grid: dict[str, Any], drawn: tuple[Any, ...] = (), samples: int = 1) -> Points:
+    axes = read_axes(grid, drawn)
+    space = make_space(on_grid(drawn, axes, scene.description), scene.description)
+    return Points(space, domain_of(space), axes, samples, "sobol", 0)
+
+
+def test_what_is_rendered_is_what_was_listed(scene: advsearch.Scene) -> None:
+    grid = {"pose.yaw": "0:360:24", "camera.elevation": [10, 12.3, 50], "environment.which": ["noon", "own", "kitchen"]}
+    axes = read_axes(grid, ())
+    points = points_of(scene, grid)
+    space = make_space(on_grid((), axes, scene.description), scene.description)
+    assert points.count == 24 * 3 * 3
+    picks = points.picks(0, points.count)
+    u = points.configurations(picks)
+    listed = list(itertools.product(*(axis.values for axis in axes)))
+    for one, wanted, said in zip(u, listed, points.values(u, picks), strict=True):
+        shown = space.describe(one)
+        assert list(said) == ["pose.yaw", "camera.elevation", "environment.which"]
+        for axis, value in zip(axes, wanted, strict=True):
+            assert said[axis.name] == {"value": value, "unit": shown[axis.name]["unit"]}
+            rendered = shown[axis.name]["value"]
+            assert rendered == (value if isinstance(value, str) else float(np.float32(value)))
+
+
+def test_a_long_axis_is_exact(scene: advsearch.Scene) -> None:
+    points = points_of(scene, {"camera.elevation": "-80:80:99991"})
+    space = make_space(
+        on_grid((), read_axes({"camera.elevation": "-80:80:99991"}, ()), scene.description), scene.description
+    )
+    for number in (0, 1, 33_333, 77_777, 99_990):
+        picks = points.picks(number, 1)
+        u = points.configurations(picks)
+        said = points.values(u, picks)[0]["camera.elevation"]["value"]
+        assert space.describe(u[0])["camera.elevation"]["value"] == float(np.float32(said))
+
+
+def test_what_is_not_in_the_grid_stays_or_is_drawn(scene: advsearch.Scene) -> None:
+    alone = points_of(scene, {"pose.yaw": [0, 90]})
+    assert [one.shape for one in alone.configurations(alone.picks(0, 2))] == [(1,), (1,)]
+    drawn = points_of(scene, {"pose.yaw": [0, 90]}, (make_control("pose"),), samples=4)
+    picks = drawn.picks(0, 8)
+    said = drawn.values(drawn.configurations(picks), picks)
+    assert set(said[0]) == {f"pose.{name}" for name in ("yaw", "pitch", "roll", "x", "y", "scale")}
+    assert [one["pose.yaw"]["value"] for one in said] == [0.0] * 4 + [90.0] * 4
+    assert len({one["pose.pitch"]["value"] for one in said}) == 8
+    assert all(-15.0 <= float(one["pose.pitch"]["value"]) <= 15.0 for one in said)
+
+
+@pytest.mark.parametrize(
+    "control",
+    ["pose", "camera", "light", "lens", "corruption", "background", "material", "occlusion", "environment", "haze"],
+)
+def test_the_fast_way_says_what_the_control_says(scene: advsearch.Scene, control: str) -> None:
+    drawn = (make_control(control),)
+    points = points_of(scene, {}, drawn, samples=16)
+    space = make_space(drawn, scene.description)
+    picks = points.picks(3, 10)
+    u = points.configurations(picks)
+    for one, said in zip(u, points.values(u, picks), strict=True):
+        assert said == space.describe(one)
+
+
+def test_draws_stay_in_their_budget_and_cover_it(scene: advsearch.Scene) -> None:
+    drawn = (
+        make_control("texture", {"resolution": 16, "epsilon": 0.1}),
+        make_control("environment", {"harmonics": [-1, 1], "epsilon": 0.4}),
+        make_control("pose", {"yaw": [0, 360], "scale": [0.5, 2.0]}),
+    )
+    points = points_of(scene, {}, drawn, samples=200)
+    space = make_space(drawn, scene.description)
+    domain = domain_of(space)
+    u = points.configurations(points.picks(0, 200))
+    assert all(domain.contains(one) for one in u)
+    texels = (u[:, : 16 * 16 * 3] - space.start[: 16 * 16 * 3]).abs()
+    assert 0.09 < float(texels.max()) <= 0.1 + 1e-6
+    picks = points.picks(0, 200)
+    values = points.values(u, picks)
+    scales = [math.log2(float(one["pose.scale"]["value"])) for one in values]
+    assert abs(np.mean(scales)) < 0.02 and min(scales) < -0.95 and max(scales) > 0.95
+    assert [one.name for one in points.drawn] == ["pose.yaw", "pose.scale"]
+    assert torch.equal(points.configurations(points.picks(150, 3)), u[150:153])
+
+
+def test_a_million_million_points_start_at_once(scene: advsearch.Scene) -> None:
+    grid = {"pose.yaw": "0:360:10000", "camera.elevation": "5:60:10000", "pose.x": "-0.1:0.1:10000"}
+    axes = read_axes(grid, ())
+    space = make_space(on_grid((), axes, scene.description), scene.description)
+    began = time.perf_counter()
+    points = Points(space, domain_of(space), axes, 1, "sobol", 0)
+    assert points.count == 10**12
+    picks = points.picks(10**12 - 8, 8)
+    said = points.values(points.configurations(picks), picks)
+    assert time.perf_counter() - began < 2.0
+    assert [round(float(said[-1][name]["value"]), 6) for name in grid] == [359.964, 60.0, 0.1]
+
+
+def test_ten_million_draws_start_at_once() -> None:
+    FakeRenderer.stops_at = 64
+    began = time.perf_counter()
+    result = advsearch.sweep("mug", model(), controls="pose", samples=10_000_000)
+    assert time.perf_counter() - began < 10.0
+    assert result.summary["ending"] == "interrupted" and result.summary["planned"] == 10_000_000
+    assert result.summary["configurations"] == 64
+
+
+# ---- what a sweep says ----------------------------------------------------------------------------------------------
+
+
+def test_counts_are_those_of_the_rows(tmp_path: Path) -> None:
+    result = advsearch.sweep("mug", model(), GRID, controls="camera.azimuth", samples=10, run=tmp_path / "run")
+    summary = result.summary
+    rows = list(result.rows())
+    assert len(rows) == summary["configurations"] == summary["planned"] == 6 * 3 * 10
+    right = [row for row in rows if row.objective is not None and row.objective <= 0.0]
+    assert 0 < len(right) < len(rows)
+    assert summary["correct"] == len(right) and summary["accuracy"] == len(right) / len(rows)
+    assert summary["interval"] == list(clopper_pearson(len(right), len(rows)))
+    assert summary["answers"] == {"vase": len(rows) - len(right)}
+    by_axis = {(row["axis"], str(row["value"])): row for row in summary["axes"]}
+    assert len(by_axis) == len(summary["axes"]) == 6 + 3 + BINS
+    for name in GRID:
+        for value in {row.values[name]["value"] for row in rows}:
+            mine = [row for row in rows if row.values[name]["value"] == value]
+            good = sum(row in right for row in mine)
+            found = by_axis[name, str(value)]
+            assert (found["configurations"], found["correct"]) == (len(mine), good)
+            assert found["interval"] == list(clopper_pearson(good, len(mine)))
+    for row in summary["axes"]:
+        if row["axis"] == "camera.azimuth":
+            low, high = row["value"]
+            inside = [one for one in rows if low <= one.values["camera.azimuth"]["value"] < high]
+            assert row["unit"] == "degrees" and row["configurations"] == len(inside) > 15
+            assert row["correct"] == sum(one in right for one in inside)
+    assert json.loads((tmp_path / "run" / "summary.json").read_text("utf-8")) == json.loads(json.dumps(summary))
+
+
+def test_the_worst_is_the_largest_margin_and_is_rendered_again(tmp_path: Path) -> None:
+    result = advsearch.sweep("mug", model(), GRID, run=tmp_path / "run", trials=7, verify_spp=32)
+    rows = list(result.rows())
+    worst = result.summary["worst"]
+    best = max(rows, key=lambda row: row.objective or -math.inf)
+    assert worst["configuration"] == best.step and worst["claimed"]["margin"] == best.objective
+    assert worst["values"] == best.values and worst["seed"] == best.seed and worst["claimed"]["label"] == "vase"
+    checked = worst["verified"]
+    assert (checked["successes"], checked["trials"], checked["spp"]) == (7, 7, 32) and checked["labels"] == {"vase": 7}
+    with RunDirectory.resume(tmp_path / "run") as run:
+        trials = list(run.store.rows("verification"))
+    assert [row.step for row in trials] == list(range(7)) and len({row.seed for row in trials}) == 7
+    assert not {row.seed for row in trials} & {row.seed for row in rows}
+    (renderer,) = FakeRenderer.made
+    at = renderer.seen[best.step][0]
+    assert all(torch.equal(u, at) and spp == 32 for u, _, spp in renderer.seen[18:25])
+    assert (tmp_path / "run" / "images" / "worst.png").is_file()
+    assert result.summary["renders"] == {"sweep": 18, "verification": 7}
+
+
+def test_objects_environments_and_models_are_outer_axes(tmp_path: Path) -> None:
+    models = [model(0.5, "strict"), model(0.9, "easy")]
+    result = advsearch.sweep(
+        ["mug", "bowl"],
+        models,
+        {"pose.yaw": [0, 90, 180]},
+        environment="studio,noon",
+        label="mug",
+        run=tmp_path / "run",
+    )
+    rows = list(result.rows())
+    places = [
+        (row.values["object"]["value"], row.values["environment"]["value"], row.values["model"]["value"])
+        for row in rows
+    ]
+    wanted = itertools.product(("mug", "bowl"), ("studio", "noon"), range(3), ("strict", "easy"))
+    assert places == [(thing, light, name) for thing, light, _, name in wanted]
+    assert [row.step for row in rows] == list(range(24))
+    for first, second in zip(rows[::2], rows[1::2], strict=True):
+        assert first.seed == second.seed and (first.renders, second.renders) == (1, 0)
+        assert first.values["pose.yaw"] == second.values["pose.yaw"]
+    assert len(FakeRenderer.made) == 4 or len(FakeRenderer.made) == 5  # the worst one may be loaded again
+    assert result.summary["renders"]["sweep"] == 12
+    accuracy = {row["value"]: row["accuracy"] for row in result.summary["axes"] if row["axis"] == "model"}
+    assert accuracy["easy"] == 1.0 > accuracy["strict"]
+    assert {row["axis"] for row in result.summary["axes"]} == {"object", "environment", "model", "pose.yaw"}
+
+
+def test_models_of_several_sizes_get_pictures_of_their_size() -> None:
+    result = advsearch.sweep("mug", [model(0.5, "a", 16), model(0.5, "b", 24)], {"pose.yaw": [0, 90]}, trials=0)
+    assert {renderer.size for renderer in FakeRenderer.made} == {(16, 16), (24, 24)}
+    assert [row.renders for row in result.rows()] == [1, 1, 1, 1] and result.summary["renders"]["sweep"] == 4
+
+
+def test_nothing_but_outer_axes_is_fine_and_one_configuration_is_refused() -> None:
+    assert advsearch.sweep("mug,bowl", model(), label="mug", trials=0).summary["configurations"] == 2
+    with pytest.raises(InputError, match=r"--grid: expected something that varies, got nothing; add an axis such as"):
+        advsearch.sweep("mug", model())
+
+
+def test_answers_that_are_not_finite_are_counted_and_not_right() -> None:
+    class Fails(Brightness):
+        def forward(self, images: Tensor) -> Tensor:
+            logits = super().forward(images)
+            return torch.where(images.mean(dim=(1, 2, 3))[:, None] > 0.6, math.nan, logits)
+
+    victim = advsearch.load_model(Fails(), labels=LABELS, input_size=SIZE, name="fails")
+    result = advsearch.sweep("mug", victim, {"pose.yaw": "0:360:40"}, trials=0)
+    bad = [row for row in result.rows() if row.objective is None]
+    assert bad and all(row.success is None for row in bad)
+    assert result.summary["not_finite"] == len(bad)
+    assert any("not finite; they count as not right" in text for text in result.summary["warnings"])
+    assert result.summary["worst"]["claimed"]["margin"] is not None
+
+
+# ---- what survives --------------------------------------------------------------------------------------------------
+
+SURVIVES: dict[str, Any] = {
+    "grid": {"pose.yaw": "0:360:6", "camera.elevation": [5, 20, 35]},
+    "controls": {"camera": {"azimuth": [0, 90]}},
+    "samples": 3,
+    "batch": 4,
+    "trials": 5,
+    "environment": "studio,noon",
+}
+
+
+PICTURES, WHOLE = 2 * 6 * 3 * 3, 108 + 16 + 5 + 1
+"""Pictures of that sweep, and all renders: two rungs of eight that choose a sample count, trials, the picture kept."""
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[list[Any], dict[str, Any]]]:
+    path = tmp_path_factory.mktemp("whole") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sweep_view, "make_renderer", FakeRenderer)
+        FakeRenderer.made, FakeRenderer.calls = [], 0
+        summary = advsearch.sweep("mug", model(), run=path, **SURVIVES).summary
+        assert FakeRenderer.calls == WHOLE
+    yield rows_of(path), timeless(summary)
+
+
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, MemoryError])
+@pytest.mark.parametrize("stops_at", [1, 4, 5, 30, 54, 55, 107, 108, 109, 124, 127, 129])
+def test_a_sweep_that_was_stopped_ends_as_one_that_was_not(
+    tmp_path: Path, uninterrupted: Any, stops_at: int, kind: type[BaseException]
+) -> None:
+    path = tmp_path / "run"
+    FakeRenderer.stops_at, FakeRenderer.stops_with = stops_at, kind
+    if kind is KeyboardInterrupt:
+        first = advsearch.sweep("mug", model(), run=path, **SURVIVES).summary
+        assert first["ending"] == "interrupted" and first["configurations"] <= stops_at
+        assert first["configurations"] == len([row for row in rows_of(path) if row[0] == KIND])
+    else:
+        with pytest.raises(kind):
+            advsearch.sweep("mug", model(), run=path, **SURVIVES)
+    FakeRenderer.stops_at = None
+    before = FakeRenderer.calls
+    again = advsearch.sweep("mug", model(), run=path, **SURVIVES)
+    rows, summary = uninterrupted
+    assert rows_of(path) == rows
+    assert timeless(again.summary) == summary
+    rendered_again = FakeRenderer.calls - before - (WHOLE - stops_at)
+    assert 0 <= rendered_again < (4 if stops_at < PICTURES else 17)  # a batch; or what chose the sample count
+
+
+def test_other_settings_do_not_go_on_and_a_finished_sweep_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    FakeRenderer.stops_at = 10
+    advsearch.sweep("mug", model(), run=path, **SURVIVES)
+    FakeRenderer.stops_at = None
+    with pytest.raises(RunExistsError, match="the run exists already"):
+        advsearch.sweep("mug", model(), run=path, **{**SURVIVES, "seed": 1})
+    advsearch.sweep("mug", model(), run=path, **SURVIVES)
+    with pytest.raises(RunExistsError, match="the run exists already"):
+        advsearch.sweep("mug", model(), run=path, **SURVIVES)
+
+
+def test_resume_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    config = SweepConfig(object="mug", grid={"pose.yaw": "0:360:40"}, resolution=32, run="mine", trials=3)
+    FakeRenderer.stops_at = 20
+    assert sweep_from_config(config).summary["configurations"] == 16
+    FakeRenderer.stops_at = None
+    summary = resume_sweep("mine").summary
+    assert summary["configurations"] == 40 and summary["ending"] == "finished"
+    other = sweep_from_config(config.model_copy(update={"run": "other"}))
+    assert rows_of(tmp_path / "runs" / "mine") == rows_of(tmp_path / "runs" / "other")
+    assert timeless(other.summary) == timeless(summary)
+    assert sweep_from_config(config.model_copy(update={"run": None, "trials": 0})).run == Path("runs/mug-sweep-001")
+
+
+def test_any_configuration_can_be_the_first() -> None:
+    config = SweepConfig(object="mug", controls={"pose": {}}, samples=100_000_000, resolution=32, trials=0)
+    sweep = Sweep(_job_of(config), None, NullProgress())
+    FakeRenderer.stops_at = 8
+    late = sweep.carry_out(first=99_999_992)
+    assert [row.step for row in late.rows()] == list(range(99_999_992, 100_000_000))
+
+
+def test_without_a_run_directory_the_rows_are_in_memory() -> None:
+    result = advsearch.sweep("mug", model(), {"pose.yaw": [0, 90]}, trials=0)
+    assert result.run is None and [row.values["pose.yaw"]["value"] for row in result.rows()] == [0.0, 90.0]
+    assert result.accuracy == result.summary["accuracy"]
+    assert isinstance(next(iter(result.rows())), Row)
+
+
+# ---- configuration and command line ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "given",
+    [range(0, 90, 30), np.arange(0.0, 90.0, 30.0), (0, 30, 60), "0,30,60", "[0, 30, 60]", {"choices": [0, 30, 60]}],
+)
+def test_a_list_of_values_may_be_written_in_many_ways(given: Any) -> None:
+    assert SweepConfig(object="mug", grid={"pose.yaw": given}).grid == {"pose.yaw": [0.0, 30.0, 60.0]}
+
+
+@pytest.mark.parametrize("given", [True, None, [[0, 1]], "", [None]])
+def test_what_is_no_list_of_values_is_refused(given: Any) -> None:
+    with pytest.raises(InputError, match=r"^--grid: expected PARAMETER=FIRST:LAST:COUNT, or values separated by"):
+        SweepConfig.from_flags({"object": "mug", "grid": {"pose.yaw": given}})
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("samples", 0, "--samples: expected a whole number from 1 to 1000000000, got 0"),
+        ("sampler", "halton", "--sampler: expected sobol or random, got halton"),
+        ("batch", 0, "--batch: expected a whole number from 1 to 1024, got 0"),
+        ("trials", -1, "--trials: expected a whole number from 0 to 100000, got -1"),
+        ("verify_spp", 0, "--verify-spp: expected a whole number from 1 to 65536, got 0"),
+        ("spp", 1.5, "--spp: expected a whole number from 1 to 65536, got 1.5"),
+        ("grid", 3, "--grid: expected PARAMETER=FIRST:LAST:COUNT, or values separated by commas, got 3"),
+        ("object", "", "--object: expected names of objects or .obj, .ply, .glb, .gltf or .stl files, got ''"),
+    ],
+)
+def test_a_wrong_setting_names_its_flag(name: str, value: Any, message: str) -> None:
+    with pytest.raises(InputError) as error:
+        SweepConfig.from_flags({"object": "mug", name: value})
+    assert str(error.value) == message
+
+
+def test_the_recipe_repeats_the_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = SweepConfig(object="mug,bowl", environment="studio,noon", grid={**GRID, "environment.which": "own,noon"})
+    (tmp_path / "run.yaml").write_text(config.to_yaml())
+    assert SweepConfig.from_yaml(tmp_path / "run.yaml") == config
+    assert "--grid pose.yaw=0:360:6 --grid 'camera.elevation=[5,20,35]'" in config.command_line()
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.obj").touch()
+    assert SweepConfig(object="a.obj,mug").recipe().object == f"{tmp_path / 'a.obj'},mug"
+
+
+def test_yaml_does_not_read_a_range_as_a_number_to_the_base_of_60() -> None:
+    given = ["camera.elevation=5:50:8", "pose.yaw=0,90", "pose.x=[0,1]", "environment.which=noon"]
+    assert axes_as_text(given) == [
+        'camera.elevation="5:50:8"',
+        'pose.yaw="0,90"',
+        "pose.x=[0,1]",
+        'environment.which="noon"',
+    ]
+    with pytest.raises(InputError, match=r"--grid pose.yaw: given twice"):
+        axes_as_text(["pose.yaw=0,90", "pose.yaw=180"])
+
+
+def command(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+    status = main(["sweep", "--object", "mug", "--resolution", "32", "--quiet", *words])
+    out, err = capsys.readouterr()
+    return status, out, err
+
+
+def test_the_command_prints_json(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    status, out, _ = command(
+        capsys, "--grid", "camera.elevation=5:50:4", "--trials", "3", "--verify-spp", "4", "--json"
+    )
+    summary = json.loads(out)
+    assert status == 0 and summary["schema"] == 1 and summary["command"] == "sweep"
+    assert [row["value"] for row in summary["axes"]] == [5.0, 20.0, 35.0, 50.0]
+    wanted = {"configurations", "correct", "accuracy", "interval", "renders_per_second", "worst", "run", "seconds"}
+    assert wanted <= set(summary) and summary["run"] == "runs/mug-sweep-001"
+
+
+def test_the_command_prints_a_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    FakeRenderer.level = 0.5
+    status, out, _ = command(capsys, "--grid", "pose.yaw=0:360:30", "--grid", "camera.elevation=5,20", "--trials", "0")
+    assert status == 0
+    assert "in 0 of 60 configurations (0 %, 95 % interval 0-6 %)" in out or "in 60 of 60 configurations (100 %" in out
+    assert "pose.yaw, degrees (the 12 of 30 values where the model is right least often)" in out
+    assert "camera.elevation, degrees\n" in out and "kept in   runs/mug-sweep-001" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--grid", "pose.yaw=0:360:0"], "--grid pose.yaw: expected a COUNT of at least 1, got 0"),
+        (["--grid", "pose.yaw=0,90", "--grid", "pose.yaw=1,2"], "--grid pose.yaw: given twice"),
+        (["--grid", "pose.yaw=0,90", "--set", "pose.yaw=30"], "--grid pose.yaw: --set fixes it already"),
+        (["--grid", "pose.yaw"], "--grid: expected NAME=VALUE"),
+        (["--grid", "pose.yaw=0,90", "--samples", "5"], "--samples: expected --control beside it"),
+        (["--control", "pose", "--samples", "0"], "--samples: expected a whole number from 1 to 1000000000, got 0"),
+        (["--environment", "noon,noon", "--grid", "pose.yaw=0,90"], "--environment: expected different names"),
+        (["--grid", "pose.yaw=0,90", "--label", "teapott"], "--label: "),
+        (["--object", "mug,teapot", "--environment", "moon", "--grid", "pose.yaw=0,90"], "unknown environment 'moon'"),
+    ],
+)
+def test_the_command_explains_mistakes_and_leaves_nothing(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    status, out, err = command(capsys, *words)
+    assert (status, out) == (2, "") and message in err and not FakeRenderer.made
+    assert not (tmp_path / "runs").exists() or not any((tmp_path / "runs").iterdir())
+
+
+def examples_of(page: Path) -> list[list[str]]:
+    text = page.read_text("utf-8").replace("\\\n", " ")
+    return [shlex.split(line) for line in re.findall(r"^advsearch sweep .*$", text, re.M)]
+
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+EXAMPLES = [words for name in ("sweeps.md", "command-line.md") for words in examples_of(DOCS / name)]
+
+
+@pytest.mark.parametrize("words", EXAMPLES, ids=" ".join)
+def test_every_example_of_the_documentation_is_a_sweep(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[SweepConfig] = []
+    monkeypatch.setattr(cli_sweep, "carry_out", lambda config, **rest: asked.append(config) or 0)
+    assert main(words[1:]) == 0
+    job = _job_of(asked[0])
+    assert Sweep(job, None, NullProgress()).total > 1
+
+
+def test_every_flag_of_its_own_is_documented() -> None:
+    page = (DOCS / "command-line.md").read_text("utf-8").partition("\n## sweep\n")[2].partition("\n## ")[0]
+    for one in settings(SweepConfig):
+        if one.group in ("sweep", "verification") and one.field != "spp":
+            what, _, rest = help_text(one).partition(": ")
+            values, _, default = rest.partition(" (default: ")
+            assert f"| `{one.flag}` | {what} | {values} | {default.removesuffix(')')} |" in page
+
+
+def test_ctrl_c_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    FakeRenderer.stops_at = 20
+    status, out, _ = command(capsys, "--grid", "pose.yaw=0:360:40")
+    assert status == 130 and "Interrupted after 16 of 40 configurations" in out and "not verified" in out
+
+
+def test_the_table_of_nothing() -> None:
+    summary = {
+        "command": "sweep",
+        "ending": "interrupted",
+        "configurations": 0,
+        "planned": 5,
+        "axes": [],
+        "worst": None,
+    }
+    assert answer(summary).startswith("Interrupted before the first configuration.")
+
+
+# ---- with the renderer ----------------------------------------------------------------------------------------------
+
+
+def test_a_small_sweep_really_rendered_is_repeatable(tmp_path: Path) -> None:
+    """Bit for bit, and each picture is that of `render` at the listed values."""
+    grid = {"pose.yaw": [0, 180], "camera.elevation": [10, 60]}
+    options: dict[str, Any] = {"spp": 1, "trials": 2, "verify_spp": 2, "resolution": (16, 16), "batch": 2}
+    first = advsearch.sweep("mug", model(), grid, run=tmp_path / "a", **options)
+    second = advsearch.sweep("mug", model(), grid, run=tmp_path / "b", **options)
+    assert rows_of(tmp_path / "a") == rows_of(tmp_path / "b")
+    assert timeless(first.summary) == timeless(second.summary)
+    rows = list(first.rows())
+    assert len({row.objective for row in rows}) == 4
+    scene = advsearch.load_scene("mug", settings={"pose.yaw": 180.0, "camera.elevation": 60.0})
+    render = scene.renderer({"pose": {"yaw": [0, 360]}}, resolution=16)
+    with torch.no_grad():
+        picture = render(render.start, seed=rows[3].seed or 0, spp=1)
+        logits = model()((picture * 255.0).round() / 255.0)
+    assert float(logits[0, 1] - logits[0, 0]) == pytest.approx(rows[3].objective, abs=0.2)
