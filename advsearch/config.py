@@ -164,7 +164,7 @@ class SceneConfig(Config):
     @classmethod
     def _controls_from_names(cls, value: Any) -> Any:
         """Accept ``"texture"`` and ``["texture", "pose"]`` for controls with nothing set, and an empty YAML value."""
-        names = [value] if isinstance(value, str) else value
+        names = [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
         if isinstance(names, (list, tuple)):
             return {name: {} for name in names}
         if isinstance(names, Mapping):
@@ -639,6 +639,7 @@ class PrecisionConfig(SceneConfig):
         "run",
         "where the figures and the numbers go, instead of a run directory",
         "the path of a folder",
+        otherwise="a run directory",
         min_length=1,
     )
 

@@ -10,20 +10,23 @@ else in a page is written by hand. `--check` writes nothing, names the files tha
 from __future__ import annotations
 
 import argparse
+import importlib
 import inspect
 import json
 import re
 import sys
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from advsearch.cli.flags import GROUPS, help_text
-from advsearch.config import AttackConfig
+from advsearch.cli.main import COMMANDS
+from advsearch.config import AttackConfig, GapConfig, PrecisionConfig, RegionConfig, SweepConfig
 from advsearch.controls import OWN
 from advsearch.scene.settings import SETTINGS
-from advsearch.settings import Setting, settings
+from advsearch.settings import Config, Setting, settings
 
 DOCS = Path(__file__).resolve().parent
 DIAGRAM = "images/reliability.svg"
@@ -87,23 +90,61 @@ def flags(record: Record) -> str:
     """Every flag of `attack` with its values and default, group by group."""
     parts = []
     for group, heading in GROUPS.items():
-        rows = []
-        for one in settings(AttackConfig):
-            if one.group == group:
-                what, values, default = _flag_cells(one)
-                rows.append([f"`{one.flag}`", what, values, default])
-        parts.append(f"**{heading.capitalize()}**\n\n" + table(["flag", "what", "values", "default"], rows))
+        rows = [_flag_row(one) for one in settings(AttackConfig) if one.group == group]
+        if rows:
+            parts.append(f"**{heading.capitalize()}**\n\n" + table(FLAG_HEADS, rows))
     return "\n".join(parts)
 
 
-def _flag_cells(one: Setting) -> tuple[str, str, str]:
-    """What a flag is, its values and its default, cut from its help text."""
+FLAG_HEADS = ("flag", "what", "values", "default")
+
+CONFIGS: dict[str, type[Config]] = {
+    "sweep": SweepConfig,
+    "gap": GapConfig,
+    "region": RegionConfig,
+    "plan": AttackConfig,
+    "check": AttackConfig,
+    "precision": PrecisionConfig,
+}
+"""The commands whose flags are settings, some of them the same as those of `attack`."""
+
+
+def own_flags(command: str) -> Callable[[Record], str]:
+    """The flags of a command that differ from those of `attack`, as a table, and the names of those that do not."""
+
+    def make(record: Record) -> str:
+        known = [one for one in settings(CONFIGS[command]) if one.flag in flags_of(command)]
+        as_in_attack = settings(AttackConfig)
+        shared = [f"`{one.flag}`" for one in known if one in as_in_attack]
+        left_out = [f"`{one.flag}`" for one in as_in_attack if one.flag not in flags_of(command)]
+        few = len(left_out) < 4
+        said = f"All flags of `attack` but {', '.join(left_out)}" if few else f"As for `attack`: {', '.join(shared)}"
+        own = [_flag_row(one) for one in known if one not in as_in_attack]
+        return _wrapped(f"{said}.") + ("\n" + table(FLAG_HEADS, own) if own else "")
+
+    return make
+
+
+def flags_of(command: str) -> set[str]:
+    """Return the flags that a command takes, as its help shows them."""
+    parser = argparse.ArgumentParser()
+    subparsers = parser.add_subparsers()
+    importlib.import_module(COMMANDS[command]).add_parser(subparsers)
+    return set(re.findall(r"^  (--[a-z][a-z-]*)", subparsers.choices[command].format_help(), re.MULTILINE))
+
+
+def _wrapped(text: str) -> str:
+    return "\n".join(textwrap.wrap(text, 119, break_long_words=False, break_on_hyphens=False)) + "\n"
+
+
+def _flag_row(one: Setting) -> list[str]:
+    """A flag, what it is, its values and its default, cut from its help text."""
     text = help_text(one).replace("%%", "%")
     if one.is_switch:
-        return text, "no value", ""
-    what, _, rest = text.partition(": ")
-    values, marked, default = rest.partition(" (default: ")
-    return what, values, "required" if one.required else default.removesuffix(")") if marked else ""
+        return [f"`{one.flag}`", text, "no value", ""]
+    values, marked, default = text.removeprefix(f"{one.description}: ").partition(" (default: ")
+    shown = "required" if one.required else default.removesuffix(")") if marked else ""
+    return [f"`{one.flag}`", one.description, values, shown]
 
 
 def scene_parameters(record: Record) -> str:
@@ -336,6 +377,7 @@ def _text(x: float, y: float, text: str, anchor: str, *, turned: bool = False) -
 
 PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("command-line.md", "flags"): flags,
+    **{("command-line.md", f"{command}-flags"): own_flags(command) for command in CONFIGS},
     ("scenes.md", "parameters"): scene_parameters,
     ("scenes.md", "objects"): objects,
     ("scenes.md", "environments"): environments,

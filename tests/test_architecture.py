@@ -44,15 +44,16 @@ class Rule:
 HEAVY = frozenset(RENDERER | {"torch"})
 RULES = {
     **{name: Rule(set(), {"numpy"}, HEAVY) for name in COMMON},
-    "config": Rule(set(), {"pydantic", "yaml"}),
+    "settings": Rule(set(), {"pydantic", "yaml", "typing_extensions"}),  # the last for the type checker only
+    "config": Rule({"settings"}, {"pydantic", "yaml"}),
     "scene": Rule(set()),
     "bundled": Rule({"scene"}),
     "controls": Rule({"scene"}),
     "models": Rule(set(), {"torch", "numpy", "safetensors"}),
     "attacks": Rule(set(), {"torch", "numpy", "scipy", "cma"}),
     "evaluation": Rule({"scene", "bundled", "controls", "models", "attacks"}),
-    "runs": Rule({"config"}, {"numpy", "pydantic", "imageio", "OpenEXR", "PIL"}),
-    "report": Rule({"runs", "config"}, forbidden=HEAVY),
+    "runs": Rule({"config", "settings"}, {"numpy", "pydantic", "imageio", "OpenEXR", "PIL", "pyarrow"}),
+    "report": Rule({"runs", "config", "settings"}, {"numpy", "PIL", "matplotlib"}, HEAVY),
     "api": Rule(None),
     "cli": Rule(None),
     "": Rule({"api"}, set()),
@@ -62,8 +63,12 @@ RULES = {
 DISTRIBUTIONS = {"PIL": "pillow", "yaml": "PyYAML", "mitsuba_oidn": "mitsuba-oidn", "imageio_ffmpeg": "imageio-ffmpeg"}
 """Where a package is installed under another name than it is imported."""
 
-BROUGHT_ALONG = {"drjit": "mitsuba"}
-"""Imported, but pinned by another package on purpose: Mitsuba works with exactly one version of Dr.Jit."""
+BROUGHT_ALONG = {"drjit": "mitsuba", "typing_extensions": "pydantic"}
+"""Imported, but pinned by another package on purpose: Mitsuba works with exactly one version of Dr.Jit, and types of
+pydantic's classes are written with its own typing_extensions."""
+
+OPTIONAL = {"pyarrow": "parquet"}
+"""Packages that only an extra brings, and which: imported inside a function that says what to do where it is not."""
 
 
 def python_files() -> list[tuple[str, Path]]:
@@ -160,6 +165,7 @@ def test_the_design_in_one_glance() -> None:
     assert not any("cli" in (rule.rooms or ()) for rule in RULES.values())
     for name in ("attacks", "models"):
         assert not RENDERER & (RULES[name].packages or RENDERER) and RULES[name].rooms == set()
+    assert RULES["settings"].rooms == set() and RULES["config"].rooms == {"settings"}
     assert RULES["report"].forbidden >= {"torch", "mitsuba"} and RULES["scene"].rooms == set()
 
 
@@ -168,21 +174,47 @@ def test_everything_imported_is_a_declared_dependency() -> None:
     for module, path in python_files():
         for name in imports(module, path):
             top = name.split(".")[0]
-            if top == "advsearch" or top in sys.stdlib_module_names:
+            if top == "advsearch" or top in sys.stdlib_module_names or top in OPTIONAL:
                 continue
             distribution = BROUGHT_ALONG.get(top) or DISTRIBUTIONS.get(top, top)
             assert canonicalize_name(distribution) in declared, f"{path.relative_to(ROOT)} imports {name}"
 
 
+@pytest.mark.parametrize(("package", "extra"), OPTIONAL.items())
+def test_an_optional_package_is_an_extra_and_imported_lazily(package: str, extra: str) -> None:
+    brought, always = requirements(extra, "options.extras_require"), requirements("install_requires")
+    (one,) = [one for one in brought if canonicalize_name(one.name) == canonicalize_name(package)]
+    assert str(one) in [str(other) for other in requirements("dev", "options.extras_require")], "tests need it too"
+    assert canonicalize_name(package) not in {canonicalize_name(other.name) for other in always}
+    users = [path for module, path in python_files() if package in {n.split(".")[0] for n in imports(module, path)}]
+    assert users, f"nothing imports {package}"
+    for path in users:
+        outside = [one for one in ast.parse(path.read_text(encoding="utf-8")).body if _imports(one, package)]
+        assert not outside, f"{path.relative_to(ROOT)} imports {package} as soon as it is imported itself"
+
+
+def _imports(statement: ast.stmt, package: str) -> bool:
+    """Whether a statement of a module imports a package when the module is imported, in a branch too."""
+    if isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef)):
+        return False
+    if isinstance(statement, ast.Import):
+        return any(alias.name.split(".")[0] == package for alias in statement.names)
+    if isinstance(statement, ast.ImportFrom):
+        return (statement.module or "").split(".")[0] == package
+    inner = (one for one in ast.iter_child_nodes(statement) if isinstance(one, (ast.stmt, ast.excepthandler)))
+    return any(_imports(one, package) for one in inner)  # type: ignore[arg-type]
+
+
 # -- what is heavy ---------------------------------------------------------------------------------------------------
 
-SHOW_HEAVY = "import sys; print([m for m in ('torch', 'mitsuba', 'drjit', 'scipy', 'trimesh') if m in sys.modules])"
+LATE = ("torch", "mitsuba", "drjit", "scipy", "trimesh", "matplotlib", "pyarrow")
+SHOW_HEAVY = f"import sys; print([m for m in {LATE} if m in sys.modules])"
 
 
 @pytest.mark.parametrize(
     "code",
     [
-        "import advsearch, advsearch.errors, advsearch.seeds, advsearch.threads, advsearch.config",
+        "import advsearch, advsearch.errors, advsearch.seeds, advsearch.threads, advsearch.settings, advsearch.config",
         "import advsearch.runs, advsearch.report, advsearch.scene, advsearch.scene.assets, advsearch.scene.llvm",
         "import contextlib, io\n"
         "from advsearch.cli.main import main\n"

@@ -19,7 +19,7 @@ import pytest
 from rich.console import Console
 from rich.progress import Progress as Bars
 from rich.progress import TextColumn
-from test_report import SUMMARY, changed, make_run
+from test_report import AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, changed, make_run
 
 from advsearch import __version__
 from advsearch.cli import list as listing
@@ -27,9 +27,11 @@ from advsearch.cli.main import COMMANDS, main
 from advsearch.cli.output import columns
 from advsearch.cli.progress import BarProgress, LineProgress, watching
 from advsearch.cli.table import answer
-from advsearch.config import AttackConfig
+from advsearch.config import AttackConfig, GapConfig, RegionConfig, SweepConfig
 from advsearch.errors import InputError, StorageError
 from advsearch.progress import NullProgress, Progress
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.store import Row
 from advsearch.settings import settings
 
 HEAVY = ("torch", "mitsuba", "drjit", "numpy", "scipy", "pydantic", "rich", "yaml", "PIL", "trimesh")
@@ -45,20 +47,36 @@ class Result:
     run: Path = Path("runs/x")
 
 
-@pytest.fixture
-def api(monkeypatch: pytest.MonkeyPatch) -> Callable[[Api], None]:
-    """Put a stand-in in the place of `advsearch.api.attack_from_config`."""
+API = ("attack_from_config", "curve_from_config", "resume_attack", "gap_from_config", "region_from_config")
+"""What the command line calls in `advsearch.api`; `advsearch.api.sweeping` has the rest."""
 
-    def install(stand_in: Api) -> None:
-        module = types.ModuleType("advsearch.api")
-        module.attack_from_config = stand_in  # type: ignore[attr-defined]
-        monkeypatch.setitem(sys.modules, "advsearch.api", module)
+
+def stand_ins(attack: Api | None, **others: Api) -> dict[str, types.ModuleType]:
+    """Modules in the place of `advsearch.api`: the functions that are given, and others that must not be called."""
+
+    def not_wanted(*args: Any, **named: Any) -> Any:
+        raise AssertionError("the command line called something else than what was asked for")
+
+    given = others if attack is None else {"attack_from_config": attack, **others}
+    api, sweeping = types.ModuleType("advsearch.api"), types.ModuleType("advsearch.api.sweeping")
+    vars(api).update({name: given.get(name, not_wanted) for name in API}, __path__=[])
+    vars(sweeping).update({name: given.get(name, not_wanted) for name in ("sweep_from_config", "resume_sweep")})
+    return {"advsearch.api": api, "advsearch.api.sweeping": sweeping}
+
+
+@pytest.fixture
+def api(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Put stand-ins in the place of `advsearch.api.attack_from_config` and of what else is named."""
+
+    def install(attack: Api | None = None, **others: Api) -> None:
+        for name, module in stand_ins(attack, **others).items():
+            monkeypatch.setitem(sys.modules, name, module)
 
     return install
 
 
 @pytest.fixture
-def asked(api: Callable[[Api], None]) -> list[AttackConfig]:
+def asked(api: Callable[..., None]) -> list[AttackConfig]:
     """The configurations that a successful stand-in was given."""
     given: list[AttackConfig] = []
 
@@ -152,12 +170,12 @@ def test_bad_input_is_one_line_and_status_2(
 
 def test_a_bug_keeps_its_traceback_and_ends_with_1() -> None:
     code = (
-        "import sys, types; api = types.ModuleType('advsearch.api'); sys.modules['advsearch.api'] = api\n"
-        "def attack_from_config(config, progress): raise ValueError('a bug')\n"
-        "api.attack_from_config = attack_from_config\n"
+        "import sys, test_cli\n"
+        "def attack(config, progress): raise ValueError('a bug')\n"
+        "sys.modules.update(test_cli.stand_ins(attack))\n"
         "from advsearch.cli.main import main; sys.exit(main(['attack', '--object', 'mug', '--json']))"
     )
-    done = python(code)
+    done = python(code, cwd=Path(__file__).parent)
     assert done.returncode == 1 and done.stdout == ""
     assert "Traceback" in done.stderr and done.stderr.endswith("ValueError: a bug\n")
 
@@ -171,7 +189,7 @@ def test_a_bug_keeps_its_traceback_and_ends_with_1() -> None:
     ],
 )
 def test_what_the_api_raises_becomes_a_status(
-    api: Callable[[Api], None], capsys: pytest.CaptureFixture[str], error: BaseException, status: int, message: str
+    api: Callable[..., None], capsys: pytest.CaptureFixture[str], error: BaseException, status: int, message: str
 ) -> None:
     def attack(config: AttackConfig, *, progress: Progress) -> Result:
         raise error
@@ -230,7 +248,7 @@ def test_attack_prints_the_table(asked: list[AttackConfig], capsys: pytest.Captu
 
 
 def test_json_is_all_that_stands_on_standard_output(
-    api: Callable[[Api], None], capfd: pytest.CaptureFixture[str]
+    api: Callable[..., None], capfd: pytest.CaptureFixture[str]
 ) -> None:
     def attack(config: AttackConfig, *, progress: Progress) -> Result:
         print("an objective of the user prints")
@@ -251,7 +269,7 @@ def test_json_is_all_that_stands_on_standard_output(
 @pytest.mark.parametrize(
     ("ending", "status"), [("found", 0), ("budget spent", 0), ("already wrong", 0), ("interrupted", 130)]
 )
-def test_the_status_of_an_attack(api: Callable[[Api], None], ending: str, status: int) -> None:
+def test_the_status_of_an_attack(api: Callable[..., None], ending: str, status: int) -> None:
     api(lambda config, progress: Result(changed(ending=ending)))
     assert main(["attack", "--object", "mug"]) == status
     assert main(["attack", "--object", "mug", "--json"]) == status
@@ -274,7 +292,7 @@ def test_run_reads_a_file_and_puts_changes_over_it(asked: list[AttackConfig], tm
         (
             "object: mug\ncommand: atack\n",
             [],
-            "unknown command 'atack'. Did you mean 'attack'? Known: attack. It stands in ",
+            "unknown command 'atack'. Did you mean 'attack'? Known: attack, gap, region, sweep. It stands in ",
         ),
         ("object: mug\n", ["steps"], "steps: expected NAME=VALUE such as camera.azimuth=130, got 'steps'"),
         ("object: mug\n", ["step=3"], "unknown setting 'step'. Did you mean 'steps'"),
@@ -293,6 +311,299 @@ def test_a_bad_file_or_change_is_told(
     Path("run.yaml").write_text(text)
     assert main(["run", "run.yaml", *change]) == 2
     assert capsys.readouterr().err.startswith(f"advsearch: error: {message}")
+
+
+# ---- studies, regions and sweeps ----
+
+RATE = {"accuracy": 0.75, "interval": [0.35, 0.97]}
+CURVE: dict[str, Any] = {
+    "schema": 1, "command": "attack", "run": "runs/mug-texture-001", "objects": ["mug", "bowl"], "ending": "done",
+    "controls": ["texture"], "epsilons": [0.01, 0.1], "parts": ["mug-epsilon-0-01"], "seconds": {"total": 9.0},
+    "table": [
+        {"object": "mug", "clean": {"correct": 20, "trials": 20}, "ending": "found", "epsilon": 0.1, "flips_at": 0.1,
+         "verified": {"successes": 19, "trials": 20}, "margin": 1.5},
+        {"object": "bowl", "clean": None, "flips_at": None, "margins": {}},
+    ],
+    "curve": [
+        {"epsilon": 0.01, "objects": 4, "robust": 3, "found": 0, "already_wrong": 1, **RATE},
+        {"epsilon": 0.1, "objects": 0, "robust": 0, "found": 0, "already_wrong": 0, "accuracy": None,
+         "interval": [0.0, 1.0]},
+    ],
+}  # fmt: skip
+GAP: dict[str, Any] = {
+    "schema": 1, "command": "gap", "run": "runs/mug-pose-001", "objects": ["mug"], "controls": ["pose"], "parts": ["a"],
+    "ending": "done", "seconds": {"total": 9.0},
+    "table": [
+        {"object": "mug", "control": "pose", "average": {"configurations": 200, "correct": 150, **RATE},
+         "worst": {"successes": 20, "trials": 20}, "ending": "found", "margin": 3.25},
+    ],
+}  # fmt: skip
+REGION: dict[str, Any] = {
+    "schema": 1, "command": "region", "run": "runs/mug-pose-002", "object": "mug", "controls": ["pose"],
+    "ending": "done", "verdict": "wrong", "same": 200, "samples": 200, "interval": [0.982, 1.0], "volume": 0.12,
+    "box": [{"name": "pose.yaw", "unit": "degrees", "low": 10.0, "high": 55.5, "centre": 30.0}],
+    "renders": {"verification": 300}, "seconds": {"total": 9.0},
+}  # fmt: skip
+SWEEP: dict[str, Any] = {
+    "schema": 1, "command": "sweep", "run": "runs/mug-sweep-001", "configurations": 8, "planned": 8, "correct": 6,
+    "ending": "finished", "axes": [], "renders": {"sweep": 8}, "seconds": {"total": 9.0}, **RATE,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("line", ["--object mug,bowl", "--object mug --epsilon 0.01,0.1"])
+def test_several_objects_or_epsilons_are_a_curve(
+    api: Callable[..., None], capsys: pytest.CaptureFixture[str], line: str
+) -> None:
+    given: list[Any] = []
+    api(curve_from_config=lambda config, progress, resumed: given.append((config, resumed)) or CURVE)
+    assert main(["attack", *line.split(), "--quiet"]) == 0
+    assert given[0][0].is_study and given[0][1] is None
+    assert capsys.readouterr().out == (
+        "  object   clean right   ending   epsilon   wrong   margin\n"
+        "  mug      20/20         found    0.1       19/20   1.50\n"
+        "  bowl     not reached\n\n"
+        "  epsilon   robust   accuracy   95 % interval   wrong already\n"
+        "  0.01      3/4      75 %       35-97 %         1\n\n"
+        "  time   9.0 s\n"
+        "  run    runs/mug-texture-001\n"
+    )
+    assert main(["attack", *line.split(), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == CURVE
+
+
+def test_gap_builds_its_configuration_and_prints_a_row_for_each_control(
+    api: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    given: list[Any] = []
+    api(gap_from_config=lambda config, progress, resumed: given.append(config) or GAP)
+    argv = ["gap", "--object", "mug,bowl", "--control", "pose,light", "--average", "50", "--run", "x", "--quiet"]
+    assert main(argv) == 0
+    assert given == [GapConfig(object="mug,bowl", controls={"pose": {}, "light": {}}, average=50, run="x")]
+    assert capsys.readouterr().out == (
+        "  object   control   right on average   95 % interval   worst: wrong   margin   ending\n"
+        "  mug      pose      150/200 (75 %)     35-97 %         20/20          3.25     found\n\n"
+        "  time   9.0 s\n"
+        "  run    runs/mug-pose-001\n"
+    )
+
+
+@pytest.mark.parametrize(("command", "summary"), [("gap", GAP), ("attack", CURVE)])
+def test_an_interrupted_study_says_how_to_go_on(
+    api: Callable[..., None], capsys: pytest.CaptureFixture[str], command: str, summary: dict[str, Any]
+) -> None:
+    answer = {**summary, "ending": "interrupted"}
+    api(**{name: lambda config, progress, resumed: answer for name in ("gap_from_config", "curve_from_config")})
+    assert main([command, "--object", "mug,bowl"]) == 130
+    assert capsys.readouterr().out.endswith("\n\nInterrupted: advsearch resume goes on.\n")
+
+
+def test_region_builds_its_configuration_and_prints_the_box(
+    api: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    given: list[Any] = []
+    api(region_from_config=lambda config, progress, resumed: given.append(config) or REGION)
+    argv = "region --object mug --control pose.yaw,pose.pitch --vary pose.yaw,pose.pitch --map 24 --samples 50 --quiet"
+    assert main(argv.split()) == 0
+    assert given == [
+        RegionConfig(
+            object="mug", controls={"pose.yaw": {}, "pose.pitch": {}}, vary="pose.yaw,pose.pitch", map=24, samples=50
+        )
+    ]
+    assert capsys.readouterr().out == (
+        "The model is wrong in 200 of 200 fresh samples of this box: with 95 % confidence in at least 98.2 % of it.\n\n"
+        "  parameter   from   to     centre   unit\n"
+        "  pose.yaw    10     55.5   30       degrees\n\n"
+        "  share of the space   12 %\n"
+        "  renders              300\n"
+        "  time                 9.0 s\n"
+        "  run                  runs/mug-pose-002\n"
+    )
+
+
+def test_region_takes_scene_and_controls_from_the_run_that_it_goes_around(
+    api: Callable[..., None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    theirs = AttackConfig(
+        object="bowl", controls={"pose": {"yaw": [0, 90]}}, spp=4, seed=7, set={"camera.azimuth": 20}, run="runs/first"
+    )
+    with RunDirectory.create_for(theirs):
+        pass
+    given: list[Any] = []
+    api(region_from_config=lambda config, progress, resumed: given.append(config) or REGION)
+    assert main("region --around first --vary pose.yaw --seed 9 --quiet".split()) == 0
+    (config,) = given
+    assert (config.object, config.controls, config.spp) == ("bowl", {"pose": {"yaw": [0, 90]}}, 4)
+    assert (config.seed, config.run, config.around, config.set_) == (9, None, "first", {"camera.azimuth": 20.0})
+
+
+def test_region_needs_an_object_or_a_run(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["region"]) == 2
+    assert "advsearch region: expected --object NAME, or --around RUN" in capsys.readouterr().err
+
+
+def test_sweep_builds_its_configuration_and_passes_its_ending_on(
+    api: Callable[..., None], capsys: pytest.CaptureFixture[str]
+) -> None:
+    given: list[Any] = []
+    api(sweep_from_config=lambda config, progress: given.append(config) or Result(SWEEP))
+    assert main("sweep --object mug --grid pose.yaw=5:50:8 --grid camera.elevation=10,30 --quiet".split()) == 0
+    assert given == [SweepConfig(object="mug", grid={"pose.yaw": "5:50:8", "camera.elevation": [10, 30]})]
+    assert capsys.readouterr().out.startswith(
+        "The model is right in 6 of 8 configurations (75 %, 95 % interval 35-97 %)."
+    )
+    api(sweep_from_config=lambda config, progress: Result({**SWEEP, "ending": "interrupted"}))
+    assert main("sweep --object mug --grid pose.yaw=5:50:8 --json".split()) == 130
+
+
+@pytest.mark.parametrize(
+    ("config", "called"),
+    [
+        (AttackConfig(object="mug", steps=9), "attack_from_config"),
+        (AttackConfig(object="mug", epsilon=(0.1, 0.2)), "curve_from_config"),
+        (GapConfig(object="mug", average=9), "gap_from_config"),
+        (RegionConfig(object="mug", samples=9), "region_from_config"),
+        (SweepConfig(object="mug", grid={"pose.yaw": [1, 2]}), "sweep_from_config"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_run_does_what_the_command_of_a_file_says(
+    api: Callable[..., None], tmp_path: Path, config: Any, called: str
+) -> None:
+    path = tmp_path / "run.yaml"
+    path.write_text(config.to_yaml())
+    given: list[Any] = []
+    summaries = {"curve_from_config": CURVE, "gap_from_config": GAP, "region_from_config": REGION}
+    answer = summaries.get(called) or Result(SWEEP if called == "sweep_from_config" else SUMMARY)
+    api(**{called: lambda config, **named: given.append(config) or answer})
+    assert main(["run", str(path), "seed=8", "--quiet"]) == 0
+    assert given == [config.model_copy(update={"seed": 8})]
+
+
+# ---- resume, runs, export ----
+
+
+@pytest.fixture
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with one run that is done and one that was killed."""
+    monkeypatch.chdir(tmp_path)
+    make_run(tmp_path / "runs" / "done", pictures=False)
+    with RunDirectory.create_for(AttackConfig(object="mug", controls=["pose"], run="killed")) as run:
+        yaw = {"pose.yaw": {"value": 12.5, "unit": "degrees"}}
+        run.record(Row("search", 0, objective=0.5, success=True, values=yaw), Row("control", 0))
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("config", "called"),
+    [
+        (AttackConfig(object="mug", run="stopped"), "resume_attack"),
+        (AttackConfig(object="mug,bowl", run="stopped"), "curve_from_config"),
+        (GapConfig(object="mug", run="stopped"), "gap_from_config"),
+        (RegionConfig(object="mug", run="stopped"), "region_from_config"),
+        (SweepConfig(object="mug", grid={"pose.yaw": [1, 2]}, run="stopped"), "resume_sweep"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_resume_goes_on_with_what_was_stopped(api: Callable[..., None], runs: Path, config: Any, called: str) -> None:
+    with RunDirectory.create_for(config) as run:
+        run.record(Row("search", 0))
+    resumed: list[Path] = []
+    summaries = {"curve_from_config": CURVE, "gap_from_config": GAP, "region_from_config": REGION}
+    answer = summaries.get(called) or Result(SWEEP if called == "resume_sweep" else SUMMARY)
+
+    def goes_on(first: Any, *, progress: Progress, resumed: Path | None = None) -> Any:
+        found.append(resumed or first)
+        return answer
+
+    found: list[Any] = []
+    api(**{called: goes_on})
+    assert main(["resume", "stopped", "--quiet"]) == 0
+    assert found == [Path("runs/stopped")] and not resumed
+
+
+def test_resume_of_a_run_that_is_done_shows_its_answer(
+    api: Callable[..., None], runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    api()
+    assert main(["resume", "done"]) == 0
+    assert capsys.readouterr() == (answer(SUMMARY) + "\n", "advsearch: runs/done is done already\n")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda folder: None, "unknown run 'gone'. Did you mean 'done'? Known: done, killed. Give a name in runs/"),
+        (lambda folder: RunDirectory.create(folder).close(), "expected a run with its run.yaml, got none"),
+    ],
+)
+def test_what_cannot_be_resumed_is_told(
+    runs: Path, capsys: pytest.CaptureFixture[str], make: Callable[[Path], None], message: str
+) -> None:
+    make(Path("runs/gone"))
+    assert main(["resume", "gone"]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_runs_are_listed(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["runs"]) == 0
+    assert capsys.readouterr().out == (
+        "  run      command   object   controls   rows   state     answer\n"
+        "  done     attack    mug      texture    80     found     20/20\n"
+        "  killed   attack    mug      pose       2      stopped\n"
+    )
+    assert main(["runs", "runs", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["runs"]
+    assert [(one["name"], one["state"], one["rows"]) for one in found] == [
+        ("done", "found", 80),
+        ("killed", "stopped", 2),
+    ]
+
+
+def test_no_runs_and_no_folder_are_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["runs"]) == 0
+    assert capsys.readouterr().out == "no runs in runs/ yet; advsearch attack makes one\n"
+    assert main(["runs", "elsewhere"]) == 2
+    assert "elsewhere: expected a folder with runs in it, got no such folder" in capsys.readouterr().err
+
+
+def test_export_writes_csv_to_standard_output_and_what_a_file_is_called(
+    runs: Path, capfdbinary: pytest.CaptureFixture[bytes]
+) -> None:
+    assert main(["export", "killed"]) == 0
+    head, first, second = capfdbinary.readouterr().out.decode().splitlines()
+    assert head.startswith("id,kind,step,") and "pose.yaw [degrees]" in head.split(",")
+    assert first.startswith("1,search,0,") and second.startswith("2,control,0,")
+    assert main(["export", "killed", "--json", "--kind", "control"]) == 0
+    assert [row["kind"] for row in json.loads(capfdbinary.readouterr().out)] == ["control"]
+    assert main(["export", "killed", "--out", "rows.json"]) == 0
+    assert capfdbinary.readouterr() == (b"", b"2 rows in rows.json\n")
+    assert [row["id"] for row in json.loads(Path("rows.json").read_text())] == [1, 2]
+    assert main(["export", "killed", "--out", "rows.txt", "--format", "csv", "--json"]) == 0
+    told = json.loads(capfdbinary.readouterr().out)
+    assert told == {"schema": 1, "command": "export", "rows": 2, "format": "csv", "out": "rows.txt"}
+    assert Path("rows.txt").read_text().splitlines()[0] == head
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["killed", "--format", "xlsx"], "unknown format 'xlsx'."),
+        (["killed", "--kind", "serch"], "unknown kind of rows 'serch'. Did you mean 'search'"),
+        (["gone"], "unknown run 'gone'."),
+        (["killed", "--json", "--format", "csv"], "--json: prints JSON, but --format asks for csv"),
+        (["killed", "--out", "runs"], "--out: expected the name of a file, got the folder runs"),
+    ],
+)
+def test_what_cannot_be_exported_is_told(
+    runs: Path, capsys: pytest.CaptureFixture[str], argv: list[str], message: str
+) -> None:
+    assert main(["export", *argv]) == 2
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith(f"advsearch: error: {message}")
 
 
 # ---- list, show, doctor ----
@@ -330,11 +641,8 @@ def registries(monkeypatch: pytest.MonkeyPatch) -> None:
 
     put("advsearch.scene.library", list_objects=lambda: ("ball", "mug"), list_environments=lambda: ("studio",))
     put("advsearch.controls", CONTROLS={"camera": Camera()})
-    put("advsearch.attacks", POLICIES={"pgd": Pgd}, OBJECTIVES={"margin": objective_of_a_user})
-
-
-def objective_of_a_user() -> None:
-    """Largest wrong logit minus largest right one."""
+    put("advsearch.attacks", POLICIES={"pgd": Pgd})
+    put("advsearch.attacks.objectives", objective_summaries=lambda: {"margin": "Largest wrong logit."})
 
 
 @pytest.mark.usefixtures("registries")
@@ -349,7 +657,7 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     assert out.startswith("objects:\n  ball\n  mug\n\nenvironments:\n  studio\n")
     assert "policies:\n  pgd   Projected gradient ascent.\n" in out
-    assert "objectives:\n  margin   Largest wrong logit minus largest right one.\n" in out
+    assert "objectives:\n  margin   Largest wrong logit.\n" in out
     assert main(["list", "objects"]) == 0
     assert capsys.readouterr().out == "  ball\n  mug\n"
 
@@ -385,6 +693,25 @@ def test_show_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert json.loads(capsys.readouterr().out) == {"schema": 1, **SUMMARY}
 
 
+@pytest.mark.parametrize(
+    ("summary", "first"),
+    [
+        (GAP, "  object   control   right on average"),
+        (CURVE, "  object   clean right   ending"),
+        (REGION, "The model is wrong in 200 of 200 fresh samples of this box"),
+        (SWEEP, "The model is right in 6 of 8 configurations"),
+    ],
+    ids=["gap", "curve", "region", "sweep"],
+)
+def test_show_prints_what_the_command_printed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], summary: dict[str, Any], first: str
+) -> None:
+    with RunDirectory.create(tmp_path / "run") as run:
+        run.write_summary(summary)
+    assert main(["show", str(tmp_path / "run")]) == 0
+    assert capsys.readouterr().out.startswith(first)
+
+
 @pytest.mark.parametrize("flag", [[], ["--json"]])
 def test_doctor_passes_its_status_on(flag: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     import advsearch.cli
@@ -418,6 +745,32 @@ def test_the_table_is_read_in_five_seconds() -> None:
 def test_the_table_says_what_matters_beside_the_verdict() -> None:
     text = answer(changed(warnings=["A texture is missing."], baseline={"verified": SUMMARY["verified"]}))
     assert text.endswith("adds nothing here.\n\nNote: A texture is missing.")
+
+
+def test_the_table_has_the_average_the_bracket_the_target_and_the_conditions() -> None:
+    summary = changed(**TARGET, over=["camera"], average=AVERAGE, smallest=BRACKET)
+    assert answer(summary) == (
+        "The model calls this mug a vase in 20 of 20 fresh renders (95 % interval 83-100 %), each with another"
+        " camera.\n\n"
+        "  clean           mug                  98 %   right in 20 of 20     83-100 %\n"
+        "  adversarial     vase                 91 %   target in 20 of 20    83-100 %\n"
+        "  random search   40 renders                  target in 1 of 20     0.1-25 %\n"
+        "  average case    200 configurations          right in 150 of 200   68-81 %\n\n"
+        "  wanted     the model should answer vase\n"
+        "  changed    texture within 0.1 (linf)\n"
+        "  over       camera, drawn anew for every picture\n"
+        "  smallest   0.0123; no search found one at 0.0118\n"
+        "  search     pgd, 40 steps: found\n"
+        "  renders    40 of the search, 40 gradients, 21 of the verification\n"
+        "  time       14.6 s\n"
+        "  pictures   runs/mug-texture-001"
+    )
+
+
+def test_easier_to_recognise_is_not_called_wrong() -> None:
+    text = answer(changed(**EASIER))
+    assert "wanted     easier to recognise\n" in text
+    assert "easier in 20 of 20" in text and "wrong in" not in text
 
 
 def test_a_table_of_almost_nothing() -> None:

@@ -8,7 +8,7 @@ import shlex
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 from hypothesis import given
@@ -16,9 +16,10 @@ from hypothesis import settings as examples
 from hypothesis import strategies as st
 
 from advsearch.cli import flags
-from advsearch.config import AttackConfig
+from advsearch.cli.sweep import axes_as_text
+from advsearch.config import AttackConfig, GapConfig, PrecisionConfig, RegionConfig, SweepConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.settings import flag, parse_assignment, read_yaml, settings
+from advsearch.settings import Config, flag, parse_assignment, read_yaml, settings
 
 WRONG: dict[str, tuple[Any, str]] = {
     "object": ("", "expected the name of an object or a .obj, .ply, .glb, .gltf or .stl file, got ''"),
@@ -45,6 +46,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "smallest": (2, "expected true or false, got 2"),
     "over": ({"camera": 3}, "expected names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}, got camera=3"),
     "draws": (0, "expected a whole number from 1 to 1000, got 0"),
+    "average": (-1, "expected a whole number from 0 to 1000000, got -1"),
     "norm": ("l3", "expected linf or l2, got l3"),
     "texture_resolution": (0, "expected a whole number from 2 to 4096, got 0"),
     "estimators": ({"pose": 3}, "expected NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME"),
@@ -71,6 +73,7 @@ GIVEN: dict[str, Any] = {
     "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2", "labels": "labels.json", "label": "coffee mug,cup",
     "controls": {"texture": {}, "pose": {"yaw": [0, 90]}}, "epsilon": {"texture": 0.03, "pose": 2.0},
     "seconds": 20.0, "target": "bowl", "minimise": False, "smallest": False, "over": {"camera": {}}, "draws": 2,
+    "average": 50,
     "norm": "l2", "texture_resolution": 64,
     "estimator": {"pose": "differences", "*": "adjoint"}, "measure": "no",
     "policy": {"name": "pgd", "momentum": 0.9},
@@ -80,11 +83,17 @@ GIVEN: dict[str, Any] = {
 }  # fmt: skip
 
 
-def of_command_line(line: str) -> AttackConfig:
-    """Return the configuration of a shell command ``advsearch attack ...``."""
+Given = TypeVar("Given", bound=Config)
+
+
+def of_command_line(line: str, config: type[Given] = AttackConfig) -> Given:  # type: ignore[assignment]
+    """Return the configuration of a shell command ``advsearch attack ...``, or of another one's."""
     parser = argparse.ArgumentParser(allow_abbrev=False)
-    flags.add_settings(parser)
-    return flags.config_from(parser.parse_args(shlex.split(line)[2:]), AttackConfig)
+    flags.add_settings(parser, config=config)
+    args = parser.parse_args(shlex.split(line)[2:])
+    if "grid" in args:
+        args.grid = axes_as_text(args.grid)
+    return flags.config_from(args, config)
 
 
 @pytest.mark.parametrize("setting", settings(AttackConfig), ids=lambda setting: setting.name)
@@ -134,10 +143,61 @@ def test_every_setting_is_documented_and_has_a_flag_of_its_own() -> None:
     assert {setting.field for setting in known} == set(AttackConfig.model_fields) == set(WRONG)
     assert {setting.name for setting in known} == set(GIVEN)
     assert len({setting.flag for setting in known}) == len(known)
+    assert flag("texture_resolution") == "--texture-resolution"
+
+
+CONFIGS = (AttackConfig, GapConfig, PrecisionConfig, RegionConfig, SweepConfig)
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.command)
+def test_every_setting_of_every_command_says_what_it_is(config: type[Config]) -> None:
+    known = settings(config)
+    assert {setting.field for setting in known} == set(config.model_fields)
+    assert len({setting.flag for setting in known}) == len(known)
     for setting in known:
         assert setting.description and setting.expects and setting.group in flags.GROUPS
         assert setting.required or setting.default is not None or setting.otherwise
-    assert flag("texture_resolution") == "--texture-resolution"
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        GapConfig(object="mug,bowl", controls=["pose", "camera"], average=50, run="x", steps=9),
+        RegionConfig(
+            object="mug", controls="pose", vary="pose.yaw,pose.pitch", map=24, samples=50, around="mug-pose-001"
+        ),
+        SweepConfig(object="mug", grid={"pose.yaw": "0:360:24", "camera.elevation": [5, 50]}, samples=3, batch=2),
+        PrecisionConfig(object="mug", controls="pose", quantities="image", seconds=9.0, depths="2,3"),
+    ],
+    ids=lambda config: config.command,
+)
+def test_every_command_has_the_same_form_in_yaml_and_in_flags(config: Config, tmp_path: Path) -> None:
+    path = tmp_path / "run.yaml"
+    path.write_text(config.to_yaml())
+    assert type(config).from_yaml(path) == config
+    assert read_yaml(path)["command"] == config.command
+    again = of_command_line(config.command_line(), type(config))
+    assert again == config.model_copy(update={"run": None, "overwrite": False})
+    assert shlex.split(config.command_line())[:2] == ["advsearch", config.command]
+
+
+@pytest.mark.parametrize(
+    ("config", "field", "value", "message"),
+    [
+        (GapConfig, "average", 0, "expected a whole number from 1 to 1000000, got 0"),
+        (RegionConfig, "around", 3.5, "expected the name or the folder of a run, got 3.5"),
+        (RegionConfig, "vary", [1], "expected names such as pose.yaw,camera.elevation, got [1]"),
+        (RegionConfig, "samples", 0, "expected a whole number from 1 to 1000000, got 0"),
+        (RegionConfig, "map", 513, "expected a whole number from 0 to 512, got 513"),
+        (RegionConfig, "verify_spp", 0, "expected a whole number from 1 to 65536, got 0"),
+    ],
+)
+def test_a_wrong_value_of_gap_and_region_names_its_flag(
+    config: type[Config], field: str, value: Any, message: str
+) -> None:
+    with pytest.raises(InputError) as error:
+        config.from_flags({"object": "mug", field: value})
+    assert str(error.value) == f"{flag(field)}: {message}"
 
 
 def test_yaml_round_trip_of_everything(tmp_path: Path) -> None:

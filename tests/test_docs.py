@@ -9,7 +9,7 @@ import re
 import shlex
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,21 +20,38 @@ import torch
 from PIL import Image
 
 import advsearch
-from advsearch.api import outcome, stages
-from advsearch.attacks import POLICIES, clopper_pearson, needed, planned_renders, sample_count, trials
-from advsearch.attacks.objectives import OBJECTIVE_KINDS
+import advsearch.config
+from advsearch.api import mapping, outcome, stages, studies
+from advsearch.api.scene import as_controls
+from advsearch.api.sweep_axes import read_axes
+from advsearch.attacks import (
+    POLICIES,
+    clopper_pearson,
+    make_policy,
+    needed,
+    planned_renders,
+    region,
+    sample_count,
+    smallest,
+    trials,
+    verification,
+)
+from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
 from advsearch.attacks.policies import pgd
 from advsearch.cli.flags import config_from
 from advsearch.cli.list import REGISTRIES
 from advsearch.cli.main import COMMANDS, _parse
-from advsearch.config import AttackConfig
-from advsearch.controls import CONTROLS, make_control, texture
+from advsearch.cli.run import COMMANDS as IN_FILES
+from advsearch.cli.sweep import axes_as_text
+from advsearch.config import TRIALS, TRIALS_OVER, AttackConfig, RegionConfig, SceneConfig, SweepConfig
+from advsearch.controls import CONTROLS, texture
 from advsearch.evaluation import reference_scenes
 from advsearch.models import calibration, loading, reference
+from advsearch.runs import directory, export, store
 from advsearch.scene import description, environments, formation, importing, library, mitsuba_scene
 from advsearch.scene.import_images import TEXTURE_LIMIT
 from advsearch.scene.settings import SETTINGS, resolve
-from advsearch.settings import parse_assignment, settings
+from advsearch.settings import parse_assignment, read_yaml, settings
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -61,12 +78,34 @@ def blocks(page: Path, language: str) -> Iterator[str]:
 # ---- everything that has a name is documented -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_a_section_with_an_example(command: str) -> None:
+def section_of(command: str) -> str:
+    """Return what the page about the command line says of a command."""
     page = (DOCS / "command-line.md").read_text("utf-8")
     section = re.search(rf"^## {command}\n(.*?)(?=^## |\Z)", page, re.M | re.S)
     assert section is not None
-    assert f"\nadvsearch {command}" in section[1]
+    return section[1]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_a_section_with_an_example(command: str) -> None:
+    assert f"\nadvsearch {command}" in section_of(command)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_flag_of_every_command_is_in_its_section(command: str) -> None:
+    known = script("make_figures").flags_of(command) - {"--json", "--quiet"}
+    section = section_of(command)
+    assert command != "attack" or len(known) > 30
+    if "All flags of `attack` but" in section:
+        known -= script("make_figures").flags_of("attack")
+    assert not [flag for flag in known if f"`{flag}`" not in section]
+
+
+def test_the_page_says_which_commands_can_be_quiet() -> None:
+    page = " ".join((DOCS / "command-line.md").read_text("utf-8").split())
+    said = page.partition("also take `--quiet`")[2].partition(".")[0]
+    quiet = {command for command in COMMANDS if "--quiet" in script("make_figures").flags_of(command)}
+    assert set(re.findall(r"`([a-z]+)`", said)) == quiet
 
 
 def test_every_flag_of_attack_is_in_the_command_line_page() -> None:
@@ -84,8 +123,25 @@ def test_every_control_has_a_page_with_its_parameters_settings_and_an_example(ki
 
 
 @pytest.mark.parametrize("name", POLICIES)
-def test_every_policy_has_a_page_with_an_example(name: str) -> None:
-    assert f"--policy {name}" in (DOCS / "policies" / f"{name}.md").read_text("utf-8")
+def test_every_policy_has_a_page_or_a_row_with_an_example(name: str) -> None:
+    page, overview = DOCS / "policies" / f"{name}.md", (DOCS / "policies" / "README.md").read_text("utf-8")
+    assert f"\n| [`{name}`]({name}.md) |" in overview if page.exists() else f"\n| `{name}` |" in overview
+    assert f"--policy {name}" in (page.read_text("utf-8") if page.exists() else overview)
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_every_option_of_a_policy_is_in_its_row_with_its_default(name: str) -> None:
+    overview = (DOCS / "policies" / "README.md").read_text("utf-8")
+    row = re.search(rf"^\| \[?`{name}`.*$", overview, re.MULTILINE)
+    assert row is not None
+    options = row[0].rpartition(" | ")[2]
+    said = dict(re.findall(r"`([a-z0-9_]+)` \(([^)]*)\)", options))
+    declared = {one.name: one.default for one in fields(POLICIES[name])}  # type: ignore[arg-type]
+    assert set(said) == set(declared)
+    for option, default in declared.items():
+        if isinstance(default, (bool, int, float)):
+            stated = re.split(r"[:;,]\s*", said[option].rpartition("; ")[2] or said[option])[0].strip("` ")
+            assert stated == f"{default:g}" if not isinstance(default, bool) else stated == str(default).lower()
 
 
 @pytest.mark.parametrize("name", OBJECTIVE_KINDS)
@@ -130,13 +186,42 @@ def test_every_benchmark_is_in_the_table() -> None:
 def test_every_field_of_a_summary_is_in_the_table() -> None:
     page = (DOCS / "design.md").read_text("utf-8")
     said = set(re.findall(r"`([a-z_]+)`", page.partition("### summary.json")[2].partition("\n## ")[0]))
+    written = keys_in(outcome, trials, formation)
+    assert {"verified", "converged", "interval", "denoiser", "average", "smallest", "distribution"} <= written
+    assert not written - said
+
+
+def keys_in(*sources: ModuleType) -> set[str]:
+    """The names under which modules put something into a mapping, or look it up there."""
     written: set[str] = set()
-    for source in (outcome, trials, formation):
+    for source in sources:
         for node in ast.walk(ast.parse(inspect.getsource(source))):
             keys = node.keys if isinstance(node, ast.Dict) else [node.slice] if isinstance(node, ast.Subscript) else []
             written |= {k.value for k in keys if isinstance(k, ast.Constant) and isinstance(k.value, str)}
-    assert {"verified", "converged", "interval", "denoiser"} <= written
+    return written
+
+
+def test_every_field_of_the_summaries_of_other_questions_is_in_their_table() -> None:
+    page = (DOCS / "questions.md").read_text("utf-8")
+    said = set(re.findall(r"`([a-z_]+)`", page.partition("## What is in summary.json")[2]))
+    inside = {"overwrite", "measure", "verify_spp", "value"}  # settings of their attacks, and what a control describes
+    written = keys_in(studies, mapping) - inside
+    assert {"curve", "worst", "box", "volume", "already_wrong"} <= written
     assert not written - said
+
+
+def test_every_column_of_an_exported_table_is_in_the_page_about_runs() -> None:
+    page = (DOCS / "runs.md").read_text("utf-8")
+    said = {name for row in re.findall(r"^\| (`.*?) \|", page, re.M) for name in re.findall(r"`([a-z_]+)`", row)}
+    assert not {*export.OWN, *export.AFTER} - said
+    assert {*export.OWN, *export.AFTER, "values"} == {one.name for one in fields(store.Row)}
+    assert all(f"`{format}`" in page for format in export.FORMATS)
+
+
+def test_everything_that_a_run_writes_is_in_the_page_about_runs() -> None:
+    page = (DOCS / "runs.md").read_text("utf-8").partition("## What survives")[0]
+    stems = [name.removesuffix("-journal").removesuffix("-wal").removesuffix("-shm") for name in directory.CONTENTS]
+    assert not [stem for stem in stems if f"`{stem}" not in page]
 
 
 # ---- what is made from the code is up to date -----------------------------------------------------------------------
@@ -150,7 +235,8 @@ def test_the_made_parts_are_up_to_date() -> None:
 def test_every_control_and_policy_with_options_has_a_made_part() -> None:
     made = script("make_figures").PARTS
     pages = [f"controls/{kind}.md" for kind in CONTROLS]
-    pages += [f"policies/{name}.md" for name in POLICIES if inspect.signature(POLICIES[name]).parameters]
+    own_pages = [name for name in POLICIES if (DOCS / "policies" / f"{name}.md").exists()]
+    pages += [f"policies/{name}.md" for name in own_pages if inspect.signature(POLICIES[name]).parameters]
     assert not [page for page in pages if page not in {page for page, _ in made}]
     for path in PAGES[1:]:
         page = path.relative_to(DOCS).as_posix()
@@ -158,15 +244,36 @@ def test_every_control_and_policy_with_options_has_a_made_part() -> None:
         assert set(marked) == {name for known, name in made if known == page}
 
 
+def default_of(function: Any, name: str) -> Any:
+    """Return the default of a parameter."""
+    return inspect.signature(function).parameters[name].default
+
+
 MADE_BY_HAND = [
     ("design.md", f"**First look**: {stages.FIRST_LOOK} renders of the clean scene"),
     ("design.md", f"That makes `steps` + {planned_renders(0)} renders"),
     ("design.md", f"at {', '.join(map(str, sample_count.LADDER[:-1]))} and {sample_count.LADDER[-1]} samples a pixel"),
     ("design.md", f"is at most {sample_count.DRIFT} of the margin itself"),
-    ("design.md", f"**Trials**: {AttackConfig.model_fields['trials'].default} renders"),
+    ("design.md", f"**Trials**: {TRIALS} renders (`--trials`; {TRIALS_OVER} with `--over`)"),
+    ("design.md", f"must reach {verification.PASS_PERCENT_OVER} % of the trials in which the clean scene is right"),
     ("design.md", f"rounded up: {needed(20)} of 20"),
     ("design.md", f"20 of 20 means a true rate of at least {100 * clopper_pearson(20, 20)[0]:.0f} %"),
     ("design.md", f"at most {mitsuba_scene.MAX_DEPTH} segments"),
+    ("questions.md", {8: "Eight renders of the best configurations"}[planned_renders(0)]),
+    ("questions.md", f"**Verified** by {TRIALS} fresh renders"),
+    ("questions.md", f"until they are within {100 * (smallest.RATIO - 1):.0f} % of each other"),
+    ("questions.md", {12: "or twelve searches are done"}[default_of(smallest.smallest, "rounds")]),
+    ("questions.md", f"What counts on the way is {TRIALS} trials"),
+    ("questions.md", f"**Verified** on {TRIALS_OVER} conditions"),
+    ("questions.md", f"needs {verification.PASS_PERCENT_OVER} % of those that count"),
+    ("questions.md", {8: "in one to eight parameters"}[mapping.MOST]),
+    ("questions.md", {8: "as long as eight random pictures"}[default_of(region.grow, "probes")]),
+    ("questions.md", {4: "with other seeds, up to four times"}[default_of(region.grow, "attempts")]),
+    ("questions.md", f"First {mapping.AT_CENTRE} trials of the centre"),
+    ("questions.md", f"Then {RegionConfig.model_fields['samples'].default} fresh samples"),
+    ("questions.md", f"an exception in {100 * (1 - clopper_pearson(200, 200)[0]):.1f} % of the box at most"),
+    ("runs.md", {1.0: "may lose the rows of the last second"}[store.SYNC_INTERVAL]),
+    ("runs.md", f"more than {100 * store.SYNC_SHARE:.0f} % of the time"),
     ("scenes.md", f"gets the linear value {description.METERED_WHITE}"),
     ("scenes.md", f"averaged down to at most {TEXTURE_LIMIT} texels"),
     ("scenes.md", "Maps larger than {1} x {0} are".format(*environments.LARGEST)),
@@ -241,26 +348,44 @@ def lines(page: Path) -> list[list[str]]:
     return [words for line in joined if (words := shlex.split(line, comments=True))]
 
 
-def check_names(config: AttackConfig) -> None:
-    """Look up every name in a configuration, as `attack` would; nothing is loaded."""
-    for kind, given in config.controls.items():
-        make_control(kind, given)
+CONFIGS: dict[str, type[SceneConfig]] = {"attack": AttackConfig, **script("make_figures").CONFIGS}
+"""What the flags of a command become."""
+
+
+def check_names(config: SceneConfig) -> None:
+    """Look up every name in a configuration, as its command would; nothing is loaded."""
+    as_controls(config.controls)
     resolve(config.set_)  # type: ignore[arg-type]
-    assert config.policy in POLICIES and config.objective in OBJECTIVE_KINDS
-    assert config.object in library.list_objects() or Path(config.object).suffix in importing.SUFFIXES
-    assert config.environment in library.list_environments() or Path(config.environment).suffix in environments.SUFFIXES
-    assert config.label is not None or config.object in library.list_objects(), "a file does not bring a label"
+    lights = config.environments if isinstance(config, SweepConfig) else (config.environment,)
+    for name in config.objects:
+        assert name in library.list_objects() or Path(name).suffix in importing.SUFFIXES
+        assert config.label is not None or name in library.list_objects(), "a file does not bring a label"
+    for name in lights:
+        assert name in library.list_environments() or Path(name).suffix in environments.SUFFIXES
+    if isinstance(config, AttackConfig):
+        as_controls(config.over)
+        make_policy(config.policy_name, **config.policy_options)
+        check_objective(config.objective, targeted=config.target is not None, minimise=config.minimise)
+        known = script("make_figures").stored_record()["labels"]
+        assert config.model != "reference" or set((config.target or known[0]).split(",")) <= set(known)
+    if isinstance(config, SweepConfig):
+        read_axes(config.grid, as_controls(config.controls))
 
 
 def check_advsearch(words: list[str], folder: Path) -> None:
     """Parse a command with the real parser, and read its settings."""
     args = _parse(words, words[0])
-    if args.command == "attack":
-        check_names(config_from(args, AttackConfig))
+    if args.command in CONFIGS:
+        if "grid" in args:
+            args.grid = axes_as_text(args.grid)
+        otherwise = {} if args.command in ("attack", "sweep", "gap") else {"object": "mug"}
+        check_names(config_from(args, CONFIGS[args.command], **otherwise))
     if args.command == "run":
         recipe = folder / "run.yaml"
         recipe.write_text("object: mug\n", encoding="utf-8")
         check_names(AttackConfig.from_yaml(recipe, dict(parse_assignment(text, text) for text in args.change)))
+    if args.command == "export":
+        assert args.format in (None, *export.FORMATS)
 
 
 def check_other(words: list[str]) -> None:
@@ -289,15 +414,18 @@ def test_every_command_in_an_example_is_one_that_the_tools_take(page: Path, tmp_
 @every_page
 def test_every_yaml_example_is_a_configuration(page: Path, tmp_path: Path) -> None:
     for block in blocks(page, "yaml"):
-        path = tmp_path / "example.yaml"
+        named = re.match(r"# (\S+\.yaml)\n", block)  # others on the page may build on it
+        path = tmp_path / (named[1] if named else "example.yaml")
         path.write_text(block, encoding="utf-8")
-        check_names(AttackConfig.from_yaml(path))
+        config = getattr(advsearch.config, IN_FILES[read_yaml(path).get("command", "attack")])
+        check_names(config.from_yaml(path))
 
 
 def parameters(call: str) -> set[str]:
     """Return the keywords that a function of `advsearch` takes."""
+    options = {"attack": AttackConfig, "sweep": SweepConfig}
     own = set(inspect.signature(getattr(advsearch, call)).parameters)
-    return own | set(AttackConfig.model_fields) if call == "attack" else own
+    return own | set(options[call].model_fields) if call in options else own
 
 
 @every_page

@@ -198,13 +198,14 @@ def test_a_steeper_slope_agrees_only_where_theory_allows_it() -> None:
     assert strict.agrees is False and free.agrees is True
 
 
-def test_a_fixed_cost_explains_a_slope_against_seconds() -> None:
-    points = measured(exact(), fixed=0.1)
-    assert fixed_seconds(points) == pytest.approx(0.1, rel=1e-6)
+def test_a_fixed_cost_keeps_points_out_of_the_slope_against_seconds() -> None:
+    points = measured(exact(), fixed=0.01)
+    assert fixed_seconds(points) == pytest.approx(0.01, rel=1e-6)
     line = fit(points, "seconds", INDEPENDENT)
-    assert line is not None and line.agrees is not True
-    if line.agrees is False:
-        assert "don't depend on the samples" in str(warning_of(line, points))
+    assert line is not None and line.points == 3 and line.fixed == pytest.approx(0.01)
+    assert line.agrees is True and line.value == pytest.approx(-0.5, abs=0.1)
+    slow = fit(measured(exact(), fixed=1.0), "seconds", INDEPENDENT)
+    assert slow is not None and slow.points == 5 and slow.value < -1.0 and slow.agrees is None
 
 
 def test_a_line_needs_three_known_points() -> None:
@@ -222,9 +223,21 @@ def error_at(samples: float) -> float:
 @pytest.mark.parametrize("goal", [0.3, 0.1, 0.05])
 def test_a_recommended_count_reaches_its_goal(goal: float) -> None:
     found = reaching(measured(exact()), goal)
-    assert found is not None and found.basis == "interpolated"
+    assert found is not None and found.basis in ("interpolated", "fitted")
     assert error_at(found.spp) == pytest.approx(goal, rel=0.1)
     assert found.seconds == pytest.approx(1e-3 * found.spp, rel=0.01)
+
+
+def test_a_line_that_explains_all_points_overrules_a_lucky_one() -> None:
+    def point(spp: int, error: float) -> Point:
+        return Point(setting(spp), "error", error, (0.5 * error, 2.0 * error), True, 0.0, 1e-3 * spp, 6)
+
+    true = [point(spp, spp**-0.5) for spp in (4, 16, 64, 256)]
+    lucky = [point(8, 0.7 * 8**-0.5), *true]
+    found = reaching(lucky, 0.1)
+    assert found is not None and found.basis == "fitted" and found.spp == pytest.approx(100, rel=0.15)
+    bent = [Point(one.setting, "error", max(one.error, 0.2), (0.19, 0.21), True, 0.0, 1.0, 6) for one in true]
+    assert reaching(bent, 0.1) is None
 
 
 def test_beyond_the_last_point_it_says_so_and_not_too_far() -> None:

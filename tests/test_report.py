@@ -128,9 +128,41 @@ def test_the_page_says_it_all(tmp_path: Path) -> None:
     ):
         assert text in page.text, text
     text = page.text
-    for empty in ("texture: {}", "set: {}", "estimator: {}"):
+    for empty in ("texture: {}", "set: {}", "estimator: {}", "over: {}"):
         text = text.replace(empty, "")
     assert not re.search(r"None|nan|\{|\}|\$", text)
+
+
+AVERAGE = {"configurations": 200, "correct": 150, "accuracy": 0.75, "interval": [0.684, 0.8084], "margin": -1.0,
+           "worst_margin": 2.5}  # fmt: skip
+BRACKET = {"epsilon": {"texture": 0.01234}, "not_found_at": {"texture": 0.0118}, "closed": True, "searches": 7,
+           "checks": 40}  # fmt: skip
+TARGET = {"goal": "a target answer", "target": ["vase"]}
+EASIER = {"goal": "a right answer", "target": None}
+ANY = {"goal": "a wrong answer", "target": None, "over": []}
+
+
+def test_the_page_says_what_was_asked_beside_the_worst_case(tmp_path: Path) -> None:
+    summary = changed(**TARGET, over=["camera", "environment"], average=AVERAGE, smallest=BRACKET)
+    page = page_of(make_run(tmp_path / "run", summary))
+    for text in (
+        "in 20 of 20 fresh renders (95 % interval 83-100 %), each with another camera and environment.",
+        "Adversarial target 20 of 20 83-100 %",
+        "Random search target 1 of 20 0.1-25 %",
+        "Average case (random configurations) right 150 of 200 68-81 %",
+        "Goal the model should answer vase",
+        "Over camera and environment, drawn anew for every picture",
+        "Smallest epsilon 0.0123; no search found one at 0.0118",
+    ):
+        assert text in page.text, text
+    assert "above: target" in [part.strip() for part in page.words]
+    bars = [svg for svg in page.all("svg") if svg.get("aria-hidden") == "true"]
+    assert len(bars) == 4
+
+
+def test_the_page_does_not_say_what_was_not_asked(tmp_path: Path) -> None:
+    text = page_of(make_run(tmp_path / "run", changed(**ANY))).text
+    assert not re.search(r"Goal|Over |Smallest epsilon|Average case", text)
 
 
 def test_the_page_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
@@ -285,18 +317,88 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
         ({"ending": "interrupted", "verified": None}, "Interrupted after 40 steps; nothing is verified."),
         ({"ending": "interrupted", "steps": 1}, f"Interrupted; so far the model is wrong about this mug in {ALL}"),
         ({"ending": "stalled", "verified": {}, "steps": 1}, "Stalled after 1 step; nothing is verified."),
+        (TARGET, f"The model calls this mug a vase in {ALL}"),
+        (
+            {
+                **TARGET,
+                "target": ["vase", "iron"],
+                "verified": {**SUMMARY["verified"], "labels": {"iron": 12, "vase": 8}},
+            },
+            f"The model takes this mug for one of the targets, most often calling it an iron, in {ALL}",
+        ),
+        (
+            {**TARGET, "target": ["vase", "iron"], "ending": "budget spent", "verified": rated(2, 0.012, 0.317)},
+            "No texture within 0.1 (linf) was found that makes the model call this mug a vase or an iron: the model"
+            " calls this mug a vase or an iron in 2 of 20 fresh renders (95 % interval 1-32 %). The budget is spent.",
+        ),
+        (
+            {**TARGET, "ending": "not verified", "verified": rated(3, 0.032, 0.379)},
+            "The search claims an answer that is not confirmed: the model calls this mug a vase in 3 of 20 fresh"
+            " renders (95 % interval 3-38 %).",
+        ),
+        (
+            {**EASIER, "verified": {**SUMMARY["verified"], "labels": {"mug": 20}}},
+            f"The model recognises this mug, more surely than in the clean scene, in {ALL}",
+        ),
+        (
+            {**EASIER, "ending": "stalled", "verified": rated(3, 0.032, 0.379)},
+            "No texture within 0.1 (linf) was found that makes this mug easier to recognise: the model recognises this"
+            " mug, more surely than in the clean scene, in 3 of 20 fresh renders (95 % interval 3-38 %). The policy had"
+            " nothing more to propose.",
+        ),
+        (
+            {"over": ["camera"]},
+            "The model calls this mug a vase in 20 of 20 fresh renders (95 % interval 83-100 %), each with another"
+            " camera.",
+        ),
     ],
 )
 def test_the_verdict_says_what_is_known_and_no_more(fields: dict[str, Any], sentence: str) -> None:
     assert wording.verdict(changed(**fields)) == sentence
 
 
-def test_every_ending_has_a_verdict() -> None:
+@pytest.mark.parametrize("goal", [ANY, TARGET, EASIER], ids=["wrong", "target", "easier"])
+def test_every_ending_has_a_verdict(goal: dict[str, Any]) -> None:
     from advsearch.attacks.ending import Ending
 
-    said = [wording.verdict(changed(ending=ending.value)) for ending in Ending]
+    said = [wording.verdict(changed(ending=ending.value, **goal)) for ending in Ending]
     assert len(set(said)) == len(said)
     assert all("mug" in text for text in said)
+
+
+@pytest.mark.parametrize(
+    ("bracket", "text"),
+    [
+        ({}, "0.0123; no search found one at 0.0118"),
+        ({"closed": False}, "0.0123; no search found one at 0.0118; the searches did not suffice to bring the two"
+                            " together"),
+        ({"not_found_at": None, "closed": False}, "0.0123; no search failed, so it may be smaller still"),
+        ({"epsilon": None, "not_found_at": {"texture": 0.1}, "closed": False}, "none found up to 0.1"),
+        (
+            {"epsilon": {"texture": 0.02, "geometry": 0.004}, "not_found_at": {"texture": 0.0195, "geometry": 0.0039}},
+            "texture 0.02, geometry 0.004; no search found one at texture 0.0195, geometry 0.0039",
+        ),
+    ],
+)  # fmt: skip
+def test_a_bracket_says_what_is_known_of_both_ends(bracket: dict[str, Any], text: str) -> None:
+    assert wording.smallest_text(changed(smallest={**BRACKET, **bracket})) == text
+    assert wording.smallest_text(SUMMARY) == ""
+
+
+def test_several_controls_have_a_budget_each() -> None:
+    several = changed(
+        controls=["texture", "pose"], epsilon={"texture": 0.05, "pose": None}, norm={"texture": "l2", "pose": None}
+    )
+    assert wording.budget_text(several) == "texture within 0.05 (l2) and pose"
+    assert wording.budget_text(changed(controls=["pose", "light"], epsilon=None)) == "pose and light"
+
+
+def test_conditions_that_the_clean_scene_fails_are_said_not_to_count() -> None:
+    clean = {"control": {"correct": 188, "trials": 200}}
+    said = "The clean scene itself fails 12 of its 200 trials."
+    assert wording.remarks(changed(clean=clean, baseline={}, over=["camera"])) == [f"{said} They do not count."]
+    assert wording.remarks(changed(clean=clean, baseline={})) == [said]
+    assert wording.remarks(changed(clean=clean, baseline={}, **EASIER)) == []
 
 
 @pytest.mark.parametrize(

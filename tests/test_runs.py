@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import enum
 import errno
+import io
 import json
 import math
 import os
@@ -18,6 +20,8 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
+import pyarrow
+import pyarrow.parquet
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -26,9 +30,11 @@ from advsearch.config import AttackConfig
 from advsearch.errors import FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
 from advsearch.runs import directory, images
 from advsearch.runs.directory import RunDirectory, default_name, find_run, run_path
+from advsearch.runs.export import FORMATS, export
 from advsearch.runs.files import PART, replacing, write_bytes, write_text
+from advsearch.runs.listing import finished, listed
 from advsearch.runs.lock import RunLock
-from advsearch.runs.store import Row, Store
+from advsearch.runs.store import MIGRATIONS, Row, Store
 from advsearch.runs.summary import plain, read_summary, to_json
 
 WRITER = """
@@ -124,7 +130,7 @@ def test_the_store_is_readable_beside_the_writer(run: RunDirectory) -> None:
 
 def test_the_file_is_versioned_commented_and_in_wal_mode(run: RunDirectory) -> None:
     with sqlite3.connect(run.path / "results.sqlite") as db:
-        assert db.execute("PRAGMA user_version").fetchone() == (1,)
+        assert db.execute("PRAGMA user_version").fetchone() == (2,)
         assert db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
         (schema,) = db.execute("SELECT sql FROM sqlite_master WHERE name = 'evaluations'").fetchone()
         meta = dict(db.execute("SELECT key, value FROM meta"))
@@ -142,6 +148,53 @@ def test_a_closed_run_is_one_file_and_opens_again(tmp_path: Path) -> None:
         assert store.count() == 2
 
 
+def test_a_file_of_version_1_is_brought_up_to_date(tmp_path: Path) -> None:
+    path = tmp_path / "results.sqlite"
+    db = sqlite3.connect(path)
+    db.executescript(f"BEGIN; {MIGRATIONS[0]} PRAGMA user_version = 1; COMMIT;")
+    with db:
+        columns = (
+            "kind, step, seed, spp, objective, success, label, label_index, probability, values_json, seconds, time"
+        )
+        given = (
+            "search",
+            3,
+            7,
+            8,
+            -0.25,
+            1,
+            "bowl",
+            2,
+            0.5,
+            '{"a.b": {"value": 1.5, "unit": "degrees"}}',
+            0.125,
+            1.7e9,
+        )
+        db.execute(f"INSERT INTO evaluations ({columns}) VALUES ({', '.join('?' * len(given))})", given)
+    db.close()
+    with pytest.raises(FileFormatError, match="expected version 2 of the results, got 1; it is not a finished"):
+        Store(path, read_only=True)  # reading changes nothing
+    with Store(path) as store:
+        store.append([Row("search", 4, renders=13)])
+        old, new = store.rows()
+        assert (old.step, old.seed, old.objective, old.success, old.label, old.time) == (
+            3,
+            7,
+            -0.25,
+            True,
+            "bowl",
+            1.7e9,
+        )
+        assert old.values == {"a.b": {"value": 1.5, "unit": "degrees"}} and old.seconds == 0.125
+        assert (old.renders, new.renders) == (None, 13)  # nobody counted then
+        assert store.note("created") is not None
+    with sqlite3.connect(path) as db:
+        assert db.execute("PRAGMA user_version").fetchone() == (2,)
+    db.close()
+    with Store(path) as store:  # and not again
+        assert [row.renders for row in store.rows()] == [None, 13]
+
+
 def test_results_of_another_advsearch_or_none_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "results.sqlite"
     with pytest.raises(FileFormatError, match=r"expected the results of a run, got no such file; check the name"):
@@ -157,7 +210,7 @@ def test_results_of_another_advsearch_or_none_are_refused(tmp_path: Path) -> Non
     with sqlite3.connect(path) as db:
         db.execute("PRAGMA user_version = 99")
     db.close()
-    with pytest.raises(FileFormatError, match=r"expected version 1 of the results, got 99; use a newer advsearch"):
+    with pytest.raises(FileFormatError, match=r"expected version 2 of the results, got 99; use a newer advsearch"):
         Store(path)
 
 
@@ -579,3 +632,129 @@ def test_text_is_on_the_disk_when_it_is_written_and_pictures_do_not_wait(
     assert len(forced) == 0
     run.write_summary({})
     assert len(forced) == 2  # the file and its folder
+
+
+# ---- the rows as a table ----
+
+
+@pytest.fixture
+def filled(run: RunDirectory) -> Store:
+    """Rows of three kinds; the values of the second have a column more, and a list."""
+    yaw = {"pose.yaw": {"value": 0.1, "unit": "degrees"}}
+    target = {
+        "camera.target": {"value": [0.5, -1.0], "unit": "sizes"},
+        "backdrop.which": {"value": 'a,"b"\n', "unit": ""},
+    }
+    run.record(
+        Row("search", 0, seed=2**63 - 1, spp=8, objective=0.1 + 0.2, success=True, label="bowl", label_index=2,
+            probability=0.5, values=yaw, seconds=0.25, renders=1),
+        Row("search", 1, objective=math.nan, success=False, label="mug", values={**yaw, **target}, renders=13),
+        Row("control", 0, spp=64, success=None),
+    )  # fmt: skip
+    return run.store
+
+
+COLUMNS = [
+    "id", "kind", "step", "seed", "spp", "objective", "success", "label", "label_index", "probability",
+    "pose.yaw [degrees]", "camera.target[0] [sizes]", "camera.target[1] [sizes]", "backdrop.which",
+    "renders", "seconds", "time",
+]  # fmt: skip
+
+
+def exported(store: Store, format: str, kind: str | None = None) -> bytes:
+    """The bytes that standard output would get."""
+    stream = io.BytesIO()
+    export(store, format, None, stream, kind)
+    return stream.getvalue()
+
+
+def test_csv_has_a_column_for_each_value_with_its_unit_and_rows_in_their_order(filled: Store) -> None:
+    first, second, third = csv.DictReader(io.StringIO(exported(filled, "csv").decode(), newline=""))
+    assert list(first) == COLUMNS
+    assert [row["id"] for row in (first, second, third)] == ["1", "2", "3"]
+    assert (first["seed"], first["success"], second["success"], third["success"]) == (str(2**63 - 1), "1", "0", "")
+    assert float(first["objective"]) == 0.1 + 0.2 and second["objective"] == ""
+    assert (second["camera.target[1] [sizes]"], second["backdrop.which"]) == ("-1.0", 'a,"b"\n')
+    assert (first["camera.target[0] [sizes]"], third["pose.yaw [degrees]"], second["renders"]) == ("", "", "13")
+
+
+def test_json_and_parquet_have_the_same_rows(filled: Store, tmp_path: Path) -> None:
+    rows = json.loads(exported(filled, "json"))
+    assert [list(row) for row in rows] == [COLUMNS] * 3
+    assert rows[0]["objective"] == 0.1 + 0.2 and rows[0]["success"] is True and rows[1]["objective"] is None
+    assert rows[2]["success"] is None and rows[1]["camera.target[0] [sizes]"] == 0.5
+    out = tmp_path / "rows.parquet"
+    assert export(filled, "parquet", out, io.BytesIO()) == 3
+    table = pyarrow.parquet.read_table(out)
+    assert table.column_names == COLUMNS and table.to_pylist() == rows
+    assert str(table.schema.field("seed").type) == "int64" and str(table.schema.field("success").type) == "bool"
+
+
+def test_one_kind_of_rows_alone(filled: Store) -> None:
+    rows = json.loads(exported(filled, "json", "control"))
+    assert [row["kind"] for row in rows] == ["control"]
+    assert not [name for name in rows[0] if name.startswith("pose")]
+    with pytest.raises(UnknownNameError, match=r"unknown kind of rows 'serch'\. Did you mean 'search'"):
+        exported(filled, "csv", "serch")
+    with pytest.raises(UnknownNameError, match=r"unknown format 'xlsx'\..*Known: csv, json, parquet"):
+        exported(filled, "xlsx")
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_a_run_without_rows_is_a_table_without_lines(run: RunDirectory, tmp_path: Path, format: str) -> None:
+    out = tmp_path / f"rows.{format}"
+    assert export(run.store, format, out, io.BytesIO()) == 0
+    assert out.stat().st_size > 0
+
+
+def test_without_pyarrow_parquet_says_what_to_do_and_leaves_nothing(
+    filled: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    (tmp_path / "rows.parquet").write_text("mine")
+    with pytest.raises(InputError, match="--format parquet: needs pyarrow; pip install pyarrow, or choose csv or json"):
+        export(filled, "parquet", tmp_path / "rows.parquet", io.BytesIO())
+    assert (tmp_path / "rows.parquet").read_text() == "mine"
+    assert not list(tmp_path.glob(f"{PART}*"))
+
+
+def test_parquet_takes_more_rows_than_one_group(
+    run: RunDirectory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("advsearch.runs.export.GROUP", 4)
+    run.record(*(Row("sweep", step, values={"p": {"value": step / 3, "unit": ""}}) for step in range(11)))
+    export(run.store, "parquet", tmp_path / "rows.parquet", io.BytesIO())
+    file = pyarrow.parquet.ParquetFile(tmp_path / "rows.parquet")
+    assert file.num_row_groups == 3
+    assert file.read().column("p").to_pylist() == [step / 3 for step in range(11)]
+
+
+# ---- the runs at a glance ----
+
+
+def test_runs_are_listed_with_their_state(home: Path) -> None:
+    def make(name: str, summary: dict[str, Any] | None, rows: int = 2) -> None:
+        with RunDirectory.create_for(AttackConfig(object="mug", controls=["pose"], run=name)) as run:
+            run.record(*(Row("search", step) for step in range(rows)))
+            if summary is not None:
+                run.write_summary(summary)
+
+    make("b-found", {"ending": "found", "verified": {"successes": 19, "trials": 20}, "controls": ["pose", "light"]})
+    make("a-killed", None, rows=3)
+    make("c-ctrl-c", {"ending": "interrupted"})
+    make("d-sweep", {"ending": "finished", "accuracy": 0.875})
+    Path("runs/e-damaged").mkdir()
+    Path("runs/e-damaged/results.sqlite").write_bytes(Path("runs/a-killed/results.sqlite").read_bytes()[:100])
+    Path("runs/not-a-run").mkdir()
+    with RunDirectory.resume("c-ctrl-c"):
+        during = {one.name: one.state for one in listed(Path("runs"))}
+    found = listed(Path("runs"))
+    assert [one.name for one in found] == ["a-killed", "b-found", "c-ctrl-c", "d-sweep", "e-damaged"]
+    assert [one.state for one in found] == ["stopped", "found", "stopped", "finished", "stopped"]
+    assert during["c-ctrl-c"] == "running" and during["b-found"] == "found"
+    assert [one.rows for one in found] == [3, 2, 2, 2, 0]
+    assert [one.answer for one in found] == ["", "19/20", "", "accuracy 87.5%", ""]
+    assert found[1].controls == ("pose", "light") and found[0].controls == ("pose",)
+    assert (found[0].object, found[0].command, found[4].object) == ("mug", "attack", "?")
+    assert [finished(Path(one.path)) for one in found] == [False, True, False, True, False]
+    assert listed(Path("nowhere")) == []

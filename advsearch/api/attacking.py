@@ -24,12 +24,15 @@ from advsearch.attacks.goal import Goal
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
 from advsearch.config import AttackConfig
 from advsearch.controls import CONTROLS, make_space
-from advsearch.errors import InputError
+from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import LabelSet, Model, ModelWarning, load_model
 from advsearch.models.features import features_of
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import CONFIG, RunDirectory, check_free, find_run, is_run, run_path
 from advsearch.scene.renderer import Renderer
+
+OVER_CONDITIONS = {"momentum": 0.9, "step_size": 0.2}
+"""Options of `pgd` where conditions vary."""
 
 CLEAN_SPP = 64
 """Samples a pixel of the clean picture that an objective compares features with."""
@@ -147,6 +150,7 @@ class _Job:
 
 def _job(config: AttackConfig) -> _Job:
     """Find and load everything that a configuration names."""
+    _check_budgets(config)
     controls = as_controls({kind: _control_settings(kind, config, given) for kind, given in config.controls.items()})
     over = as_controls(config.over)
     check_objective(config.objective, targeted=config.target is not None, minimise=config.minimise)
@@ -174,13 +178,35 @@ def _model(model: Model | nn.Module | str | Path, config: AttackConfig) -> tuple
     return loaded, said
 
 
+def instance_name(asked: str) -> str:
+    """The name of an instance as it is asked for: `key` of `light:key`, `camera` of `camera.azimuth`."""
+    kind, _, own = asked.partition(":")
+    return (own or kind).partition(".")[0]
+
+
+def _check_budgets(config: AttackConfig) -> None:
+    """Refuse a budget for a control that is not searched, or that has none."""
+    if not isinstance(config.epsilon, dict):
+        return
+    known = {instance_name(asked): asked for asked in config.controls}
+    for name in config.epsilon:
+        if name not in known:
+            raise UnknownNameError("control in --epsilon", name, known)
+        kind = str(config.controls[known[name]].get("kind") or known[name].partition(":")[0].partition(".")[0])
+        if kind in CONTROLS and "epsilon" not in {choice.name for choice in CONTROLS[kind].choices}:
+            raise InputError(
+                f"--epsilon {name}: the control has ranges and no epsilon; give its ranges, as in "
+                f"--control '{name}={{PARAMETER: [LOW, HIGH]}}'"
+            )
+
+
 def _control_settings(asked: str, config: AttackConfig, given: Mapping[str, Any]) -> dict[str, Any]:
     """Settings of one control: its own over the run's `epsilon`, `norm` and `texture_resolution`."""
     kind = str(given.get("kind") or asked.partition(":")[0].partition(".")[0])
     if kind not in CONTROLS:
         return dict(given)
     known = {choice.name for choice in CONTROLS[kind].choices}
-    epsilon = config.epsilon_of(str(given.get("name") or asked))
+    epsilon = config.epsilon_of(instance_name(asked))
     shared = {"epsilon": epsilon, "norm": config.norm, "resolution": config.texture_resolution}
     if kind != "texture":
         shared = {"epsilon": epsilon}
@@ -270,12 +296,22 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
     said = [*job.scene.description.object.warnings, *job.scene.description.environment.warnings, *job.loaded[1]]
     for text in said:
         progress.message(text)
-    policy = make_policy(job.policy, **_policy_options(job.config)) if isinstance(job.policy, str) else job.policy
+    policy = _policy(job, problem)
     with _directory(job, run) as kept:
         memory = Memory(kept)
         attack = Attack(problem, job.config, policy, Recorder(kept, problem, memory), memory, stages)
         findings = attack.carry_out()
         return summarise(job.config, problem, findings, attack.recorder, stages, said)
+
+
+def _policy(job: _Job, problem: Problem) -> Policy[Any]:
+    """The policy. Where conditions vary, every gradient is one of others, so `auto` follows a longer mean of them."""
+    if not isinstance(job.policy, str):
+        return job.policy
+    balls = all(block.norm != "box" for block in problem.domain.blocks)
+    if job.policy == "auto" and problem.conditions is not None and balls:
+        return make_policy("pgd", **OVER_CONDITIONS)
+    return make_policy(job.policy, **_policy_options(job.config))
 
 
 def _go_on(job: _Job, run: str | Path, progress: Progress) -> AttackResult:

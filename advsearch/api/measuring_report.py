@@ -142,8 +142,8 @@ def _objective_points(section: Section) -> list[dict[str, Any]]:
 
 
 def _best(section: Section) -> float:
-    """The best verified objective of any policy: the upper quartile stands in for the best seed."""
-    tops = [values[-1] for _, curve in section.curves for values in curve.objective]
+    """The best median of any policy."""
+    tops = [middle for _, curve in section.curves for _, middle, _ in curve.objective]
     return max((value for value in tops if math.isfinite(value)), default=math.nan)
 
 
@@ -164,6 +164,7 @@ def _slope(one: Slope) -> dict[str, Any]:
         "interval": list(one.interval),
         "offset": one.offset,
         "points": one.points,
+        "fixed_seconds": one.fixed,
         "theory": one.theory.slope,
         "or_steeper": one.theory.at_most,
         "agrees": one.agrees,

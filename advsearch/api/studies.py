@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from advsearch.api.attacking import attack_from_config, resume_attack
+from advsearch.api.attacking import attack_from_config, instance_name, resume_attack
 from advsearch.attacks import clopper_pearson
 from advsearch.config import AttackConfig, GapConfig
 from advsearch.errors import InputError
@@ -185,7 +185,10 @@ def _gap(config: GapConfig, parts: _Parts) -> Summary:
     rows = []
     for name in config.objects:
         for control, settings in config.controls.items():
-            one = _as_attack(config, object=name, controls={control: settings})
+            epsilon = config.epsilon
+            if isinstance(epsilon, dict):
+                epsilon = {own: value for own, value in epsilon.items() if own == instance_name(control)} or None
+            one = _as_attack(config, object=name, controls={control: settings}, epsilon=epsilon)
             summary = parts.attack(one, default_name(name, [control]))
             if summary is not None:
                 rows.append(_compared(name, control, summary))

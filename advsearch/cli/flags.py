@@ -80,7 +80,7 @@ def config_from(args: argparse.Namespace, config: type[Given], **otherwise: Any)
         InputError: a value is not allowed; the message names the flag.
     """
     known = {setting.field for setting in settings(config)}
-    data: dict[str, Any] = {**otherwise, **{name: value for name, value in vars(args).items() if name in known}}
+    data: dict[str, Any] = {name: value for name, value in vars(args).items() if name in known}
     for name, flag in (("controls", "--control"), ("over", "--over")):
         if name in data:
             data[name] = _controls(data[name], flag)
@@ -90,7 +90,7 @@ def config_from(args: argparse.Namespace, config: type[Given], **otherwise: Any)
     if "estimators" in data:
         pairs = [text if "=" in text else f"*={text}" for text in data["estimators"]]
         data["estimators"] = dict(parse_assignment(text, "--estimator") for text in pairs)
-    made: Given = config.from_flags(data)
+    made: Given = config.from_flags({**otherwise, **data})
     return made
 
 

@@ -32,6 +32,7 @@ COMMANDS = {
     "export": "advsearch.cli.export",
     "check": "advsearch.cli.check",
     "plan": "advsearch.cli.plan",
+    "stability": "advsearch.cli.stability",
     "precision": "advsearch.cli.precision",
     "list": "advsearch.cli.list",
     "show": "advsearch.cli.show",

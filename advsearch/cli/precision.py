@@ -87,12 +87,12 @@ def sentence(one: Mapping[str, Any], goal: float) -> str:
         what = "the margin"
     asked = f"{100 * goal:g} % error of {what}" + (f" {one['among']}" if one["among"] else "")
     if one["quantity"] == "objective":
-        asked = f"{100 * (1 - goal):g} % of the largest gain in the objective that was found"
+        asked = f"{100 * (1 - goal):g} % of the largest median gain in the verified objective"
     if one["estimator"] is None:
         return f"{asked}: not reached by anything that was measured; give it more --seconds or a larger --error"
     if one["quantity"] == "objective":
         return f"{asked}: policy {one['estimator']}, {one['renders']} renders, {one['seconds']:.2g} s"
-    basis = "" if one["basis"] == "interpolated" else f" ({one['basis']})"
+    basis = "" if one["basis"] in ("interpolated", "fitted") else f" ({one['basis']})"
     return f"{asked}: {one['estimator']}, {one['spp']} samples, {one['seconds']:.2g} s{basis}"
 
 
@@ -132,12 +132,12 @@ def _objectives(points: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _slopes(slopes: Sequence[Mapping[str, Any]]) -> str:
-    rows = [["what", "estimator", "against", "slope", "95 %", "theory", "points", ""]]
+    rows = [["what", "estimator", "against", "slope", "95 %", "theory", "points", "fixed s", ""]]
     for one in slopes:
         what = one["control"] or ("margin" if one["measure"] == "margin_error" else one["quantity"])
         theory = "" if one["theory"] is None else f"{one['theory']:g}" + (" or steeper" if one["or_steeper"] else "")
         low, high = one["interval"]
-        verdict = {True: "agrees", False: "DISAGREES", None: "unclear" if theory else ""}[one["agrees"]]
+        verdict = {True: "agrees", False: "DISAGREES", None: "can't be told" if theory else ""}[one["agrees"]]
         rows.append(
             [
                 what,
@@ -147,6 +147,7 @@ def _slopes(slopes: Sequence[Mapping[str, Any]]) -> str:
                 f"{low:.2f} to {high:.2f}",
                 theory,
                 str(one["points"]),
+                f"{one['fixed_seconds']:.2g}" if one["against"] == "seconds" else "",
                 verdict,
             ]
         )

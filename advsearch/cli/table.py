@@ -17,7 +17,8 @@ def answer(summary: Summary) -> str:
     Args:
         summary: as in `summary.json` (DESIGN 6); what is missing is left out.
     """
-    rates = [row for row in (_clean(summary), _adversarial(summary), _random(summary)) if row]
+    found = (_clean(summary), _adversarial(summary), _random(summary), _average(summary))
+    rates = [row for row in found if row]
     facts = [[name, text] for name, text in _facts(summary).items() if text]
     parts = [wording.verdict(summary), columns(rates), columns(facts)]
     return "\n\n".join(part for part in parts if part) + "".join(f"\n\nNote: {text}" for text in _notes(summary))
@@ -31,7 +32,7 @@ def _clean(summary: Summary) -> list[str]:
 
 def _adversarial(summary: Summary) -> list[str]:
     found, verified = summary.get("adversarial") or {}, summary.get("verified") or {}
-    return ["adversarial", *_answer(found), *_rate("wrong", verified)] if found else []
+    return ["adversarial", *_answer(found), *_rate(wording.success(summary), verified)] if found else []
 
 
 def _random(summary: Summary) -> list[str]:
@@ -39,7 +40,15 @@ def _random(summary: Summary) -> list[str]:
     if not baseline:
         return []
     renders = f"{baseline['renders']} renders" if baseline.get("renders") else ""
-    return ["random search", renders, "", *_rate("wrong", baseline.get("verified") or {})]
+    return ["random search", renders, "", *_rate(wording.success(summary), baseline.get("verified") or {})]
+
+
+def _average(summary: Summary) -> list[str]:
+    average = summary.get("average") or {}
+    if not average:
+        return []
+    drawn = wording.count(average["configurations"], "configuration")
+    return ["average case", drawn, "", wording.average_text(summary), wording.interval_text(average)]
 
 
 def _answer(answer: Summary) -> list[str]:
@@ -57,7 +66,10 @@ def _facts(summary: Summary) -> dict[str, str]:
     seconds = (summary.get("seconds") or {}).get("total")
     searched = f"{summary.get('policy')}, {wording.count(summary.get('steps'), 'step')}: {summary.get('ending')}"
     return {
+        "wanted": wording.goal_text(summary),
         "changed": wording.budget_text(summary),
+        "over": wording.over_text(summary),
+        "smallest": wording.smallest_text(summary),
         "search": searched,
         "renders": wording.renders_text(summary),
         "time": wording.seconds_text(seconds) if seconds is not None else "",

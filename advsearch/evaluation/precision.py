@@ -21,6 +21,8 @@ Measure = Callable[[Setting, int], tuple[Result, float]]
 
 LEAST = 5
 """Calls of a setting that have to fit into the budget for it to be begun."""
+CLAIM = 0.25
+"""Share of the time left that one setting may lay claim to."""
 MOST_PARTS = 64
 """Independent parts of a reference, at most."""
 
@@ -81,7 +83,7 @@ def in_rounds(
     Args:
         settings: what to measure, cheapest first.
         measure: see `Measure`; gets a seed that no other call gets.
-        budget: when to stop. A call that should not fit is not begun, so it is kept to within one wrong guess.
+        budget: when to stop. A call that should not fit is not begun: it is kept to within a setting's first calls.
         rounds: calls of each setting, at least 1, warm-up aside.
         seed: root of the seeds.
         least: see above.
@@ -100,12 +102,12 @@ def in_rounds(
             on_done(setting)
 
     for setting in ordered:
-        needed = forecast.first() + least * forecast.seconds(setting) + forecast.owed(least)
+        needed = forecast.first() + least * forecast.seconds(setting) + forecast.owed(least, budget.left)
         if found.results and needed > budget.left:
             continue
         call(setting)
         for _ in range(warm_up):
-            if forecast.seconds(setting) <= budget.left:
+            if budget.left > 0.0:
                 call(setting)
     begun = [one for one in ordered if one in found.results]
     for _ in range(1, rounds):
@@ -151,9 +153,11 @@ class Forecast(Generic[Result]):
         ]
         return max(0.0, statistics.median(more)) if more else 0.0
 
-    def owed(self, least: int) -> float:
-        """What the settings begun still need for as many calls each."""
-        return sum(max(0, least - len(taken)) * self._warm(one) for one, taken in self._results.items())
+    def owed(self, least: int, left: float) -> float:
+        """What the settings begun still need for as many calls each. One that needs more than a share `CLAIM` of what
+        is left turned out too dear, and waits until the end."""
+        needs = [max(0, least - len(taken)) * self._warm(one) for one, taken in self._results.items()]
+        return sum(need for need in needs if need <= CLAIM * left)
 
     def _warm(self, setting: Setting) -> float:
         taken = [seconds for _, seconds in self._results[setting]]

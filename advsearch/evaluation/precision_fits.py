@@ -19,6 +19,8 @@ MONTE_CARLO = -0.5
 """Slope of the error of a mean of independent samples against their number."""
 FURTHEST = 16.0
 """Times the largest measured sample count beyond which nothing is said."""
+MOSTLY_SAMPLING = 0.25
+"""Share of a call's time that may be fixed for theory to hold against seconds."""
 LEAST_POINTS = 3
 """Of a fit."""
 
@@ -59,7 +61,8 @@ class Slope:
         offset: logarithm of the error at one sample or second.
         points: how many points it goes through.
         theory: what it should be.
-        agrees: whether it is; None where theory says nothing, or the interval is too wide to tell.
+        fixed: seconds of a call that don't grow with the samples; NaN against samples.
+        agrees: whether it is as theory says; None where theory says nothing, or the interval is too wide to tell.
     """
 
     line: tuple[str, str, str]
@@ -70,6 +73,7 @@ class Slope:
     offset: float
     points: int
     theory: Theory
+    fixed: float
     agrees: bool | None
 
 
@@ -80,30 +84,29 @@ def fit(points: Sequence[Point], against: Against = "samples", theory: Theory = 
     `LEAST_POINTS` are left. An independent slope disagrees with theory where its interval leaves theory out *and* it
     is further than `AGREES` from it.
 
+    Against seconds, theory holds where time is spent on samples: if there are enough points at which the fixed part
+    of a call is at most `MOSTLY_SAMPLING` of it, the line goes through these, else nothing is said about theory.
+
     Args:
         points: of one line and one measure.
         against: the other axis.
         theory: what the slope should be.
     """
     known = [point for point in points if point.known]
-    if len({point.setting.spp for point in known}) < LEAST_POINTS:
+    if _counts(known) < LEAST_POINTS:
         return None
+    fixed, holds = math.nan, True
+    if against == "seconds":
+        fixed = fixed_seconds(points)
+        sampling = [point for point in known if fixed <= MOSTLY_SAMPLING * point.seconds]
+        holds = _counts(sampling) >= LEAST_POINTS
+        known = sampling if holds else known
     x = np.log([_across(point, against) for point in known])
     y = np.log([point.error for point in known])
     slope, offset, half = straight_line(x, y)
-    interval = (slope - half, slope + half)
-    first = known[0]
-    return Slope(
-        first.setting.line,
-        first.measure,
-        against,
-        slope,
-        interval,
-        offset,
-        len(known),
-        theory,
-        _agrees(slope, half, theory),
-    )
+    line, interval = known[0].setting.line, (slope - half, slope + half)
+    agrees = _agrees(slope, half, theory) if holds else None
+    return Slope(line, known[0].measure, against, slope, interval, offset, len(known), theory, fixed, agrees)
 
 
 def straight_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
@@ -146,10 +149,6 @@ def warning_of(slope: Slope, points: Sequence[Point]) -> str | None:
 
 
 def _reason(slope: Slope, points: Sequence[Point]) -> str:
-    fixed = fixed_seconds(points)
-    least = min(point.seconds for point in points)
-    if slope.against == "seconds" and fixed > 0.3 * least:
-        return f"{fixed:.2g} s of every call don't depend on the samples"
     if slope.value > (slope.theory.slope or 0.0):
         if levels_off(points):
             return "it levels off: a bias is left that no samples remove"
@@ -182,7 +181,7 @@ class Recommendation:
         spp: samples a pixel.
         seconds: how long it takes.
         error: what it should have.
-        basis: "measured", "interpolated" or "extrapolated".
+        basis: "measured", "fitted", "interpolated" or "extrapolated".
     """
 
     line: tuple[str, str, str]
@@ -211,20 +210,46 @@ def recommend(
 def reaching(points: Sequence[Point], goal: float, round_up: RoundUp | None = None) -> Recommendation | None:
     """Return the least sample count at which one line reaches a goal, and what it takes there.
 
-    Between measured points error and time are interpolated on logarithmic axes; beyond the last one they follow the
-    fitted slope, at most `FURTHEST` times as far, and not at all where the line levels off. A limit counts as an
-    error of that size.
+    Where the fitted line goes through the interval of every known point, of at least four, it stands for them: it
+    knows more than any one of them. Elsewhere the error is interpolated between points on logarithmic axes; beyond the
+    last one it follows the fitted slope, at most `FURTHEST` times as far, and not at all where the line levels off. A
+    limit counts as an error of that size. Time is interpolated, and beyond the last point grows with the samples.
     """
     if not points or not goal > 0.0:
         return None
     ordered = sorted(points, key=lambda point: point.setting.spp)
     line, measure = ordered[0].setting.line, ordered[0].measure
-    count, basis = _samples_for(ordered, goal)
+    fitted = _explaining(ordered)
+    count, basis = _samples_for(ordered, goal) if fitted is None else _on_line(fitted, ordered, goal)
     if count is None:
         return None
     series = line[2]
     spp = (round_up or (lambda _, samples: math.ceil(samples - 1e-9)))(series, count)
-    return Recommendation(line, measure, goal, spp, _at(ordered, spp, "seconds"), _at(ordered, spp, "error"), basis)
+    error = _at(ordered, spp, "error") if fitted is None else _line_at(fitted, spp)
+    return Recommendation(line, measure, goal, spp, _at(ordered, spp, "seconds"), error, basis)
+
+
+def _explaining(ordered: Sequence[Point]) -> Slope | None:
+    """The fitted line, if it falls and goes through the intervals of all known points, of at least four."""
+    line = fit(ordered)
+    if line is None or line.points < LEAST_POINTS + 1 or line.value > -0.1:
+        return None
+    known = [point for point in ordered if point.known]
+    through = all(point.interval[0] <= _line_at(line, point.setting.spp) <= point.interval[1] for point in known)
+    return line if through else None
+
+
+def _on_line(line: Slope, ordered: Sequence[Point], goal: float) -> tuple[float | None, str]:
+    """The samples at which a fitted line reaches a goal."""
+    least, largest = ordered[0].setting.spp, ordered[-1].setting.spp
+    count = math.exp((math.log(goal) - line.offset) / line.value)
+    if count > FURTHEST * largest:
+        return None, ""
+    return max(count, float(least)), "measured" if count <= least else "fitted" if count <= largest else "extrapolated"
+
+
+def _line_at(line: Slope, spp: int) -> float:
+    return math.exp(line.offset + line.value * math.log(spp))
 
 
 def _samples_for(ordered: Sequence[Point], goal: float) -> tuple[float | None, str]:
@@ -263,6 +288,10 @@ def _at(ordered: Sequence[Point], spp: int, what: Literal["seconds", "error"]) -
     line = fit(ordered)
     slope = 1.0 if what == "seconds" else (MONTE_CARLO if line is None else max(line.value, -1.0))
     return math.exp(values[-1] + slope * math.log(spp / counts[-1]))
+
+
+def _counts(points: Sequence[Point]) -> int:
+    return len({point.setting.spp for point in points})
 
 
 def _across(point: Point, against: Against) -> float:

@@ -21,8 +21,9 @@ from advsearch.scene.renderer import Renderer
 COUNTS = (4, 8, 16, 32, 64, 128, 256)
 BY_COORDINATE = 32
 """Sets of at most so many coordinates have a reference by differences, coordinate by coordinate."""
-ADJOINT_COST = 3.0
-"""An adjoint takes about as long as so many renders."""
+ADJOINT_COST = {"adjoint": 3.0, "material": 60.0}
+"""An adjoint takes about as long as so many renders, the kernels that the material form compiles included; any other
+as the dearest of these. It only decides what is measured first."""
 CHECK_SPP = 64
 AGREE = 0.05
 """Relative bias of a reference by an adjoint, beyond the noise, from which it is called biased."""
@@ -159,7 +160,7 @@ class GradientBench:
     def _cost(self, estimator: str) -> float:
         renders = sum(replace(group, estimator=estimator).renders for group in self.part.groups)
         if estimator in BY_ADJOINT:
-            return 1.0 + ADJOINT_COST
+            return 1.0 + ADJOINT_COST.get(estimator, max(ADJOINT_COST.values()))
         more = {"forward": 1, "simultaneous": 2 * DIRECTIONS}.get(estimator, 0)
         return 1.0 + renders + more
 
@@ -200,8 +201,8 @@ class GradientBench:
             gather(part, budget, seed=seed, name=f"precision {self.part.name}", on_done=on_done)
         )
 
-    def _rate(self, call: Callable[[int], object], pilot: int = 8) -> float:
-        """Seconds a sample, from the second of two calls at few samples."""
+    def _rate(self, call: Callable[[int], object], pilot: int = 16) -> float:
+        """Seconds a sample, from the second of two calls."""
         for _ in range(2):
             begun = time.perf_counter()
             call(pilot)

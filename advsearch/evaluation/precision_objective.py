@@ -150,7 +150,7 @@ def missing(curve: Curve, best: float, start: float) -> tuple[float, ...]:
 
     Args:
         curve: of the policy.
-        best: the best verified objective of any policy and seed.
+        best: the best median of any policy.
         start: the verified objective before any search.
     """
     gain = best - start

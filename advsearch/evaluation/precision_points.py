@@ -18,7 +18,7 @@ from scipy.special import stdtrit
 Array = npt.NDArray[np.float64]
 
 KNOWN = 2.0
-"""Times the reference's own error that a measured one must have to be known: below, half of it or more is not its own."""
+"""Times the reference's own error that a measured one must have to be known."""
 LEVEL = 0.95
 """Of every interval."""
 WARM_UP = 3

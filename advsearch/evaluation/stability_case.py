@@ -127,7 +127,8 @@ class Row:
         bad = [check for check in self.findings.checks if not check.ok]
         if not self.findings.finite and not bad:
             return "NaN or infinite values"
-        return str((bad or list(self.findings.checks[-1:]) or [""])[0])
+        deciding = bad or list(self.findings.checks[-1:])
+        return str(deciding[0]) if deciding else ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the row as DESIGN section 6 lists it, and more."""

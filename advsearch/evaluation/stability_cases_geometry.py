@@ -85,15 +85,14 @@ def million() -> Findings:
     """A sphere of a million triangles: painted, and moved once each way."""
     fine = sphere(501, 1000)
     found = examine(small(thing(fine), {"texture": {"resolution": 8}}), evaluations=2)
-    coarse = small(thing(sphere(64, 128)), {"texture": {"resolution": 8}})
-    renderer = small(thing(fine), {"pose": {"x": [-0.3, 0.3]}})
+    coarse, renderer = (small(thing(one), {"pose": {"x": [-0.3, 0.3]}}) for one in (sphere(64, 128), fine))
     _, slope = renderer.gradient(smooth_loss(renderer.formation.resolution), renderer.start, 0, SPP)
     with torch.no_grad():
         apart = float((renderer(renderer.start, 0, 64) - coarse(coarse.start, 0, 64)).abs().mean())
     return found.findings(
         Check("triangles", float(len(fine.faces)), least=1e6),
         holds("the gradient by a shift is finite", bool(torch.isfinite(slope).all())),
-        Check("mean difference from a sphere of 16,000", apart, most=0.01),
+        Check("mean difference from a sphere of 16,000", apart, most=SAME_PICTURE),
     )
 
 
@@ -144,12 +143,12 @@ def gimbal() -> Findings:
     angles = {"pose": {"yaw": [-90.0, 90.0], "pitch": [45.0, 135.0], "roll": [-90.0, 90.0], "on_ground": "no"}}
     locked = small(dark(), angles, settings=BARE)
     u = torch.tensor([0.7, 0.5, 0.5])
-    found = examine(locked, u)
+    found = examine(locked, u, seeds=(3, 5))
     with torch.no_grad():
         one = locked(torch.tensor([0.7, 0.5, 0.5]), 0, 16)
         other = locked(torch.tensor([0.5, 0.5, 0.3]), 0, 16)  # yaw 36 is roll -36 here
     free = small(dark(), {"pose": {"rotation": [-90.0, 90.0], "pitch": 90.0, "on_ground": "no"}}, settings=BARE)
-    vector = compared(free, free.start + 0.1)
+    vector = compared(free, free.start + 0.1, seeds=(3, 5))
     worst = max(one.excess for one in vector)
     return found.findings(
         Check("mean difference of yaw 36 and roll -36", float((one - other).abs().mean()), most=SAME_PICTURE),

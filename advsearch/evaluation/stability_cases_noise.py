@@ -24,11 +24,13 @@ from torch import Tensor
 from advsearch.attacks import Block, Domain, make_policy, search
 from advsearch.evaluation.gradients import probes, reference, smooth_loss
 from advsearch.evaluation.stability_case import Case, Check, Findings, holds
-from advsearch.evaluation.stability_scene import REFERENCE_SPP, compared, examine, small
+from advsearch.evaluation.stability_scene import REFERENCE_SPP, Controls, compared, examine, small
 from advsearch.evaluation.stability_search import Toy
 
 SAMPLES, GROUPS_OF_MEANS, CLIP = 24, 6, 3.0
 EXPERIMENTS = 4000
+RATIO = 1.25
+"""Factor by which tails may make the result of a search worse than gaussian noise of the same median does."""
 TAIL = 1.5
 """Index of the Pareto and t distributions: a mean, and no variance."""
 
@@ -44,18 +46,20 @@ def plain_mean(samples: Tensor) -> Tensor:
 def median_of_means(samples: Tensor, groups: int = GROUPS_OF_MEANS) -> Tensor:
     """The median of the means of groups, element by element; samples (..., n, d), n a multiple of the groups."""
     *lead, count, size = samples.shape
-    return samples.reshape(*lead, groups, count // groups, size).mean(dim=-2).quantile(0.5, dim=-2)
+    means = samples.reshape(*lead, groups, count // groups, size).mean(dim=-2)
+    return torch.quantile(means, 0.5, dim=-2)
 
 
 def clipped_mean(samples: Tensor, factor: float = CLIP) -> Tensor:
     """The mean of samples (..., n, d), each shortened to at most `factor` times the median length."""
     lengths = samples.norm(dim=-1, keepdim=True)
-    limit = factor * lengths.median(dim=-2, keepdim=True).values
-    return (samples * (limit / lengths.clamp_min(1e-30)).clamp(max=1.0)).mean(dim=-2)
+    limit: Tensor = factor * lengths.median(dim=-2, keepdim=True).values
+    shortened: Tensor = samples * (limit / lengths.clamp_min(1e-30)).clamp(max=1.0)
+    return shortened.mean(dim=-2)
 
 
 def normalised_mean(samples: Tensor) -> Tensor:
-    """The mean of samples (..., n, d) over their mean absolute values each: what PGD's momentum adds up. A direction."""
+    """The mean of samples (..., n, d) over their mean absolute values each: a direction, PGD's."""
     return (samples / samples.abs().mean(dim=-1, keepdim=True).clamp_min(1e-30)).mean(dim=-2)
 
 
@@ -93,55 +97,82 @@ def estimators(kind: str) -> Findings:
     way = normalised_mean(samples).mean(dim=0)
     cosine = float(way @ truth / (way.norm() * truth.norm()))
     measured["normalisation: cosine of its mean with the truth"] = cosine
-    allowed = 0.02 if kind == "symmetric" else 0.6
+    checks = [
+        Check(f"{name}: error, its bias included, over that of the mean", errors[name] / errors["mean"], most=0.7)
+        for name in ("median of means", "clipping")
+    ]
+    if kind == "symmetric":  # a skewed distribution has a bias whatever is done; it is printed
+        checks.append(Check("median of means: bias", measured["median of means: bias"], most=0.02))
+        checks.append(Check("normalisation: cosine of its mean with the truth", cosine, least=0.99))
     return Findings(
-        (
-            Check("median of means: error over that of the mean", errors["median of means"] / errors["mean"], most=0.7),
-            Check("clipping: error over that of the mean", errors["clipping"] / errors["mean"], most=0.7),
-            Check("median of means: bias", measured["median of means: bias"], most=allowed),
-            Check("normalisation: cosine", cosine, least=0.99 if kind == "symmetric" else 0.7),
-        ),
+        tuple(checks),
         relative_error=measured["median of means: bias"],
         measured=measured,
     )
 
 
 def heavy_search(kind: str) -> Findings:
-    """A search whose gradients have heavy tails, of twice the gradient's own size in the median."""
-    size, reach = 60, 1.0
+    """Searches with noisy gradients, the noise in the median twice as large as the gradient.
+
+    Args:
+        kind: "elements", every element has a heavy tail of its own; "lengths", the noise of one evaluation is gaussian
+            and its size has one; "spike", no noise but one gradient that is nothing but noise, 1e12 times too large.
+    """
+    checks, measured = [], {}
+    for name in ("pgd", "adam"):
+        share = _share_of_optimum(name, kind)
+        measured[f"{name}: share of the optimum"] = share
+        if kind == "spike":
+            checks.append(Check(f"{name}: share of the optimum", share, least=1.0 / RATIO))
+            continue
+        usual = _share_of_optimum(name, "gaussian")
+        measured[f"{name}: share with gaussian noise"] = usual
+        checks.append(Check(f"{name}: share with gaussian noise over that with tails", usual / share, most=RATIO))
+    error = 1.0 - min(value for key, value in measured.items() if key.endswith("optimum"))
+    return Findings(tuple(checks), relative_error=error, measured=measured)
+
+
+def _share_of_optimum(name: str, kind: str, seeds: int = 9) -> float:
+    """Median over seeds of what a search in 60 numbers reaches of the largest value of a linear objective."""
+    size = 60
     start = torch.full((size,), 0.5)
-    domain = Domain(start, (Block(size - 1, "l2", reach), Block(1, name="number")))
+    domain = Domain(start, (Block(size - 1, "l2", 1.0), Block(1, name="number")))
     weights = torch.linspace(-1.0, 1.0, size).double()
 
     def value(u: Tensor) -> Tensor:
         return (weights * (u - 0.5)).sum()
 
     best = float(value(domain.project(start + 1e3 * weights.float()).double()))
-    checks, measured = [], {}
-    for name in ("pgd", "adam"):
-        shares = []
-        for seed in range(5):
+    shares = []
+    for seed in range(seeds):
 
-            def disturb(slope: Tensor, index: int, seed: int = seed) -> Tensor:
-                generator = torch.Generator().manual_seed(1000 * seed + index)
-                if kind == "spike":
-                    return slope if index != 20 else 1e12 * torch.randn(slope.shape, generator=generator)
-                loud = 2.0 * slope.abs().mean()
-                return slope + loud * _noise("symmetric", tuple(slope.shape), generator).float()
+        def disturb(slope: Tensor, index: int, seed: int = seed) -> Tensor:
+            generator = torch.Generator().manual_seed(1000 * seed + index)
+            return slope + 2.0 * slope.abs().mean() * _disturbance(kind, index, len(slope), generator)
 
-            result = search(
-                Toy(value, domain, disturb=disturb), domain, make_policy(name), steps=100, seed=seed, candidates=0
-            )
-            shares.append(result.best_objective / best)
-        share = sorted(shares)[2]
-        measured[f"{name}: share of the optimum"] = share
-        checks.append(Check(f"{name}: median share of the optimum", share, least=0.9))
-    return Findings(tuple(checks), relative_error=1.0 - min(measured.values()), measured=measured)
+        toy = Toy(value, domain, disturb=disturb)
+        result = search(toy, domain, make_policy(name), steps=100, seed=seed, candidates=0)
+        shares.append(result.best_objective / best)
+    return sorted(shares)[seeds // 2]
+
+
+def _disturbance(kind: str, index: int, size: int, generator: torch.Generator) -> Tensor:
+    """Noise (size,) float32 of one gradient, its median absolute value 1."""
+    normal = torch.randn(size, generator=generator) / 0.674
+    if kind == "spike":
+        return 1e12 * normal if index == 20 else 0.0 * normal
+    if kind == "elements":
+        return _noise("symmetric", (size,), generator).float()
+    return normal * float(_noise("symmetric", (1,), generator).abs()) if kind == "lengths" else normal
 
 
 def one_sample() -> Findings:
     """One sample a pixel: the mean of many gradients is that of a quiet one, and the denoiser takes such a picture."""
-    controls = {"texture": {"resolution": 8}, "environment": {"exposure": [-1.0, 1.0]}, "pose": {"y": [-0.3, 0.3]}}
+    controls: Controls = {
+        "texture": {"resolution": 8},
+        "environment": {"exposure": [-1.0, 1.0]},
+        "pose": {"y": [-0.3, 0.3]},
+    }
     renderer = small("mug", controls)
     seen = examine(renderer, compare=False, spp=1)
     beside = compared(renderer, renderer.start, spp=1, repeats=48)
@@ -164,9 +195,13 @@ def heavy_render(count: int = SAMPLES) -> Findings:
     wanted = reference(renderer, loss, u, probe, seed=1, spp=REFERENCE_SPP, repeats=(8, 16))
     measured, checks = {"reference": wanted.value, "noise of the reference": wanted.noise}, []
     plan = renderer.plan
+    bad = {}
     for name in ("secant", "boundary"):
+        before = renderer.non_finite
         renderer.plan = plan.with_estimator({"pose.x": name}, "measured")
         samples = torch.stack([renderer.gradient(loss, u, seed, 4)[1] for seed in range(count)]).double()
+        bad[name] = renderer.non_finite - before
+        measured[f"{name}: values that were not finite"] = float(bad[name])
         away = (samples - samples.median()).abs()
         measured[f"{name}: farthest over the median distance"] = float(away.max() / away.median())
         for how, estimator in ESTIMATORS.items():
@@ -185,7 +220,7 @@ def heavy_render(count: int = SAMPLES) -> Findings:
         ),
         holds("the plan takes secant", plan.groups[0].estimator == "secant"),
     ]
-    return Findings(tuple(checks), renderer.non_finite == 0, off, measured=measured)
+    return Findings(tuple(checks), bad["secant"] == 0, off, measured=measured)
 
 
 _RULE = "every gradient is divided by the mean of its absolute values (pgd) or by a running root mean square (adam)"
@@ -217,12 +252,15 @@ CASES = (
             f"heavy-tailed-search-{kind}",
             "noise",
             "heavy-tailed gradients: median of means or clipping, its bias measured",
-            "Nine tenths of the optimum in 100 evaluations "
-            + ("with noise that has no variance." if kind == "tails" else "with one gradient 1e12 times too large."),
+            "Within 1.25 of " + result,
             _RULE,
             partial(heavy_search, kind),
         )
-        for kind in ("tails", "spike")
+        for kind, result in (
+            ("elements", "the result with gaussian noise of the same median, with a heavy tail in every element."),
+            ("lengths", "the result with gaussian noise of the same median, with a heavy tail in its size."),
+            ("spike", "the optimum, with one gradient 1e12 times too large."),
+        )
     ),
     Case(
         "heavy-tails-of-a-moving-mesh",

@@ -24,7 +24,10 @@ IMAGE = torch.zeros(1, 2, 2, 3)
 STEPS = 40
 SPACING = 2.0**-10
 """Distance of neighbouring 32-bit numbers at 10,000: logits themselves are no more exact than that."""
-WITH_OPTIONS = {"restarts": {"policy": "pgd", "times": 2}, "portfolio": {"policies": ["pgd", "cmaes"]}}
+WITH_OPTIONS: dict[str, dict[str, Any]] = {
+    "restarts": {"policy": "pgd", "times": 2},
+    "portfolio": {"policies": ["pgd", "cmaes"]},
+}
 FORMS = {name: kind.plain for name, kind in OBJECTIVE_KINDS.items() if kind.plain is not None}
 Logits = Callable[[], Tensor]
 
@@ -111,7 +114,7 @@ def certain() -> Findings:
     return Findings(
         (
             *found.checks,
-            holds("the model's probabilities are exactly 0 and 1", set(probabilities.unique().tolist()) == {0.0, 1.0}),
+            holds("the model's probabilities are exactly 0 and 1", set(probabilities.flatten().tolist()) == {0.0, 1.0}),
             holds("logits and gradient are finite", bool(torch.isfinite(logits).all() & torch.isfinite(slope).all())),
             holds("a search without any gradient goes elsewhere or says 'stalled'", _left(flat.ending, flat.best_u)),
         ),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -14,14 +15,14 @@ from torch import Tensor
 from advsearch.attacks import PGD, Adam, Auto, Policy, search
 from advsearch.errors import InputError
 from advsearch.evaluation.stability_case import Case, Check, Findings, holds
-from advsearch.evaluation.stability_scene import Evaluator, domain_of, examine, small
+from advsearch.evaluation.stability_scene import Controls, Evaluator, domain_of, examine, small
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.environments import import_environment
 
 BRIGHT = 1e5
 PLATEAU_STEPS = 40
 """Evaluations in which a search has to be off a plateau."""
-POLICIES: tuple[Policy[object], ...] = (PGD(), Adam(), Auto())
+POLICIES: tuple[Policy[Any], ...] = (PGD(), Adam(), Auto())
 
 
 def _map(value: float, texel: float | None = None) -> EnvironmentAsset:
@@ -89,7 +90,7 @@ def exposure(control: str, stops: float) -> Findings:
     """A picture ten stops over or under."""
     low, high = sorted((stops, stops - np.sign(stops)))
     share = 1.0 if stops > 0.0 else 0.0
-    controls = {control: {"exposure": [low, high]}, "texture": {"resolution": 8}}
+    controls: Controls = {control: {"exposure": [low, high]}, "texture": {"resolution": 8}}
     renderer = small("mug", controls)
     u = renderer.start.clone()
     u[0] = share

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import torch
@@ -19,8 +18,9 @@ from advsearch.controls.base import Parameter
 from advsearch.controls.values import Range, read, to_unit, to_value
 from advsearch.evaluation.gradients import smooth_loss
 from advsearch.evaluation.stability_case import Case, Check, Findings
-from advsearch.evaluation.stability_scene import SHARPNESS, Evaluator, domain_of, examine, small
-from advsearch.evaluation.stability_search import Toy, condition_number, hessian, numbers, quadratic, valley
+from advsearch.evaluation.stability_scene import SHARPNESS, Controls, Evaluator, domain_of, examine, small
+from advsearch.evaluation.stability_search import Toy, Value, condition_number, hessian, numbers, quadratic, valley
+from advsearch.scene.renderer import Renderer
 
 STEPS = 100
 SEEDS = 5
@@ -121,11 +121,19 @@ def curvatures(ratio: float = RATIO) -> Findings:
     return Findings(tuple(checks), True, abs(found / ratio - 1.0), measured=measured)
 
 
-def _until_there(name: str, value: Any, start: list[float], peak: list[float]) -> float:
-    """Return the evaluations until every number is `CLOSE` to the peak, a mean over seeds; infinite if one never is."""
+def _until_there(name: str, value: Value, start: list[float], peak: list[float], scale: float = 1.0) -> float:
+    """Return the evaluations until every number is `CLOSE` to the peak, a mean over seeds; infinite if one never is.
+
+    `scale` is a factor on the first number's derivative, the objective staying as it is.
+    """
+    factor = torch.tensor([scale, 1.0])
+
+    def disturb(slope: Tensor, index: int) -> Tensor:
+        return slope * factor
+
     counts = []
     for seed in range(SEEDS):
-        _, seen = path(Toy(value, numbers(start)), make_policy(name), seed=seed)
+        _, seen = path(Toy(value, numbers(start), disturb=disturb), make_policy(name), seed=seed)
         near = ((seen - torch.tensor(peak)).abs().amax(dim=1) <= CLOSE).nonzero()
         counts.append(float(near[0]) + 1.0 if len(near) else math.inf)
     return sum(counts) / len(counts)
@@ -139,17 +147,10 @@ def scaled_block() -> Findings:
     checks, measured, start, peak = [], {}, [0.15, 0.9], [0.63, 0.37]
     for name in FOLLOWERS:
         counts = {}
-        for scale in (1.0, 1e6, 1e-6):
-            factor = torch.tensor([scale, 1.0])
-            near = []
-            for seed in range(SEEDS):
-                toy = Toy(quadratic(peak, [1.0, 1.0]), numbers(start), disturb=lambda slope, _, f=factor: slope * f)
-                _, seen = path(toy, make_policy(name), seed=seed)
-                there = ((seen - torch.tensor(peak)).abs().amax(dim=1) <= CLOSE).nonzero()
-                near.append(float(there[0]) + 1.0 if len(there) else math.inf)
-            counts[scale] = sum(near) / len(near)
+        for scale in (1.0, RATIO, 1.0 / RATIO):
+            counts[scale] = _until_there(name, quadratic(peak, [1.0, 1.0]), start, peak, scale)
             measured[f"{name}: evaluations at x {scale:g}"] = counts[scale]
-        worst = max(counts[1e6], counts[1e-6]) / counts[1.0]
+        worst = max(counts.values()) / counts[1.0]
         checks.append(Check(f"{name}: evaluations over those of the unscaled gradient", worst, most=SLOWER))
     return Findings(tuple(checks), measured=measured)
 
@@ -229,7 +230,7 @@ def wide_range() -> Findings:
 
 def light_rotation_texel() -> Findings:
     """A lamp's power beside a rotation beside texels, rendered: how stiff it is, and whether each of them moves."""
-    controls = {
+    controls: Controls = {
         "light": {"type": "point", "power": [0.0, 12.0], "x": 1.0, "y": -1.0, "z": 2.0},
         "pose": {"yaw": [0.0, 360.0]},
         "texture": {"resolution": 2},
@@ -249,22 +250,8 @@ def light_rotation_texel() -> Findings:
     steps = [0.2, renderer.plan.groups[1].step * 2.0, 0.08]
     second = hessian(value, u, directions, steps)
     units = torch.diag(torch.tensor([1.0 / 12.0, 1.0 / 360.0, 1.0]).double())
-    paths = []
-    for scale in (1.0, 1e6):
-        evaluate = Evaluator(renderer, lambda image, scale=scale: scale * loss(image), 8)
-        seen: list[Tensor] = []
-        domain = domain_of(renderer, u)
-        result = search(
-            evaluate,
-            domain,
-            PGD(),
-            steps=18,
-            seed=0,
-            candidates=0,
-            on_step=lambda r, at, e: seen.append(at),  # noqa: B023
-        )
-        paths.append(torch.stack(seen))
-    moved = (paths[0] - paths[0][0]).abs().amax(dim=0)
+    (result, walked), (_, again) = (_walk(renderer, u, loss, scale) for scale in (1.0, RATIO))
+    moved = (walked - walked[0]).abs().amax(dim=0)
     found = examine(renderer, u, compare=False)
     measured = {
         "condition number in u": condition_number(second),
@@ -276,11 +263,26 @@ def light_rotation_texel() -> Findings:
         Check("how far the texels moved", float(moved[2:].max()), least=0.05),
         Check(
             "distance of the trajectory from that of the objective x 1e6",
-            float((paths[0] - paths[1]).abs().max()),
+            float((walked - again).abs().max()),
             most=1e-3,
         ),
     )
     return replace(found.findings(*checks), ending=result.ending.value, measured=measured)
+
+
+def _walk(renderer: Renderer, u: Tensor, loss: Value, scale: float) -> tuple[SearchResult, Tensor]:
+    """Search from u for a larger loss, in units of `scale`; return the result and where it has been (n, d)."""
+    seen: list[Tensor] = []
+
+    def scaled(image: Tensor) -> Tensor:
+        return scale * loss(image)
+
+    def note(record: object, at: Tensor, found: object) -> None:
+        seen.append(at)
+
+    evaluate = Evaluator(renderer, scaled, 8)
+    result = search(evaluate, domain_of(renderer, u), PGD(), steps=18, seed=0, candidates=0, on_step=note)
+    return result, torch.stack(seen)
 
 
 _BOX = "controls map their units to the unit box; policies know nothing else"

@@ -1,4 +1,4 @@
-"""Small scenes for the stability suite, and what is asked of every one: a picture, a gradient, a reference, a search."""
+"""Small scenes for the stability suite, and what is asked of each: a picture, a gradient, a reference, a search."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def mesh_of(
 ) -> Mesh:
     """Return a mesh with UVs from x and z; normals face +x unless they are given."""
     points = np.asarray(vertices, np.float32)
-    facing = np.tile(np.float32([1.0, 0.0, 0.0]), (len(points), 1)) if normals is None else np.asarray(normals)
+    facing = np.tile([1.0, 0.0, 0.0], (len(points), 1)) if normals is None else np.asarray(normals)
     low, high = points.min(axis=0), points.max(axis=0)
     uvs = ((points - low) / np.maximum(high - low, 1e-12))[:, 1:]
     return Mesh(points, np.asarray(faces, np.uint32), facing.astype(np.float32), uvs.astype(np.float32))

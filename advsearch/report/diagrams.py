@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 Points = Sequence[Mapping[str, Any]]
@@ -93,8 +94,9 @@ def _errors(axes: Axes, points: Points, measure: str, report: Mapping[str, Any])
     axes.set_xscale("log")
     axes.set_yscale("log")
     if usable:
-        _percent_axis(axes)
         _theory(axes, usable, measure)
+        _plain_axis(axes.xaxis)
+        _plain_axis(axes.yaxis)
     goal = report["goal"] * PERCENT
     low, high = axes.get_ylim()
     if low < goal < high:
@@ -161,16 +163,25 @@ def _theory(axes: Axes, points: Points, measure: str) -> None:
     )
 
 
-def _percent_axis(axes: Axes) -> None:
-    """Plain numbers on both axes."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+def _plain_axis(axis: Axis) -> None:
+    """Ticks at 1, 2 and 5 times powers of ten (only at powers over a wide range), as plain numbers."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter
 
-    for axis in (axes.xaxis, axes.yaxis):
-        low, high = axis.get_view_interval()
-        short = high < 30.0 * low
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if short else (1.0,)))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_formatter(NullFormatter())
+    low, high = sorted(axis.get_view_interval())
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    choices = (
+        (1.0,),
+        (1.0, 2.0, 5.0),
+        (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0),
+        (1.0, 1.2, 1.5, 1.7, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0),
+    )
+    for factors in choices:
+        ticks = [factor * 10.0**power for power in powers for factor in factors if low <= factor * 10.0**power <= high]
+        if len(ticks) >= 3:
+            break
+    axis.set_major_locator(FixedLocator(ticks))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _gains(axes: Axes, points: Points, kind: str, report: Mapping[str, Any]) -> None:
@@ -194,18 +205,11 @@ def _gains(axes: Axes, points: Points, kind: str, report: Mapping[str, Any]) -> 
             va="center",
         )
     axes.set_xscale("log")
-    _percent_axis_x(axes)
+    _plain_axis(axes.xaxis)
     axes.set_xlabel("seconds of search")
     axes.set_ylabel(f"{report['objective']}, verified")
     axes.grid(True, which="major")
     axes.legend(loc="upper left")
-
-
-def _percent_axis_x(axes: Axes) -> None:
-    from matplotlib.ticker import FuncFormatter, NullFormatter
-
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _explain(figure: Figure, report: Mapping[str, Any]) -> None:

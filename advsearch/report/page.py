@@ -137,11 +137,14 @@ def _textures(data: RunData) -> Html:
 
 def _rates(summary: Mapping[str, Any]) -> Html:
     control = dict((summary.get("clean") or {}).get("control") or {})
-    baseline = summary.get("baseline") or {}
+    baseline, success = summary.get("baseline") or {}, wording.success(summary)
+    average = dict(summary.get("average") or {})
+    average |= {"trials": average.get("configurations"), "rate": average.get("accuracy")}
     rows = [
         ("Clean scene (control group)", "right", control, control.get("correct")),
-        ("Adversarial", "wrong", summary.get("verified") or {}, None),
-        (f"{str(baseline.get('policy', 'random')).capitalize()} search", "wrong", baseline.get("verified") or {}, None),
+        ("Adversarial", success, summary.get("verified") or {}, None),
+        (f"{str(baseline.get('policy', 'random')).capitalize()} search", success, baseline.get("verified") or {}, None),
+        ("Average case (random configurations)", "right", average, average.get("correct")),
     ]
     lines = [
         element(
@@ -180,7 +183,8 @@ def _curve(data: RunData) -> Html:
     if not curves:
         return Html("")
     objective = str(data.summary.get("objective", "objective"))
-    chart = objective_chart(curves, objective, "above: wrong" if objective == "margin" else "")
+    above = "right" if wording.minimises(data.summary) else wording.success(data.summary)
+    chart = objective_chart(curves, objective, f"above: {above}" if objective == "margin" else "")
     note = "Lines: the best so far. Dots: each evaluation. These are the search's claims; the table above is verified."
     return join(
         element("h2", "The search"),
@@ -196,7 +200,10 @@ def _cost(summary: Mapping[str, Any]) -> Html:
     facts = {
         "Ending": summary.get("ending"),
         "Policy": f"{summary.get('policy')}, {wording.count(summary.get('steps'), 'step')}",
+        "Goal": wording.goal_text(summary),
         "Budget": wording.budget_text(summary),
+        "Over": wording.over_text(summary),
+        "Smallest epsilon": wording.smallest_text(summary),
         "Renders": wording.renders_text(summary),
         "Time": f"{total} ({parts})" if parts else total,
         "Image formation": wording.formation_text(summary),

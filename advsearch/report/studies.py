@@ -50,7 +50,7 @@ def gap_figure(answer: Mapping[str, Any]) -> Figures:
         axes.set(xlabel="accuracy", xlim=(-0.03, 1.03))
         axes.set_title(f"Average and worst case: {answer['model']}")
         axes.grid(True, axis="x")
-        axes.legend(loc="lower center", bbox_to_anchor=(0.5, -0.32 - 0.5 / max(len(rows), 1)), ncols=2)
+        axes.figure.legend(loc="outside lower center", ncols=2)
 
     return _figure(draw, (6.4, 1.6 + 0.36 * len(rows)))
 

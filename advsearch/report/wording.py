@@ -28,15 +28,16 @@ def verdict(summary: Summary) -> str:
         return f"The model already calls {thing} {wrong}: nothing was changed and nothing counts as found."
     if not verified.get("trials"):
         return f"{ending[:1].upper()}{ending[1:]} after {count(summary.get('steps'), 'step')}; nothing is verified."
-    rate = rate_text(verified)
+    rate = rate_text(verified) + _each(summary)
+    claim = _claim(summary, thing)
     if ending == "found":
         return f"{_how_it_errs(summary, verified, thing)} in {rate}."
     if ending == "interrupted":
-        return f"Interrupted; so far the model is wrong about {thing} in {rate}."
+        return f"Interrupted; so far {claim} in {rate}."
     if ending == "not verified":
-        return f"The search claims an answer that is not confirmed: the model is wrong about {thing} in {rate}."
+        return f"The search claims an answer that is not confirmed: {claim} in {rate}."
     why = _REASONS.get(ending, f"The search ended: {ending}.")
-    return f"No {_changes(summary)} was found that makes the model miss {thing}: it is wrong in {rate}. {why}"
+    return f"No {_changes(summary)} was found that {_wanted(summary, thing)}: {claim} in {rate}. {why}"
 
 
 def remarks(summary: Summary) -> list[str]:
@@ -44,8 +45,9 @@ def remarks(summary: Summary) -> list[str]:
     said = []
     control = (summary.get("clean") or {}).get("control") or {}
     missed = (control.get("trials") or 0) - (control.get("correct") or 0)
-    if missed and summary.get("ending") != "already wrong":
-        said.append(f"The clean scene itself fails {missed} of its {control['trials']} trials.")
+    if missed and summary.get("ending") != "already wrong" and not minimises(summary):
+        apart = " They do not count." if over(summary) else ""
+        said.append(f"The clean scene itself fails {missed} of its {control['trials']} trials.{apart}")
     said += _against_random(summary)
     return said + [str(text) for text in summary.get("warnings") or ()]
 
@@ -63,6 +65,57 @@ def title(summary: Summary) -> str:
 def controls(summary: Summary) -> list[str]:
     """Return the names of the controls."""
     return [str(name) for name in summary.get("controls") or ()]
+
+
+def over(summary: Summary) -> list[str]:
+    """Return the names of the controls that varied by chance."""
+    return [str(name) for name in summary.get("over") or ()]
+
+
+def targets(summary: Summary) -> list[str]:
+    """Return the answers that were wanted; empty where any wrong one was."""
+    return [str(name) for name in summary.get("target") or ()]
+
+
+def minimises(summary: Summary) -> bool:
+    """Return whether the object was to be easier to recognise."""
+    return summary.get("goal") == "a right answer"
+
+
+def success(summary: Summary) -> str:
+    """Return one word for a trial that counts: ``wrong``, ``target`` or ``easier``."""
+    return "target" if targets(summary) else "easier" if minimises(summary) else "wrong"
+
+
+def goal_text(summary: Summary) -> str:
+    """Return what was asked for, where it was not just any wrong answer."""
+    if targets(summary):
+        return f"the model should answer {' or '.join(targets(summary))}"
+    return "easier to recognise" if minimises(summary) else ""
+
+
+def over_text(summary: Summary) -> str:
+    """Return what varied by chance: ``camera and environment, drawn anew for every picture``."""
+    return f"{' and '.join(over(summary))}, drawn anew for every picture" if over(summary) else ""
+
+
+def average_text(summary: Summary) -> str:
+    """Return ``right in 150 of 200``: over configurations drawn from the whole space; empty if none were."""
+    average = summary.get("average") or {}
+    return f"right in {average['correct']} of {average['configurations']}" if average else ""
+
+
+def smallest_text(summary: Summary) -> str:
+    """Return the bracket of the smallest epsilon; empty if it was not asked for."""
+    bracket = summary.get("smallest") or {}
+    if not bracket:
+        return ""
+    found, below = _epsilons(bracket.get("epsilon")), _epsilons(bracket.get("not_found_at"))
+    if not found:
+        return f"none found up to {below}"
+    floor = f"no search found one at {below}" if below else "no search failed, so it may be smaller still"
+    still = "" if bracket.get("closed") or not below else "; the searches did not suffice to bring the two together"
+    return f"{found}; {floor}{still}"
 
 
 def short_name(value: Any) -> str:
@@ -115,12 +168,26 @@ def count(number: Any, thing: str) -> str:
 
 def budget_text(summary: Summary) -> str:
     """Return what could change and how far: ``texture within 0.1 (linf)``, as far as the summary says."""
-    names = " and ".join(controls(summary)) or "nothing"
-    epsilon = summary.get("epsilon")
+    epsilon, norm = summary.get("epsilon"), summary.get("norm")
+    if isinstance(epsilon, Mapping):
+        norms = norm if isinstance(norm, Mapping) else {}
+        return " and ".join(_within(name, epsilon.get(name), norms.get(name)) for name in controls(summary))
+    return _within(" and ".join(controls(summary)) or "nothing", epsilon, norm)
+
+
+def _within(name: str, epsilon: Any, norm: Any) -> str:
     if not isinstance(epsilon, (int, float)):
-        return names
-    norm = summary.get("norm")
-    return f"{names} within {epsilon:g}" + (f" ({norm})" if norm else "")
+        return name
+    return f"{name} within {epsilon:g}" + (f" ({norm})" if norm else "")
+
+
+def _epsilons(told: Mapping[str, float] | None) -> str:
+    """``0.0123`` of one control; ``texture 0.01, geometry 0.002`` of several."""
+    if not told:
+        return ""
+    if len(told) == 1:
+        return f"{next(iter(told.values())):.3g}"
+    return ", ".join(f"{name} {value:.3g}" for name, value in told.items())
 
 
 def renders_text(summary: Summary) -> str:
@@ -150,13 +217,41 @@ def formation_text(summary: Summary) -> str:
 
 def _how_it_errs(summary: Summary, verified: Mapping[str, Any], thing: str) -> str:
     """Return "The model calls this mug a vase" where that is known of every trial, a weaker clause otherwise."""
+    if minimises(summary):
+        return f"The model recognises {thing}, more surely than in the clean scene,"
     answers = verified.get("labels") or {}
     if len(answers) == 1:
         return f"The model calls {thing} {with_article(next(iter(answers)))}"
     if answers:
         most = max(answers, key=lambda label: answers[label])
-        return f"The model is wrong about {thing}, most often calling it {with_article(most)},"
+        what = "takes {} for one of the targets" if targets(summary) else "is wrong about {}"
+        return f"The model {what.format(thing)}, most often calling it {with_article(most)},"
     return f"The model takes {thing} for something else ({_called(summary.get('adversarial'))})"
+
+
+def _claim(summary: Summary, thing: str) -> str:
+    """Return what a trial counts as, as a clause: "the model is wrong about this mug"."""
+    if minimises(summary):
+        return f"the model recognises {thing}, more surely than in the clean scene,"
+    if targets(summary):
+        return f"the model calls {thing} {_a_target(summary)}"
+    return "it is wrong" if summary.get("ending") in _REASONS else f"the model is wrong about {thing}"
+
+
+def _wanted(summary: Summary, thing: str) -> str:
+    """Return what was looked for, as a clause: "makes the model miss this mug"."""
+    if minimises(summary):
+        return f"makes {thing} easier to recognise"
+    return f"makes the model call {thing} {_a_target(summary)}" if targets(summary) else f"makes the model miss {thing}"
+
+
+def _a_target(summary: Summary) -> str:
+    return " or ".join(with_article(name) for name in targets(summary))
+
+
+def _each(summary: Summary) -> str:
+    """Return what is said of the renders of an answer that holds for many conditions."""
+    return f", each with another {' and '.join(over(summary))}" if over(summary) else ""
 
 
 def _against_random(summary: Summary) -> list[str]:

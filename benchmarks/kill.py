@@ -1,0 +1,77 @@
+"""Kills a run with SIGKILL at random moments, resumes it each time, and compares the rows with those of a whole run.
+
+    python benchmarks/kill.py [--kills 50] [--resolution 32] [--command attack|sweep]
+
+Every row must agree in every column but times. The attack has an adjoint, so it runs under `--deterministic`; the sweep
+does not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from advsearch.runs.store import NAME, Row, Store
+
+COMMANDS = {
+    "attack": ["--control", "texture", "--steps", "60", "--trials", "30", "--verify-spp", "32", "--deterministic"],
+    "sweep": ["--grid", "pose.yaw=0:360:40", "--grid", "camera.elevation=5:60:10", "--threads", "1"],
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Kill, resume, compare; returns 0 if the rows agree, 3 otherwise."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--resolution", type=int, default=32)
+    parser.add_argument("--command", choices=COMMANDS, default="attack")
+    args = parser.parse_args(argv)
+    words = ["--object", "mug", "--resolution", str(args.resolution), *COMMANDS[args.command]]
+    with tempfile.TemporaryDirectory() as folder:
+        whole, killed = Path(folder) / "whole", Path(folder) / "killed"
+        begun = time.perf_counter()
+        _start([args.command, *words, "--run", str(whole)]).wait()
+        seconds = time.perf_counter() - begun
+        kills = _killed([args.command, *words, "--run", str(killed)], killed, args.kills, seconds)
+        same = _rows(whole) == _rows(killed)
+        print(f"{args.command}: {len(_rows(whole))} rows, {kills} kills, rows {'agree' if same else 'DIFFER'}")
+    return 0 if same else 3
+
+
+def _start(words: Sequence[str]) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", "advsearch", *words, "--quiet"]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def _killed(first: Sequence[str], folder: Path, wanted: int, seconds: float) -> int:
+    """Start the run and kill it, resume and kill it, until it is done; return how often it was killed.
+
+    Each life lasts as long as a start takes and a share of the rest, so that the kills spread over the whole run.
+    """
+    moments, kills, startup = random.Random(1), 0, 2.5
+    while True:
+        known = (folder / "run.yaml").is_file() and (folder / NAME).is_file()
+        child = _start(["resume", str(folder)] if known else first)
+        life = startup + moments.expovariate(wanted / seconds) if kills < wanted else None
+        try:
+            child.wait(life)
+            return kills
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+            kills += 1
+
+
+def _rows(folder: Path) -> list[Row]:
+    with Store(folder / NAME, read_only=True) as store:
+        return [Row(**{**vars(row), "seconds": None, "time": None}) for row in store.rows()]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

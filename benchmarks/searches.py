@@ -1,0 +1,117 @@
+"""Compares policies on bundled scenes at equal renders, by verified margin, with a dense sample of the space beside.
+
+    python benchmarks/searches.py [--spaces pose camera light environment.rotation] [--policies auto random ...]
+                                  [--renders 60] [--seeds 5] [--dense 600] [--resolution 64]
+    python benchmarks/searches.py --texture [--seeds 5]
+
+The first prints, for each space and policy, the median over seeds of the verified margin (the mean of fresh trials at a
+high sample count, in logits; above 0 the model is wrong), how far `auto` is below the best single policy, and which
+share of a dense sample of the space, ten times as many renders, has a lower margin than `auto`'s answer.
+
+The second compares the renders that gradient search needs with those of the best policy without gradients: the margin
+that `pgd` reaches within a tenth of the renders, and the margins of the others with all of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds, threads
+from advsearch.api.attacking import problem_from_config
+from advsearch.api.problem import Problem
+from advsearch.attacks import make_policy, search
+from advsearch.config import AttackConfig
+
+TRIALS, TRIAL_SPP = 8, 64
+BLIND = ("random", "nes", "sobol")
+"""Policies without gradients that take a whole texture."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure and print; returns the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--object", default="mug")
+    parser.add_argument("--environment", default="studio")
+    parser.add_argument("--spaces", nargs="+", default=["pose", "camera", "light", "environment.rotation"])
+    parser.add_argument("--policies", nargs="+", default=["auto", "random", "sobol", "cmaes", "pgd"])
+    parser.add_argument("--renders", type=int, default=60)
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--dense", type=int, default=600)
+    parser.add_argument("--resolution", type=int, default=64)
+    parser.add_argument("--texture", action="store_true")
+    args = parser.parse_args(argv)
+    threads.configure(None)
+    (_texture if args.texture else _spaces)(args)
+    return 0
+
+
+def _problem(args: argparse.Namespace, control: str) -> Problem:
+    config = AttackConfig(
+        object=args.object,
+        environment=args.environment,
+        controls={control: {}},
+        resolution=args.resolution,
+        measure="no",
+    )
+    return problem_from_config(config)[0]
+
+
+def _answer(problem: Problem, policy: str, renders: int, seed: int) -> float:
+    """Verified margin of what a search finds: fresh seeds, 8 bits, a high sample count."""
+    problem.seed = seeds.stream(7, "searches", seed)
+    steps = max(1, renders - 8)  # the ranking of candidates takes eight
+    found = search(
+        problem.evaluator(policy), problem.domain, make_policy(policy), steps=steps, seed=seeds.stream(seed, policy)
+    )
+    return _verified(problem, found.best_u)
+
+
+def _verified(problem: Problem, u: Tensor, trials: int = TRIALS) -> float:
+    margins = [problem.trial(u, seeds.stream(99, "trial", number), TRIAL_SPP).margin for number in range(trials)]
+    return statistics.fmean(margins)
+
+
+def _spaces(args: argparse.Namespace) -> None:
+    print(f"| space | {' | '.join(args.policies)} | auto below the best | share of {args.dense} below auto |")
+    print("|" + " --- |" * (len(args.policies) + 3))
+    for space in args.spaces:
+        problem = _problem(args, space)
+        margins = {
+            policy: [_answer(problem, policy, args.renders, seed) for seed in range(args.seeds)]
+            for policy in args.policies
+        }
+        medians = {policy: statistics.median(values) for policy, values in margins.items()}
+        generator = torch.Generator().manual_seed(5)
+        dense = [_verified(problem, u, 1) for u in problem.domain.sample(generator, args.dense)]
+        clean = _verified(problem, problem.domain.start)
+        best = max(medians.values())
+        cells = [
+            f"{medians[policy]:.2f} ({min(margins[policy]):.1f} to {max(margins[policy]):.1f})" for policy in margins
+        ]
+        behind = share = "-"
+        if "auto" in medians:
+            behind = f"{100 * max(0.0, best - medians['auto']) / max(best - clean, 1e-9):.0f} %"
+            share = f"{100 * sum(value < medians['auto'] for value in dense) / len(dense):.1f} %"
+        print(f"| {space} | {' | '.join(cells)} | {behind} | {share} |", flush=True)
+
+
+def _texture(args: argparse.Namespace) -> None:
+    problem = _problem(args, "texture")
+    few = max(10, args.renders // 10)
+    rows = [("pgd", few), *((policy, args.renders) for policy in BLIND)]
+    print("| policy | renders | verified margin, median | lowest | highest |")
+    print("| --- | --- | --- | --- | --- |")
+    for policy, renders in rows:
+        values = [_answer(problem, policy, renders, seed) for seed in range(args.seeds)]
+        median = statistics.median(values)
+        print(f"| {policy} | {renders} | {median:.2f} | {min(values):.2f} | {max(values):.2f} |", flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

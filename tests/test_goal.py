@@ -1,0 +1,89 @@
+"""What counts as success, and by which rule a claim is verified."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.attacks import Block, Domain, Ending, Trial, Trials, verdict, verify
+from advsearch.attacks.goal import Goal
+from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
+from advsearch.errors import InputError
+
+LOGITS = torch.tensor([[3.0, 1.0, 0.0], [0.0, 2.0, 1.0], [0.0, 1.0, 4.0], [2.0, 2.0, 0.0], [math.nan, 0.0, 1.0]])
+DOMAIN = Domain(torch.zeros(1), (Block(1),))
+
+
+@pytest.mark.parametrize(
+    ("goal", "scores"),
+    [
+        (Goal((0,)), [-2.0, 2.0, 4.0, 0.0]),
+        (Goal((0,), targets=(2,)), [-3.0, -1.0, 3.0, -2.0]),
+        (Goal((0,), minimise=True), [2.0, -2.0, -4.0, 0.0]),
+    ],
+)
+def test_a_score_over_zero_is_a_success(goal: Goal, scores: list[float]) -> None:
+    assert goal.score(LOGITS)[:4].tolist() == scores
+    assert not bool(goal.score(LOGITS)[4] > 0.0)
+    assert goal.right(LOGITS).tolist() == [True, False, False, True, False]
+
+
+def test_a_target_must_be_wrong_and_there_is_none_to_minimise() -> None:
+    with pytest.raises(InputError, match=r"--target: expected classes that are not right answers, got \[1\]"):
+        Goal((0, 1), targets=(1, 2))
+    with pytest.raises(InputError, match="--minimise"):
+        Goal((0,), targets=(1,), minimise=True)
+
+
+def trials(values: list[tuple[float, bool]]) -> list[Trial]:
+    return [Trial(margin, 0, 1.0, right) for margin, right in values]
+
+
+def run(rule: Rule, clean: list[tuple[float, bool]], found: list[tuple[float, bool]]) -> tuple[Ending, int, int]:
+    answers = iter(trials(found))
+
+    def render(u: Tensor, seed: int, spp: int) -> Trial:
+        return next(answers)
+
+    result = verify(
+        render,
+        DOMAIN,
+        DOMAIN.start,
+        claim=Ending.BUDGET_SPENT,
+        spp=1,
+        seed=0,
+        trials=len(found),
+        clean=trials(clean),
+        rule=rule,
+    )
+    return result.ending, result.adversarial.successes, result.adversarial.trials
+
+
+def test_over_conditions_those_count_in_which_the_clean_scene_is_right() -> None:
+    clean = [(-1.0, True)] * 10 + [(1.0, False)] * 10
+    wrong, right = (1.0, False), (-1.0, True)
+    assert run(OVER_CONDITIONS, clean, [wrong] * 9 + [right] + [right] * 10) == (Ending.FOUND, 9, 10)
+    assert run(OVER_CONDITIONS, clean, [wrong] * 8 + [right] * 2 + [wrong] * 10) == (Ending.BUDGET_SPENT, 8, 10)
+    assert run(WORST_CASE, clean, [wrong] * 20) == (Ending.BUDGET_SPENT, 10, 20)
+    mostly_wrong = [(-1.0, True)] * 9 + [(1.0, False)] * 11
+    assert run(OVER_CONDITIONS, mostly_wrong, [wrong] * 20)[0] is Ending.ALREADY_WRONG
+
+
+def test_a_target_reached_where_the_clean_answer_was_wrong_does_not_count() -> None:
+    clean = [(-3.0, True)] * 19 + [(-1.0, False)]  # the last is wrong without being the target
+    assert run(WORST_CASE, clean, [(1.0, False)] * 20) == (Ending.FOUND, 19, 20)
+
+
+def test_easier_means_right_and_surer_than_the_clean_scene() -> None:
+    clean = [(-1.0, False)] * 20
+    assert run(EASIER, clean, [(2.0, True)] * 20) == (Ending.FOUND, 20, 20)
+    sure = [(3.0, True)] * 20
+    assert run(EASIER, sure, [(2.0, True)] * 20) == (Ending.BUDGET_SPENT, 0, 20)
+    assert run(EASIER, sure, [(4.0, True)] * 20)[0] is Ending.FOUND
+
+
+def test_no_trial_is_no_proof() -> None:
+    assert verdict(Ending.BUDGET_SPENT, Trials(10, 20, 1), Trials(0, 1, 1), OVER_CONDITIONS) is Ending.BUDGET_SPENT

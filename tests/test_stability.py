@@ -1,0 +1,243 @@
+"""The stability suite: every extreme of the list has a case, the cheap ones hold, and the command reports honestly."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from advsearch.cli import stability as command
+from advsearch.cli.main import main
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.evaluation import stability
+from advsearch.evaluation.stability import CASES, FELL_SHORT, GROUPS, OK, Case, Check, Findings, chosen, run_case
+from advsearch.evaluation.stability_case import holds
+from advsearch.evaluation.stability_cases_noise import clipped_mean, median_of_means
+from advsearch.evaluation.stability_scene import sphere
+from advsearch.evaluation.stability_search import Toy, condition_number, hessian, numbers, quadratic
+
+WANTED = {
+    "radiometric": (
+        "one HDRI texel at 100,000",
+        "a black environment",
+        "negative or infinite texels refused",
+        "exposure of +-10 stops",
+        "saturated and black images",
+    ),
+    "materials": (
+        "roughness 0 and 1",
+        "metallic 1",
+        "perfect mirror",
+        "clear glass",
+        "texels at exactly 0 and 1",
+    ),
+    "geometry": (
+        "degenerate and sliver triangles",
+        "coincident faces",
+        "a mesh of one triangle and of a million",
+        "scale 0.01 and 100",
+        "translation by 10,000 object sizes",
+        "grazing views",
+        "near-plane intersection",
+        "the object filling or leaving the frame",
+        "gimbal angles",
+        "a full turn meeting itself",
+    ),
+    "objective": (
+        "logits of 1e4",
+        "ties",
+        "probabilities 0 and 1",
+        "NaN from the model at step k",
+        "constant model",
+        "random model",
+    ),
+    "stiff": (
+        "two controls whose curvatures differ by 1e6",
+        "a light in watts beside a rotation in degrees beside a texel",
+        "narrow curved valleys",
+        "badly scaled boxes",
+        "a rate that does not depend on the units",
+        "same trajectory in rescaled units",
+    ),
+    "precision": (
+        "single against double where the difference can change a verdict",
+        "accumulation over 10,000 steps",
+        "determinism under 1 and 2 threads",
+    ),
+    "noise": (
+        "1 sample per pixel",
+        "heavy-tailed gradients: median of means or clipping, its bias measured",
+    ),
+}
+"""What the suite was asked for."""
+
+CHEAP = [case for case in CASES if case.cheap]
+
+
+# ---- the registry ---------------------------------------------------------------------------------------------------
+
+
+def test_every_extreme_that_was_asked_for_has_a_case() -> None:
+    assert {(case.group, case.what) for case in CASES} == {(g, what) for g, list in WANTED.items() for what in list}
+    assert list(GROUPS) == list(WANTED)
+
+
+def test_cases_are_complete_and_have_names_of_their_own() -> None:
+    assert len({case.name for case in CASES}) == len(CASES)
+    for case in CASES:
+        assert case.group in GROUPS and case.holds.endswith(".") and case.rule, case.name
+
+
+def test_the_cheap_cases_cover_every_group() -> None:
+    assert {case.group for case in CHEAP} == set(GROUPS)
+
+
+# ---- the cases ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", CHEAP, ids=lambda case: case.name)
+def test_a_cheap_case_holds(case: Case) -> None:
+    row = run_case(case)
+    assert row.status == OK, row.decides
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", [case for case in CASES if not case.cheap], ids=lambda case: case.name)
+def test_a_case_holds(case: Case) -> None:
+    row = run_case(case)
+    assert row.status == OK, row.decides
+
+
+# ---- rows -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("check", "ok", "text"),
+    [
+        (Check("x", 1.0, most=2.0), True, "x: 1 (expected at most 2)"),
+        (Check("x", 3.0, most=2.0), False, "x: 3 (expected at most 2)"),
+        (Check("x", 3.0, 1.0, 2.0), False, "x: 3 (expected at least 1 and at most 2)"),
+        (Check("x", math.nan, most=2.0), False, "x: nan (expected at most 2)"),
+        (Check("x", math.nan), False, "x: nan"),
+        (holds("x", False), False, "x: 0 (expected exactly 1)"),
+    ],
+)
+def test_a_check_says_what_it_wanted(check: Check, ok: bool, text: str) -> None:
+    assert check.ok is ok and str(check) == text
+
+
+def made(findings: Findings | Exception, name: str = "made") -> Case:
+    def find() -> Findings:
+        if isinstance(findings, Exception):
+            raise findings
+        return findings
+
+    return Case(name, "noise", "", "It holds.", "a rule", find, "pose")
+
+
+def test_a_row_has_what_the_design_lists() -> None:
+    findings = Findings((Check("a", 1.0, most=2.0), Check("b", 5.0, most=2.0)), True, 0.25, "stalled", {"c": 3.0})
+    row = run_case(made(findings)).to_dict()
+    wanted = {"case": "made", "control": "pose", "finite": True, "relative_error": 0.25, "ending": "stalled"}
+    assert {**row, **wanted} == row
+    assert (row["status"], row["rule"], row["decides"]) == (FELL_SHORT, "a rule", "b: 5 (expected at most 2)")
+    assert row["seconds"] >= 0.0 and row["measured"] == {"c": 3.0}
+
+
+def test_what_is_not_finite_falls_short_whatever_the_checks_say() -> None:
+    row = run_case(made(Findings((Check("a", 1.0, most=2.0),), finite=False)))
+    assert (row.status, row.decides) == (FELL_SHORT, "NaN or infinite values")
+
+
+@pytest.mark.parametrize(
+    ("error", "ending", "text"),
+    [(InputError("no such light"), "refused", "no such light"), (ZeroDivisionError("by 0"), "raised", "by 0")],
+)
+def test_an_exception_is_a_finding(error: Exception, ending: str, text: str) -> None:
+    row = run_case(made(error))
+    assert row.status == FELL_SHORT and row.findings.ending == ending and text in row.decides
+
+
+# ---- the command ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def two_cases(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    good = made(Findings((Check("a", 1.0, most=2.0),), relative_error=0.02, ending="found"), "good")
+    bad = replace(made(Findings((Check("a", 3.0, most=2.0),)), "bad"), group="stiff")
+    monkeypatch.setattr(stability, "CASES", (good, bad))
+    yield
+
+
+@pytest.mark.usefixtures("two_cases")
+def test_the_command_prints_a_table_and_the_number_that_decides(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stability", "--quiet"]) == command.EXIT_FELL_SHORT
+    out = capsys.readouterr().out
+    assert "bad fell short: a: 3 (expected at most 2)" in out and "1 of 2 cases hold" in out
+    assert main(["stability", "--quiet", "--case", "good"]) == 0
+    assert main(["stability", "--quiet", "--group", "stiff"]) == command.EXIT_FELL_SHORT
+
+
+@pytest.mark.usefixtures("two_cases")
+def test_the_command_prints_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stability", "--quiet", "--json"]) == command.EXIT_FELL_SHORT
+    said = json.loads(capsys.readouterr().out)
+    assert (said["schema"], said["command"]) == (1, "stability")
+    assert [(row["case"], row["status"]) for row in said["rows"]] == [("good", OK), ("bad", FELL_SHORT)]
+
+
+def test_the_command_lists_its_cases_without_running_them(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["stability", "--list", "--json", "--quiet"]) == 0
+    assert [one["case"] for one in json.loads(capsys.readouterr().out)["cases"]] == [case.name for case in CASES]
+
+
+def test_unknown_cases_and_groups_are_refused() -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown case 'tie'\. Did you mean 'ties'"):
+        chosen(["tie"])
+    with pytest.raises(UnknownNameError, match=r"unknown group 'stif'\. Did you mean 'stiff'"):
+        chosen([], ["stif"])
+    assert {case.group for case in chosen(["ties"], ["stiff"])} == {"objective", "stiff"}
+
+
+# ---- the tools ------------------------------------------------------------------------------------------------------
+
+
+def test_the_condition_number_of_a_quadratic_is_estimated() -> None:
+    value = quadratic([0.5, 0.5], [1e6, 1.0])
+    second = hessian(lambda u: float(value(u)), torch.full((2,), 0.3).double(), torch.eye(2).double(), [0.01, 0.01])
+    assert condition_number(second) == pytest.approx(1e6, rel=1e-3)
+    assert condition_number(torch.diag(torch.tensor([1.0, 0.0]))) == math.inf
+
+
+def test_mixed_second_derivatives_are_estimated() -> None:
+    second = hessian(lambda u: float(u[0] * u[1]), torch.full((2,), 0.3).double(), torch.eye(2).double(), [0.1, 0.2])
+    assert torch.allclose(second, torch.tensor([[0.0, 1.0], [1.0, 0.0]]).double(), atol=1e-12)
+
+
+def test_median_of_means_and_clipping_ignore_one_huge_sample() -> None:
+    samples = torch.ones(24, 3)
+    samples[5] = 1e9
+    assert torch.equal(median_of_means(samples), torch.ones(3))
+    assert float((clipped_mean(samples) - 1.0).abs().max()) < 0.1
+    assert torch.equal(median_of_means(samples.expand(2, 24, 3)), torch.ones(2, 3))
+
+
+def test_the_sphere_is_closed_and_faces_outwards() -> None:
+    mesh = sphere(8, 12)
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    normal = np.cross(b - a, c - a)
+    assert len(mesh.faces) == 2 * 7 * 12
+    assert (np.linalg.norm(normal, axis=1) > 0.0).all()
+    assert ((normal * ((a + b + c) / 3.0 - [0.0, 0.0, 0.5])).sum(axis=1) > 0.0).all()
+
+
+def test_a_toy_counts_its_cost_and_breaks_where_it_is_told_to() -> None:
+    toy = Toy(quadratic([0.5], [1.0]), numbers([0.0]), broken=frozenset({3}))
+    u = torch.zeros(1)
+    assert toy(u, index=2, gradient=True).finite and not toy(u, index=3, gradient=True).finite
+    assert toy(u, index=2, gradient=False, samples=4).cost == 4

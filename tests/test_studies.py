@@ -1,0 +1,173 @@
+"""Curves, gaps and regions: their accounting with stand-ins for attacks, and one small region and one search over
+conditions that are rendered."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+import advsearch
+from advsearch.api import mapping, studies
+from advsearch.cli.region import answer as region_text
+from advsearch.cli.studies import answer
+from advsearch.config import AttackConfig, GapConfig, RegionConfig
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.runs.directory import RunDirectory
+
+FLIPS = {"mug": 0.02, "bowl": 0.1, "vase": 0.0, "pan": 9.0}
+"""The epsilon at which each object flips; 0: it is wrong already."""
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[AttackConfig]:
+    """Attacks that were carried out; their stand-in leaves a run with a summary."""
+    monkeypatch.chdir(tmp_path)
+    done: list[AttackConfig] = []
+
+    def attack(config: AttackConfig, *, progress: Any) -> Any:
+        done.append(config)
+        with RunDirectory.create(config.run, overwrite=config.overwrite) as run:
+            run.write_config(config)
+            summary = summary_of(config, str(run.path))
+            run.write_summary(summary)
+        return SimpleNamespace(summary=summary)
+
+    monkeypatch.setattr(studies, "attack_from_config", attack)
+    return done
+
+
+def summary_of(config: AttackConfig, run: str) -> dict[str, Any]:
+    epsilon, flips = config.epsilon if isinstance(config.epsilon, float) else 0.1, FLIPS[config.object]
+    ending = "already wrong" if flips == 0.0 else "found" if flips <= epsilon else "budget spent"
+    rated = {"successes": 20 * (ending == "found"), "trials": 20, "rate": float(ending == "found")}
+    return {
+        "command": "attack",
+        "run": run,
+        "ending": ending,
+        "epsilon": epsilon,
+        "clean": {"control": {"correct": 0 if flips == 0.0 else 20, "trials": 20}},
+        "verified": {} if flips == 0.0 else {**rated, "margin": 1.0, "interval": [0.8, 1.0]},
+        "average": {"configurations": 50, "correct": 45, "accuracy": 0.9, "interval": [0.78, 0.97]},
+        "renders": {"search": 3},
+    }
+
+
+def test_a_curve_counts_robust_objects_at_each_epsilon(asked: list[AttackConfig]) -> None:
+    config = AttackConfig(object="mug,bowl,vase,pan", epsilon="0.1,0.01,0.05", run="study")
+    summary = studies.curve_from_config(config)
+    told = [(one["epsilon"], one["robust"], one["found"], one["already_wrong"]) for one in summary["curve"]]
+    assert told == [(0.01, 3, 0, 1), (0.05, 2, 1, 1), (0.1, 1, 2, 1)]
+    low, high = summary["curve"][1]["interval"]
+    assert summary["curve"][1]["accuracy"] == 0.5 and 0.06 < low < 0.07 and 0.93 < high < 0.94
+    assert [row["flips_at"] for row in summary["table"]] == [0.05, 0.1, None, None]
+    tried = [(one.object, one.epsilon) for one in asked]  # none beyond the epsilon at which an object flips
+    assert tried == [
+        ("mug", 0.01), ("mug", 0.05), ("bowl", 0.01), ("bowl", 0.05), ("bowl", 0.1), ("vase", 0.01),
+        ("pan", 0.01), ("pan", 0.05), ("pan", 0.1),
+    ]  # fmt: skip
+    assert (Path("runs/study/images") / "attack.svg").is_file()
+    assert json.loads(Path("runs/study/summary.json").read_text())["curve"] == summary["curve"]
+    assert "2/4" in answer(summary) and "already wrong" in answer(summary)
+
+
+def test_several_objects_and_one_budget_make_one_row_each(asked: list[AttackConfig]) -> None:
+    summary = studies.curve_from_config(AttackConfig(object="mug,pan", run="study"))
+    assert [row["ending"] for row in summary["table"]] == ["found", "budget spent"]
+    assert [one["robust"] for one in summary["curve"]] == [1] and len(asked) == 2
+
+
+def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
+    asked: list[AttackConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = GapConfig(object="mug,bowl", controls="texture,geometry", run="study")
+    carry_out: Callable[..., Any] = studies.attack_from_config
+
+    def stopped(config: AttackConfig, *, progress: Any) -> Any:
+        if len(asked) == 2:
+            raise KeyboardInterrupt
+        return carry_out(config, progress=progress)
+
+    monkeypatch.setattr(studies, "attack_from_config", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        studies.gap_from_config(config)
+    assert Path("runs/study/parts/mug-texture/summary.json").is_file()
+    monkeypatch.setattr(studies, "attack_from_config", carry_out)
+    summary = studies.gap_from_config(config, resumed=Path("runs/study"))
+    assert [(row["object"], row["control"]) for row in summary["table"]] == [
+        ("mug", "texture"), ("mug", "geometry"), ("bowl", "texture"), ("bowl", "geometry"),
+    ]  # fmt: skip
+    assert len(asked) == 4, "two before the stop, two after it"
+    assert "45/50 (90 %)" in answer(summary) and "20/20" in answer(summary)
+
+
+def test_a_gap_gives_each_control_its_own_budget(asked: list[AttackConfig]) -> None:
+    config = GapConfig(object="mug", controls="texture,pose", epsilon="texture=0.05", run="study", average=7)
+    studies.gap_from_config(config)
+    assert [(one.epsilon, one.average, list(one.controls)) for one in asked] == [
+        ({"texture": 0.05}, 7, ["texture"]), (None, 7, ["pose"]),
+    ]  # fmt: skip
+    with pytest.raises(InputError, match="advsearch gap: compares over one space"):
+        studies.gap_from_config(GapConfig(object="mug", epsilon="0.1,0.2", run="other"))
+
+
+# ---- rendered -------------------------------------------------------------------------------------------------------
+
+SMALL: dict[str, Any] = {"object": "mug", "resolution": 16, "denoise": "none"}
+
+
+def test_a_region_is_told_in_the_units_of_its_parameters(tmp_path: Path) -> None:
+    config = RegionConfig(
+        **SMALL, controls={"pose": {"yaw": [10, 50], "pitch": 0, "roll": 0, "x": 0, "z": 0}, "camera.elevation": {}},
+        vary="pose.yaw,camera.elevation", samples=6, map=2, verify_spp=2, run=str(tmp_path / "run"),
+    )  # fmt: skip
+    try:
+        summary = mapping.region_from_config(config)
+    except InputError as error:  # sixteen pixels may leave the verdict to the noise, which is said
+        assert "depends on the noise" in str(error)
+        return
+    yaw, elevation = summary["box"]
+    assert (yaw["name"], yaw["unit"]) == ("pose.yaw", "degrees") and 10 <= yaw["low"] <= yaw["centre"] <= yaw[
+        "high"
+    ] <= 50
+    assert elevation["unit"] == "degrees" and 0.0 <= summary["volume"] <= 1.0
+    assert summary["same"] <= summary["samples"] == 6 and len(summary["map"]["margins"]) == 2
+    assert (tmp_path / "run" / "images" / "map.png").is_file()
+    assert "fresh samples of this box" in region_text(summary)
+
+
+@pytest.mark.parametrize(
+    ("more", "error", "message"),
+    [
+        ({"vary": "pose.yawn"}, UnknownNameError, "unknown parameter in --vary 'pose.yawn'. Did you mean 'pose.yaw'"),
+        ({"map": 4, "vary": "pose.yaw"}, InputError, "--map: expected two parameters in --vary, got 1"),
+        ({"controls": {"texture": {"resolution": 4}}}, InputError, "--vary: expected 1 to 8 parameters, got "),
+    ],
+)
+def test_a_region_refuses_what_does_not_fit(more: dict[str, Any], error: Any, message: str, tmp_path: Path) -> None:
+    with pytest.raises(error, match=message):
+        mapping.region_from_config(RegionConfig(**{**SMALL, "controls": "pose", **more, "run": str(tmp_path / "run")}))
+    assert not (tmp_path / "run").exists()
+
+
+def test_one_texture_for_many_conditions(tmp_path: Path) -> None:
+    names = advsearch.load_model("reference").labels
+    result = advsearch.attack(
+        "mug", label=[name for name in names if name != "lamp"],  # at 16 pixels a mug is none
+        controls={"texture": {"resolution": 4}}, over=["camera.azimuth"], resolution=16, denoise="none", steps=3,
+        draws=2, trials=4, verify_spp=2, average=3, baseline=False, run=tmp_path / "run",
+    )  # fmt: skip
+    summary = result.summary
+    assert summary["over"] == ["camera"] and summary["controls"] == ["texture"]
+    assert len(summary["configuration"]) and all(name.startswith("texture") for name in summary["configuration"])
+    assert summary["verified"] is None or summary["verified"]["trials"] <= 4
+    with RunDirectory.resume(tmp_path / "run") as run:
+        trials = list(run.store.rows("control"))
+        searched = list(run.store.rows("search"))
+    azimuths = {json.dumps(row.values["camera.azimuth"]) for row in trials}
+    assert len(azimuths) == 4, "every trial has conditions of its own"
+    assert all("camera.azimuth" not in row.values for row in searched)
