@@ -20,6 +20,9 @@ from advsearch.settings import PLACE, Config, all_finite, number_or_text, parse_
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
 
+AUTO_SHARE = 2
+"""With `--spp auto` a search begins with the default's samples divided by this."""
+
 TRIALS, TRIALS_OVER = 20, 200
 """Fresh renders that check an answer, and one that holds for many conditions."""
 
@@ -97,15 +100,13 @@ class SceneConfig(Config):
         ge=2,
         le=4096,
     )
-    spp: int | None = setting(
+    spp: int | Literal["auto"] | None = setting(
         None,
         "search",
-        "samples per pixel of a render of the search",
-        "a whole number from 1 to 65536",
+        "samples per pixel of a render of the search; auto begins with few and spends more where it is close",
+        "a whole number from 1 to 65536, or auto",
         otherwise="8 with the denoiser, 16 without",
         unit="samples",
-        ge=1,
-        le=65536,
     )
     denoise: Literal["oidn", "none"] = setting(
         "oidn", "search", "denoiser of every render, in search and verification", "oidn or none"
@@ -131,7 +132,9 @@ class SceneConfig(Config):
     @property
     def search_spp(self) -> int:
         """Samples a pixel of the search: what was asked for, or the default for the denoiser."""
-        return self.spp if self.spp is not None else SEARCH_SPP[self.denoise]
+        if self.spp == "auto":
+            return SEARCH_SPP[self.denoise] // AUTO_SHARE
+        return self.spp if isinstance(self.spp, int) else SEARCH_SPP[self.denoise]
 
     @property
     def objects(self) -> tuple[str, ...]:
@@ -159,6 +162,13 @@ class SceneConfig(Config):
         if isinstance(text, str) and (not text.strip() or "\0" in text):
             raise ValueError("an empty name")
         return text
+
+    @field_validator("spp")
+    @classmethod
+    def _spp_in_range(cls, value: Any) -> Any:
+        if isinstance(value, int) and not 1 <= value <= 65536:
+            raise ValueError("out of range")
+        return value
 
     @field_validator("controls", "over", mode="before", check_fields=False)
     @classmethod
@@ -212,6 +222,12 @@ class AttackConfig(SceneConfig):
 
     command: ClassVar[str] = "attack"
 
+    object: str = setting(
+        ...,
+        "scene",
+        "what the model should recognise; several, separated by commas, are attacked one after the other",
+        "the name of an object or a .obj, .ply, .glb, .gltf or .stl file",
+    )
     epsilon: float | dict[str, float] | tuple[float, ...] | None = setting(
         None,
         "search",
@@ -351,6 +367,8 @@ class AttackConfig(SceneConfig):
         """Refuse settings that exclude each other."""
         if self.smallest and self.epsilons:
             raise InputError("--smallest: finds one epsilon by itself; give one --epsilon as the largest, or none")
+        if self.smallest and self.seconds is not None:
+            raise InputError("--smallest: takes several searches; give --steps for each, and leave --seconds out")
         if self.smallest and self.over:
             raise InputError("--smallest: cannot be combined with --over yet; leave one of them out")
         if self.minimise and self.target:

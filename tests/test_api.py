@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -15,6 +16,7 @@ import advsearch
 from advsearch.api.problem import Problem
 from advsearch.config import AttackConfig
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
+from advsearch.runs.store import Row, Store
 
 SIZE = 32
 LABELS = ("mug", "vase")
@@ -150,6 +152,71 @@ def test_ctrl_c_keeps_the_run_so_far(
     assert result.summary["ending"] == "interrupted" and result.summary["verified"] is None
     assert json.loads((tmp_path / "run" / "summary.json").read_text("utf-8"))["ending"] == "interrupted"
     assert result.summary["steps"] == 3
+
+
+def test_a_stopped_run_goes_on_where_it_was(
+    scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = {**FAST, "deterministic": True, "baseline": False}
+    whole = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "whole", **options)
+    with monkeypatch.context() as patch:
+        original = Problem.evaluator
+
+        def interrupted(self: Problem, stream: str, on_image: Any = None) -> Any:
+            evaluate, calls = original(self, stream, on_image), iter(range(3))
+
+            def stops(u: Tensor, **named: Any) -> Any:
+                if next(calls, None) is None:
+                    raise KeyboardInterrupt
+                return evaluate(u, **named)
+
+            return stops
+
+        patch.setattr(Problem, "evaluator", interrupted)
+        stopped = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", **options)
+    assert stopped.summary["ending"] == "interrupted" and (tmp_path / "run" / "replay.bin").exists()
+    again = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", resume=True, **options)
+    assert torch.equal(again.u, whole.u) and again.summary["verified"] == whole.summary["verified"]
+    assert rows_of(tmp_path / "run") == rows_of(tmp_path / "whole")
+    assert not (tmp_path / "run" / "replay.bin").exists()
+
+
+def rows_of(run: Path) -> list[Row]:
+    """All that is stored of a run, but for times."""
+    with Store(run / "results.sqlite", read_only=True) as store:
+        return [dataclasses.replace(row, seconds=None, time=None) for row in store.rows()]
+
+
+def test_a_target_and_the_average_are_in_the_summary(scene: advsearch.Scene, level: float) -> None:
+    result = advsearch.attack(scene, model(level + 0.03), target="vase", average=5, baseline=False, **FAST)
+    summary = result.summary
+    assert (summary["goal"], summary["target"], summary["ending"]) == ("a target answer", ["vase"], "found")
+    average = summary["average"]
+    assert average["configurations"] == 5 and 0 <= average["correct"] <= 5
+    assert average["accuracy"] == average["correct"] / 5 and len(average["interval"]) == 2
+    assert average["margin"] <= average["worst_margin"]
+
+
+def test_the_smallest_epsilon_is_bracketed_and_verified(scene: advsearch.Scene, level: float) -> None:
+    summary = advsearch.attack(scene, model(level + 0.03), smallest=True, **FAST).summary
+    bracket = summary["smallest"]
+    assert summary["ending"] == "found" and "baseline" not in summary
+    assert 0.0 < bracket["epsilon"]["texture"] < 0.1
+    assert bracket["not_found_at"] is None or bracket["not_found_at"]["texture"] < bracket["epsilon"]["texture"]
+
+
+def test_conditions_are_other_ones_in_every_trial_and_the_same_for_both_groups(
+    scene: advsearch.Scene, level: float, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    summary = advsearch.attack(scene, model(level + 0.1), over=["camera"], draws=2, run=run, **FAST).summary
+    assert summary["over"] == ["camera"] and summary["controls"] == ["texture"]
+    with Store(run / "results.sqlite", read_only=True) as store:
+        clean, adversarial = (
+            [row.values["camera.azimuth"]["value"] for row in store.rows(kind)] for kind in ("control", "verification")
+        )
+    assert len(set(clean)) == 4
+    assert adversarial in ([], clean)  # nothing, if the clean scene is wrong in half of them
 
 
 def test_nan_logits_during_the_search_end_it_and_are_counted(

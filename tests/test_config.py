@@ -342,6 +342,7 @@ def test_a_policy_has_options_and_its_steps_are_the_runs(given: Any) -> None:
     ("data", "message"),
     [
         ({"smallest": True, "epsilon": "0.1,0.2"}, "--smallest: finds one epsilon by itself"),
+        ({"smallest": True, "seconds": 3}, "--smallest: takes several searches"),
         ({"smallest": True, "over": "camera"}, "--smallest: cannot be combined with --over"),
         ({"minimise": True, "target": "bowl"}, "--minimise: makes the right answer easier to give"),
         ({"minimise": True, "smallest": True}, "--minimise: has no smallest change"),

@@ -21,7 +21,7 @@ from PIL import Image
 
 import advsearch
 import advsearch.config
-from advsearch.api import mapping, outcome, stages, studies
+from advsearch.api import attacking, mapping, outcome, stages, studies
 from advsearch.api.scene import as_controls
 from advsearch.api.sweep_axes import read_axes
 from advsearch.attacks import (
@@ -265,13 +265,17 @@ MADE_BY_HAND = [
     ("questions.md", {12: "or twelve searches are done"}[default_of(smallest.smallest, "rounds")]),
     ("questions.md", f"What counts on the way is {TRIALS} trials"),
     ("questions.md", f"**Verified** on {TRIALS_OVER} conditions"),
+    (
+        "questions.md",
+        "`pgd` with a momentum of {momentum} and a first step of {step_size}".format(**attacking.OVER_CONDITIONS),
+    ),
     ("questions.md", f"needs {verification.PASS_PERCENT_OVER} % of those that count"),
     ("questions.md", {8: "in one to eight parameters"}[mapping.MOST]),
     ("questions.md", {8: "as long as eight random pictures"}[default_of(region.grow, "probes")]),
     ("questions.md", {4: "with other seeds, up to four times"}[default_of(region.grow, "attempts")]),
     ("questions.md", f"First {mapping.AT_CENTRE} trials of the centre"),
     ("questions.md", f"Then {RegionConfig.model_fields['samples'].default} fresh samples"),
-    ("questions.md", f"an exception in {100 * (1 - clopper_pearson(200, 200)[0]):.1f} % of the box at most"),
+    ("questions.md", f"at most {100 * (1 - clopper_pearson(200, 200)[0]):.1f} % of the box has another verdict"),
     ("runs.md", {1.0: "may lose the rows of the last second"}[store.SYNC_INTERVAL]),
     ("runs.md", f"more than {100 * store.SYNC_SHARE:.0f} % of the time"),
     ("scenes.md", f"gets the linear value {description.METERED_WHITE}"),
@@ -364,6 +368,7 @@ def check_names(config: SceneConfig) -> None:
         assert name in library.list_environments() or Path(name).suffix in environments.SUFFIXES
     if isinstance(config, AttackConfig):
         as_controls(config.over)
+        attacking._check_budgets(config)
         make_policy(config.policy_name, **config.policy_options)
         check_objective(config.objective, targeted=config.target is not None, minimise=config.minimise)
         known = script("make_figures").stored_record()["labels"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -23,7 +23,7 @@ from advsearch.evaluation.gradients import (
     smooth_loss,
     verdict,
 )
-from advsearch.evaluation.planning import COUNTS, cosines, measured_plan, tuned
+from advsearch.evaluation.planning import COUNTS, GOAL, Cosine, cosines, measured_plan, tuned
 from advsearch.progress import NullProgress, Progress
 from advsearch.scene.plan import BY_DIFFERENCES, ESTIMATORS
 
@@ -79,6 +79,11 @@ def plan(config: AttackConfig, *, progress: Progress | None = None) -> dict[str,
     progress.stage("steps and samples")
     table = cosines(renderer, problem.loss, u, seed=seed)
     renderer.plan, spp = tuned(renderer.plan, table)
+    progress.stage("the other denoiser")
+    other = "none" if config.denoise == "oidn" else "oidn"
+    theirs, _ = problem_from_config(config, denoise=other)
+    theirs.plan = theirs.plan.with_estimator({one.name: one.estimator for one in renderer.plan.groups}, "as beside")
+    tables = {config.denoise: table, other: cosines(theirs.renderer, theirs.loss, u, seed=seed)}
     chosen = renderer.plan.to_dict()
     used = {group.estimator for group in renderer.plan.groups}
     return {
@@ -91,10 +96,43 @@ def plan(config: AttackConfig, *, progress: Progress | None = None) -> dict[str,
         "image_formation": renderer.formation.summary(),
         **chosen,
         "spp": spp or problem.spp,
-        "cosines": [vars(row) for row in table],
+        "cosines": [{"denoise": name, **vars(row)} for name, rows in tables.items() for row in rows],
+        "denoise": quieter(tables, config.denoise),
         "left_out": _left_out(problem),
         "limits": _limits() if "material" in used else [],
     }
+
+
+def quieter(tables: Mapping[str, Sequence[Cosine]], asked: str) -> dict[str, str]:
+    """Say which denoiser makes the better gradients: the one that reaches the goal in all controls in less time.
+
+    A denoiser is part of the image formation, the same in search and verification, so that this is advice: another one
+    is another question.
+
+    Args:
+        tables: denoiser to its measured cosines.
+        asked: the run's.
+    """
+
+    def rank(name: str) -> tuple[bool, float]:
+        best = [
+            max((row for row in tables[name] if row.control == control), key=lambda row: row.cosine)
+            for control in dict.fromkeys(row.control for row in tables[name])
+        ]
+        reached = all(min(row.cosine, row.converged) >= GOAL for row in best)
+        return not reached, sum(row.seconds for row in best) if reached else -min(row.cosine for row in best)
+
+    measured = [name for name in tables if tables[name]]
+    advised = min(measured, key=rank) if measured else asked
+    reached = bool(measured) and not rank(advised)[0]
+    why = (
+        f"a cosine of {GOAL:g} in every control, in less time"
+        if reached
+        else "the greater cosine, though below the goal"
+        if measured
+        else "nothing was measured"
+    )
+    return {"asked": asked, "advised": advised, "reason": why}
 
 
 def _limits() -> list[Any]:
@@ -143,7 +181,7 @@ def _linear(config: AttackConfig, progress: Progress) -> list[dict[str, Any]]:
     problem, _ = problem_from_config(config, denoise="none")
     problem.renderer.formation = replace(problem.renderer.formation, transfer="linear")
     loss = smooth_loss(problem.renderer.formation.resolution, config.seed)
-    return _rows(problem, config, loss, "linear", config.spp or RAW_SPP, progress)
+    return _rows(problem, config, loss, "linear", config.spp if isinstance(config.spp, int) else RAW_SPP, progress)
 
 
 def _model(config: AttackConfig, progress: Progress) -> list[dict[str, Any]]:

@@ -22,7 +22,7 @@ from advsearch.config import AttackConfig, RegionConfig, SceneConfig, split_name
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.studies import map_figure
-from advsearch.runs.directory import RunDirectory, find_run
+from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.store import NAME, Store
 
@@ -60,7 +60,8 @@ def region_from_config(config: RegionConfig, *, progress: Progress | None = None
     stages = Stages(progress or NullProgress())
     stages.begin("setup", "set-up")
     as_attack = AttackConfig(**{name: getattr(config, name) for name in SceneConfig.model_fields})
-    as_attack = as_attack.model_copy(update={"measure": "no", "verify_spp": config.verify_spp})
+    budget = {} if config.around is None else _budget(config.around)
+    as_attack = as_attack.model_copy(update={"measure": "no", "verify_spp": config.verify_spp, **budget})
     problem, _ = problem_from_config(as_attack)
     varied = _varied(problem, config)
     centre = _centre(problem, config)
@@ -114,6 +115,12 @@ def region_from_config(config: RegionConfig, *, progress: Progress | None = None
         }
         run.write_summary(answer)
         return answer
+
+
+def _budget(around: str) -> dict[str, Any]:
+    """How far a run's controls may go, so that its answer lies within."""
+    theirs = AttackConfig.from_yaml(find_run(around) / CONFIG)
+    return {"epsilon": theirs.epsilon, "norm": theirs.norm}
 
 
 def _centre(problem: Problem, config: RegionConfig) -> Tensor:
@@ -176,6 +183,12 @@ def _box(problem: Problem, found: Region, at: Any, varied: Varied) -> list[dict[
     for name in varied.names:
         stem, _, number = name.rpartition(".")
         known = name if name in ends[0] else stem
+        if known not in ends[0]:  # one of many numbers, which nobody describes
+            place = varied.names.index(name)
+            sides = (found.low, found.high, found.centre)
+            low, high, centre = (float(side[place]) for side in sides)
+            rows.append({"name": name, "unit": "of the range", "low": low, "high": high, "centre": centre})
+            continue
         low, high, centre = (_number(end[known], number if known == stem else "") for end in ends)
         unit = str(ends[0][known].get("unit", ""))
         rows.append({"name": name, "unit": unit, "low": low, "high": high, "centre": centre})
@@ -198,7 +211,8 @@ def _map(attack: Attack, side: int, at: Any, varied: Varied, box: Any, run: RunD
     ends = [attack.problem.describe(at(torch.full((2,), end))) for end in (0.0, 1.0)]
     axes = []
     for one in box:
-        low, high = (_number(end[one["name"]], "") for end in ends)
+        known = one["name"] in ends[0]
+        low, high = (_number(end[one["name"]], "") for end in ends) if known else (0.0, 1.0)
         axes.append({"name": one["name"], "unit": one["unit"], "low": low, "high": high})
     for suffix, data in map_figure(margins, axes, box).items():
         write_bytes(run.path / "images" / f"map.{suffix}", data)

@@ -80,7 +80,7 @@ def summarise(
     artifacts = space.artifacts(u)
     answers = _answers(config, problem, findings, clean, adversarial)
     run = recorder.run
-    costs = _costs(findings, stages)
+    costs = _costs(findings, problem, stages)
     where = {"run": None if run is None else str(run.path)}
     summary = {"schema": 1, "command": "attack", **where, **answers, **costs, "seed": config.seed}
     summary |= {"warnings": [*said, *_remarks(findings, problem)], "command_line": config.command_line()}
@@ -138,7 +138,7 @@ def _answers(
     if findings.baseline is not None:
         summary["baseline"] = {
             "policy": "random",
-            "renders": findings.baseline.renders,
+            "renders": findings.baseline.renders * problem.draws,
             "verified": _verified(findings.baseline_verification, labels),
         }
     if findings.average:
@@ -232,13 +232,13 @@ def _mean_margin(verification: Verification) -> float:
     return sum(margins) / len(margins)
 
 
-def _costs(findings: Findings, stages: Stages) -> dict[str, Any]:
+def _costs(findings: Findings, problem: Problem, stages: Stages) -> dict[str, Any]:
     search, baseline = findings.search, findings.baseline
     return {
         "renders": {
-            "search": search.renders if search else 0,
+            "search": search.renders * problem.draws if search else 0,
             "gradient": search.gradients if search else 0,
-            "baseline": baseline.renders if baseline else 0,
+            "baseline": baseline.renders * problem.draws if baseline else 0,
             "verification": findings.verification_renders + len(findings.first_look),
         },
         "steps": len(search.history) if search else 0,

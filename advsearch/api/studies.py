@@ -129,7 +129,7 @@ def _curve(config: AttackConfig, parts: _Parts) -> Summary:
     epsilons: Sequence[float | None] = sorted(config.epsilons) or [None]
     rows = []
     for name in config.objects:
-        row: Summary = {"object": name, "clean": None, "flips_at": None, "margins": {}}
+        row: Summary = {"object": name, "clean": None, "flips_at": None}
         for epsilon in epsilons:
             label = default_name(name, [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")])
             one = _as_attack(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)

@@ -1,8 +1,8 @@
 """How large is the region around a configuration in which the model's answer stays as it is?
 
 A box is grown face by face, and what comes out is checked by fresh samples of the whole box: the guarantee is
-statistical. With n samples and no exception, the share of the box in which the answer is another one is below
-1 - 0.05^(1/n) with 95 % confidence (the "rule of three": about 3 / n).
+statistical: a Clopper-Pearson interval of the share of the box with the centre's answer, whose confidence is raised for
+the number of boxes that were tried (Bonferroni), so that choosing among them costs nothing of the 95 %.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ class Region:
         low, high: (d,) its corners, inside the unit box.
         same: how many of the final samples had the centre's answer.
         samples: how many there were.
+        attempts: how many boxes were sampled until there was no exception, or no attempt left.
         renders: pictures in all.
         exceptions: (k, d) final samples with another answer.
     """
@@ -39,13 +40,14 @@ class Region:
     high: Tensor
     same: int
     samples: int
+    attempts: int
     renders: int
     exceptions: Tensor
 
     @property
     def interval(self) -> tuple[float, float]:
-        """95 % Clopper-Pearson interval of the share of the box with the centre's answer."""
-        return clopper_pearson(self.same, self.samples)
+        """95 % interval of the share of the box with the centre's answer; see the module."""
+        return clopper_pearson(self.same, self.samples, 1.0 - 0.05 / self.attempts)
 
     @property
     def volume(self) -> float:
@@ -93,7 +95,7 @@ def grow(
             break
         for point in wrong:
             _cut(low, high, centre, point)
-    return Region(centre, low, high, samples - len(wrong), samples, judge.count, wrong)
+    return Region(centre, low, high, samples - len(wrong), samples, attempt + 1, judge.count, wrong)
 
 
 class _Judge:

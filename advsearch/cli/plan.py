@@ -64,10 +64,19 @@ def text(chosen: dict[str, Any]) -> str:
         *(f"  {sentence}" for sentence in chosen["left_out"]),
     ]
     if chosen["cosines"]:
-        heads = ["control", "step", "samples", "cosine with the converged gradient", "of two converged", "seconds"]
+        heads = [
+            "control",
+            "denoiser",
+            "step",
+            "samples",
+            "cosine with the converged gradient",
+            "of two converged",
+            "seconds",
+        ]
         body = [
             [
                 row["control"],
+                row["denoise"],
                 f"x {row['factor']:g}",
                 str(row["spp"]),
                 f"{row['cosine']:.3f}",
@@ -77,6 +86,11 @@ def text(chosen: dict[str, Any]) -> str:
             for row in chosen["cosines"]
         ]
         lines += ["", output.columns([heads, *body])]
+        denoise = chosen["denoise"]
+        lines += [
+            "",
+            f"denoiser asked for: {denoise['asked']}; better gradients: {denoise['advised']} ({denoise['reason']})",
+        ]
     if chosen["limits"]:
         lines += ["", "limits of the material form:", *(f"  {limit}" for limit in chosen["limits"])]
     return "\n".join(lines)

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
+from advsearch.errors import InputError
+
+if TYPE_CHECKING:
+    from advsearch.config import PrecisionConfig
 
 HELP = "draw error against run time: of the picture, of gradients and of policies, and what follows from it"
 INTERRUPTED = 130
@@ -37,18 +42,31 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print; 130 if it was interrupted, after what there is."""
-    from contextlib import nullcontext
-
     from advsearch.cli.flags import config_from
-    from advsearch.cli.progress import watching
     from advsearch.config import PrecisionConfig
 
-    config = config_from(args, PrecisionConfig, object="mug")
-    with output.output_kept_clean() if args.json else nullcontext(), watching(quiet=args.quiet) as progress:
+    return carry_out(config_from(args, PrecisionConfig, object="mug"), as_json=args.json, quiet=args.quiet)
+
+
+def carry_out(config: PrecisionConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
+    """Measure what `config` describes, print it and return the exit status.
+
+    Raises:
+        InputError: a run is to be resumed; measured times are of one sitting.
+    """
+    from contextlib import nullcontext
+
+    from advsearch.cli.progress import watching
+
+    if resumed is not None:
+        raise InputError(
+            f"{resumed}: times are measured in one sitting, so that there is nothing to go on with; run again"
+        )
+    with output.output_kept_clean() if as_json else nullcontext(), watching(quiet=quiet) as progress:
         from advsearch.api.measuring import precision
 
         report = precision(config, progress=progress)
-    if args.json:
+    if as_json:
         output.print_json(report)
     else:
         print(text(report))

@@ -13,7 +13,13 @@ from advsearch.errors import UnknownNameError
 
 HELP = "do what a YAML file describes: a run.yaml repeats its run"
 
-COMMANDS = {"attack": "AttackConfig", "sweep": "SweepConfig", "gap": "GapConfig", "region": "RegionConfig"}
+COMMANDS = {
+    "attack": "AttackConfig",
+    "sweep": "SweepConfig",
+    "gap": "GapConfig",
+    "region": "RegionConfig",
+    "precision": "PrecisionConfig",
+}
 """What the `command` of a file may say, and the configuration that it is."""
 
 
