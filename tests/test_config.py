@@ -55,7 +55,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "steps": (2.5, "expected a whole number from 1 to 1000000, got 2.5"),
     "step_size": (0.0, "expected a number greater than 0, got 0.0"),
     "objective": ({}, "expected the name of an objective, got {}"),
-    "spp": ("many", "expected a whole number from 1 to 65536, got many"),
+    "spp": ("many", "expected a whole number from 1 to 65536, or auto, got many"),
     "denoise": (False, "expected oidn or none, got False"),
     "baseline": ("maybe", "expected true or false, got maybe"),
     "verify_spp": (0, "expected a whole number from 1 to 65536, got 0"),

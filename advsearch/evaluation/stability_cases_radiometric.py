@@ -16,7 +16,7 @@ from advsearch.attacks import PGD, Adam, Auto, Policy, search
 from advsearch.errors import InputError
 from advsearch.evaluation.stability_case import Case, Check, Findings, holds
 from advsearch.evaluation.stability_scene import Controls, Evaluator, domain_of, examine, small
-from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.assets import EnvironmentAsset, Floats
 from advsearch.scene.environments import import_environment
 
 BRIGHT = 1e5
@@ -25,12 +25,16 @@ PLATEAU_STEPS = 40
 POLICIES: tuple[Policy[Any], ...] = (PGD(), Adam(), Auto())
 
 
-def _map(value: float, texel: float | None = None) -> EnvironmentAsset:
+def _radiance(value: float, texel: float | None = None) -> Floats:
     """A grey map (16, 32, 3), one texel of it different."""
     radiance = np.full((16, 32, 3), value, np.float32)
     if texel is not None:
         radiance[4, 10] = texel
-    return EnvironmentAsset("made", radiance)
+    return radiance
+
+
+def _map(value: float, texel: float | None = None) -> EnvironmentAsset:
+    return EnvironmentAsset("made", _radiance(value, texel))
 
 
 def bright_texel() -> Findings:
@@ -68,16 +72,16 @@ def lamp_in_the_dark() -> Findings:
 
 def refused(value: float, *, as_file: bool) -> Findings:
     """A texel that is no light, in a file or in an array, has to be refused in a sentence."""
-    asset = _map(0.3, value)
+    radiance = _radiance(0.3, value)
     try:
         if as_file:
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / "bad.exr"
-                with OpenEXR.File({}, {"RGB": asset.radiance}) as picture:
+                with OpenEXR.File({}, {"RGB": radiance}) as picture:
                     picture.write(str(path))
                 import_environment(path)
         else:
-            rendered = small("mug", {"texture": {"resolution": 8}}, environment=asset)
+            rendered = small("mug", {"texture": {"resolution": 8}}, environment=EnvironmentAsset("made", radiance))
             with torch.no_grad():
                 rendered(rendered.start, seed=0, spp=1)
     except InputError as error:
