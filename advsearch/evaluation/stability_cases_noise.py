@@ -223,7 +223,10 @@ def heavy_render(count: int = SAMPLES) -> Findings:
     return Findings(tuple(checks), bad["secant"] == 0, off, measured=measured)
 
 
-_RULE = "every gradient is divided by the mean of its absolute values (pgd) or by a running root mean square (adam)"
+_RULE = (
+    "outliers are clipped: elements at 3 medians in an l-infinity ball and 10 in an l2 ball, the whole gradient at 3 "
+    "medians of the latest lengths"
+)
 
 CASES = (
     Case(

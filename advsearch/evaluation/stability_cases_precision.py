@@ -325,7 +325,7 @@ CASES = (
         "precision",
         "determinism under 1 and 2 threads",
         "Changing the number of threads while a scene is in use does not end the process.",
-        "nothing yet: Dr.Jit's pool is resized at once (advsearch.threads.configure)",
+        "a recorded kernel is made anew when the number of threads changes",
         threads_under_a_scene,
         "pose",
         cheap=False,

@@ -133,7 +133,7 @@ def plateau(low: float, high: float) -> Findings:
 _SCENE = "counted and set to zero where they arise (Renderer.non_finite); none is expected"
 _FLAT = "a zero gradient gives a random step; the fifth in a row ends the search as 'stalled'"
 _REFUSED = "import_environment counts the texels that are not light and refuses the map"
-_ASSET = "nothing yet: only files are checked"
+_ASSET = "an environment with such a texel is refused, wherever it comes from"
 
 CASES = (
     Case(

@@ -344,7 +344,7 @@ CASES = (
         "stiff",
         "badly scaled boxes",
         "The derivative does not depend on how wide the searched range is.",
-        "a difference is as wide as moves the outline by a pixel, but at least 1e-4 of the range",
+        "a difference is as wide as moves the outline by a pixel, but at least 1e-6 of the range",
         wide_range,
         "pose",
     ),

@@ -88,12 +88,25 @@ class EnvironmentAsset:
             a photograph (a file's own order).
         source: where it came from.
         warnings: what the importer had to repair or leave out, one sentence each.
+
+    Raises:
+        InputError: a texel is negative, NaN or infinite.
     """
 
     name: str
     radiance: Floats
     source: str = ""
     warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)
+        if bad.any():
+            row, column = np.unravel_index(int(bad.argmax()), bad.shape)
+            raise InputError(
+                f"environment {self.name!r}: expected finite radiance of at least 0, got {int(bad.sum())} of "
+                f"{bad.size} texels that are negative, NaN or infinite (the first in row {row}, column {column}); clamp "
+                "them"
+            )
 
 
 def normalised(mesh: Mesh) -> Mesh:

@@ -139,7 +139,7 @@ class MitsubaScene:
         self._base: dict[str, Any] = {}
         self._applied: dict[str, Tensor] = {}
         self._recorded: dict[tuple[str, int], Callable[..., Any]] = {}
-        self._recorded_at = 0
+        self._recorded_at = (0, 0)
         _population.bury()
         _population.add(self, self._scene, self._integrators, self._parameters)
 
@@ -343,9 +343,10 @@ class MitsubaScene:
         import drjit as dr
 
         _population.bury()
-        if self._recorded_at != _population.changes:
+        now = (_population.changes, dr.thread_count())  # a recording crashes in another thread pool
+        if self._recorded_at != now:
             self._recorded.clear()
-            self._recorded_at = _population.changes
+            self._recorded_at = now
         if not self._freeze or what in self._unsettled:
             self._unsettled.discard(what)
             return function

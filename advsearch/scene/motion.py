@@ -19,12 +19,20 @@ from advsearch.scene.plan import DEFAULT_PIXELS, DEFAULT_STEP, STEP_RANGE
 
 POINTS = 400
 """Vertices of a mesh that are followed."""
-NUDGE = 2e-3
-"""Change of u that the speed is measured over."""
+NUDGES = (2e-3, 2e-4, 2e-5, 2e-6)
+"""Changes of u that the speed is measured over: the largest that leaves something in the frame."""
+
+
+DIRECTIONS = 4000
+"""Directions in which the environment is followed: some hundred of them lie in a frame."""
+FAR = 1e4
+"""How far away its points are taken to be, in scene units."""
 
 
 class Motion:
-    """Projects the vertices of a scene's meshes into the picture.
+    """Projects the vertices of a scene's meshes, and points of the environment behind them, into the picture.
+
+    A camera that goes around an object hardly moves the object's outline, but all that lies behind it.
 
     Args:
         description: the scene with all its parts.
@@ -39,6 +47,7 @@ class Motion:
         self._assembly = assembly
         self._camera = torch.from_numpy(camera_to_world(description, width / height)).to(torch.float64)
         self._fov = description.number("camera.fov")
+        self._far = _far_points(bool(description.number("ground.size")), description.backdrop is not None)
         self._picks = {
             name: torch.from_numpy(np.linspace(0, len(mesh.vertices) - 1, min(POINTS, len(mesh.vertices))).astype(int))
             for name, mesh in assembly.meshes.items()
@@ -55,6 +64,7 @@ class Motion:
             if vertices is None:
                 vertices = mesh.place(None, None)[0]
             found.append(vertices[self._picks[name]].double())
+        found.append(self._far)
         relative = (torch.cat(found) - camera[:3, 3]) @ camera[:3, :3]
         depth = relative[:, 2]
         seen = depth > 1e-3
@@ -76,14 +86,28 @@ class Motion:
         with torch.no_grad():
             here, seen = self.pixels(inputs(u))
             for number in coordinates:
-                there = u.clone()
-                nudge = NUDGE if float(u[number]) + NUDGE <= 1.0 else -NUDGE
-                there[number] += nudge
-                moved, still = self.pixels(inputs(there))
-                both = seen & still
-                if bool(both.any()):
-                    speeds[number] = float((moved - here)[both].norm(dim=1).max()) / NUDGE
+                for size in NUDGES:
+                    there = u.clone()
+                    there[number] += size if float(u[number]) + size <= 1.0 else -size
+                    moved, still = self.pixels(inputs(there))
+                    both = seen & still
+                    if bool(both.any()):
+                        speeds[number] = float((moved - here)[both].norm(dim=1).max()) / size
+                        break
         return speeds
+
+
+def _far_points(ground: bool, backdrop: bool) -> Tensor:
+    """(N, 3) points of the environment, evenly spread (Fibonacci spiral).
+
+    Above the horizon where there is a ground, none where a plain colour hides them.
+    """
+    number = torch.arange(0 if backdrop else DIRECTIONS, dtype=torch.float64)
+    height = 1.0 - (2.0 * number + 1.0) / DIRECTIONS
+    turn = number * torch.pi * (3.0 - 5.0**0.5)
+    radius = (1.0 - height**2).sqrt()
+    points = torch.stack([radius * turn.cos(), height, radius * turn.sin()], dim=1) * FAR
+    return points[points[:, 1] > 0.0] if ground else points
 
 
 def steps_for(speeds: Tensor, pixels: float = DEFAULT_PIXELS) -> Tensor:

@@ -140,7 +140,8 @@ class Renderer:
         at = u.detach().clone().requires_grad_()
         self._left_out = BY_DIFFERENCES if free else frozenset({"secant"})
         try:
-            value = loss(self(at, seed, spp))
+            with torch.enable_grad():
+                value = loss(self(at, seed, spp))
             found = torch.autograd.grad(value, at, allow_unused=True)[0] if value.requires_grad else None
         finally:
             self._left_out = frozenset()

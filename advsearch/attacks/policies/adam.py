@@ -12,6 +12,7 @@ from torch import Tensor
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.evaluation import Evaluation
 from advsearch.attacks.policies.base import Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.clipping import clipped
 from advsearch.attacks.policies.pgd import PATIENCE
 from advsearch.attacks.policies.scaling import half_widths
 from advsearch.errors import InputError
@@ -32,6 +33,7 @@ class AdamState:
         flat: evaluations in a row whose gradient was zero.
         best: the largest objective so far.
         peak: (d,) where it was met.
+        lengths: of the latest gradients, as `clipped` wants them.
         shrunk: what the rate is multiplied by; half of it is gone after every objective that could not be computed.
     """
 
@@ -48,6 +50,7 @@ class AdamState:
     best: float = -math.inf
     peak: Tensor | None = None
     shrunk: float = 1.0
+    lengths: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -62,9 +65,9 @@ class Adam(Policy[AdamState]):
     beta2, 0.9 by default, since a search has tens of steps and not thousands; and in an l2 ball g^2 is the mean over
     the block, since there the best step for a constant gradient is along it and not along its signs.
 
-    An evaluation without a gradient goes on along m. One whose objective could not be computed sends the search back to
-    its best configuration, with m = v = 0 and half the rate. While there is no gradient but zero the step is random;
-    after five zero gradients in a row there is nothing more to propose.
+    g is clipped first (see `clipping`). An evaluation without a gradient goes on along m. One whose objective could not
+    be computed sends the search back to its best configuration, with m = v = 0 and half the rate. While there is no
+    gradient but zero the step is random; after five zero gradients in a row there is nothing more to propose.
 
     Attributes:
         step_size: the first rate, over 0, at most 2.
@@ -108,7 +111,8 @@ class Adam(Policy[AdamState]):
         if evaluation.objective > state.best:
             state = replace(state, best=evaluation.objective, peak=u)
         if evaluation.gradient is not None:
-            state = self._learn(state, evaluation.gradient)
+            gradient, lengths = clipped(state.domain, evaluation.gradient, state.lengths)
+            state = replace(self._learn(state, gradient), lengths=lengths)
         return replace(state, u=state.domain.project(torch.addcmul(u, state.scale, self._way(state), value=rate)))
 
     def _way(self, state: AdamState) -> Tensor:

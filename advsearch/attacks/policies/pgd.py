@@ -12,6 +12,7 @@ from torch import Tensor
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.evaluation import Evaluation
 from advsearch.attacks.policies.base import Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.clipping import clipped
 from advsearch.errors import InputError
 
 FIRST_WINDOW, SHORTEN, SHORTEST = 0.22, 0.03, 0.06
@@ -94,6 +95,7 @@ class PGDState:
         step_size: in units of each block's radius.
         flat: evaluations in a row whose gradient was zero.
         count: evaluations so far.
+        lengths: of the latest gradients, as `clipped` wants them.
     """
 
     domain: Domain
@@ -106,6 +108,7 @@ class PGDState:
     window: Window
     flat: int = 0
     count: int = 0
+    lengths: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -118,8 +121,8 @@ class PGD(Policy[PGDState]):
         m <- momentum * m + g / mean|g|                (MI-FGSM, Dong et al. 2018, eq. 6)
         u <- P(u + step_size * steepest(m))
 
-    Accumulating gradients before the sign is taken matters here: each comes from another seed, and the sign of one
-    noisy gradient is a coin toss wherever the noise exceeds it.
+    g is clipped first (see `clipping`). Accumulating gradients before the sign is taken matters here: each comes from
+    another seed, and the sign of one noisy gradient is a coin toss wherever the noise exceeds it.
 
     The step size is halved at checkpoints when the objective stalls, by the two conditions of Auto-PGD (Croce and
     Hein 2020, section 3.1; see `Window.stalled`). There we depart from Auto-PGD: it always goes on from the best
@@ -171,7 +174,11 @@ class PGD(Policy[PGDState]):
         state = replace(state, count=state.count + 1)
         if not evaluation.finite:
             return _retreat(state)
-        state = _accumulate(state, evaluation.gradient, self.momentum)
+        gradient = evaluation.gradient
+        if gradient is not None:
+            gradient, lengths = clipped(state.domain, gradient, state.lengths)
+            state = replace(state, lengths=lengths)
+        state = _accumulate(state, gradient, self.momentum)
         if state.peak is None or evaluation.objective > state.peak.objective:
             state = replace(state, peak=Peak(evaluation.objective, u, state.direction))
         state = replace(state, window=state.window.add(evaluation.objective))
