@@ -102,10 +102,10 @@ class EnvironmentAsset:
         bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)
         if bad.any():
             row, column = np.unravel_index(int(bad.argmax()), bad.shape)
+            found = f"{int(bad.sum())} of {bad.size} texels that are negative, NaN or infinite"
             raise InputError(
-                f"environment {self.name!r}: expected finite radiance of at least 0, got {int(bad.sum())} of "
-                f"{bad.size} texels that are negative, NaN or infinite (the first in row {row}, column {column}); clamp "
-                "them"
+                f"environment {self.name!r}: expected finite radiance of at least 0, got {found} (the first in row {row}, "
+                f"column {column}); clamp them"
             )
 
 
