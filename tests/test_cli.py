@@ -292,7 +292,7 @@ def test_run_reads_a_file_and_puts_changes_over_it(asked: list[AttackConfig], tm
         (
             "object: mug\ncommand: atack\n",
             [],
-            "unknown command 'atack'. Did you mean 'attack'? Known: attack, gap, precision, region, sweep. It stands in ",
+            "unknown command 'atack'. Did you mean 'attack'? Known: attack, gap, precision, region, sweep. It stands ",
         ),
         ("object: mug\n", ["steps"], "steps: expected NAME=VALUE such as camera.azimuth=130, got 'steps'"),
         ("object: mug\n", ["step=3"], "unknown setting 'step'. Did you mean 'steps'"),

@@ -104,8 +104,8 @@ class EnvironmentAsset:
             row, column = np.unravel_index(int(bad.argmax()), bad.shape)
             found = f"{int(bad.sum())} of {bad.size} texels that are negative, NaN or infinite"
             raise InputError(
-                f"environment {self.name!r}: expected finite radiance of at least 0, got {found} (the first in row {row}, "
-                f"column {column}); clamp them"
+                f"environment {self.name!r}: expected finite radiance of at least 0, got {found} (the first in row "
+                f"{row}, column {column}); clamp them"
             )
 
 
