@@ -14,7 +14,7 @@ SOURCES := advsearch scenes tests benchmarks docs
 export TORCH_INDEX
 
 .DEFAULT_GOAL := help
-.PHONY: help setup attack test test-slow check lint format typecheck bench reference wheel check-wheel clean
+.PHONY: help setup attack test test-slow check lint format typecheck bench study reference wheel check-wheel clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -47,9 +47,15 @@ format: $(STAMP) ## format the code and mend what can be mended
 typecheck: $(STAMP) ## mypy, strict, on the package
 	@$(BIN)/mypy
 
+# what compares answers and not times, and takes long
+STUDIES := searches closed_form policies precision kill
+
 bench: $(STAMP) ## the benchmarks: ratios against a floor measured in the same run
-	@set -e; for file in benchmarks/*.py; do case $$file in benchmarks/_*) continue;; esac; \
+	@set -e; for file in $(filter-out $(STUDIES:%=benchmarks/%.py),$(wildcard benchmarks/[!_]*.py)); do \
 	  echo "== $$file"; $(BIN)/python $$file $(ARGS); done
+
+study: $(STAMP) ## the slow studies: policies at equal renders, stated budgets, promised errors, kills (an hour)
+	@set -e; for name in $(STUDIES); do echo "== $$name"; $(BIN)/python benchmarks/$$name.py $(ARGS); done
 
 reference: $(STAMP) ## render, train and evaluate the bundled classifier again (some 45 minutes)
 	@$(BIN)/python -m advsearch.evaluation.reference all $(ARGS)

@@ -113,8 +113,8 @@ def _json(records: Iterable[Mapping[str, Any]], names: list[str], stream: IO[byt
 
 def _parquet(records: Iterable[Mapping[str, Any]], names: list[str], stream: IO[bytes]) -> None:
     try:
-        import pyarrow  # type: ignore[import-not-found, unused-ignore]
-        import pyarrow.parquet  # type: ignore[import-not-found, unused-ignore]
+        import pyarrow
+        import pyarrow.parquet
     except ImportError:
         raise InputError("--format parquet: needs pyarrow; pip install pyarrow, or choose csv or json") from None
     rows = iter(records)
