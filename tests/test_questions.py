@@ -10,7 +10,7 @@ from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Evaluation, make_policy, search
 from advsearch.attacks.region import grow
-from advsearch.attacks.smallest import RATIO, scaled, smallest
+from advsearch.attacks.smallest import RATIO, Bracket, confirmed, scaled, shrunk, smallest
 from advsearch.errors import InputError
 
 NORMS = {"linf": lambda w: float(w.abs().sum()), "l2": lambda w: float(w.norm())}
@@ -45,6 +45,22 @@ def test_the_smallest_epsilon_of_a_linear_model_is_within_five_per_cent(norm: st
     assert share <= bracket.high <= RATIO * share  # the closed form
     assert bracket.low <= share
     assert bracket.searches <= 12
+
+
+def test_an_end_that_passed_by_luck_moves_out_until_it_passes_again() -> None:
+    domain, weights, bias = linear(5, "linf", 0.5)
+
+    def margin(u: Tensor) -> float:
+        return float((u - domain.start) @ weights) + bias
+
+    edge = shrunk(domain, domain.start + 0.4 * weights.sign(), 0.5)
+    lucky = Bracket(0.48, 0.5, edge, 3, 10)
+    sure = confirmed(lucky, lambda u, _: margin(u) > 0.02 * -bias, domain)
+    assert 0.5 < sure.high <= 0.5 * RATIO and sure.u is not None and margin(sure.u) > 0.0
+    assert scaled(domain, sure.high).contains(sure.u)
+    assert confirmed(lucky, lambda u, _: True, domain).high == 0.5
+    nothing = Bracket(1.0, math.inf, None, 1, 1)
+    assert confirmed(nothing, lambda u, _: False, domain) is nothing
 
 
 def test_without_a_flip_the_whole_budget_is_the_lower_end() -> None:

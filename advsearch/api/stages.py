@@ -32,7 +32,7 @@ from advsearch.attacks import (
 from advsearch.attacks import search as run_search
 from advsearch.attacks import verify as run_verify
 from advsearch.attacks.sample_count import LADDER
-from advsearch.attacks.smallest import scaled, smallest
+from advsearch.attacks.smallest import confirmed, scaled, smallest
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.config import AttackConfig
 from advsearch.evaluation.gradients import inside
@@ -40,6 +40,9 @@ from advsearch.evaluation.planning import cosines, measured_plan, tuned
 
 FIRST_LOOK = 4
 """Renders of the clean configuration before the search; wrong in all of them, it goes through the full trials first."""
+
+CONFIRMED = 40
+"""Trials in a row that the upper end of a smallest epsilon has to pass, or as many checks as have them."""
 
 MANY = 64
 """Of a configuration with more numbers than this, a trial's row does not hold the values."""
@@ -292,6 +295,7 @@ def find_smallest(attack: Attack) -> None:
     What is verified at the end is the configuration at the upper end of the bracket.
     """
     problem, config, findings = attack.problem, attack.config, attack.findings
+    scaled(problem.domain, 1.0)  # refuses what has no budget before anything is rendered
     attack.choose_spp({"clean": problem.domain.start})
     results: list[SearchResult] = []
 
@@ -309,7 +313,8 @@ def find_smallest(attack: Attack) -> None:
                 return False
         return True
 
-    bracket = smallest(found, passes, scaled(problem.domain, 1.0))
+    times = -(-CONFIRMED // config.trial_count)
+    bracket = confirmed(smallest(found, passes, problem.domain), passes, problem.domain, times=times)
     renders, gradients = sum(one.renders for one in results), sum(one.gradients for one in results)
     answer = results[0].best_u if bracket.u is None else bracket.u
     ending = results[0].ending if bracket.u is None else Ending.FOUND
