@@ -60,7 +60,7 @@ RULES = {
 }
 """DESIGN, section 2. The empty name is `advsearch/__init__.py`."""
 
-DISTRIBUTIONS = {"PIL": "pillow", "yaml": "PyYAML", "mitsuba_oidn": "mitsuba-oidn", "imageio_ffmpeg": "imageio-ffmpeg"}
+DISTRIBUTIONS = {"PIL": "pillow", "yaml": "PyYAML", "mitsuba_oidn": "mitsuba-oidn"}
 """Where a package is installed under another name than it is imported."""
 
 BROUGHT_ALONG = {"drjit": "mitsuba", "typing_extensions": "pydantic"}

@@ -68,10 +68,10 @@ def test_a_part_that_does_not_work_is_told_with_what_to_do_and_status_3(
 def test_a_missing_optional_part_is_a_warning(
     well: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(doctor, "installed_version", lambda name: None if name == "imageio-ffmpeg" else "1.0")
+    monkeypatch.setattr(doctor, "installed_version", lambda name: None if name == "pyarrow" else "1.0")
     assert doctor.run(json=True) == 0
-    (part,) = (p for p in json.loads(capsys.readouterr().out)["parts"] if p["name"] == "imageio-ffmpeg")
-    assert part["status"] == "warning" and "animations" in part["detail"]
+    (part,) = (p for p in json.loads(capsys.readouterr().out)["parts"] if p["name"] == "pyarrow")
+    assert part["status"] == "warning" and "Parquet" in part["detail"]
 
 
 def test_a_missing_package_is_told() -> None:

@@ -32,12 +32,12 @@ DISK_WANTED, MEMORY_WANTED = 1 * GIB, 3 * GIB
 """Below these a warning: a run's pictures and the kernel cache; the peak of a search (2.5 GiB) and what else runs."""
 
 SECONDS_ALLOWED = 300
-OPTIONAL = {"imageio-ffmpeg": "animations of the search are not written"}
+OPTIONAL = {"pyarrow": "advsearch export does not write Parquet"}
 """Packages without which the rest works, and what is lost."""
 
 PROBE = (sys.executable, "-m", "advsearch.cli.doctor_probe")
 
-_SMALL_PACKAGES = ("OpenEXR", "imageio", "imageio-ffmpeg", "trimesh", "xatlas")
+_SMALL_PACKAGES = ("OpenEXR", "imageio", "matplotlib", "cma", "trimesh", "xatlas", "pyarrow")
 _NO_FIX_NEEDED = ""
 
 

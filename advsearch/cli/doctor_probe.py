@@ -109,11 +109,37 @@ def imageio() -> str:
     return ""
 
 
-def ffmpeg() -> str:
-    """Find the ffmpeg that writes animations."""
-    import imageio_ffmpeg
+def pyarrow() -> str:
+    """Write a Parquet table and read it back."""
+    import io
 
-    return f"ffmpeg {imageio_ffmpeg.get_ffmpeg_version()}"
+    import pyarrow
+    import pyarrow.parquet
+
+    stream = io.BytesIO()
+    pyarrow.parquet.write_table(pyarrow.table({"x": [1.5]}), stream)
+    found = pyarrow.parquet.read_table(io.BytesIO(stream.getvalue())).to_pylist()
+    if found != [{"x": 1.5}]:
+        raise RuntimeError(f"expected the table that was written, got {found}")
+    return "writes and reads a table"
+
+
+def matplotlib() -> str:
+    """Draw an empty figure."""
+    import io
+
+    from matplotlib.figure import Figure
+
+    stream = io.BytesIO()
+    Figure(figsize=(1, 1)).savefig(stream, format="png")
+    return f"drew {len(stream.getvalue())} bytes"
+
+
+def cma() -> str:
+    """Import the library of evolution strategies."""
+    import cma as library
+
+    return f"pycma {library.__version__.split()[0]}"
 
 
 def trimesh() -> str:
@@ -142,7 +168,9 @@ TRIALS: dict[str, Callable[[], str]] = {
     "torch": torch,
     "OpenEXR": openexr,
     "imageio": imageio,
-    "imageio-ffmpeg": ffmpeg,
+    "matplotlib": matplotlib,
+    "cma": cma,
+    "pyarrow": pyarrow,
     "trimesh": trimesh,
     "xatlas": xatlas,
     "render": render,

@@ -69,11 +69,11 @@ def carry_out(config: PrecisionConfig, *, as_json: bool, quiet: bool, resumed: P
     if as_json:
         output.print_json(report)
     else:
-        print(text(report))
+        print(answer(report))
     return INTERRUPTED if report["interrupted"] else 0
 
 
-def text(report: Mapping[str, Any]) -> str:
+def answer(report: Mapping[str, Any]) -> str:
     """Return the report as text."""
     machine = report["machine"]
     threads = " and ".join(f"{count} of {name}" for name, count in machine["threads"].items())

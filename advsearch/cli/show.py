@@ -42,7 +42,12 @@ def show_run(name: str, as_json: bool) -> int:
     from advsearch.runs.summary import read_summary
 
     summary = read_summary(find_run(name))
-    tables = {"sweep": "advsearch.cli.sweep_table", "gap": "advsearch.cli.studies", "region": "advsearch.cli.region"}
+    tables = {
+        "sweep": "advsearch.cli.sweep_table",
+        "gap": "advsearch.cli.studies",
+        "region": "advsearch.cli.region",
+        "precision": "advsearch.cli.precision",
+    }
     kind = "gap" if "parts" in summary else summary.get("command")
     answer = importlib.import_module(tables.get(str(kind), "advsearch.cli.table")).answer
     if as_json:
