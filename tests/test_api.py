@@ -259,3 +259,13 @@ def test_mistakes_are_explained_and_leave_nothing(scene: advsearch.Scene, level:
     with pytest.raises(RunExistsError, match="not empty and not a run"):
         advsearch.attack(scene, victim, run=run, **FAST)
     assert (run / "mine.txt").read_text("utf-8") == "keep"
+
+
+def test_samples_are_spent_where_the_decision_is_close(scene: advsearch.Scene, level: float, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    more: dict[str, Any] = {**FAST, "spp": "auto", "steps": 12, "policy": "random", "run": run}
+    summary = advsearch.attack(scene, model(level + 0.03), **more).summary
+    with Store(run / "results.sqlite", read_only=True) as store:
+        rows = [row for row in store.rows("search") if row.step < summary["steps"]]
+    assert sum(row.renders or 0 for row in rows) == 12, "the budget is one of renders, however they are shared out"
+    assert len(rows) < 12, "some configuration was rendered again"
