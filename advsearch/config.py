@@ -10,12 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import field_validator, model_validator
 
 from advsearch.errors import InputError
 from advsearch.settings import PLACE, Config, all_finite, number_or_text, parse_assignment, setting
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
@@ -140,6 +143,13 @@ class SceneConfig(Config):
     def objects(self) -> tuple[str, ...]:
         """The objects by name."""
         return split_names(self.object)
+
+    def recipe(self) -> Self:
+        """See `Config.recipe`; files in a list get absolute paths too."""
+        found = super().recipe()
+        lists = {name: split_names(getattr(found, name)) for name in ("object", "environment", "model")}
+        several = {name: ",".join(map(_absolute_file, parts)) for name, parts in lists.items() if len(parts) > 1}
+        return found.model_copy(update=several)
 
     @field_validator(
         "object",
@@ -367,6 +377,10 @@ class AttackConfig(SceneConfig):
         """Refuse settings that exclude each other."""
         if self.smallest and self.epsilons:
             raise InputError("--smallest: finds one epsilon by itself; give one --epsilon as the largest, or none")
+        if self.smallest and self.is_study:
+            raise InputError("--smallest: is about one object; name one --object, and one --epsilon as the largest")
+        if self.minimise and self.is_study:
+            raise InputError("--minimise: has no robust accuracy; name one --object and one --epsilon")
         if self.smallest and self.seconds is not None:
             raise InputError("--smallest: takes several searches; give --steps for each, and leave --seconds out")
         if self.smallest and self.over:
@@ -578,13 +592,6 @@ class SweepConfig(SceneConfig):
     def models(self) -> tuple[str, ...]:
         """The models by name."""
         return split_names(self.model)
-
-    def recipe(self) -> SweepConfig:
-        """See `Config.recipe`; files in a list get absolute paths too."""
-        found = super().recipe()
-        lists = {"object": found.objects, "environment": found.environments, "model": found.models}
-        several = {name: ",".join(map(_absolute_file, parts)) for name, parts in lists.items() if len(parts) > 1}
-        return found.model_copy(update=several)
 
     @field_validator("grid", mode="before")
     @classmethod

@@ -24,6 +24,7 @@ threads.configure()
 from advsearch.api.problem import Problem  # noqa: E402
 from advsearch.api.scene import load_scene, make_renderer  # noqa: E402
 from advsearch.attacks import get_objective, make_policy  # noqa: E402
+from advsearch.attacks.goal import Goal  # noqa: E402
 from advsearch.controls import TextureControl, make_space  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 
@@ -37,7 +38,8 @@ def main() -> None:
     space = make_space([TextureControl()], description)
     model = load_model("reference")
     renderer = make_renderer(description, space, args.size, "oidn", 0)
-    problem = Problem(renderer, space, model, model.label_set("mug"), get_objective("margin"), 4, 0)
+    labels = model.label_set("mug")
+    problem = Problem(renderer, space, model, labels, get_objective("margin"), Goal(labels.indices), 4, 0)
     policy, evaluate = make_policy("pgd"), problem.evaluator("search")
     state = policy.start(problem.domain, torch.Generator().manual_seed(0), args.steps)
     seconds, memory = [], []

@@ -26,6 +26,7 @@ threads.configure()
 from advsearch.api.problem import Problem  # noqa: E402
 from advsearch.api.scene import load_scene, make_renderer  # noqa: E402
 from advsearch.attacks import get_objective, make_policy  # noqa: E402
+from advsearch.attacks.goal import Goal  # noqa: E402
 from advsearch.controls import TextureControl, make_space  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 from advsearch.scene.backend import mitsuba  # noqa: E402
@@ -52,7 +53,7 @@ def compare(size: int, denoise: str, spp: int, repeats: int) -> tuple[float, flo
     model = load_model("reference")
     labels = model.label_set("mug")
     renderer = make_renderer(description, space, size, denoise, 0)
-    problem = Problem(renderer, space, model, labels, get_objective("margin"), spp, 0)
+    problem = Problem(renderer, space, model, labels, get_objective("margin"), Goal(labels.indices), spp, 0)
     floor = Floor(description, size, spp, denoise, lambda image: model(image)[0, labels.indices[0]])
     step = steps(problem, 3 + repeats)
     ratios = []

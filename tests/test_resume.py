@@ -58,6 +58,7 @@ class StandInProblem:
     goal: Goal = field(default_factory=lambda: Goal((0,)))
     spp: int = 4
     seed: int = 3
+    draws: int = 1
     plan: StandInPlan = StandInPlan()
     model: Any = field(default_factory=lambda: SimpleNamespace(labels=["mug", "bowl"]))
 
@@ -74,8 +75,8 @@ class StandInProblem:
             logits = self._logits(at, stream(self.seed, kind, index))
             value = logits[1] - logits[0]
             slope = torch.autograd.grad(value, at)[0] if gradient else None
-            if tell is not None:
-                tell(index, torch.full((2, 2, 3), float(u.mean())))
+            if tell is not None and tell.wants(index):
+                tell.tell(index, torch.full((2, 2, 3), float(u.mean())))
             return Evaluation(float(value.detach()), slope, logits.detach(), bool(value > 0), cost=samples)
 
         return evaluate
@@ -147,9 +148,9 @@ def kill_and_resume(folder: Path, policy: str) -> int:
     while kills < 300:
         child = os.fork()
         if child == 0:
-            carry_out(folder, configuration(policy), pause=0.012, resume=begun)
+            carry_out(folder, configuration(policy), pause=0.003, resume=begun)
             os._exit(0)
-        time.sleep(moments.uniform(0.002, 0.06) * (1.0 + kills / 10))  # a policy thinks again: that takes its time
+        time.sleep(moments.uniform(0.002, 0.06) * (1.0 + kills / 6))  # a policy thinks again: that takes its time
         if os.waitpid(child, os.WNOHANG) != (0, 0):
             return kills
         os.kill(child, signal.SIGKILL)
@@ -175,11 +176,11 @@ def test_killed_at_random_moments_it_ends_with_the_same_rows(tmp_path: Path, pol
         cwd=Path(__file__).parent,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
     assert done.returncode == 0, done.stderr
-    assert int(done.stdout) >= 6, "it was hardly killed"
+    assert int(done.stdout) >= 5, "it was hardly killed"
     assert rows(tmp_path / "run") == rows(tmp_path / "whole")
     assert not (tmp_path / "run" / "replay.bin").exists()
 

@@ -95,7 +95,7 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
     monkeypatch.setattr(studies, "attack_from_config", stopped)
     with pytest.raises(KeyboardInterrupt):
         studies.gap_from_config(config)
-    assert Path("runs/study/parts/mug-texture/summary.json").is_file()
+    assert Path("runs/study/parts/00-00-mug-texture/summary.json").is_file()
     monkeypatch.setattr(studies, "attack_from_config", carry_out)
     summary = studies.gap_from_config(config, resumed=Path("runs/study"))
     assert [(row["object"], row["control"]) for row in summary["table"]] == [

@@ -25,6 +25,7 @@ from advsearch.attacks.goal import Goal
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
 from advsearch.config import AttackConfig
 from advsearch.controls import CONTROLS, make_space
+from advsearch.controls.base import Control
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import LabelSet, Model, ModelWarning, load_model
 from advsearch.models.features import features_of
@@ -73,7 +74,7 @@ def attack(
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
-    scene = scene if isinstance(scene, Scene) else load_scene(scene)
+    scene = _scene(scene, options)
     instances, conditions = as_controls(controls), as_controls(over)
     described = {
         "object": scene.description.object_spec or scene.description.object.name,
@@ -88,6 +89,7 @@ def attack(
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
     check_objective(objective, targeted=config.target is not None, minimise=config.minimise)
+    instances = _budgeted(controls, instances, config)
     job = _Job(config, scene, _model(model, config), instances, conditions, objective, policy, run is not None)
     if resume and run is not None and is_run(run_path(run)):
         return _go_on(job, run, progress or NullProgress())
@@ -130,6 +132,32 @@ def problem_from_config(config: AttackConfig, *, denoise: str | None = None) -> 
     """
     job = _job(config if denoise is None else config.model_copy(update={"denoise": denoise}))
     return _problem(job), job.loaded[1]
+
+
+def _scene(scene: Scene | str | Path, options: Mapping[str, Any]) -> Scene:
+    """The scene as it was given, or the one that a name and the options describe."""
+    told = {"set": options.get("set", options.get("set_")), **{one: options.get(one) for one in ("environment", "up")}}
+    told["exposure"] = options.get("exposure")
+    if isinstance(scene, Scene):
+        clash = [name for name, value in told.items() if value is not None]
+        if clash:
+            raise InputError(f"{', '.join(clash)}: belongs to the scene, which is given already; give it to load_scene")
+        return scene
+    settings = dict(told["set"] or {})
+    if told["exposure"]:
+        settings["camera.exposure"] = told["exposure"]
+    return load_scene(scene, told["environment"], up=told["up"], settings=settings)
+
+
+def _budgeted(controls: Controls, instances: tuple[Control, ...], config: AttackConfig) -> tuple[Control, ...]:
+    """Controls that were given by name, with the run's `epsilon`, `norm` and `texture_resolution`."""
+    if not isinstance(controls, (str, Mapping)) and all(isinstance(one, Control) for one in controls):
+        if config.epsilon is not None:
+            raise InputError("epsilon: the controls are instances already; give each its own, as in TextureControl")
+        return instances
+    _check_budgets(config)
+    named = controls if isinstance(controls, Mapping) else {one.name: one.settings() for one in instances}
+    return as_controls({name: _control_settings(name, config, given or {}) for name, given in named.items()})
 
 
 # ---- from names to things -------------------------------------------------------------------------------------------
@@ -187,18 +215,31 @@ def instance_name(asked: str) -> str:
 
 def _check_budgets(config: AttackConfig) -> None:
     """Refuse a budget for a control that is not searched, or that has none."""
+    if config.epsilon is None:
+        return
     if not isinstance(config.epsilon, dict):
+        without = [name for name, given in config.controls.items() if not _has_epsilon(name, given)]
+        if without and (config.epsilons or len(without) == len(config.controls)):
+            raise _no_epsilon(without[0])
         return
     known = {instance_name(asked): asked for asked in config.controls}
     for name in config.epsilon:
         if name not in known:
             raise UnknownNameError("control in --epsilon", name, known)
-        kind = str(config.controls[known[name]].get("kind") or known[name].partition(":")[0].partition(".")[0])
-        if kind in CONTROLS and "epsilon" not in {choice.name for choice in CONTROLS[kind].choices}:
-            raise InputError(
-                f"--epsilon {name}: the control has ranges and no epsilon; give its ranges, as in "
-                f"--control '{name}={{PARAMETER: [LOW, HIGH]}}'"
-            )
+        if not _has_epsilon(known[name], config.controls[known[name]]):
+            raise _no_epsilon(name)
+
+
+def _has_epsilon(asked: str, given: Mapping[str, Any]) -> bool:
+    kind = str(given.get("kind") or asked.partition(":")[0].partition(".")[0])
+    return kind not in CONTROLS or "epsilon" in {choice.name for choice in CONTROLS[kind].choices}
+
+
+def _no_epsilon(name: str) -> InputError:
+    return InputError(
+        f"--epsilon {name}: the control has ranges and no epsilon; give its ranges, as in "
+        f"--control '{name}={{PARAMETER: [LOW, HIGH]}}'"
+    )
 
 
 def _control_settings(asked: str, config: AttackConfig, given: Mapping[str, Any]) -> dict[str, Any]:

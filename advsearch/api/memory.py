@@ -97,10 +97,10 @@ class Memory:
         kept: dict[int, Tensor] = {}
 
         def told(index: int, image: Tensor) -> None:
-            if frames is not None and frames.wants(index):
+            if frames is not None:
                 kept[index] = frames.add(image)
 
-        evaluate = make(told)
+        evaluate = make(None if frames is None else OnImage(frames.wants, told))
         if self._run is None:
             return evaluate
         log, count = self._run.replay, 0
@@ -121,16 +121,37 @@ class Memory:
 
         return remembered
 
-    def spent(self, kind: str) -> float:
-        """Return the seconds that the evaluations in the log have taken."""
-        if self._run is None:
-            return 0.0
-        return math.fsum(self._run.replay.read(kind, number).facts["seconds"] for number in self._numbers(kind))
+    def clock(self, kind: str, steps: int, seconds: float | None) -> Callable[[int], bool] | None:
+        """Return what says whether the time of a search is over, that of its earlier lives included.
 
-    def _numbers(self, kind: str) -> Iterator[int]:
-        log, number = self._run.replay if self._run else (), 0
+        An evaluation that is read back never ends the search before the one after which it was ended; if the log has
+        renders of the ranking, that is the last one before these.
+
+        Args:
+            kind: of search.
+            steps: of it; the ranking's renders have indices from there on.
+            seconds: allowed; None for no limit.
+        """
+        if seconds is None:
+            return None
+        entries = list(self._entries(kind))
+        explored = [entry for entry in entries if entry.facts["index"] < steps]
+        left = seconds - math.fsum(entry.facts["seconds"] for entry in explored)
+        ended, begun = len(entries) > len(explored), time.perf_counter()
+
+        def late(count: int) -> bool:
+            if count < len(explored):
+                return False
+            return ended or time.perf_counter() - begun >= left
+
+        return late
+
+    def _entries(self, kind: str) -> Iterator[Entry]:
+        if self._run is None:
+            return
+        log, number = self._run.replay, 0
         while (kind, number) in log:
-            yield number
+            yield log.read(kind, number)
             number += 1
 
     def trial(self, kind: str, number: int, goal: Goal) -> Trial | None:

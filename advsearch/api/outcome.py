@@ -181,6 +181,7 @@ def _smallest(bracket: Bracket, problem: Problem) -> dict[str, Any]:
         "epsilon": {name: bracket.high * epsilon for name, epsilon in budgets.items()} if flips else None,
         "not_found_at": {name: bracket.low * epsilon for name, epsilon in budgets.items()} if bracket.low else None,
         "closed": bracket.closed,
+        "confirmed": bracket.confirmed,
         "searches": bracket.searches,
         "checks": bracket.checks,
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,8 +20,18 @@ from advsearch.scene.formation import to_8_bit
 from advsearch.scene.plan import GradientPlan
 from advsearch.scene.renderer import Renderer
 
-OnImage = Callable[[int, Tensor], None]
-"""Called with the index and the picture of every evaluation."""
+
+class OnImage(NamedTuple):
+    """Who is told the picture of an evaluation.
+
+    Attributes:
+        wants: whether that of the evaluation with this index is wanted.
+        tell: called with the index and the picture.
+    """
+
+    wants: Callable[[int], bool]
+    tell: Callable[[int, Tensor], None]
+
 
 BY_CHANCE = "forced: it varies by chance, so nobody asks for its derivative"
 
@@ -145,8 +155,8 @@ class Problem:
                 return self._evaluate(u, noise, index, gradient, samples, on_image)
             draws = [seeds.stream(noise, "draw", number) for number in range(self.draws)]
             found = [self._evaluate(self.whole(u, d), d, index, gradient, samples, None) for d in draws]
-            if on_image is not None:
-                on_image(index, self.picture(u, noise, self.spp, drawn=False))
+            if on_image is not None and on_image.wants(index):
+                on_image.tell(index, self.picture(u, noise, self.spp, drawn=False))
             return _mean(found, u.numel())
 
         return evaluate
@@ -170,8 +180,8 @@ class Problem:
             with torch.no_grad():
                 value = loss(self.renderer(whole, seed=noise, spp=spp))
         image, logits = seen[0]
-        if on_image is not None:
-            on_image(index, image)
+        if on_image is not None and on_image.wants(index):
+            on_image.tell(index, image)
         return Evaluation(
             objective=float(value),
             gradient=derivative,

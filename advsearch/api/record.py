@@ -126,7 +126,7 @@ class Recorder:
                 kind=kind,
                 step=record.step,
                 seed=seeds.stream(problem.seed, kind, record.index),
-                spp=problem.spp,
+                spp=problem.spp * record.samples,
                 objective=record.objective,
                 success=record.success,
                 label=problem.model.labels[predicted],
@@ -134,7 +134,7 @@ class Recorder:
                 probability=float(probabilities[predicted]),
                 values=problem.describe(u),
                 seconds=record.seconds,
-                renders=renders,
+                renders=renders * problem.draws,
             )
         )
 

@@ -69,6 +69,7 @@ class Attack:
     memory: Memory
     stages: Stages
     findings: Findings = field(default_factory=Findings)
+    _clean_spp: int = 0
 
     def carry_out(self) -> Findings:
         """Do everything; what an interrupt leaves undone is missing from the findings."""
@@ -144,7 +145,7 @@ class Attack:
         findings.search = self.one_search("search", self.policy, config.steps, config.seed, frames, config.seconds)
         if not config.baseline or self.policy.name == "random":
             return
-        steps = config.steps if config.seconds is None else max(1, findings.search.history[-1].renders)
+        steps = config.steps if config.seconds is None else _spent(findings.search)
         self.stages.begin("baseline", "random baseline", planned_renders(steps))
         seed = seeds.stream(config.seed, "baseline")
         findings.baseline = self.one_search("baseline", make_policy("random"), steps, seed)
@@ -175,7 +176,7 @@ class Attack:
             policy,
             steps=steps,
             seed=seed,
-            seconds=None if seconds is None else max(1e-9, seconds - self.memory.spent(kind)),
+            late=self.memory.clock(kind, steps, seconds),
             on_step=on_step,
         )
         if found.ending is Ending.INTERRUPTED:
@@ -217,15 +218,22 @@ class Attack:
         self.findings.verification_renders += self.findings.sample_count.renders
 
     def clean_trials(self) -> None:
-        """The control group: the clean configuration under the seeds that every other group gets."""
+        """The control group: the clean configuration under the seeds that every other group gets.
+
+        A start that looked wrong at first has been through it before the search, at a sample count of its own.
+        """
+        if self.findings.clean and self._clean_spp == self.findings.spp:
+            return
+        kind = "first control" if self.findings.search is None else "control"
+        self._clean_spp = self.findings.spp
         self.findings.clean = run_trials(
-            self._trial("control"),
+            self._trial(kind),
             self.problem.domain.start,
             spp=self.findings.spp,
             seed=self.config.seed,
             trials=self.config.trial_count,
             group="clean",
-            on_trial=self._teller("control"),
+            on_trial=self._teller(kind),
         )
 
     def verified(self, kind: str, found: SearchResult) -> Verification:
@@ -286,6 +294,11 @@ class Attack:
         return on_trial
 
 
+def _spent(found: SearchResult) -> int:
+    """Renders of the search itself, without those of the ranking."""
+    return max(1, found.history[-1].renders) if found.history else 1
+
+
 # ---- the smallest change --------------------------------------------------------------------------------------------
 
 
@@ -319,4 +332,5 @@ def find_smallest(attack: Attack) -> None:
     answer = results[0].best_u if bracket.u is None else bracket.u
     ending = results[0].ending if bracket.u is None else Ending.FOUND
     findings.smallest = bracket
-    findings.search = replace(results[-1], best_u=answer, ending=ending, renders=renders, gradients=gradients)
+    own = results[0 if bracket.u is None else bracket.found_by]
+    findings.search = replace(own, best_u=answer, ending=ending, renders=renders, gradients=gradients)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.api.attacking import attack_from_config, instance_name, resume_attack
-from advsearch.attacks import clopper_pearson
+from advsearch.attacks import clopper_pearson, needed
 from advsearch.config import AttackConfig, GapConfig
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
@@ -128,15 +128,18 @@ def _as_attack(config: AttackConfig, **update: Any) -> AttackConfig:
 def _curve(config: AttackConfig, parts: _Parts) -> Summary:
     epsilons: Sequence[float | None] = sorted(config.epsilons) or [None]
     rows = []
-    for name in config.objects:
+    _check_different(config.objects)
+    for place, name in enumerate(config.objects):
         row: Summary = {"object": name, "clean": None, "flips_at": None}
         for epsilon in epsilons:
-            label = default_name(name, [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")])
+            label = f"{place:02d}-" + default_name(
+                name, [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")]
+            )
             one = _as_attack(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)
             summary = parts.attack(one, label)
             if summary is None:
                 break
-            row |= _seen(summary, epsilon)
+            row |= _seen(summary, epsilon) | {"tried": epsilon}
             if row["ending"] in ("found", "already wrong"):
                 break
         rows.append(row)
@@ -158,9 +161,31 @@ def _seen(summary: Mapping[str, Any], epsilon: float | None) -> Summary:
     }
 
 
+def _known(row: Summary, epsilon: float | None) -> bool:
+    """Whether a row says anything about an epsilon: it was tried there, or had flipped before.
+
+    What ended without a number says nothing, and neither does an object that its own noise makes wrong too often for
+    any answer to be verified.
+    """
+    ending = row.get("ending")
+    if ending in (None, "non-finite objective"):
+        return False
+    if ending in ("found", "already wrong"):
+        return True
+    clean = row["clean"]
+    steady = clean is not None and clean["correct"] >= needed(clean["trials"])
+    return steady and (epsilon is None or row["tried"] >= epsilon)
+
+
+def _check_different(names: Sequence[str]) -> None:
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise InputError(f"--object: expected different objects, got {twice[0]} twice; leave one of them out")
+
+
 def _accuracy(rows: Sequence[Summary], epsilon: float | None) -> Summary:
     """How many objects are still recognised at an epsilon."""
-    known = [row for row in rows if row.get("ending") is not None]
+    known = [row for row in rows if _known(row, epsilon)]
     wrong = sum(row["ending"] == "already wrong" for row in known)
     found = sum(row["ending"] == "found" and (epsilon is None or float(row["flips_at"]) <= epsilon) for row in known)
     robust = len(known) - wrong - found
@@ -183,13 +208,14 @@ def _gap(config: GapConfig, parts: _Parts) -> Summary:
     if config.epsilons or config.smallest:
         raise InputError("advsearch gap: compares over one space; give one --epsilon, and leave --smallest out")
     rows = []
-    for name in config.objects:
-        for control, settings in config.controls.items():
+    _check_different(config.objects)
+    for place, name in enumerate(config.objects):
+        for number, (control, settings) in enumerate(config.controls.items()):
             epsilon = config.epsilon
             if isinstance(epsilon, dict):
                 epsilon = {own: value for own, value in epsilon.items() if own == instance_name(control)} or None
             one = _as_attack(config, object=name, controls={control: settings}, epsilon=epsilon)
-            summary = parts.attack(one, default_name(name, [control]))
+            summary = parts.attack(one, f"{place:02d}-{number:02d}-" + default_name(name, [control]))
             if summary is not None:
                 rows.append(_compared(name, control, summary))
     return {"table": rows}

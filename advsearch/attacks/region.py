@@ -30,7 +30,7 @@ class Region:
         low, high: (d,) its corners, inside the unit box.
         same: how many of the final samples had the centre's answer.
         samples: how many there were.
-        attempts: how many boxes were sampled until there was no exception, or no attempt left.
+        attempts: how many boxes might have been sampled until there was no exception.
         renders: pictures in all.
         exceptions: (k, d) final samples with another answer.
     """
@@ -95,7 +95,7 @@ def grow(
             break
         for point in wrong:
             _cut(low, high, centre, point)
-    return Region(centre, low, high, samples - len(wrong), samples, attempt + 1, judge.count, wrong)
+    return Region(centre, low, high, samples - len(wrong), samples, attempts, judge.count, wrong)
 
 
 class _Judge:

@@ -61,6 +61,9 @@ class StepRecord:
     samples: int = 1
 
 
+Late = Callable[[int], bool]
+"""Whether the time is over after so many evaluations."""
+
 OnStep = Callable[[StepRecord, Tensor, Evaluation], None]
 """Called after every evaluation, ranking included, with its record, u, and the (usable) evaluation."""
 
@@ -120,6 +123,7 @@ def search(
     stop_when: StopWhen | None = None,
     on_step: OnStep | None = None,
     seconds: float | None = None,
+    late: Late | None = None,
 ) -> SearchResult:
     """Run one policy on one domain and return the worst configuration it found.
 
@@ -150,6 +154,8 @@ def search(
         on_step: called after every evaluation.
         seconds: end step 1 after the first evaluation that is done later than this, over 0; None for no limit. There
             is always one evaluation, and step 2 comes on top. Policies still plan for `steps`.
+        late: says, after so many evaluations, whether the time is over; in place of `seconds`, for a run that goes on
+            after it was stopped.
 
     Raises:
         InputError: steps, candidates, repeats or seconds out of range, or the policy cannot search this domain.
@@ -164,8 +170,8 @@ def search(
     begun = time.perf_counter()
     log = _Log(evaluate, domain, on_step, max(1, candidates))
     try:
-        until = math.inf if seconds is None else begun + seconds
-        stopped = _explore(log, policy, steps, seed, stop_when, until)
+        in_time = math.inf if seconds is None else begun + seconds
+        stopped = _explore(log, policy, steps, seed, stop_when, late or (lambda _: time.perf_counter() >= in_time))
         if candidates:
             _rank(log, steps, repeats)
     except KeyboardInterrupt:
@@ -226,7 +232,7 @@ class _Log:
         return evaluation
 
 
-def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, stop_when: StopWhen | None, until: float) -> Ending:
+def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, stop_when: StopWhen | None, late: Late) -> Ending:
     """Let the policy propose until the budget is spent or something ends it sooner; return what."""
     generator = torch.Generator().manual_seed(stream(seed, "search"))
     name, policy = policy.name, with_choices(policy, log.domain)
@@ -247,7 +253,7 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, stop_when: S
         if log.renders < steps:
             state = policy.update(state, proposal.u, evaluation)
             log.answer = partial(answer_of, policy, state)
-        if time.perf_counter() >= until:
+        if late(len(log.records)):
             break
     return Ending.BUDGET_SPENT
 

@@ -39,6 +39,8 @@ class Bracket:
         u: (d,) a configuration within `high`; None where nothing passed.
         searches: how many were run.
         checks: how often a configuration went through the trials.
+        found_by: number of the search that found `u`, or the longer change that it is the end of.
+        confirmed: whether `u` has passed again, with new seeds (see `confirmed`).
     """
 
     low: float
@@ -46,6 +48,8 @@ class Bracket:
     u: Tensor | None
     searches: int
     checks: int
+    found_by: int = 0
+    confirmed: bool = False
 
     @property
     def closed(self) -> bool:
@@ -108,7 +112,7 @@ def smallest(search: Search, passes: Passes, domain: Domain, *, rounds: int = 12
         passed = passes(u, state.checks)
         state = replace(state, searches=state.searches + 1, checks=state.checks + 1)
         if passed:
-            state = _shorten(replace(state, high=scale, u=u), passes, domain)
+            state = _shorten(replace(state, high=scale, u=u, found_by=state.searches - 1), passes, domain)
         else:
             state = replace(state, low=scale)
     return state
@@ -125,14 +129,14 @@ def confirmed(bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 
         passes: verifies a configuration.
         domain: the largest budget.
         times: in a row.
-        attempts: steps outwards at most; the last one counts whatever it shows.
+        attempts: steps outwards at most; what the last one leads to is returned untried, and not `confirmed`.
     """
     if bracket.u is None:
         return bracket
     edge, reached, at = bracket.u, bracket.high, 1.0
     for _ in range(attempts):
         if all(passes(bracket.u, bracket.checks + again) for again in range(times)):
-            return replace(bracket, checks=bracket.checks + times)
+            return replace(bracket, checks=bracket.checks + times, confirmed=True)
         at *= math.sqrt(RATIO)
         high = min(1.0, reached * at)
         farther = scaled(domain, high).project(domain.start + at * (edge - domain.start))

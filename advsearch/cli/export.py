@@ -39,7 +39,7 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the table."""
-    from advsearch.runs.directory import find_run
+    from advsearch.runs.directory import PARTS, find_run
     from advsearch.runs.export import FORMATS, export
     from advsearch.runs.store import NAME, Store
 
@@ -51,7 +51,11 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--json: prints JSON, but --format asks for {format}; leave one of them out")
     if out is not None and out.is_dir():
         raise InputError(f"--out: expected the name of a file, got the folder {out}")
-    with Store(find_run(args.run) / NAME, read_only=True) as store:
+    folder = find_run(args.run)
+    if (folder / PARTS).is_dir():
+        parts = ", ".join(str(one) for one in sorted((folder / PARTS).iterdir()))
+        raise InputError(f"{folder}: is a study, whose rows are those of its parts; export one of {parts}")
+    with Store(folder / NAME, read_only=True) as store:
         count = export(store, format, out, sys.stdout.buffer, args.kind)
     if out is not None and args.json:
         output.print_json({"schema": 1, "command": "export", "rows": count, "format": format, "out": str(out)})

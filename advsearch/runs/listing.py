@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.errors import AdvsearchError
-from advsearch.runs import lock, store, summary
+from advsearch.runs import lock, replay, store, summary
 from advsearch.runs.directory import CONFIG, is_run
 from advsearch.settings import read_yaml
 
@@ -46,7 +46,9 @@ def listed(folder: Path) -> list[Listed]:
 
 
 def finished(path: Path) -> bool:
-    """Whether a run has come to its end; one that was interrupted has not."""
+    """Whether a run has come to its end; one that was interrupted, or killed while its report was written, has not."""
+    if (path / replay.NAME).exists():
+        return False
     return (path / summary.NAME).is_file() and summary.read_summary(path).get("ending") != "interrupted"
 
 

@@ -213,8 +213,7 @@ def _connect_to_write(path: Path) -> sqlite3.Connection:
         version = _version(db)
         if version == 0:
             _make(db)
-        for number, script in enumerate(MIGRATIONS[version:], start=version + 1):
-            db.executescript(f"BEGIN; {script} PRAGMA user_version = {number}; COMMIT;")
+        _migrate(db)
     return db
 
 
@@ -236,7 +235,22 @@ def _connect_to_read(path: Path) -> sqlite3.Connection:
     except sqlite3.OperationalError:
         db.close()
         db = sqlite3.connect(f"{address}?immutable=1", uri=True)
-    return db
+    return _migrated_copy(db) if 0 < _version(db) < len(MIGRATIONS) else db
+
+
+def _migrated_copy(db: sqlite3.Connection) -> sqlite3.Connection:
+    """An older file's contents in memory, as the present version has them; the file stays as it is."""
+    copy = sqlite3.connect(":memory:")
+    db.backup(copy)
+    db.close()
+    _migrate(copy)
+    return copy
+
+
+def _migrate(db: sqlite3.Connection) -> None:
+    """Bring a file up to date."""
+    for number, script in enumerate(MIGRATIONS[_version(db) :], start=_version(db) + 1):
+        db.executescript(f"BEGIN; {script} PRAGMA user_version = {number}; COMMIT;")
 
 
 def _version(db: sqlite3.Connection) -> int:

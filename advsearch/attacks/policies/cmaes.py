@@ -237,5 +237,5 @@ def _pycma() -> Any:
     """Import pycma, which takes most of a second and complains that there is no matplotlib."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        import cma  # type: ignore[import-untyped]
+        import cma
     return cma
