@@ -29,7 +29,7 @@ from advsearch.attacks import make_policy, search
 from advsearch.config import AttackConfig
 
 TRIALS, TRIAL_SPP = 8, 64
-BLIND = ("random", "nes", "sobol")
+BLIND = ("random", "nes")
 """Policies without gradients that take a whole texture."""
 
 
