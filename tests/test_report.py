@@ -443,3 +443,13 @@ def test_only_certainty_is_called_100_percent(share: float | None, text: str) ->
 )
 def test_times(seconds: float | None, text: str) -> None:
     assert wording.seconds_text(seconds) == text
+
+
+def test_where_random_search_won_it_is_said() -> None:
+    own = {"successes": 3, "trials": 20, "margin": -1.25, "interval": [0.03, 0.4]}
+    (said,) = [
+        text
+        for text in wording.remarks({**SUMMARY, "answer_from": "random", "policy_verified": own})
+        if "random" in text
+    ]
+    assert "worse configuration than the policy did (3 of 20 with a margin of -1.25)" in said

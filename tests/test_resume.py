@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ from torch import Tensor
 from advsearch.api.memory import Memory
 from advsearch.api.record import Findings, Recorder, Stages
 from advsearch.api.stages import Attack
-from advsearch.attacks import Block, Domain, Evaluation, Trial, make_policy
+from advsearch.attacks import Block, Domain, Evaluation, Policy, Proposal, Trial, make_policy
 from advsearch.attacks.goal import Goal
 from advsearch.config import AttackConfig
 from advsearch.errors import InputError
@@ -257,3 +257,33 @@ def test_two_processes_on_one_run_are_refused(tmp_path: Path) -> None:
         run.write_config(configuration())
         other = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert other.returncode == 7 and f"process {os.getpid()} is working on this run" in other.stdout
+
+
+@dataclass(frozen=True)
+class Sleeper(Policy[Domain]):
+    """Never leaves the start."""
+
+    name: ClassVar[str] = "sleeper"
+    uses_gradient: ClassVar[bool] = False
+
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Domain:
+        return domain
+
+    def propose(self, state: Domain) -> tuple[Proposal, Domain]:
+        return Proposal(state.start), state
+
+    def update(self, state: Domain, u: Tensor, evaluation: Evaluation) -> Domain:
+        return state
+
+
+@pytest.mark.parametrize(("policy", "beaten"), [(Sleeper(), True), (make_policy("pgd"), False)])
+def test_the_random_searchs_answer_is_taken_where_it_is_the_worse_one(policy: Policy[Any], beaten: bool) -> None:
+    problem: Any = StandInProblem()
+    memory = Memory(None)
+    attack = Attack(problem, configuration(), policy, Recorder(None, problem, memory), memory, Stages(NullProgress()))
+    findings = attack.carry_out()
+    assert findings.search is not None and findings.baseline is not None and findings.verification is not None
+    assert (findings.beaten is not None) == beaten
+    random = findings.baseline.best_u
+    assert torch.equal(findings.search.best_u, random) == beaten
+    assert torch.equal(findings.verification.u, problem.domain.project(random)) == beaten

@@ -141,6 +141,9 @@ def _answers(
             "renders": findings.baseline.renders * problem.draws,
             "verified": _verified(findings.baseline_verification, labels),
         }
+    if findings.beaten is not None:
+        summary["answer_from"] = "random"
+        summary["policy_verified"] = _verified(findings.beaten, labels)
     if findings.average:
         summary["average"] = _average(findings, problem)
     if findings.smallest is not None:

@@ -31,6 +31,8 @@ class Findings:
         clean: the control group's trials.
         verification: of the policy's answer.
         baseline_verification: of the random search's.
+        beaten: verification of the policy's own answer, where the random search's turned out worse for the model and is
+            the run's answer instead.
         average: trials of configurations drawn from the whole space.
         smallest: the least epsilon, where it was asked for.
         frames: pictures of the search as 8-bit values in [0, 1], for the animation.
@@ -45,6 +47,7 @@ class Findings:
     clean: tuple[Trial, ...] = ()
     verification: Verification | None = None
     baseline_verification: Verification | None = None
+    beaten: Verification | None = None
     average: tuple[Trial, ...] = ()
     smallest: Bracket | None = None
     frames: list[Any] = field(default_factory=list)

@@ -48,7 +48,14 @@ def remarks(summary: Summary) -> list[str]:
     if missed and summary.get("ending") != "already wrong" and not minimises(summary):
         apart = " They do not count." if over(summary) else ""
         said.append(f"The clean scene itself fails {missed} of its {control['trials']} trials.{apart}")
-    said += _against_random(summary)
+    if summary.get("answer_from") == "random":
+        own = summary.get("policy_verified") or {}
+        said.append(
+            "The random search beside it found a worse configuration than the policy did "
+            f"({tally(own)} with a margin of {own.get('margin', 0.0):.2f}); that of the random search is the answer."
+        )
+    else:
+        said += _against_random(summary)
     return said + [str(text) for text in summary.get("warnings") or ()]
 
 
