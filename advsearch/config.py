@@ -10,15 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator, model_validator
 
 from advsearch.errors import InputError
-from advsearch.settings import PLACE, Config, all_finite, number_or_text, parse_assignment, setting
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
+from advsearch.settings import PLACE, Config, all_finite, number_or_text, parse_assignment, setting, split_names
 
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
@@ -143,13 +140,6 @@ class SceneConfig(Config):
     def objects(self) -> tuple[str, ...]:
         """The objects by name."""
         return split_names(self.object)
-
-    def recipe(self) -> Self:
-        """See `Config.recipe`; files in a list get absolute paths too."""
-        found = super().recipe()
-        lists = {name: split_names(getattr(found, name)) for name in ("object", "environment", "model")}
-        several = {name: ",".join(map(_absolute_file, parts)) for name, parts in lists.items() if len(parts) > 1}
-        return found.model_copy(update=several)
 
     @field_validator(
         "object",
@@ -709,18 +699,6 @@ def _grid_values(given: Any) -> Any:
     if not values or any(one is None or isinstance(one, (bool, list, Mapping)) for one in values):
         raise ValueError("not values")
     return [number_or_text(one) for one in values]
-
-
-def _absolute_file(name: str) -> str:
-    """The absolute path of a file, and a name as it is."""
-    return str(Path(name).resolve()) if ("/" in name or Path(name).suffix) and Path(name).is_file() else name
-
-
-def split_names(text: str) -> tuple[str, ...]:
-    """Return the parts of ``mug,bowl``; a file whose name has a comma is one part."""
-    if "," not in text or Path(text).is_file():
-        return (text,)
-    return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 def _plain_values(given: Any) -> Any:

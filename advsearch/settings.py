@@ -367,10 +367,21 @@ def _put(data: dict[str, Any], name: str, value: Any) -> None:
     data[first] = inner
 
 
+def split_names(text: str) -> tuple[str, ...]:
+    """Return the parts of ``mug,bowl``; a file whose name has a comma is one part."""
+    if "," not in text or Path(text).is_file():
+        return (text,)
+    return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
 def _absolute(value: str | None) -> str | None:
-    """Return the absolute path of `value` where it is a file, and the name it is otherwise."""
-    is_path = value is not None and ("/" in value or Path(value).suffix != "") and Path(value).is_file()
-    return str(Path(str(value)).resolve()) if is_path else value
+    """Return the absolute path of `value` where it is a file, and the name it is otherwise; of a list, each part."""
+    return None if value is None else ",".join(map(_absolute_file, split_names(value)))
+
+
+def _absolute_file(name: str) -> str:
+    is_path = ("/" in name or Path(name).suffix != "") and Path(name).is_file()
+    return str(Path(name).resolve()) if is_path else name
 
 
 def _as_flags(setting: Setting, value: Any) -> list[str]:

@@ -18,13 +18,14 @@ from advsearch.api.record import Recorder, Stages
 from advsearch.api.stages import Attack
 from advsearch.attacks import make_policy
 from advsearch.attacks.region import Region, grow
-from advsearch.config import AttackConfig, RegionConfig, SceneConfig, split_names
+from advsearch.config import AttackConfig, RegionConfig, SceneConfig
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.studies import map_figure
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.store import NAME, Store
+from advsearch.settings import split_names
 
 MOST = 8
 """A box is grown in at most so many parameters."""

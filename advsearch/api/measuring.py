@@ -16,7 +16,7 @@ from advsearch.api.attacking import problem_from_config
 from advsearch.api.measuring_report import Section, figures_of, report_of
 from advsearch.api.problem import Problem
 from advsearch.attacks import make_policy
-from advsearch.config import PrecisionConfig, split_names
+from advsearch.config import PrecisionConfig
 from advsearch.errors import InputError
 from advsearch.evaluation.gradients import Loss, inside, smooth_loss
 from advsearch.evaluation.planning import measured_plan
@@ -31,6 +31,7 @@ from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory, check_free, default_name
 from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.summary import to_json
+from advsearch.settings import split_names
 
 SHARES = {"image": 0.45, "gradient": 0.3, "objective": 0.25}
 """Of the time, by quantity; what one doesn't use is the others'."""

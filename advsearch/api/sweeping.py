@@ -14,7 +14,7 @@ from advsearch.api.scene import Controls, Scene, as_controls, load_scene
 from advsearch.api.sweep_axes import read_axes
 from advsearch.api.sweep_job import Job, Place
 from advsearch.api.sweep_loop import SweepResult, carry_out
-from advsearch.config import SweepConfig, split_names
+from advsearch.config import SweepConfig
 from advsearch.errors import InputError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.progress import NullProgress, Progress
@@ -22,6 +22,7 @@ from advsearch.runs.directory import CONFIG, RunDirectory, check_free, default_n
 from advsearch.runs.summary import NAME as SUMMARY
 from advsearch.runs.summary import read_summary
 from advsearch.scene.settings import SETTINGS
+from advsearch.settings import split_names
 
 SAMPLES = 100
 """Draws where there is no grid and nothing is said."""
