@@ -46,12 +46,9 @@ def run(args: argparse.Namespace) -> int:
 
 def carry_out(config: AttackConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
     """Run the attack that `config` describes, or go on with it; print its answer and return the exit status."""
-    from contextlib import nullcontext
+    from advsearch.cli.progress import at_work
 
-    from advsearch.cli.main import INTERRUPTED, OK
-    from advsearch.cli.progress import watching
-
-    with output.output_kept_clean() if as_json else nullcontext(), watching(quiet=quiet) as progress:
+    with at_work(as_json=as_json, quiet=quiet) as progress:
         from advsearch.api import attack_from_config, curve_from_config, resume_attack
 
         if config.is_study:
@@ -60,10 +57,6 @@ def carry_out(config: AttackConfig, *, as_json: bool, quiet: bool, resumed: Path
             summary = resume_attack(resumed, progress=progress).summary
         else:
             summary = attack_from_config(config, progress=progress).summary
-    if as_json:
-        output.print_json(summary)
-    else:
-        from advsearch.cli import studies, table
+    from advsearch.cli import studies, table
 
-        print((studies if config.is_study else table).answer(summary))
-    return INTERRUPTED if summary.get("ending") == "interrupted" else OK
+    return output.finish(summary, (studies if config.is_study else table).answer, as_json=as_json)

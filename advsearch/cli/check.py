@@ -42,15 +42,13 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check, print the table; 3 if a gradient falls short."""
-    from contextlib import nullcontext
-
     from advsearch.cli.flags import config_from
-    from advsearch.cli.progress import watching
+    from advsearch.cli.progress import at_work
     from advsearch.config import AttackConfig
 
     config = config_from(args, AttackConfig, object="mug")
     losses = ("linear", "model") if args.loss == "both" else (args.loss,)
-    with output.output_kept_clean() if args.json else nullcontext(), watching(quiet=args.quiet) as progress:
+    with at_work(as_json=args.json, quiet=args.quiet) as progress:
         from advsearch.api.checking import check
 
         rows = check(config, losses=losses, everything=args.all, progress=progress)

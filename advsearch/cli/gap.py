@@ -46,19 +46,12 @@ def run(args: argparse.Namespace) -> int:
 
 def carry_out(config: GapConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
     """Do what `config` describes, or go on with it; print the table and return the exit status."""
-    from contextlib import nullcontext
+    from advsearch.cli.progress import at_work
 
-    from advsearch.cli.main import INTERRUPTED, OK
-    from advsearch.cli.progress import watching
-
-    with output.output_kept_clean() if as_json else nullcontext(), watching(quiet=quiet) as progress:
+    with at_work(as_json=as_json, quiet=quiet) as progress:
         from advsearch.api import gap_from_config
 
         summary = gap_from_config(config, progress=progress, resumed=resumed)
-    if as_json:
-        output.print_json(summary)
-    else:
-        from advsearch.cli.studies import answer
+    from advsearch.cli.studies import answer
 
-        print(answer(summary))
-    return INTERRUPTED if summary["ending"] == "interrupted" else OK
+    return output.finish(summary, answer, as_json=as_json)

@@ -7,7 +7,7 @@ import ctypes
 import json
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from typing import Any
 
@@ -24,6 +24,23 @@ def print_json(value: Any) -> None:
     from advsearch.runs.summary import plain
 
     print(json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False))
+
+
+def finish(summary: Mapping[str, Any], answer: Callable[[Any], str], *, as_json: bool) -> int:
+    """Print the last word of a command, and return its exit status.
+
+    Args:
+        summary: what came out; its `ending` says whether it was interrupted.
+        answer: makes a text for a person of it.
+        as_json: print the summary itself instead.
+    """
+    from advsearch.cli.main import INTERRUPTED, OK
+
+    if as_json:
+        print_json(summary)
+    else:
+        print(answer(summary))
+    return INTERRUPTED if summary.get("ending") == "interrupted" else OK
 
 
 @contextmanager

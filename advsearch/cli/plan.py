@@ -29,22 +29,16 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print the plan."""
-    from contextlib import nullcontext
-
     from advsearch.cli.flags import config_from
-    from advsearch.cli.progress import watching
+    from advsearch.cli.progress import at_work
     from advsearch.config import AttackConfig
 
     config = config_from(args, AttackConfig, object="mug")
-    with output.output_kept_clean() if args.json else nullcontext(), watching(quiet=args.quiet) as progress:
+    with at_work(as_json=args.json, quiet=args.quiet) as progress:
         from advsearch.api.checking import plan
 
         chosen = plan(config, progress=progress)
-    if args.json:
-        output.print_json(chosen)
-    else:
-        print(text(chosen))
-    return 0
+    return output.finish(chosen, text, as_json=args.json)
 
 
 def text(chosen: dict[str, Any]) -> str:

@@ -54,15 +54,13 @@ def carry_out(config: PrecisionConfig, *, as_json: bool, quiet: bool, resumed: P
     Raises:
         InputError: a run is to be resumed; measured times are of one sitting.
     """
-    from contextlib import nullcontext
-
-    from advsearch.cli.progress import watching
+    from advsearch.cli.progress import at_work
 
     if resumed is not None:
         raise InputError(
             f"{resumed}: times are measured in one sitting, so that there is nothing to go on with; run again"
         )
-    with output.output_kept_clean() if as_json else nullcontext(), watching(quiet=quiet) as progress:
+    with at_work(as_json=as_json, quiet=quiet) as progress:
         from advsearch.api.measuring import precision
 
         report = precision(config, progress=progress)

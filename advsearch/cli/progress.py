@@ -5,9 +5,10 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, TextIO
 
+from advsearch.cli.output import output_kept_clean
 from advsearch.progress import NullProgress, Progress
 
 if TYPE_CHECKING:
@@ -16,6 +17,13 @@ if TYPE_CHECKING:
 
 LINE_INTERVAL = 5.0
 """Seconds between two lines where there is no terminal."""
+
+
+@contextmanager
+def at_work(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
+    """Watch a command's work; where JSON is to be printed, keep everything else off standard output meanwhile."""
+    with output_kept_clean() if as_json else nullcontext(), watching(quiet=quiet) as progress:
+        yield progress
 
 
 @contextmanager

@@ -57,20 +57,13 @@ def run(args: argparse.Namespace) -> int:
 
 def carry_out(config: RegionConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
     """Do what `config` describes, or go on with it; print the region and return the exit status."""
-    from contextlib import nullcontext
+    from advsearch.cli.progress import at_work
 
-    from advsearch.cli.main import OK
-    from advsearch.cli.progress import watching
-
-    with output.output_kept_clean() if as_json else nullcontext(), watching(quiet=quiet) as progress:
+    with at_work(as_json=as_json, quiet=quiet) as progress:
         from advsearch.api import region_from_config
 
         summary = region_from_config(config, progress=progress, resumed=resumed)
-    if as_json:
-        output.print_json(summary)
-    else:
-        print(answer(summary))
-    return OK
+    return output.finish(summary, answer, as_json=as_json)
 
 
 def answer(summary: Mapping[str, Any]) -> str:

@@ -41,11 +41,9 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the cases, print the table; 3 if one falls short."""
-    from contextlib import nullcontext
+    from advsearch.cli.progress import at_work
 
-    from advsearch.cli.progress import watching
-
-    with output.output_kept_clean() if args.json else nullcontext(), watching(quiet=args.quiet) as progress:
+    with at_work(as_json=args.json, quiet=args.quiet) as progress:
         from advsearch.evaluation.stability import OK, chosen, run_cases
 
         cases = chosen(args.case, args.group)

@@ -52,25 +52,18 @@ def run(args: argparse.Namespace) -> int:
 
 def carry_out(config: SweepConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
     """Do the sweep that `config` describes, or go on with it; print its answer and return the exit status."""
-    from contextlib import nullcontext
+    from advsearch.cli.progress import at_work
 
-    from advsearch.cli.main import INTERRUPTED, OK
-    from advsearch.cli.progress import watching
-
-    with output.output_kept_clean() if as_json else nullcontext(), watching(quiet=quiet) as progress:
+    with at_work(as_json=as_json, quiet=quiet) as progress:
         from advsearch.api.sweeping import resume_sweep, sweep_from_config
 
         if resumed is not None:
             result = resume_sweep(resumed, progress=progress)
         else:
             result = sweep_from_config(config, progress=progress)
-    if as_json:
-        output.print_json(result.summary)
-    else:
-        from advsearch.cli.sweep_table import answer
+    from advsearch.cli.sweep_table import answer
 
-        print(answer(result.summary))
-    return INTERRUPTED if result.summary.get("ending") == "interrupted" else OK
+    return output.finish(result.summary, answer, as_json=as_json)
 
 
 def axes_as_text(given: Sequence[str]) -> list[str]:
