@@ -27,7 +27,7 @@ import advsearch
 from advsearch.api import sweep_view
 from advsearch.api.sweep_axes import axis_values, on_grid, read_axes
 from advsearch.api.sweep_loop import KIND, Sweep
-from advsearch.api.sweep_points import BINS, Points, domain_of
+from advsearch.api.sweep_points import BINS, Points
 from advsearch.api.sweeping import _job_of, resume_sweep, sweep_from_config
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.draws import NET, Draws, Seeds
@@ -41,6 +41,7 @@ from advsearch.config import SweepConfig
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
+from advsearch.evaluation.domains import domain_of
 from advsearch.progress import NullProgress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
@@ -302,7 +303,7 @@ def scene() -> advsearch.Scene:
 def points_of(scene: advsearch.Scene, grid: dict[str, Any], drawn: tuple[Any, ...] = (), samples: int = 1) -> Points:
     axes = read_axes(grid, drawn)
     space = make_space(on_grid(drawn, axes, scene.description), scene.description)
-    return Points(space, domain_of(space), axes, samples, "sobol", 0)
+    return Points(space, domain_of(space.controls), axes, samples, "sobol", 0)
 
 
 def test_what_is_rendered_is_what_was_listed(scene: advsearch.Scene) -> None:
@@ -369,7 +370,7 @@ def test_draws_stay_in_their_budget_and_cover_it(scene: advsearch.Scene) -> None
     )
     points = points_of(scene, {}, drawn, samples=200)
     space = make_space(drawn, scene.description)
-    domain = domain_of(space)
+    domain = domain_of(space.controls)
     u = points.configurations(points.picks(0, 200))
     assert all(domain.contains(one) for one in u)
     texels = (u[:, : 16 * 16 * 3] - space.start[: 16 * 16 * 3]).abs()
@@ -387,7 +388,7 @@ def test_a_million_million_points_start_at_once(scene: advsearch.Scene) -> None:
     axes = read_axes(grid, ())
     space = make_space(on_grid((), axes, scene.description), scene.description)
     began = time.perf_counter()
-    points = Points(space, domain_of(space), axes, 1, "sobol", 0)
+    points = Points(space, domain_of(space.controls), axes, 1, "sobol", 0)
     assert points.count == 10**12
     picks = points.picks(10**12 - 8, 8)
     said = points.values(points.configurations(picks), picks)

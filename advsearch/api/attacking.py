@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,8 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from advsearch import seeds, threads
+from advsearch import seeds
 from advsearch.api.memory import Memory
+from advsearch.api.naming import load_models, scene_settings
 from advsearch.api.outcome import AttackResult, summarise
 from advsearch.api.problem import Problem
 from advsearch.api.record import Recorder, Stages
@@ -27,7 +27,7 @@ from advsearch.config import AttackConfig
 from advsearch.controls import CONTROLS, make_space
 from advsearch.controls.base import Control
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.models import LabelSet, Model, ModelWarning, load_model
+from advsearch.models import LabelSet, Model
 from advsearch.models.features import features_of
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import CONFIG, RunDirectory, check_free, find_run, is_run, run_path
@@ -143,9 +143,7 @@ def _scene(scene: Scene | str | Path, options: Mapping[str, Any]) -> Scene:
         if clash:
             raise InputError(f"{', '.join(clash)}: belongs to the scene, which is given already; give it to load_scene")
         return scene
-    settings = dict(told["set"] or {})
-    if told["exposure"]:
-        settings["camera.exposure"] = told["exposure"]
+    settings = scene_settings(told["set"], told["exposure"])
     return load_scene(scene, told["environment"], up=told["up"], settings=settings)
 
 
@@ -184,11 +182,7 @@ def _job(config: AttackConfig) -> _Job:
     over = as_controls(config.over)
     check_objective(config.objective, targeted=config.target is not None, minimise=config.minimise)
     objective, policy = config.objective, make_policy(config.policy_name, **_policy_options(config))
-    given: dict[str, Any] = dict(config.set_)
-    if config.exposure:
-        if "camera.exposure" in given:
-            raise InputError("--exposure and --set camera.exposure say the same thing; leave one of them out")
-        given["camera.exposure"] = config.exposure
+    given = scene_settings(config.set_, config.exposure)
     scene = load_scene(config.object, config.environment, up=config.up, settings=given)
     model = _model(config.model, config)
     return _Job(config, scene, model, controls, over, objective, policy, True)
@@ -196,14 +190,7 @@ def _job(config: AttackConfig) -> _Job:
 
 def _model(model: Model | nn.Module | str | Path, config: AttackConfig) -> tuple[Model, list[str]]:
     """Load the model; its warnings become sentences of the run."""
-    threads.configure(1 if config.deterministic else config.threads)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", ModelWarning)
-        loaded = load_model(model, labels=config.labels)
-    said = [str(one.message) for one in caught if issubclass(one.category, ModelWarning)]
-    for one in caught:
-        if not issubclass(one.category, ModelWarning):
-            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+    (loaded,), said = load_models([model], config)
     return loaded, said
 
 

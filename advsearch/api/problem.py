@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Block, Domain, Evaluate, Evaluation, Objective, Trial
+from advsearch.attacks import Domain, Evaluate, Evaluation, Objective, Trial
 from advsearch.attacks.evaluation import Wanted
 from advsearch.attacks.goal import Goal
-from advsearch.controls import Group, Space
-from advsearch.controls.base import BoundControl, Value
+from advsearch.controls import Space
+from advsearch.controls.base import Value
+from advsearch.evaluation.domains import domain_of
 from advsearch.models import LabelSet, Model
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.plan import GradientPlan
@@ -84,8 +85,9 @@ class Problem:
         none = {group.name: "none" for group in plan.groups if group.control in names}
         self.renderer.plan = plan.with_estimator(none, BY_CHANCE)
         controls = self.space.controls
-        self.domain = _domain(controls[: self.searched], gradient_cost=self.renderer.plan.renders)
-        self.conditions = _domain(controls[self.searched :]) if self._over else None
+        cost = self.renderer.plan.renders
+        self.domain = domain_of(controls[: self.searched], gradient_cost=cost, partial_gradients=True)
+        self.conditions = domain_of(controls[self.searched :]) if self._over else None
 
     @property
     def _over(self) -> bool:
@@ -212,22 +214,4 @@ def _mean(found: Sequence[Evaluation], size: int) -> Evaluation:
         success=sum(one.success for one in found) * 10 >= 9 * count,
         non_finite=sum(one.non_finite for one in found),
         cost=max(one.cost for one in found),
-    )
-
-
-def _domain(controls: Sequence[BoundControl], **more: Any) -> Domain:
-    blocks = tuple(_block(control.name, group) for control in controls for group in control.groups)
-    start = torch.cat([control.start for control in controls]) if controls else torch.zeros(0)
-    return Domain(start, blocks, partial_gradients=True, **more)
-
-
-def _block(name: str, group: Group) -> Block:
-    budget = group.budget
-    return Block(
-        group.size,
-        budget.norm,  # type: ignore[arg-type]
-        budget.epsilon,
-        periodic=group.periodic,
-        name=name,
-        options=group.options,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -156,18 +156,31 @@ class Recorder:
         """
         if self.run is None or self._memory.holds(kind, number):
             return
-        self.run.record(
-            Row(
-                kind=kind,
-                step=number,
-                seed=seed,
-                spp=spp,
-                objective=trial.margin,
-                success=trial.wrong,
-                label=self._problem.model.labels[trial.predicted],
-                label_index=trial.predicted,
-                probability=trial.probability,
-                values={**(values or {}), **self._problem.conditions_of(seed)},
-                renders=1,
-            )
-        )
+        labels = self._problem.model.labels
+        told = {**(values or {}), **self._problem.conditions_of(seed)}
+        self.run.record(trial_row(kind, number, seed, spp, trial, labels, told))
+
+
+def trial_row(
+    kind: str,
+    number: int,
+    seed: int,
+    spp: int,
+    trial: Trial,
+    labels: Sequence[str],
+    values: Mapping[str, Any] | None = None,
+) -> Row:
+    """Return what the store keeps of a trial; arguments as for `Recorder.trial`."""
+    return Row(
+        kind=kind,
+        step=number,
+        seed=seed,
+        spp=spp,
+        objective=trial.margin,
+        success=trial.wrong,
+        label=labels[trial.predicted],
+        label_index=trial.predicted,
+        probability=trial.probability,
+        values=values or {},
+        renders=1,
+    )

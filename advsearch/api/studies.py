@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.api.attacking import attack_from_config, instance_name, resume_attack
+from advsearch.api.naming import different
 from advsearch.attacks import clopper_pearson, needed
 from advsearch.config import AttackConfig, GapConfig
 from advsearch.errors import InputError
@@ -128,8 +129,7 @@ def _as_attack(config: AttackConfig, **update: Any) -> AttackConfig:
 def _curve(config: AttackConfig, parts: _Parts) -> Summary:
     epsilons: Sequence[float | None] = sorted(config.epsilons) or [None]
     rows = []
-    _check_different(config.objects)
-    for place, name in enumerate(config.objects):
+    for place, name in enumerate(different(config.objects, "--object")):
         row: Summary = {"object": name, "clean": None, "flips_at": None}
         for epsilon in epsilons:
             label = f"{place:02d}-" + default_name(
@@ -177,12 +177,6 @@ def _known(row: Summary, epsilon: float | None) -> bool:
     return steady and (epsilon is None or row["tried"] >= epsilon)
 
 
-def _check_different(names: Sequence[str]) -> None:
-    twice = [name for name in names if names.count(name) > 1]
-    if twice:
-        raise InputError(f"--object: expected different objects, got {twice[0]} twice; leave one of them out")
-
-
 def _accuracy(rows: Sequence[Summary], epsilon: float | None) -> Summary:
     """How many objects are still recognised at an epsilon."""
     known = [row for row in rows if _known(row, epsilon)]
@@ -208,8 +202,7 @@ def _gap(config: GapConfig, parts: _Parts) -> Summary:
     if config.epsilons or config.smallest:
         raise InputError("advsearch gap: compares over one space; give one --epsilon, and leave --smallest out")
     rows = []
-    _check_different(config.objects)
-    for place, name in enumerate(config.objects):
+    for place, name in enumerate(different(config.objects, "--object")):
         for number, (control, settings) in enumerate(config.controls.items()):
             epsilon = config.epsilon
             if isinstance(epsilon, dict):

@@ -7,11 +7,12 @@ from functools import cached_property
 
 from advsearch.api.scene import Scene, framed
 from advsearch.api.sweep_axes import Axis, on_grid
-from advsearch.api.sweep_points import BINS, Drawn, Points, domain_of
+from advsearch.api.sweep_points import BINS, Drawn, Points
 from advsearch.config import SweepConfig
 from advsearch.controls import Control, Space, make_space
 from advsearch.controls.base import Value
 from advsearch.errors import InputError
+from advsearch.evaluation.domains import domain_of
 from advsearch.models import LabelSet, Model
 
 
@@ -78,7 +79,7 @@ class Job:
     def points(self, space: Space) -> Points:
         """The configurations of a space."""
         config = self.config
-        return Points(space, domain_of(space), self.axes, self.samples, config.sampler, config.seed)
+        return Points(space, domain_of(space.controls), self.axes, self.samples, config.sampler, config.seed)
 
     def label_set(self, place: Place, model: Model) -> LabelSet:
         """The right answers: what was said, or else the object's own label.

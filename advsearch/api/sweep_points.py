@@ -199,22 +199,6 @@ class Points:
         return found
 
 
-def domain_of(space: Space) -> Domain:
-    """Return the budgets of all controls of a space."""
-    blocks = tuple(
-        Block(
-            group.size,
-            group.budget.norm,  # type: ignore[arg-type]
-            group.budget.epsilon,
-            periodic=group.periodic,
-            name=control.name,
-            options=group.options,
-        )
-        for control, group in space.groups
-    )
-    return Domain(space.start, blocks)
-
-
 # ---- saying what a control does, fast -------------------------------------------------------------------------------
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from torch import Tensor
 
-from advsearch.api.record import Stages
+from advsearch.api.record import Stages, trial_row
 from advsearch.api.sweep_job import Job
 from advsearch.api.sweep_summary import verified
 from advsearch.api.sweep_view import View
@@ -58,7 +58,8 @@ def check_worst(
     def keep(group: str, number: int, trial: Trial) -> None:
         stages.progress.advance(1)
         if run is not None and number >= len(stored):
-            run.record(_row(number, stream(config.seed, KIND, number), count.spp, trial, network.labels))
+            seed = stream(config.seed, KIND, number)
+            run.record(trial_row(KIND, number, seed, count.spp, trial, network.labels))
 
     render = _after(stored, lambda at, seed, spp: view.trial(model, at, seed, spp))
     trials = run_trials(render, u, spp=count.spp, seed=config.seed, trials=config.trials, on_trial=keep)
@@ -71,21 +72,6 @@ def trial_of(row: store.Row) -> Trial:
     """Return what was seen of a configuration from its row."""
     seen = math.nan if row.objective is None else row.objective
     return Trial(seen, row.label_index or 0, math.nan if row.probability is None else row.probability)
-
-
-def _row(number: int, seed: int, spp: int, trial: Trial, labels: Sequence[str]) -> store.Row:
-    return store.Row(
-        kind=KIND,
-        step=number,
-        seed=seed,
-        spp=spp,
-        objective=trial.margin,
-        success=trial.wrong,
-        label=labels[trial.predicted],
-        label_index=trial.predicted,
-        probability=trial.probability,
-        renders=1,
-    )
 
 
 def _after(stored: Sequence[Trial], render: Callable[[Tensor, int, int], Trial]) -> Callable[[Tensor, int, int], Trial]:

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from torch import nn
 
-from advsearch import threads
+from advsearch.api.naming import different, load_models, scene_settings
 from advsearch.api.scene import Controls, Scene, as_controls, load_scene
 from advsearch.api.sweep_axes import read_axes
 from advsearch.api.sweep_job import Job, Place
 from advsearch.api.sweep_loop import SweepResult, carry_out
 from advsearch.config import SweepConfig
 from advsearch.errors import InputError
-from advsearch.models import Model, ModelWarning, load_model
+from advsearch.models import Model
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import CONFIG, RunDirectory, check_free, default_name, find_run, is_run, run_path
-from advsearch.runs.summary import NAME as SUMMARY
-from advsearch.runs.summary import read_summary
+from advsearch.runs.listing import finished
 from advsearch.scene.settings import SETTINGS
 from advsearch.settings import split_names
 
@@ -186,12 +184,8 @@ def _with_texture_size(controls: Controls, config: SweepConfig) -> Controls:
 
 def _places(config: SweepConfig) -> tuple[Place, ...]:
     """Every object under every environment; each is loaded once."""
-    given: dict[str, Any] = dict(config.set_)
-    if config.exposure:
-        if "camera.exposure" in given:
-            raise InputError("--exposure and --set camera.exposure say the same thing; leave one of them out")
-        given["camera.exposure"] = config.exposure
-    objects, environments = _different(config.objects, "--object"), _different(config.environments, "--environment")
+    given = scene_settings(config.set_, config.exposure)
+    objects, environments = different(config.objects, "--object"), different(config.environments, "--environment")
     firsts = {name: load_scene(name, environments[0], up=config.up, settings=given) for name in objects}
     lights = {environments[0]: firsts[objects[0]].description.environment}
     for name in environments[1:]:
@@ -203,30 +197,15 @@ def _places(config: SweepConfig) -> tuple[Place, ...]:
     )
 
 
-def _different(names: Sequence[str], flag: str) -> Sequence[str]:
-    twice = [name for name in names if names.count(name) > 1]
-    if twice or not names:
-        raise InputError(f"{flag}: expected different names, got {','.join(names)!r}; leave {', '.join(twice[:1])} out")
-    return names
-
-
 def _models(models: Sequence[AnyModel], config: SweepConfig) -> tuple[tuple[Model, ...], list[str]]:
     """Load the models; their warnings become sentences of the run."""
-    threads.configure(1 if config.deterministic else config.threads)
     names = [_model_name(one) for one in models]
     if len(set(names)) < len(names):
         raise InputError(
             f"--model: expected models with different names, got {', '.join(names)}; from Python, "
             "load_model(..., name=...) gives one"
         )
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", ModelWarning)
-        loaded = tuple(load_model(one, labels=config.labels) for one in models)
-    said = [str(one.message) for one in caught if issubclass(one.category, ModelWarning)]
-    for one in caught:
-        if not issubclass(one.category, ModelWarning):
-            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
-    return loaded, said
+    return load_models(models, config)
 
 
 # ---- where it is kept -----------------------------------------------------------------------------------------------
@@ -237,10 +216,9 @@ def _stopped(config: SweepConfig) -> Path | None:
     if config.run is None or config.overwrite or not is_run(run_path(config.run)):
         return None
     path = run_path(config.run)
-    ended = (path / SUMMARY).is_file() and read_summary(path).get("ending") != "interrupted"
     recipe = path / CONFIG
     same = recipe.is_file() and recipe.read_text(encoding="utf-8") == config.recipe().to_yaml()
-    return path if same and not ended else None
+    return path if same and not finished(path) else None
 
 
 def _kept(job: Job, progress: Progress, resumed: Path | None) -> SweepResult:

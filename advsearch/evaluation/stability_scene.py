@@ -12,9 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.attacks import PGD, Block, Domain, Evaluation, Policy, SearchResult, search
+from advsearch.attacks import PGD, Domain, Evaluation, Policy, SearchResult, search
 from advsearch.attacks.evaluation import Wanted
 from advsearch.controls import Space, make_control, make_space
+from advsearch.evaluation import domains
 from advsearch.evaluation.gradients import Loss, Probe, estimates, probes, reference, scale_of, smooth_loss, verdict
 from advsearch.evaluation.stability_case import Check, Findings, holds
 from advsearch.scene import library
@@ -312,16 +313,5 @@ def domain_of(renderer: Renderer, start: Tensor | None = None) -> Domain:
     """Return where a search of a renderer's space may look, from its start or another one."""
     space = renderer.space
     assert isinstance(space, Space)
-    blocks = tuple(
-        Block(
-            group.size,
-            group.budget.norm,  # type: ignore[arg-type]
-            group.budget.epsilon,
-            periodic=group.periodic,
-            name=control.name,
-            options=group.options,
-        )
-        for control, group in space.groups
-    )
-    begin = renderer.start if start is None else start
-    return Domain(begin, blocks, gradient_cost=renderer.plan.renders, partial_gradients=True)
+    more: dict[str, Any] = {"gradient_cost": renderer.plan.renders, "partial_gradients": True}
+    return domains.domain_of(space.controls, renderer.start if start is None else start, **more)
