@@ -1,0 +1,29 @@
+"""The typed description of a run: what YAML files, flags and Python calls all become. One file a command.
+
+Each setting states its flag, unit, range and default once, here; the command line's help and the docs are made from
+that (`settings`). Names of objects, controls, policies and the rest are checked by whoever looks them up, not here, so
+that this package stays light.
+"""
+
+from __future__ import annotations
+
+from advsearch.config.attack import TRIALS, TRIALS_OVER, AttackConfig
+from advsearch.config.precision import QUANTITIES, SAMPLERS, PrecisionConfig
+from advsearch.config.questions import GapConfig, RegionConfig
+from advsearch.config.scene import AUTO_SHARE, SEARCH_SPP, SceneConfig
+from advsearch.config.sweep import SweepConfig
+
+__all__ = [
+    "AUTO_SHARE",
+    "QUANTITIES",
+    "SAMPLERS",
+    "SEARCH_SPP",
+    "TRIALS",
+    "TRIALS_OVER",
+    "AttackConfig",
+    "GapConfig",
+    "PrecisionConfig",
+    "RegionConfig",
+    "SceneConfig",
+    "SweepConfig",
+]

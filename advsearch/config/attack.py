@@ -1,0 +1,220 @@
+"""What `attack` needs to know."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
+
+from pydantic import field_validator, model_validator
+
+from advsearch.config.scene import SceneConfig
+from advsearch.errors import InputError
+from advsearch.settings import parse_assignment, setting
+
+TRIALS, TRIALS_OVER = 20, 200
+"""Fresh renders that check an answer, and one that holds for many conditions."""
+
+
+class AttackConfig(SceneConfig):
+    """Everything that decides what `attack` does. Frozen; unknown names are refused."""
+
+    command: ClassVar[str] = "attack"
+
+    object: str = setting(
+        ...,
+        "scene",
+        "what the model should recognise; several, separated by commas, are attacked one after the other",
+        "the name of an object or a .obj, .ply, .glb, .gltf or .stl file",
+    )
+    epsilon: float | dict[str, float] | tuple[float, ...] | None = setting(
+        None,
+        "search",
+        "how far a control may go from where it starts, in its own unit (or CONTROL=NUMBER,...; or NUMBER,NUMBER,... "
+        "for a curve)",
+        "a number greater than 0",
+        otherwise="the control's own",
+    )
+    norm: Literal["linf", "l2"] = setting("linf", "search", "how that distance is measured", "linf or l2")
+    estimators: dict[str, str] = setting(
+        dict,
+        "search",
+        "force how derivatives are obtained",
+        "NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME; `advsearch plan` shows the names",
+        alias="estimator",
+    )
+    measure: Literal["no", "quick", "full"] = setting(
+        "quick",
+        "search",
+        "measure which valid estimator of a derivative is best on this scene; full chooses step and samples too",
+        "no, quick or full",
+    )
+    policy: str | dict[str, Any] = setting(
+        "auto", "search", "the rule that proposes configurations", "the name of a policy, or NAME={OPTION: VALUE}"
+    )
+    steps: int = setting(
+        40,
+        "search",
+        "steps of the search, its budget in renders",
+        "a whole number from 1 to 1000000",
+        ge=1,
+        le=1_000_000,
+    )
+    seconds: float | None = setting(
+        None,
+        "search",
+        "time after which the search stops; the random one beside it gets as many renders",
+        "a number greater than 0",
+        otherwise="no limit",
+        unit="seconds",
+        gt=0.0,
+    )
+    step_size: float | None = setting(
+        None,
+        "search",
+        "first step of the policy as a share of epsilon",
+        "a number greater than 0",
+        otherwise="the policy's own",
+        gt=0.0,
+    )
+    objective: str = setting("margin", "search", "what is maximised", "the name of an objective")
+    target: str | None = setting(
+        None,
+        "search",
+        "the wrong answer that the model should give, or several",
+        "names of classes or their numbers, separated by commas",
+        otherwise="any wrong answer",
+    )
+    minimise: bool = setting(False, "search", "make the object easier to recognise, not harder", "true or false")
+    smallest: bool = setting(
+        False, "search", "find the smallest epsilon at which the model is wrong, up to --epsilon", "true or false"
+    )
+    over: dict[str, dict[str, Any]] = setting(
+        dict,
+        "search",
+        "controls that vary by chance: one answer has to hold for all of them",
+        "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
+    )
+    draws: int = setting(
+        4, "search", "conditions that a step of --over looks at", "a whole number from 1 to 1000", ge=1, le=1000
+    )
+    average: int = setting(
+        0,
+        "search",
+        "random configurations of the same space that say how often the model is wrong on average",
+        "a whole number from 0 to 1000000",
+        unit="renders",
+        ge=0,
+        le=1_000_000,
+    )
+    baseline: bool = setting(True, "search", "run a random search with as many renders beside it", "true or false")
+
+    verify_spp: int | None = setting(
+        None,
+        "verification",
+        "samples per pixel of the verification",
+        "a whole number from 1 to 65536",
+        otherwise="raised until noise moves nothing",
+        unit="samples",
+        ge=1,
+        le=65536,
+    )
+    trials: int | None = setting(
+        None,
+        "verification",
+        "fresh renders that check the answer, and as many of the clean scene",
+        "a whole number from 1 to 100000",
+        otherwise=f"{TRIALS}, or {TRIALS_OVER} with --over",
+        unit="renders",
+        ge=1,
+        le=100_000,
+    )
+
+    @field_validator("epsilon", mode="before")
+    @classmethod
+    def _epsilon_from_text(cls, value: Any) -> Any:
+        """Accept ``0.05``, ``0.01,0.02`` and ``texture=0.05,geometry=0.01``; a number greater than 0 each."""
+        if isinstance(value, str):
+            parts = [part.strip() for part in value.split(",") if part.strip()]
+            if any("=" in part for part in parts):
+                value = dict(parse_assignment(part, "--epsilon") for part in parts)
+            else:
+                value = parts[0] if len(parts) == 1 else tuple(parts)
+        if isinstance(value, list) and len(value) == 1:
+            value = value[0]
+        several = value.values() if isinstance(value, Mapping) else value if isinstance(value, (list, tuple)) else ()
+        _positive(value) if not isinstance(value, (Mapping, list, tuple, type(None))) else [*map(_positive, several)]
+        return value
+
+    @model_validator(mode="before")
+    @classmethod
+    def _policy_with_steps(cls, data: Any) -> Any:
+        """Accept ``policy: {name: pgd, steps: 80, momentum: 0.9}``, ``pgd={momentum: 0.9}`` and a name."""
+        policy = data.get("policy")
+        if isinstance(policy, str) and "=" in policy:
+            name, options = parse_assignment(policy, "--policy")
+            policy = {"name": name, **(options if isinstance(options, Mapping) else {"": options})}
+        if not isinstance(policy, Mapping):
+            return data
+        options = dict(policy)
+        steps = {"steps": options.pop("steps")} if "steps" in options else {}
+        name = options.pop("name", "auto")
+        return {**data, **steps, "policy": {"name": name, **options} if options else name}
+
+    @model_validator(mode="after")
+    def _together(self) -> AttackConfig:
+        """Refuse settings that exclude each other."""
+        if self.smallest and self.epsilons:
+            raise InputError("--smallest: finds one epsilon by itself; give one --epsilon as the largest, or none")
+        if self.smallest and self.is_study:
+            raise InputError("--smallest: is about one object; name one --object, and one --epsilon as the largest")
+        if self.minimise and self.is_study:
+            raise InputError("--minimise: has no robust accuracy; name one --object and one --epsilon")
+        if self.smallest and self.seconds is not None:
+            raise InputError("--smallest: takes several searches; give --steps for each, and leave --seconds out")
+        if self.smallest and self.over:
+            raise InputError("--smallest: cannot be combined with --over yet; leave one of them out")
+        if self.minimise and self.target:
+            raise InputError("--minimise: makes the right answer easier to give; leave --target out")
+        if self.minimise and self.smallest:
+            raise InputError("--minimise: has no smallest change; leave --smallest out")
+        twice = set(self.over) & set(self.controls)
+        if twice:
+            raise InputError(f"--over: {', '.join(sorted(twice))} is searched already; leave it out of one of the two")
+        return self
+
+    @property
+    def policy_name(self) -> str:
+        """Name of the policy."""
+        return self.policy if isinstance(self.policy, str) else str(self.policy["name"])
+
+    @property
+    def policy_options(self) -> dict[str, Any]:
+        """Options of the policy."""
+        return {} if isinstance(self.policy, str) else {k: v for k, v in self.policy.items() if k != "name"}
+
+    @property
+    def epsilons(self) -> tuple[float, ...]:
+        """The several epsilons of a curve; empty where there is one."""
+        return self.epsilon if isinstance(self.epsilon, tuple) else ()
+
+    @property
+    def is_study(self) -> bool:
+        """Whether it takes several attacks: over objects, or over epsilons."""
+        return bool(self.epsilons) or len(self.objects) > 1
+
+    @property
+    def trial_count(self) -> int:
+        """Trials of each group in the verification."""
+        return self.trials if self.trials is not None else TRIALS_OVER if self.over else TRIALS
+
+    def epsilon_of(self, control: str) -> float | None:
+        """The budget asked for one control by the name of its instance; None leaves it its own."""
+        if isinstance(self.epsilon, dict):
+            return self.epsilon.get(control)
+        return None if isinstance(self.epsilon, tuple) else self.epsilon
+
+
+def _positive(value: Any) -> None:
+    if isinstance(value, bool) or not 0.0 < float(value) < math.inf:
+        raise ValueError("expected a number greater than 0")

@@ -1,0 +1,108 @@
+"""What `precision` needs to know."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from pydantic import field_validator
+
+from advsearch.config.attack import AttackConfig
+from advsearch.config.scene import SceneConfig
+from advsearch.settings import PLACE, setting, split_names
+
+QUANTITIES = ("image", "gradient", "objective")
+SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
+"""What `precision` measures, and the samplers that it knows."""
+
+
+class PrecisionConfig(SceneConfig):
+    """Everything that decides what `precision` does: error against run time, for a scene, its controls and a model."""
+
+    command: ClassVar[str] = "precision"
+
+    quantities: str = setting(
+        "image,gradient,objective",
+        "search",
+        "what is measured, separated by commas",
+        "image, gradient, objective",
+    )
+    seconds: float = setting(
+        120.0, "search", "time that all measurements may take", "a number greater than 0", unit="seconds", gt=0.0
+    )
+    error: float = setting(
+        0.05, "search", "relative error that the recommended settings should have", "a number greater than 0", gt=0.0
+    )
+    rounds: int = setting(
+        8, "search", "measurements of every setting, at most", "a whole number from 3 to 1000", ge=3, le=1000
+    )
+    samplers: str = setting(
+        "independent,stratified,multijitter,orthogonal,ldsampler",
+        "search",
+        "samplers that are compared, separated by commas",
+        "independent, stratified, multijitter, orthogonal, ldsampler",
+    )
+    depths: str = setting(
+        "2,3,4,12",
+        "search",
+        "longest light paths that are compared with the run's own, separated by commas",
+        "whole numbers from 2 to 64",
+        unit="segments",
+    )
+    loss: Literal["linear", "model"] = setting(
+        "linear",
+        "search",
+        "whose gradient is measured: a smooth linear loss of the raw picture, or the model's in its image formation",
+        "linear or model",
+    )
+    objective: str = setting("margin", "search", "what policies maximise", "the name of an objective")
+    epsilon: float | None = setting(
+        None,
+        "search",
+        "how far a control may go from where it starts, in its own unit",
+        "a number greater than 0",
+        otherwise="the control's own",
+        gt=0.0,
+    )
+    policies: str = setting(
+        "auto,random", "search", "policies that are compared, separated by commas", "names of policies"
+    )
+    steps: int = setting(
+        32, "search", "renders of each search of a policy", "a whole number from 2 to 100000", ge=2, le=100_000
+    )
+    repeats: int = setting(
+        5, "search", "searches of each policy, with other seeds", "a whole number from 1 to 1000", ge=1, le=1000
+    )
+    out: str | None = setting(
+        None,
+        "run",
+        "where the figures and the numbers go, instead of a run directory",
+        "the path of a folder",
+        otherwise="a run directory",
+        min_length=1,
+    )
+
+    @field_validator("quantities", "samplers", "depths", "policies", mode="before")
+    @classmethod
+    def _names_from_list(cls, value: Any) -> Any:
+        """Accept a list of names for names separated by commas."""
+        return ",".join(str(part) for part in value) if isinstance(value, (list, tuple)) else value
+
+    @field_validator("quantities", "samplers")
+    @classmethod
+    def _known_names(cls, value: str, info: Any) -> str:
+        known = {"quantities": QUANTITIES, "samplers": SAMPLERS}[info.field_name]
+        if not split_names(value) or not set(split_names(value)) <= set(known):
+            raise ValueError("unknown names")
+        return value
+
+    @field_validator("depths")
+    @classmethod
+    def _depths_in_range(cls, value: str) -> str:
+        if not all(2 <= int(part) <= 64 for part in split_names(value)):
+            raise ValueError("out of range")
+        return value
+
+    def as_attack(self) -> AttackConfig:
+        """Return the settings that an attack shares."""
+        shared = {name: getattr(self, name) for name in SceneConfig.model_fields if name not in PLACE}
+        return AttackConfig(**shared, objective=self.objective, epsilon=self.epsilon)

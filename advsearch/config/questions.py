@@ -1,0 +1,74 @@
+"""What `gap` and `region` need to know."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from advsearch.config.attack import AttackConfig
+from advsearch.config.scene import SceneConfig
+from advsearch.settings import setting
+
+
+class GapConfig(AttackConfig):
+    """Everything that decides what `gap` does: the worst case beside the average, for each object and each control."""
+
+    command: ClassVar[str] = "gap"
+
+    average: int = setting(
+        200,
+        "search",
+        "random configurations of the same space that say how often the model is wrong on average",
+        "a whole number from 1 to 1000000",
+        unit="renders",
+        ge=1,
+        le=1_000_000,
+    )
+
+
+class RegionConfig(SceneConfig):
+    """Everything that decides what `region` does: the box around a configuration in which the verdict stays."""
+
+    command: ClassVar[str] = "region"
+
+    around: str | None = setting(
+        None,
+        "region",
+        "a run whose answer is the centre; it brings scene, model and controls with it",
+        "the name or the folder of a run",
+        otherwise="the scene as it is",
+    )
+    vary: str | None = setting(
+        None,
+        "region",
+        "the parameters in which the box grows, separated by commas",
+        "names such as pose.yaw,camera.elevation",
+        otherwise="all that the controls search, up to eight",
+    )
+    samples: int = setting(
+        200,
+        "region",
+        "fresh samples that check the box",
+        "a whole number from 1 to 1000000",
+        unit="renders",
+        ge=1,
+        le=1_000_000,
+    )
+    map: int = setting(
+        0,
+        "region",
+        "side of the map of the margin, where there are two parameters; 0 for none",
+        "a whole number from 0 to 512",
+        unit="points",
+        ge=0,
+        le=512,
+    )
+    verify_spp: int | None = setting(
+        None,
+        "region",
+        "samples per pixel",
+        "a whole number from 1 to 65536",
+        otherwise="raised until noise moves nothing",
+        unit="samples",
+        ge=1,
+        le=65536,
+    )

@@ -1,0 +1,203 @@
+"""What every command over a scene and a model needs to know."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import field_validator
+
+from advsearch.settings import Config, all_finite, number_or_text, setting, split_names
+
+SEARCH_SPP = {"oidn": 8, "none": 16}
+"""Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
+
+AUTO_SHARE = 2
+"""With `--spp auto` a search begins with the default's samples divided by this."""
+
+
+class SceneConfig(Config):
+    """What every command over a scene and a model needs to know.
+
+    A file is looked for relative to the current directory. None means "choose for me", and the description says how.
+    """
+
+    object: str = setting(
+        ...,
+        "scene",
+        "what the model should recognise",
+        "the name of an object or a .obj, .ply, .glb, .gltf or .stl file",
+    )
+    environment: str = setting("studio", "scene", "what lights it", "the name of an environment or a .hdr or .exr file")
+    up: Literal["y", "z"] | None = setting(
+        None, "scene", "axis of an imported object that points up", "y or z", otherwise="found from the file"
+    )
+    set_: dict[str, float | str | tuple[float, ...]] = setting(
+        dict,
+        "scene",
+        "fix a parameter of the scene, such as camera.azimuth=130",
+        "PARAMETER=VALUE with a finite number, a name or a list of numbers",
+        alias="set",
+    )
+    exposure: float = setting(
+        0.0, "scene", "brightness of the picture", "a number from -10 to 10", unit="stops", ge=-10.0, le=10.0
+    )
+    resolution: tuple[int, int] | None = setting(
+        None,
+        "scene",
+        "size of the rendered picture",
+        "SIDE or HEIGHTxWIDTH, each from 8 to 4096",
+        otherwise="what the model takes",
+        unit="pixels",
+    )
+
+    model: str = setting(
+        "reference",
+        "model",
+        "the network under test",
+        "reference, a .pt2 (torch.export), .pt or .ts (TorchScript) file, package.module:callable, or torchvision:NAME",
+    )
+    labels: str | None = setting(
+        None, "model", "names of the model's classes", "a JSON or text file", otherwise="the model's own"
+    )
+    label: str | None = setting(
+        None,
+        "model",
+        "the right answers, separated by commas",
+        'names of classes or their numbers, such as "coffee mug,cup" or #504',
+        otherwise="the object's own",
+    )
+
+    controls: dict[str, dict[str, Any]] = setting(
+        lambda: {"texture": {}},
+        "search",
+        "what may change, separated by commas",
+        "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
+        min_length=1,
+    )
+    texture_resolution: int | None = setting(
+        None,
+        "search",
+        "side of the searched texture",
+        "a whole number from 2 to 4096",
+        unit="texels",
+        otherwise="chosen from the object's own",
+        ge=2,
+        le=4096,
+    )
+    spp: int | Literal["auto"] | None = setting(
+        None,
+        "search",
+        "samples per pixel of a render of the search; auto begins with few and spends more where it is close",
+        "a whole number from 1 to 65536, or auto",
+        otherwise="8 with the denoiser, 16 without",
+        unit="samples",
+    )
+    denoise: Literal["oidn", "none"] = setting(
+        "oidn", "search", "denoiser of every render, in search and verification", "oidn or none"
+    )
+
+    seed: int = setting(
+        0, "run", "root of every random stream", "a whole number from 0 to 2**63 - 1", ge=0, le=2**63 - 1
+    )
+    threads: int | None = setting(
+        None, "run", "processor threads", "a whole number from 1 to 1024", otherwise="all", ge=1, le=1024
+    )
+    deterministic: bool = setting(False, "run", "the same numbers bit for bit, at some cost in time", "true or false")
+    run: str | None = setting(
+        None,
+        "run",
+        "where the run is kept",
+        "a name (kept in runs/) or the path of a folder",
+        otherwise="runs/OBJECT-CONTROL-NNN",
+        min_length=1,
+    )
+    overwrite: bool = setting(False, "run", "replace a run that is there already", "true or false")
+
+    @property
+    def search_spp(self) -> int:
+        """Samples a pixel of the search: what was asked for, or the default for the denoiser."""
+        if self.spp == "auto":
+            return SEARCH_SPP[self.denoise] // AUTO_SHARE
+        return self.spp if isinstance(self.spp, int) else SEARCH_SPP[self.denoise]
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """The objects by name."""
+        return split_names(self.object)
+
+    @field_validator(
+        "object",
+        "environment",
+        "model",
+        "labels",
+        "label",
+        "run",
+        "objective",
+        "target",
+        mode="before",
+        check_fields=False,
+    )
+    @classmethod
+    def _as_text(cls, value: Any) -> Any:
+        """Accept a path for a file, a number or a list of names for labels; refuse what can't be a name."""
+        text = str(value) if isinstance(value, (Path, int)) and not isinstance(value, bool) else value
+        if isinstance(text, (list, tuple)) and all(isinstance(part, str) for part in text):
+            text = ",".join(text)
+        if isinstance(text, str) and (not text.strip() or "\0" in text):
+            raise ValueError("an empty name")
+        return text
+
+    @field_validator("spp")
+    @classmethod
+    def _spp_in_range(cls, value: Any) -> Any:
+        if isinstance(value, int) and not 1 <= value <= 65536:
+            raise ValueError("out of range")
+        return value
+
+    @field_validator("controls", "over", mode="before", check_fields=False)
+    @classmethod
+    def _controls_from_names(cls, value: Any) -> Any:
+        """Accept ``"texture"`` and ``["texture", "pose"]`` for controls with nothing set, and an empty YAML value."""
+        names = [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
+        if isinstance(names, (list, tuple)):
+            return {name: {} for name in names}
+        if isinstance(names, Mapping):
+            return {name: {} if given is None else given for name, given in names.items()}
+        return value
+
+    @field_validator("estimators", mode="before", check_fields=False)
+    @classmethod
+    def _estimators_from_name(cls, value: Any) -> Any:
+        """Accept ``differences`` for all controls."""
+        return {"*": value} if isinstance(value, str) else value
+
+    @field_validator("resolution", mode="before")
+    @classmethod
+    def _resolution_from_text(cls, value: Any) -> Any:
+        """Accept 224, ``"224"`` and ``"224x320"`` (height by width)."""
+        parts = value.lower().split("x") if isinstance(value, str) else value
+        if isinstance(parts, int):
+            parts = [parts]
+        return parts * 2 if isinstance(parts, list) and len(parts) == 1 else parts
+
+    @field_validator("resolution")
+    @classmethod
+    def _resolution_in_range(cls, value: tuple[int, int] | None) -> tuple[int, int] | None:
+        if value is not None and not all(8 <= side <= 4096 for side in value):
+            raise ValueError("out of range")
+        return value
+
+    @field_validator("set_", mode="before")
+    @classmethod
+    def _numbers_from_text(cls, value: Any) -> Any:
+        """Read ``1e-3`` as a number: YAML takes it for text."""
+        return {name: number_or_text(given) for name, given in value.items()} if isinstance(value, Mapping) else value
+
+    @field_validator("set_", "controls")
+    @classmethod
+    def _finite_inside(cls, value: Any) -> Any:
+        if not all_finite(value):
+            raise ValueError("not finite")
+        return value

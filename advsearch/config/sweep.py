@@ -1,0 +1,145 @@
+"""What `sweep` needs to know."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
+
+from pydantic import field_validator
+
+from advsearch.config.scene import SceneConfig
+from advsearch.settings import number_or_text, setting, split_names
+
+
+class SweepConfig(SceneConfig):
+    """Everything that decides what `sweep` does: the average case over a grid, over random draws, or both."""
+
+    command: ClassVar[str] = "sweep"
+
+    object: str = setting(
+        ...,
+        "scene",
+        "what the model should recognise; several separated by commas",
+        "names of objects or .obj, .ply, .glb, .gltf or .stl files",
+    )
+    environment: str = setting(
+        "studio",
+        "scene",
+        "what lights it; several separated by commas",
+        "names of environments or .hdr or .exr files",
+    )
+    model: str = setting(
+        "reference",
+        "model",
+        "the network under test; several separated by commas are shown the same pictures",
+        "reference, a .pt2 (torch.export), .pt or .ts (TorchScript) file, package.module:callable, or torchvision:NAME",
+    )
+    grid: dict[str, Any] = setting(
+        dict,
+        "sweep",
+        "an axis of the grid; may be repeated",
+        "PARAMETER=FIRST:LAST:COUNT, or values separated by commas",
+    )
+    controls: dict[str, dict[str, Any]] = setting(
+        dict,
+        "sweep",
+        "what is drawn by chance beside the grid, separated by commas",
+        "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
+    )
+    samples: int | None = setting(
+        None,
+        "sweep",
+        "draws of the controls at each point of the grid",
+        "a whole number from 1 to 1000000000",
+        otherwise="1, or 100 without a grid",
+        ge=1,
+        le=1_000_000_000,
+    )
+    sampler: Literal["sobol", "random"] = setting("sobol", "sweep", "how the draws are made", "sobol or random")
+    batch: int = setting(
+        16,
+        "sweep",
+        "pictures that the model sees at once, and that are stored at once",
+        "a whole number from 1 to 1024",
+        unit="pictures",
+        ge=1,
+        le=1024,
+    )
+    spp: int | None = setting(
+        None,
+        "sweep",
+        "samples per pixel of a picture",
+        "a whole number from 1 to 65536",
+        otherwise="8 with the denoiser, 16 without",
+        unit="samples",
+        ge=1,
+        le=65536,
+    )
+    trials: int = setting(
+        20,
+        "verification",
+        "fresh renders that check the worst configuration",
+        "a whole number from 0 to 100000",
+        unit="renders",
+        ge=0,
+        le=100_000,
+    )
+    verify_spp: int | None = setting(
+        None,
+        "verification",
+        "samples per pixel of these",
+        "a whole number from 1 to 65536",
+        otherwise="raised until noise moves nothing",
+        unit="samples",
+        ge=1,
+        le=65536,
+    )
+    run: str | None = setting(
+        None,
+        "run",
+        "where the run is kept",
+        "a name (kept in runs/) or the path of a folder",
+        otherwise="runs/OBJECT-sweep-NNN",
+        min_length=1,
+    )
+
+    @property
+    def environments(self) -> tuple[str, ...]:
+        """The environments by name."""
+        return split_names(self.environment)
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """The models by name."""
+        return split_names(self.model)
+
+    @field_validator("grid", mode="before")
+    @classmethod
+    def _grid_of_values(cls, value: Any) -> Any:
+        """Accept any sequence of values from Python (a range, an array), and ``a,b,c``; FIRST:LAST:COUNT stays text."""
+        if not isinstance(value, Mapping):
+            return value
+        return {str(name): _grid_values(given) for name, given in value.items()}
+
+
+def _grid_values(given: Any) -> Any:
+    """The values of one axis as a list, or FIRST:LAST:COUNT as text."""
+    if isinstance(given, Mapping) and set(given) == {"choices"}:
+        given = given["choices"]
+    if isinstance(given, str):
+        text = given.strip().removeprefix("[").removesuffix("]")
+        if ":" in text and "," not in text:
+            return text
+        given = [part.strip() for part in text.split(",") if part.strip()]
+    values = _plain_values(given)
+    values = values if isinstance(values, list) else [values]
+    if not values or any(one is None or isinstance(one, (bool, list, Mapping)) for one in values):
+        raise ValueError("not values")
+    return [number_or_text(one) for one in values]
+
+
+def _plain_values(given: Any) -> Any:
+    """A sequence, a range or an array as a list of Python numbers and names; one value stays one."""
+    given = given.tolist() if hasattr(given, "tolist") else given
+    sequence = isinstance(given, (range, tuple, list))
+    return [one.item() if hasattr(one, "item") else one for one in given] if sequence else given
