@@ -233,6 +233,7 @@ def flag(name: str) -> str:
     """Return the flag of the setting `name`: ``texture_resolution`` is ``--texture-resolution``."""
     special = {"controls": "--control", "set_": "--set", "set": "--set"}
     special |= {"estimators": "--estimator", "estimator": "--estimator", "baseline": "--no-baseline"}
+    special |= {"specialise": "--no-specialise"}
     return special.get(name) or "--" + name.replace("_", "-")
 
 

@@ -30,6 +30,7 @@ from advsearch.attacks.goal import Goal  # noqa: E402
 from advsearch.controls import TextureControl, make_space  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 from advsearch.scene.backend import mitsuba  # noqa: E402
+from advsearch.scene.leaving_out import EVERYTHING  # noqa: E402
 from advsearch.scene.mitsuba_scene import BASE_COLOR, MitsubaScene  # noqa: E402
 
 
@@ -87,7 +88,7 @@ class Floor:
 
     def __init__(self, description, size: int, spp: int, denoise: str, score: Callable) -> None:  # type: ignore[no-untyped-def]
         self.mi = mitsuba()
-        holder = MitsubaScene(description, (size, size), freeze=False)
+        holder = MitsubaScene(description, (size, size), leave_out=EVERYTHING - {"tracing"})
         self.scene, self.path, self.guides = holder._scene, holder._path, holder._guides
         self.parameters, self.key = holder._parameters, holder._keys[BASE_COLOR]
         self.holder, self.spp, self.denoise, self.score = holder, spp, denoise, score

@@ -37,6 +37,7 @@ from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.runs.directory import RunDirectory  # noqa: E402
 from advsearch.scene.denoise import Denoiser  # noqa: E402
 from advsearch.scene.formation import ImageFormation  # noqa: E402
+from advsearch.scene.leaving_out import EVERYTHING  # noqa: E402
 from advsearch.scene.mitsuba_scene import MitsubaScene  # noqa: E402
 
 ASKED_PER_SECOND, ASKED_SHARE = 10_000, 0.95
@@ -177,7 +178,7 @@ class Bare:
         self.space = job.space(job.places[0], self.size)
         self.description = framed(job.places[0].scene.description, self.size)
         self.formation = ImageFormation(resolution=self.size, gain=self.description.gain)
-        self.scene = MitsubaScene(self.space.scene or self.description, self.size, freeze=False)
+        self.scene = MitsubaScene(self.space.scene or self.description, self.size, leave_out=EVERYTHING - {"tracing"})
         self.denoise = Denoiser(self.size)
 
     def turn(self, count: int) -> float:

@@ -57,6 +57,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "objective": ({}, "expected the name of an objective, got {}"),
     "spp": ("many", "expected a whole number from 1 to 65536, or auto, got many"),
     "denoise": (False, "expected oidn or none, got False"),
+    "specialise": ("maybe", "expected true or false, got maybe"),
     "baseline": ("maybe", "expected true or false, got maybe"),
     "verify_spp": (0, "expected a whole number from 1 to 65536, got 0"),
     "trials": (0, "expected a whole number from 1 to 100000, got 0"),
@@ -78,6 +79,7 @@ GIVEN: dict[str, Any] = {
     "estimator": {"pose": "differences", "*": "adjoint"}, "measure": "no",
     "policy": {"name": "pgd", "momentum": 0.9},
     "steps": 3, "step_size": 0.5, "objective": "cross_entropy", "spp": 4, "denoise": "none",
+    "specialise": False,
     "baseline": False, "verify_spp": 32, "trials": 7, "seed": 9, "threads": 1, "deterministic": True, "run": "x/y",
     "overwrite": True,
 }  # fmt: skip

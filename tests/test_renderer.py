@@ -15,6 +15,7 @@ from advsearch.errors import InputError
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import describe, metered_gain
 from advsearch.scene.formation import ImageFormation, linear_to_srgb, srgb_to_linear, to_8_bit
+from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_scene import BASE_COLOR, MitsubaScene
 from advsearch.scene.renderer import Renderer
 
@@ -90,7 +91,7 @@ def test_an_interrupted_gradient_leaves_nothing_behind(raw: Renderer, monkeypatc
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setitem(raw.scene._integrators, "path", Interrupted())
+        patch.setitem(raw.scene._integrators, ("path", raw.scene.depth), Interrupted())
         raw.scene.adjoint({BASE_COLOR: torch.zeros(TEXELS, TEXELS, 3)}, torch.ones(SIZE, SIZE, 3), 1, 4)
     assert torch.equal(base, raw.scene.radiance({}, 5, 4))
 
@@ -123,7 +124,7 @@ def test_a_recording_survives_the_birth_and_death_of_other_scenes(raw: Renderer)
 def test_recording_kernels_changes_no_byte(size: int, spp: int, texels: int) -> None:
     description = describe("mug")
     frozen = MitsubaScene(description, (size, size))
-    plain = MitsubaScene(description, (size, size), freeze=False)
+    plain = MitsubaScene(description, (size, size), leave_out=EVERYTHING - {"tracing"})
     for seed in range(5):
         inputs = {BASE_COLOR: torch.full((texels, texels, 3), 0.1 + 0.15 * seed)}
         assert torch.equal(frozen.radiance(inputs, seed, spp), plain.radiance(inputs, seed, spp))

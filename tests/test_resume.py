@@ -57,6 +57,7 @@ class StandInProblem:
     conditions: None = None
     goal: Goal = field(default_factory=lambda: Goal((0,)))
     spp: int = 4
+    search_depth: int | None = None
     seed: int = 3
     draws: int = 1
     plan: StandInPlan = StandInPlan()

@@ -31,6 +31,7 @@ from advsearch.models import LabelSet, Model
 from advsearch.models.features import features_of
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import CONFIG, RunDirectory, check_free, find_run, is_run, run_path
+from advsearch.scene.leaving_out import EVERYTHING, NOTHING
 from advsearch.scene.renderer import Renderer
 
 OVER_CONDITIONS = {"momentum": 0.9, "step_size": 0.2}
@@ -273,7 +274,8 @@ def _problem(job: _Job) -> Problem:
     resolution = config.resolution or (model.input_size[0], model.input_size[1])
     description = framed(description, resolution)
     space = make_space((*job.controls, *job.over), description)
-    renderer = make_renderer(description, space, resolution, config.denoise, config.seed, config.estimators)
+    left = EVERYTHING if config.specialise else NOTHING
+    renderer = make_renderer(description, space, resolution, config.denoise, config.seed, config.estimators, left)
     goal = _goal(model, labels, config)
     objective = _objective(job, goal, renderer)
     return Problem(

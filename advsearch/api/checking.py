@@ -1,8 +1,8 @@
-"""Checks and plans gradients of a scene as it is: what `advsearch check` and `advsearch plan` do."""
+"""Checks gradients of a scene as it is: what `advsearch check` does."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -23,9 +23,8 @@ from advsearch.evaluation.gradients import (
     smooth_loss,
     verdict,
 )
-from advsearch.evaluation.planning import COUNTS, GOAL, Cosine, cosines, measured_plan, tuned
+from advsearch.evaluation.planning import COUNTS, cosines
 from advsearch.progress import NullProgress, Progress
-from advsearch.scene.plan import BY_DIFFERENCES, ESTIMATORS
 
 SCENES = (("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"))
 """Bundled scenes that `check --all` goes through."""
@@ -61,100 +60,6 @@ def check(
         if "model" in losses:
             rows += _model(one, progress)
     return rows
-
-
-def plan(config: AttackConfig, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Choose how every derivative is obtained, by measurement, and say why.
-
-    Returns:
-        The plan with its reasons, the cosines that chose steps and samples, and the limits of the estimators.
-    """
-    progress = progress or NullProgress()
-    progress.stage("set-up")
-    problem, _ = problem_from_config(config)
-    renderer, seed = problem.renderer, seeds.stream(config.seed, "measure")
-    u = inside(renderer)
-    progress.stage("estimators")
-    renderer.plan = measured_plan(renderer, problem.loss, u, seed=seed, spp=problem.spp, every=True)
-    progress.stage("steps and samples")
-    table = cosines(renderer, problem.loss, u, seed=seed)
-    renderer.plan, spp = tuned(renderer.plan, table)
-    progress.stage("the other denoiser")
-    other = "none" if config.denoise == "oidn" else "oidn"
-    theirs, _ = problem_from_config(config, denoise=other)
-    theirs.plan = theirs.plan.with_estimator({one.name: one.estimator for one in renderer.plan.groups}, "as beside")
-    tables = {config.denoise: table, other: cosines(theirs.renderer, theirs.loss, u, seed=seed)}
-    chosen = renderer.plan.to_dict()
-    used = {group.estimator for group in renderer.plan.groups}
-    return {
-        "schema": 1,
-        "command": "plan",
-        "object": config.object,
-        "environment": config.environment,
-        "controls": list(config.controls),
-        "model": problem.model.name,
-        "image_formation": renderer.formation.summary(),
-        **chosen,
-        "spp": spp or problem.spp,
-        "cosines": [{"denoise": name, **vars(row)} for name, rows in tables.items() for row in rows],
-        "denoise": quieter(tables, config.denoise),
-        "left_out": _left_out(problem),
-        "limits": _limits() if "material" in used else [],
-    }
-
-
-def quieter(tables: Mapping[str, Sequence[Cosine]], asked: str) -> dict[str, str]:
-    """Say which denoiser makes the better gradients: the one that reaches the goal in all controls in less time.
-
-    A denoiser is part of the image formation, the same in search and verification, so that this is advice: another one
-    is another question.
-
-    Args:
-        tables: denoiser to its measured cosines.
-        asked: the run's.
-    """
-
-    def rank(name: str) -> tuple[bool, float]:
-        best = [
-            max((row for row in tables[name] if row.control == control), key=lambda row: row.cosine)
-            for control in dict.fromkeys(row.control for row in tables[name])
-        ]
-        reached = all(min(row.cosine, row.converged) >= GOAL for row in best)
-        return not reached, sum(row.seconds for row in best) if reached else -min(row.cosine for row in best)
-
-    measured = [name for name in tables if tables[name]]
-    advised = min(measured, key=rank) if measured else asked
-    reached = bool(measured) and not rank(advised)[0]
-    why = (
-        f"a cosine of {GOAL:g} in every control, in less time"
-        if reached
-        else "the greater cosine, though below the goal"
-        if measured
-        else "nothing was measured"
-    )
-    return {"asked": asked, "advised": advised, "reason": why}
-
-
-def _limits() -> list[Any]:
-    """What the material form does not cover, as it states itself."""
-    from advsearch.scene.material_form import LIMITS
-
-    return [vars(limit) if hasattr(limit, "__dict__") else str(limit) for limit in LIMITS]
-
-
-def _left_out(problem: Problem) -> list[str]:
-    """What this search does not compute, in sentences."""
-    used = {group.estimator for group in problem.renderer.plan.groups}
-    said = []
-    if not used & {"boundary", "guided", "material"}:
-        said.append("boundary terms: nothing that an adjoint differentiates moves an outline")
-    if not used & {"adjoint", "boundary", "guided", "material"}:
-        said.append("adjoint renders: no coordinate needs one")
-    if not used & BY_DIFFERENCES:
-        said.append("renders for differences: every derivative is an adjoint or of the picture itself")
-    if not problem.renderer.scene.volumetric:
-        said.append("the volumetric integrator: there is no medium")
-    return said
 
 
 # ---- inside ---------------------------------------------------------------------------------------------------------
@@ -245,6 +150,3 @@ def _sets(found: Sequence[Probe]) -> list[list[Probe]]:
 
 def _place(config: AttackConfig, loss: str) -> dict[str, Any]:
     return {"object": config.object, "environment": config.environment, "loss": loss}
-
-
-__all__ = ["ESTIMATORS", "check", "plan"]

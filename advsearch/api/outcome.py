@@ -127,6 +127,10 @@ def _answers(
         "ending": _ending(findings, problem).value,
         "image_formation": problem.renderer.formation.summary(),
         "gradient_plan": problem.plan.to_dict(),
+        "light_path_segments": {
+            "search": problem.search_depth or problem.renderer.scene.max_depth,
+            "verification": problem.renderer.scene.max_depth,
+        },
         "clean": {
             **_named(clean_trial, labels),
             "correct": clean_trial.predicted in problem.labels.indices,

@@ -53,6 +53,8 @@ class Problem:
         searched: how many of the controls are searched; None for all. The others are the conditions: drawn anew from
             their whole range for every picture.
         draws: conditions that one evaluation looks at, where there are any; the objective is their mean.
+        search_depth: longest light path in segments of a search's renders; None for the scene's. Verification always
+            renders the scene's.
         domain: where a search may look: the searched controls.
         conditions: where the others are drawn from; None where there are none.
     """
@@ -67,6 +69,7 @@ class Problem:
     seed: int
     searched: int | None = None
     draws: int = 1
+    search_depth: int | None = None
     domain: Domain = field(init=False)
     conditions: Domain | None = field(init=False)
 
@@ -176,11 +179,12 @@ class Problem:
             return value
 
         spp, derivative = self.spp * samples, None
-        if gradient:
-            value, derivative = self.renderer.gradient(loss, whole, noise, spp, free=gradient == "free")
-        else:
-            with torch.no_grad():
-                value = loss(self.renderer(whole, seed=noise, spp=spp))
+        with self.renderer.scene.shorter(self.search_depth):
+            if gradient:
+                value, derivative = self.renderer.gradient(loss, whole, noise, spp, free=gradient == "free")
+            else:
+                with torch.no_grad():
+                    value = loss(self.renderer(whole, seed=noise, spp=spp))
         image, logits = seen[0]
         if on_image is not None and on_image.wants(index):
             on_image.tell(index, image)

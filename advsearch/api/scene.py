@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
@@ -13,6 +13,7 @@ from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.formation import ImageFormation
+from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_scene import MitsubaScene
 from advsearch.scene.motion import Motion
 from advsearch.scene.renderer import Renderer
@@ -103,6 +104,7 @@ def make_renderer(
     denoise: str,
     seed: int,
     estimators: Mapping[str, str] | None = None,
+    leave_out: Collection[str] = EVERYTHING,
 ) -> Renderer:
     """Put a described scene, with what the space's controls need in it, into Mitsuba at one size."""
     size = (resolution, resolution) if isinstance(resolution, int) else resolution
@@ -110,7 +112,7 @@ def make_renderer(
     formation = ImageFormation(
         denoiser=denoise, exposure=description.number("camera.exposure"), resolution=size, gain=description.gain
     )
-    scene = MitsubaScene(description, size, filter=formation.filter)
+    scene = MitsubaScene(description, size, filter=formation.filter, leave_out=leave_out)
     motion = Motion(description, size, scene.assembly)
     return Renderer(scene, space, formation, seed, motion=motion, estimators=estimators)
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
+from advsearch.api.bounces import WORTH, bounces_of
 from advsearch.api.memory import PLAN, Frames, Memory
 from advsearch.api.problem import Problem
 from advsearch.api.record import Findings, Recorder, Stages
@@ -103,14 +104,17 @@ class Attack:
         problem, stored = self.problem, self.memory.note(PLAN)
         if stored is None:
             self._measure()
-            self.memory.set_note(PLAN, {"plan": problem.plan.to_dict(), "spp": problem.spp})
+            chosen = {"plan": problem.plan.to_dict(), "spp": problem.spp, "search_depth": problem.search_depth}
+            self.memory.set_note(PLAN, chosen)
             return
         problem.plan = problem.plan.restored(stored["plan"])
-        problem.spp = stored["spp"]
+        problem.spp, problem.search_depth = stored["spp"], stored.get("search_depth")
 
     def _measure(self) -> None:
         """Replace the first gradient plan by a measured one, as far as the configuration wants that."""
         problem, config = self.problem, self.config
+        if config.specialise and (config.measure == "full" or config.steps >= WORTH):
+            problem.search_depth = bounces_of(problem, config.seed).depth
         if config.measure == "no" or not self.policy.uses_gradient:
             return
         renderer, full = problem.renderer, config.measure == "full"

@@ -97,7 +97,10 @@ def config_from(args: argparse.Namespace, config: type[Given], **otherwise: Any)
 def help_text(setting: Setting) -> str:
     """Return what the help says of a setting: what it is, its values with range and unit, and its default."""
     if setting.is_switch:
-        without = {"baseline": "without the random search that runs beside the search"}
+        without = {
+            "baseline": "without the random search that runs beside the search",
+            "specialise": "compute what the scene and the search don't need too; `advsearch plan` shows what that is",
+        }
         return without.get(setting.field, setting.description)
     unit = f", in {setting.unit}" if setting.unit else ""
     default = setting.otherwise if setting.default is None else _default(setting.default)

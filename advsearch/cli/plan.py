@@ -1,4 +1,4 @@
-"""`advsearch plan`: how every derivative of a search would be obtained, and why."""
+"""`advsearch plan`: how every derivative of a search would be obtained and what it would leave out, and why."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from advsearch.cli import output
 from advsearch.cli.check import FIELDS, GROUPS
 
-HELP = "show how the derivatives of a search are obtained, measured on its scene, and why"
+HELP = "show how a search gets its derivatives and what it leaves out, measured on its scene, and why"
 
 
 def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
@@ -23,7 +23,7 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    add_settings(parser, groups=GROUPS, fields=FIELDS)
+    add_settings(parser, groups=GROUPS, fields=(*FIELDS, "specialise"))
     output.add_flags(parser, quiet=True)
 
 
@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
 
     config = config_from(args, AttackConfig, object="mug")
     with at_work(as_json=args.json, quiet=args.quiet) as progress:
-        from advsearch.api.checking import plan
+        from advsearch.api.planning import plan
 
         chosen = plan(config, progress=progress)
     return output.finish(chosen, text, as_json=args.json)
@@ -54,8 +54,7 @@ def text(chosen: dict[str, Any]) -> str:
         "",
         f"renders for one gradient beside the picture itself: {chosen['renders_per_gradient']}",
         f"samples a pixel: {chosen['spp']}",
-        "left out:",
-        *(f"  {sentence}" for sentence in chosen["left_out"]),
+        *_left_out(chosen),
     ]
     if chosen["cosines"]:
         heads = [
@@ -88,3 +87,36 @@ def text(chosen: dict[str, Any]) -> str:
     if chosen["limits"]:
         lines += ["", "limits of the material form:", *(f"  {limit}" for limit in chosen["limits"])]
     return "\n".join(lines)
+
+
+def _left_out(chosen: dict[str, Any]) -> list[str]:
+    """Lines on what the search doesn't compute: sentences, then what was measured."""
+    if not chosen["specialised"]:
+        return ["left out: nothing (--no-specialise)"]
+    rows = [["left out", "a gradient with it takes", "picture differs", "gradient differs"]]
+    for row in chosen["gains"]:
+        agrees = [_agreement(row[name]) for name in ("picture_difference", "gradient_difference")]
+        rows.append([row["what"], f"x {row['gain']:.2f}", *agrees])
+    bounces = chosen["bounces"]
+    return [
+        "not needed:",
+        *(f"  {sentence}" for sentence in chosen["left_out"]),
+        "",
+        output.columns(rows),
+        "",
+        f"longest light path of the search: {bounces['depth']} segments of {bounces['full']}: {bounces['reason']}",
+        *(
+            f"texels of {one['control']}: {one['seen']} are seen in {one['pixels']} pixels; "
+            + (
+                f"--texture-resolution {one['enough']} would resolve as much"
+                if one["enough"] < one["side"]
+                else f"{one['side']} a side is what the pixels resolve"
+            )
+            for one in chosen["texels"]
+        ),
+    ]
+
+
+def _agreement(share: float) -> str:
+    """How a picture or gradient compares with another seed's."""
+    return "not at all" if share == 0.0 else f"by {share:.2g} of its noise"

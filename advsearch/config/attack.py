@@ -107,6 +107,7 @@ class AttackConfig(SceneConfig):
         ge=0,
         le=1_000_000,
     )
+    specialise: bool = setting(True, "search", "leave out what the scene and the search don't need", "true or false")
     baseline: bool = setting(True, "search", "run a random search with as many renders beside it", "true or false")
 
     verify_spp: int | None = setting(

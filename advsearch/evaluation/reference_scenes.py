@@ -20,6 +20,7 @@ from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import ImageFormation
+from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import resolve
@@ -52,7 +53,8 @@ def picture(split: str, index: int, seed: int = 0) -> Picture:
     description = random_scene(CLASSES[class_of(index)], "heldout" if split == "heldout" else "train", rng)
     denoiser = "none" if rng.random() < RAW_SHARE else "oidn"
     formation = ImageFormation(denoiser=denoiser, resolution=SIZE, gain=description.gain)
-    renderer = Renderer(MitsubaScene(description, SIZE, freeze=False), Space(()), formation, root_seed=seed)
+    scene = MitsubaScene(description, SIZE, leave_out=EVERYTHING - {"tracing"})
+    renderer = Renderer(scene, Space(()), formation, root_seed=seed)
     with torch.no_grad():
         display = renderer(torch.zeros(0), seed=index, spp=SPP * (2 if denoiser == "none" else 1))
     return (display * 255.0).round().to(torch.uint8).numpy()

@@ -7,8 +7,6 @@ no configuration is ever applied on top of another.
 
 from __future__ import annotations
 
-import gc
-import weakref
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -20,10 +18,12 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.backend import mitsuba
-from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import camera_to_world, object_to_world
-from advsearch.scene.parts import MeshPart, PartInput, as_is, number, transform
+from advsearch.scene.geometry import object_to_world
+from advsearch.scene.leaving_out import EVERYTHING, IDLE_LOBES
+from advsearch.scene.mitsuba_dict import camera_inputs, scene_dict
+from advsearch.scene.parts import MeshPart, PartInput, as_is
+from advsearch.scene.population import population
 
 MAX_DEPTH = 6
 """Longest light path in segments: five bounces off surfaces."""
@@ -40,39 +40,6 @@ ENVIRONMENT_INPUT = PartInput("environment.padded", "environment.data", as_is, i
 """(H, W + 2, 3): Mitsuba keeps a copy of the last column before the first, and of the first after the last."""
 
 
-class _Population:
-    """The scenes inside Mitsuba that this process holds, and when they may go.
-
-    A recorded kernel refers to the objects of all scenes that lived when it was recorded, and Dr.Jit leaves undefined
-    what happens when it is replayed after one was added or removed. So every change of the population makes every
-    recording stale, and a scene that nobody uses any more is kept until no render is under way: Python's garbage
-    collector may strike in the middle of one.
-    """
-
-    def __init__(self) -> None:
-        self.changes = 0
-        self._held: dict[int, tuple[Any, ...]] = {}
-        self._unused: list[int] = []
-
-    def add(self, owner: MitsubaScene, *objects: Any) -> None:
-        """Hold Mitsuba's objects for as long as their owner lives, and a little longer."""
-        self.changes += 1
-        self._held[self.changes] = objects
-        weakref.finalize(owner, self._unused.append, self.changes)
-
-    def bury(self) -> None:
-        """Let go of what has lost its owner. Call it between renders only."""
-        if not self._unused:
-            return
-        while self._unused:
-            self._held.pop(self._unused.pop(), None)
-        gc.collect()  # Mitsuba's Python objects form cycles; they have to go now, not during a later render
-        self.changes += 1
-
-
-_population = _Population()
-
-
 class MitsubaScene:
     """Renders one scene at one size.
 
@@ -85,7 +52,7 @@ class MitsubaScene:
         description: what to build.
         resolution: (height, width) in pixels.
         filter: reconstruction filter, "box" or "gaussian".
-        freeze: record primal renders once and replay them (`dr.freeze`); off only to measure what it brings.
+        leave_out: names from `advsearch.scene.leaving_out.ITEMS`; less than everything only to measure what it brings.
         max_depth: longest light path in segments.
         sampler: Mitsuba's name of the sampler; some round sample counts up, see `advsearch.api.measuring`.
         integrator: Mitsuba's name of the path integrator of primal renders, where there is no medium.
@@ -97,17 +64,20 @@ class MitsubaScene:
         resolution: tuple[int, int],
         *,
         filter: str = "box",
-        freeze: bool = True,
+        leave_out: Collection[str] = EVERYTHING,
         max_depth: int = MAX_DEPTH,
         sampler: str = "independent",
         integrator: str = "prb",
     ) -> None:
         mi = mitsuba()
-        self._made = (description, resolution, filter, freeze)
+        self._made = (description, resolution, filter, frozenset(leave_out))
         self.resolution = resolution
         self.assembly = Assembly(description)
         self.max_depth = max_depth
-        self._freeze = freeze and not description.thin_lens  # Dr.Jit cannot record Mitsuba's thin lens
+        self._depth = max_depth
+        self._leave_out = frozenset(leave_out)
+        self._freeze = "tracing" in leave_out and not description.thin_lens  # Dr.Jit cannot record Mitsuba's thin lens
+        self._thin_lens = description.thin_lens
         self._backdrop = description.backdrop
         object_part = MeshPart(
             "object",
@@ -115,10 +85,11 @@ class MitsubaScene:
             object_to_world(description),
             description.object.base_color,
             description.material,
+            {} if "lobes" in leave_out else dict(IDLE_LOBES),
         )
         parts = (object_part, *description.parts)
         self.volumetric = any(part.volumetric for part in parts)
-        plugins = _scene_dict(description, resolution, filter)
+        plugins = scene_dict(description, resolution, filter)
         plugins["camera"]["sampler"] = {"type": sampler}
         for part in parts:
             plugins |= part.plugins()
@@ -129,8 +100,8 @@ class MitsubaScene:
         self._scene = mi.load_dict(plugins, optimize=False)
         self._sensor = self._scene.sensors()[0]
         self._parameters = mi.traverse(self._scene)
-        self._integrators: dict[str, Any] = {}
-        declared = [*_camera_inputs(resolution), ENVIRONMENT_INPUT, *(one for part in parts for one in part.inputs())]
+        self._integrators: dict[tuple[str, int], Any] = {}
+        declared = [*camera_inputs(resolution), ENVIRONMENT_INPUT, *(one for part in parts for one in part.inputs())]
         self._inputs = {one.name: (key, one) for one in declared if (key := _key(self._parameters, one.key))}
         self.names = frozenset(self._inputs)
         self.interior = frozenset(name for name, (_, one) in self._inputs.items() if one.interior)
@@ -138,19 +109,37 @@ class MitsubaScene:
         self._unsettled: set[str] = set()
         self._base: dict[str, Any] = {}
         self._applied: dict[str, Tensor] = {}
-        self._recorded: dict[tuple[str, int], Callable[..., Any]] = {}
+        self._recorded: dict[tuple[str, int, int], Callable[..., Any]] = {}
         self._recorded_at = (0, 0)
-        _population.bury()
-        _population.add(self, self._scene, self._integrators, self._parameters)
+        population.bury()
+        population.add(self, self._scene, self._integrators, self._parameters)
+        self._every: dict[str, Tensor] = {}
+        if "uploads" not in leave_out:
+            self._every = {name: self.base(name) for name in sorted(self.names)}
 
     def like(self, **changes: Any) -> MitsubaScene:
-        """Return another scene made as this one was, but with another `max_depth`, `sampler` or `integrator`."""
-        description, resolution, filter, freeze = self._made
-        settings = {"max_depth": self.max_depth, **changes}
-        other = MitsubaScene(description, resolution, filter=filter, freeze=freeze, **settings)
+        """Return another scene made as this one was, but with another `max_depth`, `sampler`, `integrator`, or
+        `leave_out`."""
+        description, resolution, filter, leave_out = self._made
+        settings = {"max_depth": self.max_depth, "leave_out": leave_out, **changes}
+        other = MitsubaScene(description, resolution, filter=filter, **settings)
         for what in ("path", "guides"):
             other._integrator(what)  # one that comes later makes the recordings of all scenes stale
         return other
+
+    @property
+    def depth(self) -> int:
+        """Longest light path in segments of the renders now."""
+        return self._depth
+
+    @contextmanager
+    def shorter(self, depth: int | None) -> Iterator[None]:
+        """Render light paths of at most `depth` segments inside the `with`; None changes nothing."""
+        before, self._depth = self._depth, self._depth if depth is None else min(depth, self.max_depth)
+        try:
+            yield
+        finally:
+            self._depth = before
 
     def base(self, name: str) -> Tensor:
         """Return the base value of an input, as a fresh torch tensor of the input's shape."""
@@ -210,7 +199,12 @@ class MitsubaScene:
 
         self._apply(inputs)
         wanted = tuple(inputs if wrt is None else wrt)
-        tracked = {name: mi.TensorXf(_contiguous(inputs[name])) for name in wanted}
+        method, beside = self._general(method, wanted)
+        values = {name: inputs[name] if name in inputs else self.base(name) for name in beside} if beside else {}
+        values |= {name: inputs[name] for name in wanted}
+        if beside:
+            self._apply(inputs)
+        tracked = {name: mi.TensorXf(_contiguous(value)) for name, value in values.items()}
         try:
             for name, value in tracked.items():
                 dr.enable_grad(value)
@@ -224,10 +218,11 @@ class MitsubaScene:
                 self._integrator(method).render_backward(
                     self._scene, self._parameters, arriving, sensor=self._sensor, seed=seed, spp=spp
                 )
-            return {name: _torch(dr.grad(value)).reshape(inputs[name].shape) for name, value in tracked.items()}
+            found = {name: _torch(dr.grad(value)).reshape(values[name].shape) for name, value in tracked.items()}
+            return {name: found[name] for name in wanted}
         finally:
-            for name in wanted:
-                self._write(name, mi.TensorXf(_contiguous(inputs[name])))
+            for name, value in values.items():
+                self._write(name, mi.TensorXf(_contiguous(value)))
             self._parameters.update()
 
     def material_adjoint(
@@ -256,14 +251,23 @@ class MitsubaScene:
             cotangent=cotangent,
             seed=seed,
             spp=spp,
-            max_depth=self.max_depth,
+            max_depth=self._depth,
             shadow_spp=SHADOW_SPP,
         )
-        _population.changes += 1  # the first call loads integrators of its own
+        population.changes += 1  # the first call loads integrators of its own
         found = {f"{name}.vertices": one for name, one in zip(names, by_vertices, strict=True)}
         return found | {f"{name}.normals": one for name, one in zip(names, by_normals, strict=True)}
 
     # ---- inside -----------------------------------------------------------------------------------------------------
+
+    def _general(self, method: str, wanted: Collection[str]) -> tuple[str, list[str]]:
+        """Return the adjoint's method and what to differentiate beside what is wanted, where that is not left out."""
+        beside = set() if "gradients" in self._leave_out else set(self.interior)
+        plain = method == "path" and not self._thin_lens and not self.volumetric
+        if "boundary" not in self._leave_out and plain:  # Mitsuba's projective integrator knows no lens and no medium
+            method = "boundary"
+            beside |= {name for name in self._shapes if name.endswith((".vertices", ".normals"))}
+        return method, sorted(beside - set(wanted))
 
     def _apply(self, inputs: Mapping[str, Tensor]) -> None:
         """Set exactly these inputs, everything else at its base value; does nothing for what is set already."""
@@ -272,6 +276,9 @@ class MitsubaScene:
         unknown = [name for name in inputs if name not in self._inputs]
         if unknown:
             raise InputError(f"the scene has no input {', '.join(unknown)}; it has {', '.join(sorted(self._inputs))}")
+        if self._every:
+            inputs = {**self._every, **inputs}
+            self._applied.clear()
         changed: set[str] = set()
         for name in [name for name in self._applied if name not in inputs]:
             self._parameters[self._inputs[name][0]] = type(self._base[name])(self._base[name])
@@ -292,32 +299,33 @@ class MitsubaScene:
             self._parameters.update()
         if not changed.isdisjoint(self._shapes):
             self._unsettled = {"path", "hidden", "guides"}
-            _population.changes += 1
+            population.changes += 1
 
     def _write(self, name: str, value: Any) -> None:
         key, one = self._inputs[name]
         self._parameters[key] = one.write(value)
 
     def _integrator(self, method: str) -> Any:
-        """Return the integrator of one method, made on first use."""
-        if method not in self._integrators:
+        """Return the integrator of one method for the paths that are rendered now, made on first use."""
+        key = method, self._depth
+        if key not in self._integrators:
             mi = mitsuba()
-            path = {"type": "prb", "max_depth": self.max_depth, "rr_depth": NO_ROULETTE, **self._path}
+            path = {"type": "prb", "max_depth": self._depth, "rr_depth": NO_ROULETTE, **self._path}
             recipes: dict[str, dict[str, Any]] = {
                 "path": path,
                 "hidden": {**path, "hide_emitters": True},
                 "guides": {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"},
                 "boundary": {
                     "type": "prb_projective",
-                    "max_depth": self.max_depth,
+                    "max_depth": self._depth,
                     "rr_depth": NO_ROULETTE,
                     "guiding": "none",
                 },
-                "guided": {"type": "prb_projective", "max_depth": self.max_depth, "rr_depth": NO_ROULETTE},
+                "guided": {"type": "prb_projective", "max_depth": self._depth, "rr_depth": NO_ROULETTE},
             }
-            self._integrators[method] = mi.load_dict(recipes[method])
-            _population.changes += 1
-        return self._integrators[method]
+            self._integrators[key] = mi.load_dict(recipes[method])
+            population.changes += 1
+        return self._integrators[key]
 
     def _render(self, what: str, seed: int, spp: int) -> Tensor:
         mi = mitsuba()
@@ -342,17 +350,18 @@ class MitsubaScene:
         """
         import drjit as dr
 
-        _population.bury()
-        now = (_population.changes, dr.thread_count())  # a recording crashes in another thread pool
+        population.bury()
+        now = (population.changes, dr.thread_count())  # a recording crashes in another thread pool
         if self._recorded_at != now:
             self._recorded.clear()
             self._recorded_at = now
         if not self._freeze or what in self._unsettled:
             self._unsettled.discard(what)
             return function
-        if (what, spp) not in self._recorded:
-            self._recorded[what, spp] = dr.freeze(function)
-        return self._recorded[what, spp]
+        key = what, spp, self._depth
+        if key not in self._recorded:
+            self._recorded[key] = dr.freeze(function)
+        return self._recorded[key]
 
 
 @contextmanager
@@ -373,6 +382,9 @@ def _contiguous(tensor: Tensor) -> Tensor:
 
 def _torch(value: Any) -> Tensor:
     """Return a Dr.Jit value as a torch tensor with memory of its own."""
+    mi = mitsuba()
+    if isinstance(value, (mi.Color3f, mi.Point3f)):  # Dr.Jit's own conversion gives a colour six entries
+        return torch.cat([_torch(component) for component in value])
     value = getattr(value, "matrix", value)
     if hasattr(value, "torch"):
         tensor: Tensor = value.torch()
@@ -400,76 +412,3 @@ def _key(parameters: Any, pattern: str) -> str | None:
     if len(found) > 1:
         raise RuntimeError(f"expected one Mitsuba parameter {pattern}, found {found}")
     return str(found[0]) if found else None
-
-
-def _scene_dict(description: SceneDescription, resolution: tuple[int, int], filter: str) -> dict[str, Any]:
-    """Everything but the object and the parts."""
-    mi = mitsuba()
-    place = mi.ScalarTransform4f
-    number = description.number
-    scene: dict[str, Any] = {
-        "type": "scene",
-        "camera": _camera(description, resolution, filter),
-        "environment": {
-            "type": "envmap",
-            "bitmap": mi.Bitmap(np.ascontiguousarray(description.environment.radiance, dtype=np.float32)),
-            "scale": 2.0 ** number("environment.exposure"),
-            "to_world": place().rotate([0, 0, 1], number("environment.rotation")).rotate([1, 0, 0], 90),
-        },
-    }
-    if number("ground.size") > 0.0:
-        color = [number(f"ground.{channel}") for channel in ("red", "green", "blue")]
-        reflectance = srgb_to_linear(np.array(color, np.float32)).tolist()
-        scene["ground"] = {
-            "type": "rectangle",
-            "to_world": place().scale(number("ground.size") / 2.0),
-            "bsdf": {
-                "type": "twosided",
-                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": reflectance}},
-            },
-        }
-    return scene
-
-
-def _camera(description: SceneDescription, resolution: tuple[int, int], filter: str) -> dict[str, Any]:
-    height, width = resolution
-    camera: dict[str, Any] = {
-        "type": "thinlens" if description.thin_lens else "perspective",
-        "fov": description.number("camera.fov"),
-        "fov_axis": "larger",
-        "near_clip": 0.01,
-        "far_clip": 1e5,
-        "to_world": mitsuba().ScalarTransform4f(camera_to_world(description, width / height)),
-        "film": {
-            "type": "hdrfilm",
-            "width": width,
-            "height": height,
-            "pixel_format": "rgba" if description.backdrop else "rgb",
-            "component_format": "float32",
-            "rfilter": {"type": filter},
-        },
-        "sampler": {"type": "independent"},
-    }
-    if description.thin_lens:
-        camera |= {"aperture_radius": 1e-4, "focus_distance": 1.0}
-    return camera
-
-
-def _camera_inputs(resolution: tuple[int, int]) -> tuple[PartInput, ...]:
-    """The camera's inputs. Our field of view is along the larger side, Mitsuba's parameter along the width."""
-    height, width = resolution
-
-    def along_width(value: Any) -> Any:
-        import drjit as dr
-
-        half = dr.deg2rad(value.array) / 2.0
-        return mitsuba().Float(2.0 * dr.rad2deg(dr.atan(dr.tan(half) * min(1.0, width / height))))
-
-    return (
-        PartInput("camera.to_world", "camera.to_world", transform, shape=(4, 4)),
-        PartInput("camera.fov", "camera.x_fov", along_width, shape=(1,)),
-        PartInput("camera.shift_x", "camera.principal_point_offset_x", number, shape=(1,)),
-        PartInput("camera.shift_y", "camera.principal_point_offset_y", number, shape=(1,)),
-        PartInput("camera.aperture", "camera.aperture_radius", number, shape=(1,)),
-        PartInput("camera.focus", "camera.focus_distance", number, shape=(1,)),
-    )

@@ -51,6 +51,7 @@ class Renderer:
         start: (d,) float32 in [0, 1], the configuration that leaves the scene as it is.
         formation: how radiance becomes the picture.
         plan: how each coordinate is differentiated; may be replaced.
+        routes: which scene inputs each group of coordinates reaches, by `control.parameter`.
         renders: number of primal renders so far, those of differences included.
         gradients: number of adjoint renders so far.
         non_finite: number of pixels and gradient entries that were NaN or infinite and were set to zero.
@@ -85,7 +86,7 @@ class Renderer:
         self._left_out: frozenset[str] = frozenset()
         groups = space.group_plans()
         self.plan = first_plan(groups, self._steps(groups, motion), estimators)
-        self._routes = self._find_routes(groups)
+        self.routes = self._find_routes(groups)
 
     @property
     def start(self) -> Tensor:
@@ -230,7 +231,7 @@ class Renderer:
         wanted: dict[str, list[str]] = {}
         taken: set[str] = set()
         for estimator in ("material", "boundary", "guided", "adjoint"):
-            names = {name for group in self.plan.having(estimator) for name in self._routes.get(group.name, ())}
+            names = {name for group in self.plan.having(estimator) for name in self.routes.get(group.name, ())}
             if estimator == "adjoint":
                 names &= self.scene.interior
             chosen = [name for name in inputs if name in names and name not in taken]

@@ -1,0 +1,33 @@
+"""How many bounces of light the search of a problem renders."""
+
+from __future__ import annotations
+
+import torch
+
+from advsearch import seeds
+from advsearch.api.problem import Problem
+from advsearch.evaluation.bounces import Bounces, measured_bounces
+
+DRAWS = 2
+"""Configurations, beside the clean one, that the measurement looks at."""
+SPP = 4
+"""Samples a pixel: the same paths are compared, so that few are enough."""
+WORTH = 200
+"""Renders of a search from which the measurement pays; each path length costs a compilation."""
+
+
+def bounces_of(problem: Problem, seed: int) -> Bounces:
+    """Measure the bounces that a problem's search needs, over its clean configuration and random ones of its space.
+
+    Args:
+        problem: whose scene and space.
+        seed: root of the noise and of the draws.
+    """
+    drawn = [
+        problem.domain.sample(torch.Generator().manual_seed(seeds.stream(seed, "bounces", number)))[0]
+        for number in range(DRAWS)
+    ]
+    conditions = [seeds.stream(seed, "conditions of bounces", number) for number in range(DRAWS)]
+    wholes = [problem.whole(problem.domain.start)]
+    wholes += [problem.whole(u, draw) for u, draw in zip(drawn, conditions, strict=True)]
+    return measured_bounces(problem.renderer, wholes, seed=seeds.stream(seed, "bounces"), spp=SPP)

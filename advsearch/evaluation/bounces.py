@@ -1,0 +1,124 @@
+"""How many bounces of light a search needs: what each one adds to the picture, measured on the scene at hand.
+
+Renders of other path lengths with the same seed draw the same paths, cut off earlier, so that their difference is the
+light of the bounces left out, almost without noise. A search may leave out what the eye could not see; a verification
+leaves out nothing, so that no answer rests on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.evaluation.precision_image import with_formation
+from advsearch.scene.renderer import Renderer
+
+SHORTEST = 2
+"""Segments of the shortest path tried: light that reaches the camera from a surface that it falls on directly."""
+BOUND = 0.5
+"""Root-mean-square change of the displayed picture, in 8-bit levels, that a search accepts."""
+LEVELS = 255.0
+
+
+@dataclass(frozen=True)
+class Cut:
+    """What paths of at most so many segments leave out, the worst over the configurations looked at.
+
+    Attributes:
+        depth: longest path in segments.
+        light: share of the picture's radiance that is missing.
+        levels: root-mean-square bias of the displayed picture, in 8-bit levels.
+    """
+
+    depth: int
+    light: float
+    levels: float
+
+
+@dataclass(frozen=True)
+class Bounces:
+    """The path length of a search and why.
+
+    Attributes:
+        depth: longest path in segments that the search renders.
+        full: that the verification renders.
+        cuts: what was measured, longest paths first.
+        configurations: how many the measurement looked at.
+    """
+
+    depth: int
+    full: int
+    cuts: tuple[Cut, ...]
+    configurations: int
+
+    @property
+    def reason(self) -> str:
+        """In words."""
+        found = {cut.depth: cut for cut in self.cuts}
+        rejected = found.get(self.depth - 1)
+        said = []
+        if self.depth < self.full:
+            cut = found[self.depth]
+            said.append(
+                f"paths of {self.depth} segments leave out {cut.light:.2%} of the light, which moves the picture by "
+                f"{cut.levels:.2f} of 255 levels (bound {BOUND:g})"
+            )
+        if rejected is not None:
+            said.append(f"{rejected.depth} would leave out {rejected.light:.2%} and move it by {rejected.levels:.2f}")
+        return "; ".join(said) or f"all {self.full} segments"
+
+
+def measured_bounces(
+    renderer: Renderer, configurations: Sequence[Tensor], *, seed: int, spp: int, bound: float = BOUND
+) -> Bounces:
+    """Return the shortest paths whose pictures agree with those of the full length to within a bound.
+
+    Args:
+        renderer: at the full length.
+        configurations: where to look, each (d,).
+        seed: root of the noise, which is the same for all lengths.
+        spp: samples a pixel of each of two halves; few are enough.
+        bound: in 8-bit levels, see `Cut.levels`.
+
+    Returns:
+        The depth, with what was measured: from the full length downwards, to the first that misses the bound.
+    """
+    full = renderer.scene.max_depth
+    noises = [seeds.stream(seed, "half", half) for half in range(2)]
+    wholes = [[_pictures(renderer, u, noise, spp, full) for noise in noises] for u in configurations]
+    cuts, chosen = [], full
+    for depth in range(full - 1, SHORTEST - 1, -1):
+        light = levels = 0.0
+        for u, whole in zip(configurations, wholes, strict=True):
+            cut = [_pictures(renderer, u, noise, spp, depth) for noise in noises]
+            light = max(light, _missing(whole, cut))
+            levels = max(levels, LEVELS * _bias(whole, cut))
+        cuts.append(Cut(depth, light, levels))
+        if not levels <= bound:
+            break
+        chosen = depth
+    return Bounces(chosen, full, tuple(cuts), len(configurations))
+
+
+def _missing(whole: Sequence[tuple[Tensor, Tensor]], cut: Sequence[tuple[Tensor, Tensor]]) -> float:
+    """The share of the radiance that is missing."""
+    full = sum(float(radiance.mean()) for radiance, _ in whole)
+    return 1.0 - sum(float(radiance.mean()) for radiance, _ in cut) / full if full > 0.0 else 0.0
+
+
+def _bias(whole: Sequence[tuple[Tensor, Tensor]], cut: Sequence[tuple[Tensor, Tensor]]) -> float:
+    """The root-mean-square bias: the product of two independent differences has no noise in its mean."""
+    first, second = (one[1] - other[1] for one, other in zip(whole, cut, strict=True))
+    return float((first * second).mean().clamp_min(0.0).sqrt())
+
+
+def _pictures(renderer: Renderer, u: Tensor, seed: int, spp: int, depth: int) -> tuple[Tensor, Tensor]:
+    """Radiance and displayed picture, both without denoiser: it would spread a change over its neighbours."""
+    raw = with_formation(renderer, denoiser="none")
+    with torch.no_grad(), renderer.scene.shorter(depth):
+        radiance = raw.radiance(u, seed, spp)
+        return radiance, raw.space.picture(u, raw.formation.display(radiance))

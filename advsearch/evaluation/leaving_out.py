@@ -1,0 +1,187 @@
+"""What leaving things out brings on a scene as it is, and the proof that nothing of it changes the answer.
+
+Each item of `advsearch.scene.leaving_out` is put back alone, then all together. The gain is the time of a gradient
+with it over the time without, medians of interleaved repeats. The proof is that the same seed gives the same picture
+and the same gradient: what differs is measured against what another seed changes.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.evaluation.gradients import Loss
+from advsearch.evaluation.precision_image import with_formation
+from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
+from advsearch.scene.mitsuba_scene import MitsubaScene
+from advsearch.scene.renderer import Renderer
+
+ALL = "everything above"
+"""Name of the row in which all items are put back together."""
+BOUNCES = "bounces"
+"""Name of the row in which paths have their full length."""
+WHAT = {**ITEMS, BOUNCES: "bounces of light beyond the search's longest path", ALL: "all of these"}
+"""What is left out, in words, for each row."""
+AGREES = 1.0
+"""Difference, as a share of what another seed changes, up to which two pictures or gradients agree."""
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What leaving one thing out brings.
+
+    Attributes:
+        item: a key of `WHAT`.
+        gain: time of a gradient with it put back over the time without it.
+        picture: root-mean-square difference of the pictures with and without it at one seed, over that of two seeds.
+        gradient: the same of the gradients; 0 where there are none.
+        seconds: of a gradient with it put back.
+    """
+
+    item: str
+    gain: float
+    picture: float
+    gradient: float
+    seconds: float
+
+    @property
+    def safe(self) -> bool:
+        """Whether pictures and gradients agree to within their noise."""
+        return self.picture <= AGREES and self.gradient <= AGREES
+
+
+def measured_gains(
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    *,
+    seed: int,
+    spp: int,
+    repeats: int = 3,
+    depth: int | None = None,
+    tick: Callable[[], None] = lambda: None,
+) -> list[Gain]:
+    """Put back what is left out, item by item and all at once, and measure a gradient.
+
+    Args:
+        renderer: with everything left out.
+        loss: what is differentiated.
+        u: (d,) where.
+        seed: root of the noise.
+        spp: samples a pixel.
+        repeats: timed gradients of each.
+        depth: longest light path of the search, where it is shorter than the scene's.
+        tick: called after each gradient.
+
+    Returns:
+        One row for each item, and one for all.
+    """
+    shorter = depth is not None and depth < renderer.scene.max_depth
+    everyone: dict[str, tuple[Renderer, int | None]] = {"": (renderer, depth)}
+    for item in ITEMS:
+        everyone[item] = with_formation(renderer, renderer.scene.like(leave_out=EVERYTHING - {item})), depth
+    if shorter:
+        everyone[BOUNCES] = renderer, None
+    everyone[ALL] = with_formation(renderer, renderer.scene.like(leave_out=NOTHING)), None
+    first = [_one(each, loss, u, seed, spp) for each in everyone.values()]  # compiles, and compares
+    again = _one(everyone[""], loss, u, seeds.stream(seed, "another"), spp)
+    noises = [seeds.stream(seed, "round", number) for number in range(repeats)]
+    rounds = [[_seconds(each, loss, u, noise, spp, tick) for each in everyone.values()] for noise in noises]
+    typical = [statistics.median(times) for times in zip(*rounds, strict=True)]
+    rows = []
+    for number, item in list(enumerate(everyone))[1:]:
+        picture = _share(first[number][0] - first[0][0], again[0] - first[0][0])
+        gradient = _share(first[number][1] - first[0][1], again[1] - first[0][1])
+        rows.append(Gain(item, typical[number] / typical[0], picture, gradient, typical[number]))
+    return rows
+
+
+def _one(which: tuple[Renderer, int | None], loss: Loss, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor]:
+    renderer, depth = which
+    with renderer.scene.shorter(depth):
+        with torch.no_grad():
+            picture = renderer(u, seed, spp)
+        return picture, renderer.gradient(loss, u, seed, spp)[1]
+
+
+def _seconds(
+    which: tuple[Renderer, int | None], loss: Loss, u: Tensor, seed: int, spp: int, tick: Callable[[], None]
+) -> float:
+    renderer, depth = which
+    begun = time.perf_counter()
+    with renderer.scene.shorter(depth):
+        renderer.gradient(loss, u, seed, spp)
+    tick()
+    return time.perf_counter() - begun
+
+
+def _share(difference: Tensor, noise: Tensor) -> float:
+    size = float(noise.norm())
+    return float(difference.norm()) / size if size > 0.0 else float(difference.norm())
+
+
+# ---- texels ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Texels:
+    """How many texels of a searched texture a pixel shows.
+
+    Attributes:
+        control: whose texture.
+        side: of the texture, in texels.
+        seen: texels that light reaches the camera from directly.
+        pixels: pixels that show the surface.
+        enough: side, a power of two, at which a pixel still shows `PER_PIXEL` texels; at most `side`.
+    """
+
+    control: str
+    side: int
+    seen: int
+    pixels: int
+    enough: int
+
+
+PER_PIXEL = 2.0
+"""Texels a pixel that `Texels.enough` keeps: two samples a period (Nyquist), with room for oblique views."""
+
+
+def resolved_texels(renderer: Renderer, u: Tensor, *, seed: int, spp: int = 16) -> list[Texels]:
+    """Return, for every searched texture, how its texels compare with the pixels that show them."""
+    found = []
+    groups = [group for group in renderer.plan.groups if group.parameter == "texels"]
+    inputs = {name: value.detach() for name, value in renderer.scene.assembly(renderer.space.inputs(u)).items()}
+    inputs = {name: value for name, value in inputs.items() if name in renderer.scene.names}
+    for group in groups:
+        for name in sorted(renderer.routes.get(group.name, ())):
+            found.append(_texels(renderer.scene, group.control, name, inputs, seed, spp))
+    return found
+
+
+def _texels(scene: MitsubaScene, control: str, name: str, inputs: dict[str, Tensor], seed: int, spp: int) -> Texels:
+    texture = inputs[name]
+    bright, dark = ({**inputs, name: torch.full_like(texture, level)} for level in (1.0, 0.0))
+    difference = scene.guides(bright, seed, spp)[0] - scene.guides(dark, seed, spp)[0]
+    pixels = int((difference.amax(dim=-1) > 0.0).sum())
+    with scene.shorter(2):
+        gradient = scene.adjoint(inputs, torch.ones(*scene.resolution, 3), seed, spp, wrt=[name])[name]
+    seen, side = int((gradient.abs().amax(dim=-1) > 0.0).sum()), max(texture.shape[:2])
+    enough = side
+    while enough > 2 and seen * (enough / 2 / side) ** 2 >= PER_PIXEL * pixels:
+        enough //= 2
+    return Texels(control, side, seen, pixels, enough)
+
+
+def sequence_of(gains: Sequence[Gain]) -> list[dict[str, object]]:
+    """Return rows for a file or a table."""
+    return [
+        {"item": one.item, "what": WHAT[one.item], "gain": one.gain}
+        | {"picture_difference": one.picture, "gradient_difference": one.gradient, "seconds": one.seconds}
+        for one in gains
+    ]

@@ -1,0 +1,151 @@
+"""What leaving things out brings, at equal gradient error, over pairs of scene and control; and that verdicts agree.
+
+    python benchmarks/leaving_out.py [--size 128] [--spp 8] [--repeats 5] [--configurations 200] [--json FILE]
+
+The gain of a pair is (squared error x time) of a gradient with nothing left out over that with everything left out,
+so that a smaller error counts as less time. Errors are those of the linear loss of `advsearch check`, against the mean
+of gradients of both at eight times the samples. Searches of 200 renders and more cut light paths too: the gain with the
+cut is in the last column but one. Verdicts are those of the reference model on random configurations of the first pair,
+each rendered at one seed with and without; beside them, how often another seed changes the verdict.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.api.attacking import problem_from_config
+from advsearch.api.bounces import bounces_of
+from advsearch.api.problem import Problem
+from advsearch.config import AttackConfig
+from advsearch.evaluation.gradients import inside, smooth_loss
+from advsearch.evaluation.precision_image import with_formation
+from advsearch.scene.leaving_out import NOTHING
+from advsearch.scene.renderer import Renderer
+
+PAIRS = (
+    ("mug", "studio", "texture"),
+    ("bowl", "kitchen", "material"),
+    ("bottle", "noon", "environment"),
+    ("mug", "studio", "light"),
+    ("bowl", "noon", "camera"),
+    ("bottle", "kitchen", "pose"),
+)
+REFERENCES = 4
+"""Gradients of each kind behind a reference."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure, print a table; 1 if a pair is slower, or the mean gain below 2."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--size", type=int, default=128)
+    parser.add_argument("--spp", type=int, default=8)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--configurations", type=int, default=200)
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args(argv)
+    rows = []
+    print("| scene and control | milliseconds | gain | error, of its size | with cut paths | segments |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for pair in PAIRS:
+        row = measured(pair, args.size, args.spp, args.repeats)
+        rows.append(row)
+        print(
+            f"| {', '.join(pair)} | {1e3 * row['seconds']:.0f} | {row['gain']:.2f} | {row['error']:.3f} "
+            f"| {row['gain_cut']:.2f} | {row['depth']} |",
+            flush=True,
+        )
+    mean = math.exp(statistics.fmean(math.log(row["gain"]) for row in rows))
+    with_cut = math.exp(statistics.fmean(math.log(row["gain_cut"]) for row in rows))
+    print(f"geometric mean {mean:.2f}, with cut paths {with_cut:.2f}; smallest {min(row['gain'] for row in rows):.2f}")
+    verdicts = agreement(PAIRS[0], args.size, args.spp, args.configurations)
+    print(
+        f"verdicts of {verdicts['configurations']} configurations: {verdicts['agree']} agree at one seed, "
+        f"{verdicts['other_seed']} agree between two seeds"
+    )
+    if args.json:
+        args.json.write_text(json.dumps({"rows": rows, "mean": mean, "mean_cut": with_cut, "verdicts": verdicts}))
+    return int(mean < 2.0 or min(row["gain"] for row in rows) < 1.0)
+
+
+def measured(pair: tuple[str, str, str], size: int, spp: int, repeats: int) -> dict[str, Any]:
+    """One pair: times, errors, gains."""
+    problem = problem_of(pair, size, pair[2])
+    lean, u, loss = problem.renderer, inside(problem.renderer), smooth_loss((size, size))
+    full = with_formation(lean, lean.scene.like(leave_out=NOTHING))
+    depth = bounces_of(problem, 0).depth
+    ways: list[tuple[Renderer, int | None]] = [(lean, None), (full, None), (lean, depth)]
+    truth = torch.stack(
+        [
+            one.gradient(loss, u, seeds.stream(1, "truth", n), 8 * spp)[1]
+            for n in range(REFERENCES)
+            for one in (lean, full)
+        ]
+    ).mean(dim=0)
+    for way in ways:
+        gradient(way, loss, u, 0, spp)
+    found: list[list[tuple[float, float]]] = [[] for _ in ways]
+    for number in range(repeats):
+        for way, results in zip(ways, found, strict=True):
+            begun = time.perf_counter()
+            estimate = gradient(way, loss, u, seeds.stream(2, "working", number), spp)
+            seconds = time.perf_counter() - begun
+            results.append((seconds, float((estimate - truth).square().sum())))
+    times = [statistics.median(one[0] for one in results) for results in found]
+    errors = [statistics.fmean(one[1] for one in results) for results in found]
+    return {
+        "pair": list(pair),
+        "seconds": times[0],
+        "gain": times[1] * errors[1] / (times[0] * errors[0]),
+        "gain_cut": times[1] * errors[1] / (times[2] * errors[2]),
+        "time_ratio": times[1] / times[0],
+        "error": math.sqrt(errors[0]) / float(truth.norm()),
+        "errors": errors,
+        "depth": depth,
+    }
+
+
+def gradient(way: tuple[Renderer, int | None], loss: Any, u: Tensor, seed: int, spp: int) -> Tensor:
+    """One gradient."""
+    renderer, depth = way
+    with renderer.scene.shorter(depth):
+        return renderer.gradient(loss, u, seed, spp)[1]
+
+
+def agreement(pair: tuple[str, str, str], size: int, spp: int, count: int) -> dict[str, int]:
+    """Verdicts with everything and with nothing left out, over textures, poses and cameras."""
+    problem = problem_of(pair, size, "texture,pose,camera")
+    lean = problem.renderer
+    full = with_formation(lean, lean.scene.like(leave_out=NOTHING))
+    depth = bounces_of(problem, 0).depth
+    same = other = 0
+    with torch.no_grad():
+        for number in range(count):
+            u = problem.domain.sample(torch.Generator().manual_seed(number))[0]
+            with lean.scene.shorter(depth):
+                verdicts = [int(problem.model(lean(u, noise, spp))[0].argmax()) for noise in (number, count + number)]
+            whole = int(problem.model(full(u, number, spp))[0].argmax())
+            same, other = same + (verdicts[0] == whole), other + (verdicts[0] == verdicts[1])
+    return {"configurations": count, "agree": same, "other_seed": other, "depth": depth}
+
+
+def problem_of(pair: tuple[str, str, str], size: int, controls: str) -> Problem:
+    """The problem of a pair at a size."""
+    named: dict[str, Any] = {name: {} for name in controls.split(",")}
+    config = AttackConfig(object=pair[0], environment=pair[1], controls=named, resolution=(size, size))
+    return problem_from_config(config)[0]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

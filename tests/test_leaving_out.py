@@ -1,0 +1,185 @@
+"""What searches leave out changes neither pictures nor gradients, and bounces only within a bound."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+
+from advsearch.api import attack, load_scene
+from advsearch.api.attacking import problem_from_config
+from advsearch.api.planning import plan
+from advsearch.api.problem import OnImage
+from advsearch.cli.plan import text
+from advsearch.config import AttackConfig
+from advsearch.evaluation.bounces import BOUND, measured_bounces
+from advsearch.evaluation.gradients import inside, smooth_loss
+from advsearch.evaluation.leaving_out import ALL, WHAT, measured_gains, resolved_texels
+from advsearch.evaluation.precision_image import with_formation
+from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
+from advsearch.scene.renderer import Renderer
+
+SIZE = 40
+
+
+def made(controls: Any, object: str = "mug", environment: str = "studio") -> Renderer:
+    return load_scene(object, environment).renderer(controls, resolution=SIZE, denoise="none")
+
+
+@pytest.mark.parametrize("control", ["texture", "haze"])
+def test_nothing_that_is_left_out_changes_a_picture_or_a_gradient(control: str) -> None:
+    renderer = made(control)
+    loss, u = smooth_loss((SIZE, SIZE)), inside(renderer)
+    full = with_formation(renderer, renderer.scene.like(leave_out=NOTHING))
+    with torch.no_grad():
+        noise = (renderer(u, 100, 4) - renderer(u, 101, 4)).norm()
+        for seed in range(3):  # the second is replayed where the first was recorded
+            assert (full(u, seed, 4) - renderer(u, seed, 4)).norm() <= 0.01 * noise
+    mine, theirs = (one.gradient(loss, u, 5, 4)[1] for one in (renderer, full))
+    assert mine.norm() > 0.0
+    assert (mine - theirs).norm() <= 0.01 * mine.norm()
+
+
+def test_putting_an_item_back_takes_effect(monkeypatch: pytest.MonkeyPatch) -> None:
+    renderer = made("texture")
+    written: list[str] = []
+
+    def adjoints(item: str) -> tuple[set[str], set[str]]:
+        scene = renderer.scene.like(leave_out=EVERYTHING - {item})
+        inner = scene._write
+        monkeypatch.setattr(scene, "_write", lambda name, value: (written.append(name), inner(name, value)))
+        inputs = {"object.base_color": scene.base("object.base_color") * 0.5}
+        scene.radiance(inputs, 0, 1)
+        by_render = set(written)
+        written.clear()
+        scene.adjoint(inputs, torch.ones(SIZE, SIZE, 3), 0, 1)
+        by_adjoint = set(written)
+        written.clear()
+        return by_render, by_adjoint
+
+    only = {"object.base_color"}
+    assert adjoints("tracing") == (only, only)
+    every, _ = adjoints("uploads")
+    assert {"environment.padded", "object.vertices", "camera.to_world"} <= every
+    _, differentiated = adjoints("gradients")
+    assert {"environment.padded", "object.roughness"} <= differentiated and "object.vertices" not in differentiated
+    _, differentiated = adjoints("boundary")
+    assert {"object.base_color", "object.vertices"} <= differentiated
+
+
+@pytest.mark.slow
+def test_gains_have_a_row_for_each_item_and_their_proof() -> None:
+    renderer = made("texture")
+    rows = measured_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=2, repeats=2, depth=4)
+    assert [row.item for row in rows] == [*ITEMS, "bounces", ALL] and {row.item for row in rows} == set(WHAT)
+    assert all(row.gain > 0.0 and row.safe for row in rows)
+
+
+def test_what_changes_the_picture_is_not_called_safe(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("advsearch.evaluation.leaving_out.ITEMS", {"tracing": ""})
+    monkeypatch.setattr("advsearch.evaluation.leaving_out.NOTHING", EVERYTHING)
+    renderer = made("camera.exposure")
+    rows = measured_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=512, repeats=2, depth=2)
+    tracing, bounces, _ = rows
+    assert tracing.picture == 0.0 and tracing.safe and tracing.gain > 0.0
+    assert bounces.item == "bounces" and bounces.picture > 1.0 and not bounces.safe
+
+
+def test_bounces_are_cut_where_they_are_dark_and_not_where_they_are_seen() -> None:
+    dark, light = made("texture", "bottle", "noon"), made("texture", "mug", "studio")
+    cut = measured_bounces(dark, [dark.start], seed=0, spp=4)
+    assert cut.depth < cut.full == dark.scene.max_depth
+    kept = {one.depth: one for one in cut.cuts}
+    assert kept[cut.depth].levels <= BOUND < kept[cut.depth - 1].levels
+    assert "segments leave out" in cut.reason
+    seen = measured_bounces(light, [light.start], seed=0, spp=4)
+    assert seen.depth > cut.depth and seen.cuts[-1].levels > BOUND
+    assert dark.scene.depth == dark.scene.max_depth
+
+
+def test_the_measured_bias_does_not_depend_on_the_noise() -> None:
+    renderer = made("texture")
+    few, many = (measured_bounces(renderer, [renderer.start], seed=3, spp=spp, bound=1e9).cuts[-1] for spp in (4, 256))
+    assert few.depth == many.depth == 2 and few.levels == pytest.approx(many.levels, rel=0.2)
+    assert few.light == pytest.approx(many.light, rel=0.1)
+
+
+def test_a_black_scene_needs_no_bounces() -> None:
+    renderer = made({"camera": {"exposure": [-10.0, -9.0]}})
+    cut = measured_bounces(renderer, [torch.zeros_like(renderer.start)], seed=0, spp=1)
+    assert cut.depth == 2 and cut.cuts[-1].levels <= BOUND
+
+
+def test_searches_cut_paths_and_verifications_do_not() -> None:
+    config = AttackConfig(object="bowl", controls={"texture": {}}, denoise="none", resolution=(SIZE, SIZE))
+    problem, _ = problem_from_config(config)
+    start = problem.domain.start
+    seen: list[torch.Tensor] = []
+    evaluate = problem.evaluator("search", OnImage(lambda index: True, lambda index, image: seen.append(image)))
+    trial = problem.trial(start, 3, 8)
+    evaluate(start, index=0, gradient=False)
+    problem.search_depth = 2
+    evaluate(start, index=0, gradient=False)
+    evaluate(start, index=0, gradient="full")
+    assert seen[1].mean() < seen[0].mean() - 0.005 and torch.equal(seen[1], seen[2])
+    assert problem.trial(start, 3, 8) == trial
+
+
+def test_a_long_search_says_what_paths_it_rendered() -> None:
+    options: dict[str, Any] = {"controls": "camera", "steps": 1, "trials": 2, "verify_spp": 4, "resolution": SIZE}
+    options |= {"environment": "noon", "baseline": False, "measure": "full", "denoise": "none", "spp": 2}
+    found = attack("bottle", **options)
+    segments = found.summary["light_path_segments"]
+    assert 2 <= segments["search"] < segments["verification"] == 6
+    whole = attack("bottle", **{**options, "specialise": False})
+    assert whole.summary["light_path_segments"] == {"search": 6, "verification": 6}
+
+
+def test_texels_beyond_what_a_pixel_shows_are_counted() -> None:
+    fine = made({"texture": {"resolution": 512}})
+    (found,) = resolved_texels(fine, fine.start, seed=0, spp=64)
+    assert found.side == 512 and 0 < found.pixels < SIZE**2
+    assert found.enough < 512 and found.seen > 4 * found.pixels
+    coarse = made({"texture": {"resolution": 16}})
+    (found,) = resolved_texels(coarse, coarse.start, seed=0, spp=64)
+    assert found.enough == found.side == 16
+    assert resolved_texels(made("light"), made("light").start, seed=0) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("specialise", [True, False])
+def test_the_plan_shows_what_is_left_out(specialise: bool) -> None:
+    config = AttackConfig(
+        object="mug",
+        controls={"texture": {"resolution": 32}},
+        resolution=(32, 32),
+        spp=2,
+        denoise="none",
+        specialise=specialise,
+    )
+    found = plan(config)
+    said = text(found)
+    assert found["specialised"] is specialise
+    if specialise:
+        assert {row["item"] for row in found["gains"]} >= {*ITEMS, ALL}
+        assert found["bounces"]["reason"] in said and "texels of texture" in said
+    else:
+        assert "gains" not in found and "nothing (--no-specialise)" in said
+
+
+def test_every_input_of_a_light_has_a_base_value() -> None:
+    scene = made("light").scene
+    assert all(torch.isfinite(scene.base(name)).all() for name in scene.names)
+    assert scene.base("light.radiance").shape == (3,)
+
+
+def test_a_shorter_path_is_only_for_the_block() -> None:
+    scene = made("texture").scene
+    with scene.shorter(3):
+        assert scene.depth == 3
+        with scene.shorter(None):
+            assert scene.depth == 3
+        with scene.shorter(50):
+            assert scene.depth == scene.max_depth
+    assert scene.depth == scene.max_depth
