@@ -71,9 +71,20 @@ def direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
 
 
 def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
-    """Interpolate a table (10, ...) linearly between whole turbidities."""
+    """Interpolate a table (10, ...) between whole turbidities by cubics with a continuous derivative.
+
+    The slope at a whole turbidity is that between its neighbours (Catmull and Rom 1974), one-sided at the ends. The
+    authors interpolate linearly, so that the derivative jumps at whole turbidities, the default of 3 among them.
+    """
     below = min(8, max(0, int(turbidity.detach()) - 1))
-    return torch.lerp(table[below], table[below + 1], turbidity - 1.0 - below)
+    t = turbidity - 1.0 - below
+    first, second = table[below], table[below + 1]
+    slopes = [
+        (table[min(9, k + 1)] - table[max(0, k - 1)]) / (min(9, k + 1) - max(0, k - 1)) for k in (below, below + 1)
+    ]
+    straight = torch.lerp(first, second, t)
+    rise = second - first
+    return straight + t * (1.0 - t) * ((1.0 - t) * (slopes[0] - rise) - t * (slopes[1] - rise))
 
 
 def sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
