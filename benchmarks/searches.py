@@ -1,12 +1,14 @@
 """Compares policies on bundled scenes at equal renders, by verified margin, with a dense sample of the space beside.
 
     python benchmarks/searches.py [--spaces pose camera light environment.rotation] [--policies auto random ...]
-                                  [--renders 60] [--seeds 5] [--dense 600] [--resolution 64]
-    python benchmarks/searches.py --texture [--seeds 5]
+                                  [--renders 60] [--seeds 10] [--dense 600] [--resolution 64]
+                                  [--object FILE --environment FILE --model FILE --labels FILE --label NAME]
+    python benchmarks/searches.py --texture [--seeds 10]
 
 The first prints, for each space and policy, the median over seeds of the verified margin (the mean of fresh trials at a
 high sample count, in logits; above 0 the model is wrong), how far `auto` is below the best single policy, and which
-share of a dense sample of the space, ten times as many renders, has a lower margin than `auto`'s answer.
+share of a dense sample of the space, ten times as many configurations, has a lower margin than `auto`'s answer. Those
+are verified by `DENSE_TRIALS` trials each: the best of many noisy values is a noisy one.
 
 The second compares the renders that gradient search needs with those of the best policy without gradients: the margin
 that `pgd` reaches within a tenth of the renders, and the margins of the others with all of them.
@@ -28,7 +30,7 @@ from advsearch.api.problem import Problem
 from advsearch.attacks import make_policy, search
 from advsearch.config import AttackConfig
 
-TRIALS, TRIAL_SPP = 8, 64
+TRIALS, TRIAL_SPP, DENSE_TRIALS = 8, 64, 4
 BLIND = ("random", "nes")
 """Policies without gradients that take a whole texture."""
 
@@ -38,10 +40,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--object", default="mug")
     parser.add_argument("--environment", default="studio")
+    parser.add_argument("--model", default="reference")
+    parser.add_argument("--labels")
+    parser.add_argument("--label")
     parser.add_argument("--spaces", nargs="+", default=["pose", "camera", "light", "environment.rotation"])
     parser.add_argument("--policies", nargs="+", default=["auto", "random", "sobol", "cmaes", "pgd"])
     parser.add_argument("--renders", type=int, default=60)
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--dense", type=int, default=600)
     parser.add_argument("--resolution", type=int, default=64)
     parser.add_argument("--texture", action="store_true")
@@ -55,6 +60,9 @@ def _problem(args: argparse.Namespace, control: str) -> Problem:
     config = AttackConfig(
         object=args.object,
         environment=args.environment,
+        model=args.model,
+        labels=args.labels,
+        label=args.label,
         controls={control: {}},
         resolution=args.resolution,
         measure="no",
@@ -88,7 +96,7 @@ def _spaces(args: argparse.Namespace) -> None:
         }
         medians = {policy: statistics.median(values) for policy, values in margins.items()}
         generator = torch.Generator().manual_seed(5)
-        dense = [_verified(problem, u, 1) for u in problem.domain.sample(generator, args.dense)]
+        dense = [_verified(problem, u, DENSE_TRIALS) for u in problem.domain.sample(generator, args.dense)]
         clean = _verified(problem, problem.domain.start)
         best = max(medians.values())
         cells = [

@@ -30,7 +30,7 @@ from advsearch.attacks import (
     search,
 )
 from advsearch.attacks.objectives import OBJECTIVES
-from advsearch.attacks.policies.base import seeded
+from advsearch.attacks.policies.base import Counts, seeded
 from advsearch.attacks.policies.pgd import Window
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.seeds import stream
@@ -612,3 +612,52 @@ def test_unknown_policies_and_options_name_their_neighbours() -> None:
 def test_options_out_of_range_are_refused(options: dict[str, float], message: str) -> None:
     with pytest.raises(InputError, match=message):
         make_policy("pgd", **options)
+
+
+# ---- what policies had to do ----------------------------------------------------------------------------------------
+
+
+def told(policy: Policy[Any], objective: Callable[[int, Tensor], Evaluation], domain: Domain, steps: int) -> Any:
+    def evaluate(u: Tensor, *, index: int, gradient: Any, samples: int = 1) -> Evaluation:
+        found = objective(index, u)
+        return found if gradient else replace(found, gradient=None)
+
+    return search(evaluate, domain, policy, steps=steps, seed=1, candidates=0)
+
+
+@pytest.mark.parametrize("name", ["pgd", "adam", "auto", "restarts", "portfolio"])
+def test_outliers_and_steps_taken_back_are_counted(name: str) -> None:
+    domain = Domain(torch.full((20,), 0.5), (Block(20, "linf", 0.3),))
+    options: dict[str, Any] = {"restarts": {"policy": "pgd", "times": 1}, "portfolio": {"policies": ["adam"]}}
+
+    def objective(index: int, u: Tensor) -> Evaluation:
+        size = 1e4 if index in (9, 14) else 1.0
+        gradient = torch.linspace(0.9, 1.1, 20) * size
+        if index == 5:
+            gradient[3] = 50.0
+        value = float("nan") if index == 12 else float(u.sum())
+        return Evaluation(value, gradient, torch.zeros(2), False)
+
+    found = told(make_policy(name, **options.get(name, {})), objective, domain, 20)
+    assert found.counts.shortened == 2 and found.counts.rejected >= 1
+    assert 1 <= found.counts.cut <= 2  # that of step 5
+    assert len(found.agreement) == found.gradients - 2 and max(found.agreement) > 0.99 > min(found.agreement)
+
+
+def test_a_smooth_objective_is_taken_as_it_comes() -> None:
+    domain = Domain(torch.full((12,), 0.5), (Block(12, "linf", 0.3),))
+    found = told(
+        make_policy("pgd"), lambda _, u: Evaluation(float(u.sum()), torch.ones(12), torch.zeros(2), False), domain, 10
+    )
+    assert vars(found.counts) == {"cut": 0, "shortened": 0, "rejected": 0}
+    assert found.agreement == pytest.approx([1.0] * (found.gradients - 1))
+
+
+def test_gradients_of_zero_agree_with_nothing() -> None:
+    domain = Domain(torch.full((12,), 0.5), (Block(12, "linf", 0.3),))
+    found = told(make_policy("pgd"), lambda _, u: Evaluation(0.0, torch.zeros(12), torch.zeros(2), False), domain, 10)
+    assert found.agreement == () and found.gradients > 1
+
+
+def test_random_search_counts_nothing() -> None:
+    assert make_policy("random").counts(None) == Counts()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import statistics
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -162,8 +163,22 @@ def _answers(
             "re_evaluated": findings.search.best_objective,
             "success_rate": findings.search.success_rate,
         }
+        summary["gradients"] = _gradients(findings.search)
         summary["configuration"] = problem.describe(problem.domain.project(findings.search.best_u))
     return summary
+
+
+def _gradients(found: SearchResult) -> dict[str, Any]:
+    """What the search saw of its gradients, and what its policy did about them and about steps that failed."""
+    norms = [record.gradient_norm for record in found.history if record.objective == record.objective]
+    return {
+        "count": found.gradients,
+        "cosine_with_the_one_before": statistics.median(found.agreement) if found.agreement else None,
+        "zero": sum(norm == 0.0 for norm in norms),
+        "non_finite_elements": found.non_finite_elements,
+        "non_finite_objectives": found.non_finite_objectives,
+        **vars(found.counts),
+    }
 
 
 def _average(findings: Findings, problem: Problem) -> dict[str, Any]:

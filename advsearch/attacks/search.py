@@ -17,7 +17,7 @@ from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import TOLERANCE, Domain
 from advsearch.attacks.ending import Ending
 from advsearch.attacks.evaluation import Evaluate, Evaluation, StopWhen, usable
-from advsearch.attacks.policies.base import Policy, Proposal, affordable, answer_of
+from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, affordable, answer_of
 from advsearch.attacks.policies.choices import with_choices
 from advsearch.errors import InputError
 from advsearch.seeds import stream
@@ -87,6 +87,9 @@ class SearchResult:
         non_finite_objectives: evaluations whose objective was NaN or infinite.
         non_finite_elements: gradient elements that were set to zero, over all evaluations.
         seconds: total time, evaluations included.
+        agreement: cosines of gradients with those before them, in their order: what noise and the way between left of
+            them; none for gradients of zero.
+        counts: what the policy had to do about gradients and steps.
         distribution: what the policy answers beside `best_u`, if it is one that answers with a distribution.
     """
 
@@ -103,6 +106,8 @@ class SearchResult:
     non_finite_objectives: int
     non_finite_elements: int
     seconds: float
+    agreement: tuple[float, ...] = ()
+    counts: Counts = NO_COUNTS
     distribution: Distribution | None = None
 
 
@@ -193,7 +198,10 @@ class _Log:
     gradients: int = 0
     non_finite: int = 0
     renders: int = 0
+    before: Tensor | None = None
+    agreement: list[float] = field(default_factory=list)
     answer: Callable[[], Distribution | None] = lambda: None
+    counts: Callable[[], Counts] = lambda: NO_COUNTS
 
     def render(self, proposal: Proposal, index: int, phase: Phase) -> Evaluation:
         """Evaluate one proposal and take note of it."""
@@ -227,9 +235,18 @@ class _Log:
             samples=proposal.samples,
         )
         self.records.append(record)
+        self._compare(evaluation.gradient)
         if self.on_step is not None:
             self.on_step(record, proposal.u, evaluation)
         return evaluation
+
+    def _compare(self, gradient: Tensor | None) -> None:
+        """Note the cosine of a gradient with the one before that was not zero."""
+        if gradient is None or not bool(gradient.any()):
+            return
+        if self.before is not None:
+            self.agreement.append(float(torch.cosine_similarity(gradient, self.before, dim=0, eps=1e-30)))
+        self.before = gradient
 
 
 def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, stop_when: StopWhen | None, late: Late) -> Ending:
@@ -252,7 +269,7 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, stop_when: S
             return Ending.FOUND
         if log.renders < steps:
             state = policy.update(state, proposal.u, evaluation)
-            log.answer = partial(answer_of, policy, state)
+            log.answer, log.counts = partial(answer_of, policy, state), partial(policy.counts, state)
         if late(len(log.records)):
             break
     return Ending.BUDGET_SPENT
@@ -291,6 +308,8 @@ def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
         non_finite_objectives=log.non_finite,
         non_finite_elements=sum(r.non_finite for r in log.records),
         seconds=seconds,
+        agreement=tuple(log.agreement),
+        counts=log.counts(),
         distribution=log.answer(),
     )
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.evaluation import Evaluation
-from advsearch.attacks.policies.base import Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.clipping import clipped
 from advsearch.attacks.policies.pgd import PATIENCE
 from advsearch.attacks.policies.scaling import half_widths
@@ -34,6 +34,7 @@ class AdamState:
         best: the largest objective so far.
         peak: (d,) where it was met.
         lengths: of the latest gradients, as `clipped` wants them.
+        counts: outliers cut and steps taken back so far.
         shrunk: what the rate is multiplied by; half of it is gone after every objective that could not be computed.
     """
 
@@ -51,6 +52,7 @@ class AdamState:
     peak: Tensor | None = None
     shrunk: float = 1.0
     lengths: tuple[float, ...] = ()
+    counts: Counts = NO_COUNTS
 
 
 @dataclass(frozen=True)
@@ -111,9 +113,13 @@ class Adam(Policy[AdamState]):
         if evaluation.objective > state.best:
             state = replace(state, best=evaluation.objective, peak=u)
         if evaluation.gradient is not None:
-            gradient, lengths = clipped(state.domain, evaluation.gradient, state.lengths)
-            state = replace(self._learn(state, gradient), lengths=lengths)
+            gradient, lengths, outliers = clipped(state.domain, evaluation.gradient, state.lengths)
+            counts = state.counts + outliers
+            state = replace(self._learn(state, gradient), lengths=lengths, counts=counts)
         return replace(state, u=state.domain.project(torch.addcmul(u, state.scale, self._way(state), value=rate)))
+
+    def counts(self, state: AdamState) -> Counts:
+        return state.counts
 
     def _way(self, state: AdamState) -> Tensor:
         """Return the step for the rate 1, in units of `scale`; at random as long as nothing is known."""
@@ -143,4 +149,5 @@ def _retreat(state: AdamState) -> AdamState:
     """Go back to the best configuration, or else to where the search began, and forget the gradients."""
     zero = torch.zeros_like(state.u)
     u = state.domain.begin if state.peak is None else state.peak
-    return replace(state, u=u, mean=zero, square=zero, taken=0, shrunk=state.shrunk / 2)
+    counts = state.counts + Counts(rejected=1)
+    return replace(state, u=u, mean=zero, square=zero, taken=0, shrunk=state.shrunk / 2, counts=counts)

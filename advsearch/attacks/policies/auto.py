@@ -11,7 +11,7 @@ from torch import Tensor
 
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.evaluation import Evaluation, Wanted
-from advsearch.attacks.policies.base import Policy, Proposal, draw_seed, one_thread, seeded
+from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, draw_seed, one_thread, seeded
 from advsearch.attacks.policies.coordinates import Coordinates, box_coordinates
 from advsearch.attacks.policies.pgd import PGD, PGDState
 from advsearch.attacks.policies.surrogate import Scales, Surrogate, fit
@@ -159,10 +159,14 @@ class Auto(Policy[AutoState]):
         if state.climbing and state.ascent is not None:
             ascent = PGD().update(state.ascent, u, evaluation)
             if state.trial is not None and evaluation.objective < state.trial.objective:
-                ascent = replace(ascent, u=state.domain.project(state.box.put(ascent.u, state.trial.x)))
+                u = state.domain.project(state.box.put(ascent.u, state.trial.x))
+                ascent = replace(ascent, u=u, counts=ascent.counts + Counts(rejected=1))
             return replace(state, ascent=ascent, last=evaluation.objective)
         points = torch.cat([state.points, state.box.take(u)[None]])
         return replace(state, points=points, values=(*state.values, evaluation.objective))
+
+    def counts(self, state: AutoState) -> Counts:
+        return NO_COUNTS if state.ascent is None else PGD().counts(state.ascent)
 
 
 def make_plan(domain: Domain, box: Coordinates, steps: int) -> Plan:

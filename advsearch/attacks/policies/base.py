@@ -49,6 +49,27 @@ class Proposal:
         return self.samples * (1 + (domain.gradient_cost if self.gradient is True else 0))
 
 
+@dataclass(frozen=True)
+class Counts:
+    """What a policy had to do about the evaluations it was told; for the summary of a run.
+
+    Attributes:
+        cut: gradients of which single numbers were outliers and cut (see `clipping`).
+        shortened: gradients that were outliers as a whole.
+        rejected: steps that were taken back: the search went on from a configuration before them.
+    """
+
+    cut: int = 0
+    shortened: int = 0
+    rejected: int = 0
+
+    def __add__(self, other: Counts) -> Counts:
+        return Counts(self.cut + other.cut, self.shortened + other.shortened, self.rejected + other.rejected)
+
+
+NO_COUNTS = Counts()
+
+
 class Policy(ABC, Generic[State]):
     """Proposes configurations, one at a time. Write a new one by implementing the three methods below.
 
@@ -90,6 +111,10 @@ class Policy(ABC, Generic[State]):
         its objective is finite or -inf, which stands for "could not be evaluated". The objective is noisy: the same u
         with another seed gives another value, and a maximum over many is biased upwards.
         """
+
+    def counts(self, state: State) -> Counts:
+        """Return what the policy did about the evaluations so far; nothing where it takes them as they come."""
+        return NO_COUNTS
 
 
 class Distributional(Policy[State]):

@@ -13,7 +13,7 @@ from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Block, Domain, centre_of_option
 from advsearch.attacks.evaluation import Evaluation
 from advsearch.attacks.policies import racing
-from advsearch.attacks.policies.base import Distributional, Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import Counts, Distributional, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.racing import Race, Runner
 from advsearch.attacks.policies.stay import Stay
 
@@ -95,6 +95,9 @@ class Choices(Distributional[ChoicesState]):
         if evaluation.gradient is not None:
             evaluation = replace(evaluation, gradient=evaluation.gradient[state.numbers])
         return replace(state, race=racing.update(state.race, u[state.numbers], evaluation))
+
+    def counts(self, state: ChoicesState) -> Counts:
+        return racing.counts(state.race)
 
     def answer(self, state: ChoicesState) -> Distribution | None:
         inner = racing.answer(state.race)

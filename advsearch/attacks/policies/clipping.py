@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain
+from advsearch.attacks.policies.base import Counts
 
 CLIP = 3.0
 """What exceeds the median so many times is out of the usual."""
@@ -25,8 +26,8 @@ FEWEST = 8
 """Fewer numbers than this have no median to speak of."""
 
 
-def clipped(domain: Domain, gradient: Tensor, lengths: tuple[float, ...]) -> tuple[Tensor, tuple[float, ...]]:
-    """Return a gradient without outliers, and the lengths of the latest gradients.
+def clipped(domain: Domain, gradient: Tensor, lengths: tuple[float, ...]) -> tuple[Tensor, tuple[float, ...], Counts]:
+    """Return a gradient without outliers, the lengths of the latest gradients, and what was an outlier.
 
     - In a ball of at least `FEWEST` numbers, each is cut to so many medians of those that are not zero: `CLIP` in an
       l-infinity ball, where the step follows the signs, so that this changes how gradients are averaged and no single
@@ -38,7 +39,7 @@ def clipped(domain: Domain, gradient: Tensor, lengths: tuple[float, ...]) -> tup
         gradient: (d,) float32, finite.
         lengths: of the gradients before, the latest last.
     """
-    out = gradient
+    out, cut, shortened = gradient, False, False
     for block, part in domain.parts():
         if block.norm != "box" and block.size >= FEWEST:
             sizes = out[part].abs()
@@ -46,10 +47,12 @@ def clipped(domain: Domain, gradient: Tensor, lengths: tuple[float, ...]) -> tup
             if some.numel():
                 limit = (CLIP if block.norm == "linf" else CLIP_L2) * float(some.median())
                 out = out.clone() if out is gradient else out
+                cut = cut or float(sizes.amax()) > limit
                 out[part] = out[part].clamp(-limit, limit)
     length = float(torch.linalg.vector_norm(out))
     lengths = (*lengths, length)[-MEMORY:]
     usual = sorted(lengths)[len(lengths) // 2]
     if length > CLIP * usual > 0.0:
+        shortened = True
         out = out * (CLIP * usual / length)
-    return out, lengths
+    return out, lengths, Counts(int(cut), int(shortened))

@@ -8,13 +8,12 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.evaluation import Evaluation
 from advsearch.attacks.policies import racing
-from advsearch.attacks.policies.base import Distributional, Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.choices import with_choices
-from advsearch.attacks.policies.racing import Race, Runner
+from advsearch.attacks.policies.racing import Race, Raced, Runner
 from advsearch.attacks.policies.stay import Stay
 from advsearch.errors import InputError
 
@@ -32,7 +31,7 @@ WORTH = 8
 
 
 @dataclass(frozen=True)
-class Halving(Distributional[Race]):
+class Halving(Raced):
     """Successive halving over starts and sample counts (Karnin, Koren and Somekh 2013; Jamieson and Talwalkar 2016).
 
     Starts are the clean configuration and samples of the domain (by turns at the extremes of the norm balls and inside,
@@ -93,6 +92,3 @@ class Halving(Distributional[Race]):
 
     def update(self, state: Race, u: Tensor, evaluation: Evaluation) -> Race:
         return racing.update(state, u, evaluation)
-
-    def answer(self, state: Race) -> Distribution | None:
-        return racing.answer(state)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.evaluation import Evaluation
-from advsearch.attacks.policies.base import Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.clipping import clipped
 from advsearch.errors import InputError
 
@@ -96,6 +96,7 @@ class PGDState:
         flat: evaluations in a row whose gradient was zero.
         count: evaluations so far.
         lengths: of the latest gradients, as `clipped` wants them.
+        counts: outliers cut and steps taken back so far.
     """
 
     domain: Domain
@@ -109,6 +110,7 @@ class PGDState:
     flat: int = 0
     count: int = 0
     lengths: tuple[float, ...] = ()
+    counts: Counts = NO_COUNTS
 
 
 @dataclass(frozen=True)
@@ -176,8 +178,8 @@ class PGD(Policy[PGDState]):
             return _retreat(state)
         gradient = evaluation.gradient
         if gradient is not None:
-            gradient, lengths = clipped(state.domain, gradient, state.lengths)
-            state = replace(state, lengths=lengths)
+            gradient, lengths, outliers = clipped(state.domain, gradient, state.lengths)
+            state = replace(state, lengths=lengths, counts=state.counts + outliers)
         state = _accumulate(state, gradient, self.momentum)
         if state.peak is None or evaluation.objective > state.peak.objective:
             state = replace(state, peak=Peak(evaluation.objective, u, state.direction))
@@ -186,10 +188,13 @@ class PGD(Policy[PGDState]):
             return _step(state, u, state.direction)
         return _checkpoint(state, u)
 
+    def counts(self, state: PGDState) -> Counts:
+        return state.counts
+
 
 def _retreat(state: PGDState) -> PGDState:
     """Return to the best configuration itself with half the step size; if there is none, leave the start at random."""
-    state = replace(state, step_size=state.step_size / 2)
+    state = replace(state, step_size=state.step_size / 2, counts=state.counts + Counts(rejected=1))
     if state.peak is None:
         return _step(state, state.domain.begin, torch.zeros_like(state.u))
     return replace(state, u=state.peak.u, direction=state.peak.direction)
@@ -215,6 +220,7 @@ def _checkpoint(state: PGDState, u: Tensor) -> PGDState:
     direction = state.direction
     if peak is not None and stalled and window.lags(best):
         u, direction = peak.u, peak.direction
+        state = replace(state, counts=state.counts + Counts(rejected=1))
     step_size = state.step_size / 2 if stalled else state.step_size
     window = window.next(state.steps, best, stalled)
     state = replace(state, step_size=step_size, direction=direction, window=window)

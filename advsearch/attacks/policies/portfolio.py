@@ -6,22 +6,19 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor
 
-from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.evaluation import Evaluation
 from advsearch.attacks.policies import racing
 from advsearch.attacks.policies.auto import Auto
-from advsearch.attacks.policies.base import Distributional, Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import Policy, draw_seed, seeded
 from advsearch.attacks.policies.choices import with_choices
 from advsearch.attacks.policies.cmaes import CMAES
-from advsearch.attacks.policies.racing import Race, Runner
+from advsearch.attacks.policies.racing import Race, Raced, Runner
 from advsearch.errors import InputError
 
 
 @dataclass(frozen=True)
-class Portfolio(Distributional[Race]):
+class Portfolio(Raced):
     """Lets several policies search side by side and goes on with those that reached more.
 
     With n policies there are 1 + ceil(log2 n) rounds of equally many renders, see `racing`. Within a round every policy
@@ -67,12 +64,3 @@ class Portfolio(Distributional[Race]):
         if not runners:
             raise errors[0]
         return racing.line_up(tuple(runners), steps, seed, eta=2)
-
-    def propose(self, state: Race) -> tuple[Proposal | None, Race]:
-        return racing.propose(state)
-
-    def update(self, state: Race, u: Tensor, evaluation: Evaluation) -> Race:
-        return racing.update(state, u, evaluation)
-
-    def answer(self, state: Race) -> Distribution | None:
-        return racing.answer(state)

@@ -19,7 +19,16 @@ from torch import Tensor
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.evaluation import Evaluation
-from advsearch.attacks.policies.base import Policy, Proposal, affordable, answer_of, seeded
+from advsearch.attacks.policies.base import (
+    NO_COUNTS,
+    Counts,
+    Distributional,
+    Policy,
+    Proposal,
+    affordable,
+    answer_of,
+    seeded,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +161,28 @@ def answer(race: Race) -> Distribution | None:
     """Return the leader's distribution, if it has one."""
     runner = race.runners[leader(race)]
     return None if runner.state is None else answer_of(runner.policy, runner.state)
+
+
+def counts(race: Race) -> Counts:
+    """Return the sum over all searches."""
+    begun = [runner for runner in race.runners if runner.state is not None]
+    return sum((runner.policy.counts(runner.state) for runner in begun), NO_COUNTS)
+
+
+class Raced(Distributional[Race]):
+    """A policy that is a race; its `start` lines it up."""
+
+    def propose(self, state: Race) -> tuple[Proposal | None, Race]:
+        return propose(state)
+
+    def update(self, state: Race, u: Tensor, evaluation: Evaluation) -> Race:
+        return update(state, u, evaluation)
+
+    def answer(self, state: Race) -> Distribution | None:
+        return answer(state)
+
+    def counts(self, state: Race) -> Counts:
+        return counts(state)
 
 
 # ---- turns and rounds -----------------------------------------------------------------------------------------------

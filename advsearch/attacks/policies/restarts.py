@@ -6,20 +6,17 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor
 
-from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.evaluation import Evaluation
 from advsearch.attacks.policies import racing
-from advsearch.attacks.policies.base import Distributional, Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import Policy, draw_seed, seeded
 from advsearch.attacks.policies.pgd import PGD
-from advsearch.attacks.policies.racing import Race, Runner
+from advsearch.attacks.policies.racing import Race, Raced, Runner
 from advsearch.errors import InputError
 
 
 @dataclass(frozen=True)
-class Restarts(Distributional[Race]):
+class Restarts(Raced):
     """Lets a policy search `times` times, one search after the other, each with an equal share of the renders.
 
     The first begins where the policy would begin by itself, the others at samples of the domain (`Domain.sample`); the
@@ -57,12 +54,3 @@ class Restarts(Distributional[Race]):
         begins = (domain.begin, *(domain.sample(seeded(seed, number))[0] for number in range(1, count)))
         runners = tuple(Runner(self.policy, replace(domain, first=begin)) for begin in begins)
         return racing.line_up(runners, steps, seed, eta=1)
-
-    def propose(self, state: Race) -> tuple[Proposal | None, Race]:
-        return racing.propose(state)
-
-    def update(self, state: Race, u: Tensor, evaluation: Evaluation) -> Race:
-        return racing.update(state, u, evaluation)
-
-    def answer(self, state: Race) -> Distribution | None:
-        return racing.answer(state)
