@@ -48,7 +48,7 @@ typecheck: $(STAMP) ## mypy, strict, on the package
 	@$(BIN)/mypy
 
 # what compares answers and not times, and takes long
-STUDIES := searches closed_form policies precision kill
+STUDIES := searches close_calls closed_form policies precision kill
 
 bench: $(STAMP) ## the benchmarks: ratios against a floor measured in the same run
 	@set -e; for file in $(filter-out $(STUDIES:%=benchmarks/%.py),$(wildcard benchmarks/[!_]*.py)); do \

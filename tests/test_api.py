@@ -242,7 +242,7 @@ def test_mistakes_are_explained_and_leave_nothing(scene: advsearch.Scene, level:
     with pytest.raises(InputError, match="--label"):
         advsearch.attack(scene, victim, label="teapot", run=run, **FAST)
     with pytest.raises(
-        InputError, match="the object's own label does not fit the model; say which is right with --label"
+        InputError, match="the label of teapot itself does not fit the model; say which is right with --label"
     ):
         advsearch.attack("teapot", victim, run=run, **FAST)
     with pytest.raises(UnknownNameError, match=r"unknown policy 'pgdd'. Did you mean 'pgd'"):

@@ -379,3 +379,35 @@ def test_the_start_is_the_scene_as_it_is_in_a_picture_that_is_not_square() -> No
         with torch.no_grad():
             difference = render(render.start, seed=0, spp=32) - plain(plain.start, seed=0, spp=32)
         assert float(difference.abs().mean()) < 2e-3
+
+
+# ---- how fast things move -------------------------------------------------------------------------------------------
+
+
+def azimuth_speed(**fixed: float) -> float:
+    """Pixels a degree of azimuth."""
+    scene = load_scene("mug", settings={name.replace("_", ".", 1): value for name, value in fixed.items()})
+    made = scene.renderer({"camera": {"azimuth": [30, 50]}}, resolution=SIZE, denoise="none")
+    return 1.0 / made.plan.groups[0].step / 20.0
+
+
+def test_the_camera_follows_what_is_seen_behind_the_object() -> None:
+    open_air = azimuth_speed(ground_size=0.0, camera_elevation=5.0)
+    focal = SIZE / 2.0 / math.tan(math.radians(35.0 / 2.0))
+    assert 1.0 <= open_air / math.radians(focal) <= 1.2  # what is far turns with the camera, faster at the edges
+    below = azimuth_speed(ground_size=0.0, camera_elevation=30.0)
+    assert below > 0.8 * math.radians(focal) * math.cos(math.radians(30.0))
+
+
+def test_what_the_ground_hides_is_not_followed() -> None:
+    hidden = azimuth_speed(ground_size=1000.0, camera_elevation=45.0)
+    assert hidden < 0.7 * azimuth_speed(ground_size=0.0, camera_elevation=45.0)
+
+
+def test_the_smooth_loss_does_not_see_the_edge_of_the_picture() -> None:
+    loss = smooth_loss((SIZE, SIZE), seed=3)
+    picture = torch.rand(SIZE, SIZE, 3)
+    framed = picture.clone()
+    framed[0], framed[-1], framed[:, 0], framed[:, -1] = 100.0, 100.0, 100.0, 100.0
+    assert float(loss(framed)) == pytest.approx(float(loss(picture)), abs=1e-4)
+    assert abs(float(loss(picture))) > 1e-4

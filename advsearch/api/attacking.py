@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from advsearch import seeds
 from advsearch.api.memory import Memory
-from advsearch.api.naming import load_models, scene_settings
+from advsearch.api.naming import load_models, right_answers, scene_settings
 from advsearch.api.outcome import AttackResult, summarise
 from advsearch.api.problem import Problem
 from advsearch.api.record import Recorder, Stages
@@ -247,30 +247,10 @@ def _policy_options(config: AttackConfig) -> dict[str, Any]:
     return config.policy_options | ({} if config.step_size is None else {"step_size": config.step_size})
 
 
-def _label_set(model: Model, config: AttackConfig, label: str | None) -> LabelSet:
-    """The right answers: what was said, or else the object's own label."""
-    if config.label is not None:
-        try:
-            return model.label_set(config.label)
-        except InputError as error:
-            raise InputError(f"--label: {error}") from None
-    if label is None:
-        raise InputError(
-            f'--label: expected the right answers for {config.object}, got none; add --label "name" with a class of '
-            f"model {model.name}"
-        )
-    try:
-        return model.label_set(label)
-    except InputError as error:
-        raise InputError(
-            f"the object's own label does not fit the model; say which is right with --label ({error})"
-        ) from None
-
-
 def _problem(job: _Job) -> Problem:
     config, (model, _) = job.config, job.loaded
     description = job.scene.description
-    labels = _label_set(model, config, description.object.label)
+    labels = right_answers(model, config.label, config.object, description.object.label)
     resolution = config.resolution or (model.input_size[0], model.input_size[1])
     description = framed(description, resolution)
     space = make_space((*job.controls, *job.over), description)

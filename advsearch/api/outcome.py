@@ -175,8 +175,6 @@ def _gradients(found: SearchResult) -> dict[str, Any]:
         "count": found.gradients,
         "cosine_with_the_one_before": statistics.median(found.agreement) if found.agreement else None,
         "zero": sum(norm == 0.0 for norm in norms),
-        "non_finite_elements": found.non_finite_elements,
-        "non_finite_objectives": found.non_finite_objectives,
         **vars(found.counts),
     }
 

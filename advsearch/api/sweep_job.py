@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+from advsearch.api.naming import right_answers
 from advsearch.api.scene import Scene, framed
 from advsearch.api.sweep_axes import Axis, on_grid
 from advsearch.api.sweep_points import BINS, Drawn, Points
@@ -88,16 +89,7 @@ class Job:
             InputError: the model has no such class, or the object has no label.
         """
         own = place.scene.description.object.label
-        if self.config.label is None and own is None:
-            raise InputError(
-                f'--label: expected the right answers for {place.object}, got none; add --label "name" with a class of '
-                f"model {model.name}"
-            )
-        try:
-            return model.label_set(self.config.label if self.config.label is not None else str(own))
-        except InputError as error:
-            whose = "" if self.config.label is not None else f"the label of {place.object} itself does not fit: "
-            raise InputError(f"--label: {whose}{error}") from None
+        return right_answers(model, self.config.label, place.object, own)
 
 
 def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.evaluation import Evaluation
-from advsearch.attacks.policies.base import Policy, Proposal, State
+from advsearch.attacks.policies.base import Counts, Policy, Proposal, State
 from advsearch.errors import InputError
 
 Z = 1.0
@@ -143,6 +143,15 @@ class CloseCalls(Policy[Calls[Any]]):
     def uses_gradient(self) -> bool:
         """As the policy underneath."""
         return self.policy.uses_gradient
+
+    @property
+    def handles_choices(self) -> bool:  # type: ignore[override]
+        """As the policy underneath."""
+        return self.policy.handles_choices
+
+    def counts(self, state: Calls[Any]) -> Counts:
+        """See `Policy.counts`."""
+        return self.policy.counts(state.inner)
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Calls[Any]:
         """See `Policy.start`."""

@@ -98,7 +98,11 @@ class Estimate:
 
 
 def smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
-    """Return a linear loss with smooth weights: a sum of a few waves of the picture's size, other in each channel."""
+    """Return a linear loss with smooth weights: a sum of a few waves of the picture's size, other in each channel.
+
+    They fall to zero at the picture's edge (a Hann window). With a hard edge the loss would be as rough as whatever
+    moves across it, a photographed interior above all, and its differences would depend on the step.
+    """
     generator = torch.Generator().manual_seed(seeds.stream(seed, "smooth loss"))
     height, width = resolution
     rows = torch.linspace(-1.0, 1.0, height)[:, None, None]
@@ -107,7 +111,8 @@ def smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
     for _ in range(6):
         across, down, phase, size = (torch.rand(3, generator=generator) * 2.0 - 1.0 for _ in range(4))
         weights += size * torch.cos(math.pi * (1.2 * across * columns + 1.2 * down * rows + phase))
-    weights /= height * width
+    window = torch.cos(0.5 * math.pi * rows).square() * torch.cos(0.5 * math.pi * columns).square()
+    weights *= window / (height * width)
 
     def loss(image: Tensor) -> Tensor:
         return (image * weights).sum()

@@ -25,12 +25,14 @@ NUDGES = (2e-3, 2e-4, 2e-5, 2e-6)
 
 DIRECTIONS = 4000
 """Directions in which the environment is followed: some hundred of them lie in a frame."""
+EDGE = 25
+"""Points that are followed along each side of the ground plane."""
 FAR = 1e4
 """How far away its points are taken to be, in scene units."""
 
 
 class Motion:
-    """Projects the vertices of a scene's meshes, and points of the environment behind them, into the picture.
+    """Projects a scene's vertices, the ground's edge and what is seen of the environment into the picture.
 
     A camera that goes around an object hardly moves the object's outline, but all that lies behind it.
 
@@ -47,7 +49,9 @@ class Motion:
         self._assembly = assembly
         self._camera = torch.from_numpy(camera_to_world(description, width / height)).to(torch.float64)
         self._fov = description.number("camera.fov")
-        self._far = _far_points(bool(description.number("ground.size")), description.backdrop is not None)
+        self._ground = description.number("ground.size") / 2.0
+        self._edge = _edge_points(self._ground)
+        self._far = _far_points(description.backdrop)
         self._picks = {
             name: torch.from_numpy(np.linspace(0, len(mesh.vertices) - 1, min(POINTS, len(mesh.vertices))).astype(int))
             for name, mesh in assembly.meshes.items()
@@ -64,15 +68,24 @@ class Motion:
             if vertices is None:
                 vertices = mesh.place(None, None)[0]
             found.append(vertices[self._picks[name]].double())
-        found.append(self._far)
+        found += [self._edge, self._far]
         relative = (torch.cat(found) - camera[:3, 3]) @ camera[:3, :3]
         depth = relative[:, 2]
         seen = depth > 1e-3
+        seen[len(seen) - len(self._far) :] &= ~self._behind_ground(camera[:3, 3])
         projected = focal * relative[:, :2] / depth.clamp_min(1e-3)[:, None]
         for axis, name in enumerate(("camera.shift_x", "camera.shift_y")):
             if name in inputs:
                 projected[:, axis] += 2.0 * self._frame[axis] * inputs[name].double().reshape(())
         return projected, seen & (projected.abs() <= 1.2 * self._frame.double()).all(dim=1)
+
+    def _behind_ground(self, eye: Tensor) -> Tensor:
+        """Which of the far points the ground plane hides from a camera at `eye`."""
+        downwards = (self._far - eye)[:, 2]
+        reach = -eye[2] / downwards.clamp_max(-1e-9)
+        hit = eye + reach[:, None] * (self._far - eye)
+        on_it = (hit[:, :2].abs() <= self._ground).all(dim=1)
+        return (downwards < 0.0) & bool(eye[2] > 0.0) & on_it
 
     def speeds(self, inputs: Callable[[Tensor], Mapping[str, Tensor]], u: Tensor, coordinates: list[int]) -> Tensor:
         """Return the speed of the fastest point in the frame for each coordinate, in pixels per unit of u.
@@ -97,17 +110,21 @@ class Motion:
         return speeds
 
 
-def _far_points(ground: bool, backdrop: bool) -> Tensor:
-    """(N, 3) points of the environment, evenly spread (Fibonacci spiral).
+def _edge_points(half: float) -> Tensor:
+    """(N, 3) points along the edge of the ground plane, a square of half the side `half` at height 0."""
+    along = torch.linspace(-half, half, EDGE, dtype=torch.float64) if half > 0.0 else torch.zeros(0).double()
+    side, zero = torch.full_like(along, half), torch.zeros_like(along)
+    sides = [(along, side), (along, -side), (side, along), (-side, along)]
+    return torch.cat([torch.stack([x, y, zero], dim=1) for x, y in sides])
 
-    Above the horizon where there is a ground, none where a plain colour hides them.
-    """
+
+def _far_points(backdrop: bool) -> Tensor:
+    """(N, 3) points of the environment, evenly spread (Fibonacci spiral); none where a plain colour hides them."""
     number = torch.arange(0 if backdrop else DIRECTIONS, dtype=torch.float64)
     height = 1.0 - (2.0 * number + 1.0) / DIRECTIONS
     turn = number * torch.pi * (3.0 - 5.0**0.5)
     radius = (1.0 - height**2).sqrt()
-    points = torch.stack([radius * turn.cos(), height, radius * turn.sin()], dim=1) * FAR
-    return points[points[:, 1] > 0.0] if ground else points
+    return torch.stack([radius * turn.cos(), radius * turn.sin(), height], dim=1) * FAR
 
 
 def steps_for(speeds: Tensor, pixels: float = DEFAULT_PIXELS) -> Tensor:
