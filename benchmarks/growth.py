@@ -1,6 +1,6 @@
-"""Time and memory of a search step over a thousand steps: neither may grow.
+"""Time and memory of a search step over two thousand steps: neither may grow.
 
-    python benchmarks/growth.py [--steps 1000] [--size 64]
+    python benchmarks/growth.py [--steps 2000] [--size 64]
 
 Prints the median step of the last tenth over that of the second tenth, and the resident memory at the end over that
 after the first tenth (by then every kernel is compiled and every pool is filled).
@@ -31,7 +31,7 @@ from advsearch.models import load_model  # noqa: E402
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=1000, help="steps of the search (default 1000)")
+    parser.add_argument("--steps", type=int, default=2000, help="steps of the search (default 2000)")
     parser.add_argument("--size", type=int, default=64, help="side of the picture in pixels (default 64)")
     args = parser.parse_args()
     description = load_scene("mug").description

@@ -95,7 +95,8 @@ def page(facts: Mapping[str, Mapping[str, Any]]) -> str:
         cells = [_cheapest(known, goal) for goal in GOALS]
         best = min(known, key=lambda point: float(point["error"]), default=None)
         cells.append("none known" if best is None else f"{100 * best['error']:.3g} %: {_setting(best)}")
-        lines.append(f"| [{name}](#{name}) | {' | '.join(cells)} |")
+        longer = "" if fact["seconds"] == some["seconds"] else f" ({fact['seconds']} s)"
+        lines.append(f"| [{name}](#{name}){longer} | {' | '.join(cells)} |")
     lines += ["", "## The picture, the margin and the policies", "", f"![diagrams](images/precision/{PICTURE}.svg)"]
     for name in shown:
         if "refused" not in facts[name]:

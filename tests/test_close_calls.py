@@ -14,7 +14,7 @@ from torch import Tensor
 from advsearch.attacks import Block, Domain, Evaluation, Policy, StepRecord, search
 from advsearch.attacks.close_calls import CloseCalls, Noise, more_renders, pooled
 from advsearch.attacks.evaluation import Wanted
-from advsearch.attacks.policies import Proposal, Random
+from advsearch.attacks.policies import Proposal, Random, make_policy
 from advsearch.errors import InputError
 
 NOISE = 0.3
@@ -127,3 +127,15 @@ def test_at_equal_renders_it_ends_higher_than_any_fixed_count() -> None:
     close = statistics.fmean(answer(CloseCalls(Random()), seed) for seed in range(120))
     for samples in (1, 2, 4, 8):
         assert close > statistics.fmean(answer(Fixed(samples=samples), seed) for seed in range(120)), samples
+
+
+def test_what_the_policy_underneath_handles_and_counts_is_passed_on() -> None:
+    domain = Domain(torch.full((16,), 0.5), (Block(16, "linf", 0.3),))
+
+    def evaluate(u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
+        slope = torch.ones(16) * (1e4 if index == 12 else 1.0)
+        return Evaluation(float(u.sum()), slope if gradient else None, torch.zeros(2), False, cost=samples)
+
+    found = search(evaluate, domain, CloseCalls(make_policy("pgd"), noise=0.0), steps=20, seed=1, candidates=0)
+    assert found.counts.shortened == 1
+    assert CloseCalls(make_policy("auto")).handles_choices and not CloseCalls(make_policy("pgd")).handles_choices

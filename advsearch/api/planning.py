@@ -11,7 +11,7 @@ from advsearch.api.bounces import bounces_of
 from advsearch.api.problem import Problem
 from advsearch.config import AttackConfig
 from advsearch.evaluation.gradients import inside
-from advsearch.evaluation.leaving_out import measured_gains, resolved_texels, sequence_of
+from advsearch.evaluation.leaving_out import measured_gains, resolved_texels, rows_of
 from advsearch.evaluation.planning import GOAL, Cosine, cosines, measured_plan, tuned
 from advsearch.progress import NullProgress, Progress
 from advsearch.scene.plan import BY_DIFFERENCES
@@ -84,7 +84,7 @@ def leaving_out(problem: Problem, config: AttackConfig, progress: Progress) -> d
         tick=lambda: progress.advance(1),
     )
     return {
-        "gains": sequence_of(gains),
+        "gains": rows_of(gains),
         "bounces": {**vars(bounces), "cuts": [vars(cut) for cut in bounces.cuts], "reason": bounces.reason},
         "texels": [vars(one) for one in resolved_texels(renderer, u, seed=seed)],
     }

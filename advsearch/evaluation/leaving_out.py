@@ -178,7 +178,7 @@ def _texels(scene: MitsubaScene, control: str, name: str, inputs: dict[str, Tens
     return Texels(control, side, seen, pixels, enough)
 
 
-def sequence_of(gains: Sequence[Gain]) -> list[dict[str, object]]:
+def rows_of(gains: Sequence[Gain]) -> list[dict[str, object]]:
     """Return rows for a file or a table."""
     return [
         {"item": one.item, "what": WHAT[one.item], "gain": one.gain}
