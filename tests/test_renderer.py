@@ -238,3 +238,29 @@ def test_metering_puts_a_white_card_under_uniform_light_at_its_level() -> None:
 
 def test_a_black_environment_meters_to_one() -> None:
     assert metered_gain(EnvironmentAsset("night", np.zeros((8, 16, 3), np.float32))) == 1.0
+
+
+def test_multijittered_samples_have_the_same_mean_and_less_noise() -> None:
+    scene = load_scene("mug")
+    plain, better = (
+        scene.renderer("camera", resolution=SIZE, denoise="none", sampler=name)
+        for name in ("independent", "multijitter")
+    )
+    assert better.formation.summary()["sampler"] == "multijitter"
+    with torch.no_grad():
+        pictures = {
+            name: torch.stack([render(render.start, seed, 16) for seed in range(8)])
+            for name, render in (("plain", plain), ("better", better))
+        }
+        again = scene.renderer("camera", resolution=SIZE, denoise="none", sampler="multijitter")
+        assert torch.equal(again(again.start, 3, 16), pictures["better"][3])
+    noise = {name: float(found.var(0).mean()) for name, found in pictures.items()}
+    assert noise["better"] < 0.75 * noise["plain"]
+    means = [found.mean(0) for found in pictures.values()]
+    assert float((means[0] - means[1]).square().mean()) < (noise["plain"] + noise["better"]) / 8 * 1.5
+    assert better.scene.like(max_depth=3)._made[-1] == "multijitter"
+
+
+def test_unknown_samplers_are_refused() -> None:
+    with pytest.raises(InputError, match="--pixel-sampler: expected one of independent, multijitter, got 'halton'"):
+        load_scene("mug").renderer("camera", resolution=SIZE, sampler="halton")

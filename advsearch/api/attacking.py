@@ -255,7 +255,9 @@ def _problem(job: _Job) -> Problem:
     description = framed(description, resolution)
     space = make_space((*job.controls, *job.over), description)
     left = EVERYTHING if config.specialise else NOTHING
-    renderer = make_renderer(description, space, resolution, config.denoise, config.seed, config.estimators, left)
+    renderer = make_renderer(
+        description, space, resolution, config.denoise, config.seed, config.estimators, left, config.pixel_sampler
+    )
     goal = _goal(model, labels, config)
     objective = _objective(job, goal, renderer)
     return Problem(

@@ -43,6 +43,7 @@ class Scene:
         denoise: str = "oidn",
         seed: int = 0,
         estimators: Mapping[str, str] | None = None,
+        sampler: str = "independent",
     ) -> Renderer:
         """Return `render(u, seed, spp)` for the space of these controls.
 
@@ -51,6 +52,7 @@ class Scene:
             resolution: side, or (height, width), in pixels.
             denoise: "oidn" or "none".
             seed: root of the noise; the `seed` of each call counts on from it.
+            sampler: "independent" or "multijitter".
             estimators: how derivatives are obtained, by "control.parameter", "control" or "*"; see `advsearch plan`.
 
         Raises:
@@ -58,7 +60,7 @@ class Scene:
         """
         description = framed(self.description, resolution)
         space = make_space(as_controls(controls), description)
-        return make_renderer(description, space, resolution, denoise, seed, estimators)
+        return make_renderer(description, space, resolution, denoise, seed, estimators, sampler=sampler)
 
     def with_settings(self, given: Mapping[str, float]) -> Scene:
         """Return the scene with some of its parameters fixed to other values.
@@ -105,14 +107,19 @@ def make_renderer(
     seed: int,
     estimators: Mapping[str, str] | None = None,
     leave_out: Collection[str] = EVERYTHING,
+    sampler: str = "independent",
 ) -> Renderer:
     """Put a described scene, with what the space's controls need in it, into Mitsuba at one size."""
     size = (resolution, resolution) if isinstance(resolution, int) else resolution
     description = space.scene or description
     formation = ImageFormation(
-        denoiser=denoise, exposure=description.number("camera.exposure"), resolution=size, gain=description.gain
+        denoiser=denoise,
+        sampler=sampler,
+        exposure=description.number("camera.exposure"),
+        resolution=size,
+        gain=description.gain,
     )
-    scene = MitsubaScene(description, size, filter=formation.filter, leave_out=leave_out)
+    scene = MitsubaScene(description, size, filter=formation.filter, leave_out=leave_out, sampler=sampler)
     motion = Motion(description, size, scene.assembly)
     return Renderer(scene, space, formation, seed, motion=motion, estimators=estimators)
 

@@ -37,7 +37,9 @@ class View:
         for size in dict.fromkeys(job.sizes):
             space = job.space(place, size)
             description = framed(place.scene.description, size)
-            self.renderers[size] = make_renderer(description, space, size, config.denoise, config.seed)
+            self.renderers[size] = make_renderer(
+                description, space, size, config.denoise, config.seed, sampler=config.pixel_sampler
+            )
             if len(self.renderers) == 1:
                 self.points = job.points(space)
         self.labels = tuple(job.label_set(place, model).indices for model in job.models)

@@ -9,7 +9,18 @@ from advsearch.cli import output
 
 HELP = "check the gradient of every parameter of a scene against differences"
 GROUPS = ("scene", "model")
-FIELDS = ("controls", "estimators", "spp", "denoise", "objective", "seed", "threads", "epsilon", "norm")
+FIELDS = (
+    "controls",
+    "estimators",
+    "spp",
+    "denoise",
+    "pixel_sampler",
+    "objective",
+    "seed",
+    "threads",
+    "epsilon",
+    "norm",
+)
 """The settings of `attack` that matter here, beside those of scene and model."""
 FELL_SHORT = 3
 

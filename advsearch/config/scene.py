@@ -97,6 +97,13 @@ class SceneConfig(Config):
     denoise: Literal["oidn", "none"] = setting(
         "oidn", "search", "denoiser of every render, in search and verification", "oidn or none"
     )
+    pixel_sampler: Literal["independent", "multijitter"] = setting(
+        "independent",
+        "search",
+        "how samples are spread over a pixel, in search and verification; multijitter has less noise, and rounds "
+        "sample counts up to products of two near numbers",
+        "independent or multijitter",
+    )
 
     seed: int = setting(
         0, "run", "root of every random stream", "a whole number from 0 to 2**63 - 1", ge=0, le=2**63 - 1

@@ -16,6 +16,7 @@ from torch import Tensor
 from advsearch.errors import InputError
 
 DENOISERS = ("oidn", "none")
+SAMPLERS = ("independent", "multijitter")
 FILTERS = ("box", "gaussian")
 
 
@@ -26,6 +27,8 @@ class ImageFormation:
     Attributes:
         denoiser: "oidn" (Intel Open Image Denoise with albedo and normals as guides) or "none".
         filter: reconstruction filter, "box" or "gaussian"; a gaussian correlates pixels, so the denoiser refuses it.
+        sampler: how samples are spread over a pixel: "independent", or "multijitter" (Kensler 2013, Correlated
+            multi-jittered sampling), whose noise is less.
         exposure: stops over the metered exposure; kept for the record, `gain` is what is applied.
         resolution: (height, width) in pixels.
         gain: factor from radiance to display-linear values.
@@ -35,6 +38,7 @@ class ImageFormation:
 
     denoiser: str = "oidn"
     filter: str = "box"
+    sampler: str = "independent"
     exposure: float = 0.0
     resolution: tuple[int, int] = (128, 128)
     gain: float = 1.0
@@ -43,6 +47,8 @@ class ImageFormation:
     def __post_init__(self) -> None:
         if self.denoiser not in DENOISERS:
             raise InputError(f"--denoise: expected one of {', '.join(DENOISERS)}, got {self.denoiser!r}")
+        if self.sampler not in SAMPLERS:
+            raise InputError(f"--pixel-sampler: expected one of {', '.join(SAMPLERS)}, got {self.sampler!r}")
         if self.filter not in FILTERS:
             raise InputError(f"reconstruction filter: expected one of {', '.join(FILTERS)}, got {self.filter!r}")
         if self.denoiser == "oidn" and self.filter != "box":
@@ -64,6 +70,7 @@ class ImageFormation:
         return {
             "denoiser": self.denoiser,
             "filter": self.filter,
+            "sampler": self.sampler,
             "exposure": self.exposure,
             "resolution": [height, width],
             "gain": self.gain,

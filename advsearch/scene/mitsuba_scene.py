@@ -70,7 +70,7 @@ class MitsubaScene:
         integrator: str = "prb",
     ) -> None:
         mi = mitsuba()
-        self._made = (description, resolution, filter, frozenset(leave_out))
+        self._made = (description, resolution, filter, frozenset(leave_out), sampler)
         self.resolution = resolution
         self.assembly = Assembly(description)
         self.max_depth = max_depth
@@ -120,8 +120,8 @@ class MitsubaScene:
     def like(self, **changes: Any) -> MitsubaScene:
         """Return another scene made as this one was, but with another `max_depth`, `sampler`, `integrator`, or
         `leave_out`."""
-        description, resolution, filter, leave_out = self._made
-        settings = {"max_depth": self.max_depth, "leave_out": leave_out, **changes}
+        description, resolution, filter, leave_out, sampler = self._made
+        settings = {"max_depth": self.max_depth, "leave_out": leave_out, "sampler": sampler, **changes}
         other = MitsubaScene(description, resolution, filter=filter, **settings)
         for what in ("path", "guides"):
             other._integrator(what)  # one that comes later makes the recordings of all scenes stale
