@@ -96,7 +96,7 @@ class Watch(NullProgress):
 
 def constant(configurations: int) -> None:
     """Print the speed of the loop and how much its memory grows, for a grid and for draws."""
-    sweep_view.make_renderer = lambda scene, space, size, denoise, seed: ConstantRenderer(size)  # type: ignore[attr-defined]
+    sweep_view.make_renderer = lambda scene, space, size, *more, **named: ConstantRenderer(size)  # type: ignore[attr-defined]
     model = load_model(Trivial(), labels=("mug", "vase"), input_size=16, name="trivial")
     side = max(1, round(configurations**0.5))
     grid = {"pose.yaw": f"0:360:{side}", "camera.elevation": f"5:60:{side}"}

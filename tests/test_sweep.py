@@ -65,7 +65,9 @@ class FakeRenderer:
     calls = 0
     level: float | None = None
 
-    def __init__(self, scene: Any, space: Any, size: tuple[int, int], denoise: str, seed: int) -> None:
+    def __init__(
+        self, scene: Any, space: Any, size: tuple[int, int], denoise: str, seed: int, sampler: str = "independent"
+    ) -> None:
         self.space, self.size, self.non_finite = space, size, 0
         self.formation = ImageFormation(denoiser=denoise, resolution=size)
         self.seen: list[tuple[Tensor, int, int]] = []

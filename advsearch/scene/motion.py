@@ -103,9 +103,9 @@ class Motion:
                     there = u.clone()
                     there[number] += size if float(u[number]) + size <= 1.0 else -size
                     moved, still = self.pixels(inputs(there))
-                    both = seen & still
-                    if bool(both.any()):
-                        speeds[number] = float((moved - here)[both].norm(dim=1).max()) / size
+                    distances = (moved - here)[seen & still].norm(dim=1)
+                    if bool((distances > 0.0).any()):  # what stands still says nothing of what has left the frame
+                        speeds[number] = float(distances.max()) / size
                         break
         return speeds
 
