@@ -143,7 +143,7 @@ def gimbal() -> Findings:
     angles = {"pose": {"yaw": [-90.0, 90.0], "pitch": [45.0, 135.0], "roll": [-90.0, 90.0], "on_ground": "no"}}
     locked = small(dark(), angles, settings=BARE)
     u = torch.tensor([0.7, 0.5, 0.5])
-    found = examine(locked, u, seeds=(3, 5))
+    found = examine(locked, u, seeds=(3, 12), spp=2 * SPP)
     with torch.no_grad():
         one = locked(torch.tensor([0.7, 0.5, 0.5]), 0, 16)
         other = locked(torch.tensor([0.5, 0.5, 0.3]), 0, 16)  # yaw 36 is roll -36 here

@@ -197,7 +197,7 @@ def examine(
     evaluations: int = 3,
     policy: Policy[Any] | None = None,
     spp: int = SPP,
-    seeds: tuple[int, int] = (3, 8),
+    seeds: tuple[int, int] = (3, 12),
 ) -> Examined:
     """Render a configuration, differentiate it, compare the gradient with differences, and search from there.
 
@@ -230,7 +230,7 @@ def examine(
 
 
 def compared(
-    renderer: Renderer, u: Tensor, *, spp: int = SPP, seeds: tuple[int, int] = (3, 8), repeats: int = 8
+    renderer: Renderer, u: Tensor, *, spp: int = SPP, seeds: tuple[int, int] = (3, 12), repeats: int = 24
 ) -> tuple[Compared, ...]:
     """Compare the plan's own gradient with common-random-number differences, of a linear loss of the raw picture."""
     before = renderer.formation
