@@ -232,8 +232,8 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
 def flag(name: str) -> str:
     """Return the flag of the setting `name`: ``texture_resolution`` is ``--texture-resolution``."""
     special = {"controls": "--control", "set_": "--set", "set": "--set"}
-    special |= {"estimators": "--estimator", "estimator": "--estimator", "baseline": "--no-baseline"}
-    special |= {"specialise": "--no-specialise"}
+    special |= {"estimators": "--estimator", "estimator": "--estimator"}
+    special |= {"baseline": "--no-baseline", "specialise": "--no-specialise"}
     return special.get(name) or "--" + name.replace("_", "-")
 
 

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from advsearch import seeds
 from advsearch.api.attacking import problem_from_config
@@ -30,9 +29,7 @@ from advsearch.api.bounces import bounces_of
 from advsearch.api.problem import Problem
 from advsearch.config import AttackConfig
 from advsearch.evaluation.gradients import inside, smooth_loss
-from advsearch.evaluation.precision_image import with_formation
 from advsearch.scene.leaving_out import NOTHING
-from advsearch.scene.renderer import Renderer
 
 PAIRS = (
     ("mug", "studio", "texture"),
@@ -83,9 +80,9 @@ def measured(pair: tuple[str, str, str], size: int, spp: int, repeats: int) -> d
     """One pair: times, errors, gains."""
     problem = problem_of(pair, size, pair[2])
     lean, u, loss = problem.renderer, inside(problem.renderer), smooth_loss((size, size))
-    full = with_formation(lean, lean.scene.like(leave_out=NOTHING))
+    full = lean.like(lean.scene.like(leave_out=NOTHING))
     depth = bounces_of(problem, 0).depth
-    ways: list[tuple[Renderer, int | None]] = [(lean, None), (full, None), (lean, depth)]
+    ways = [lean, full, lean.like(lean.scene.like(max_depth=depth))]
     truth = torch.stack(
         [
             one.gradient(loss, u, seeds.stream(1, "truth", n), 8 * spp)[1]
@@ -94,12 +91,12 @@ def measured(pair: tuple[str, str, str], size: int, spp: int, repeats: int) -> d
         ]
     ).mean(dim=0)
     for way in ways:
-        gradient(way, loss, u, 0, spp)
+        way.gradient(loss, u, 0, spp)
     found: list[list[tuple[float, float]]] = [[] for _ in ways]
     for number in range(repeats):
         for way, results in zip(ways, found, strict=True):
             begun = time.perf_counter()
-            estimate = gradient(way, loss, u, seeds.stream(2, "working", number), spp)
+            estimate = way.gradient(loss, u, seeds.stream(2, "working", number), spp)[1]
             seconds = time.perf_counter() - begun
             results.append((seconds, float((estimate - truth).square().sum())))
     times = [statistics.median(one[0] for one in results) for results in found]
@@ -116,18 +113,11 @@ def measured(pair: tuple[str, str, str], size: int, spp: int, repeats: int) -> d
     }
 
 
-def gradient(way: tuple[Renderer, int | None], loss: Any, u: Tensor, seed: int, spp: int) -> Tensor:
-    """One gradient."""
-    renderer, depth = way
-    with renderer.scene.shorter(depth):
-        return renderer.gradient(loss, u, seed, spp)[1]
-
-
 def agreement(pair: tuple[str, str, str], size: int, spp: int, count: int) -> dict[str, int]:
     """Verdicts with everything and with nothing left out, over textures, poses and cameras."""
     problem = problem_of(pair, size, "texture,pose,camera")
     lean = problem.renderer
-    full = with_formation(lean, lean.scene.like(leave_out=NOTHING))
+    full = lean.like(lean.scene.like(leave_out=NOTHING))
     depth = bounces_of(problem, 0).depth
     same = other = 0
     with torch.no_grad():

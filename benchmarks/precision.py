@@ -29,7 +29,6 @@ from advsearch.evaluation.precision_image import (  # noqa: E402
     REFERENCE_SAMPLER,
     PictureBench,
     variants,
-    with_formation,
 )
 from advsearch.evaluation.precision_points import Sample, Setting, point_of  # noqa: E402
 
@@ -110,8 +109,8 @@ def measured(config: PrecisionConfig, found: dict[str, Any]) -> tuple[float, boo
         ]
         bench = PictureBench(renderer, problem.whole(problem.domain.start), lambda picture: 1.0, chosen)
     else:
-        renderer = with_formation(renderer, denoiser="none", transfer="linear")
-        exact = with_formation(renderer, renderer.scene.like(sampler=REFERENCE_SAMPLER))
+        renderer = renderer.like(denoiser="none", transfer="linear")
+        exact = renderer.like(renderer.scene.like(sampler=REFERENCE_SAMPLER))
         part = next(one for one in parts_of(renderer.plan.groups, linear=True) if one.name == found["control"])
         loss = smooth_loss(renderer.formation.resolution, config.seed)
         bench = GradientBench(renderer, loss, inside(renderer), part, exact)

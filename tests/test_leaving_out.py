@@ -16,7 +16,6 @@ from advsearch.config import AttackConfig
 from advsearch.evaluation.bounces import BOUND, measured_bounces
 from advsearch.evaluation.gradients import inside, smooth_loss
 from advsearch.evaluation.leaving_out import ALL, WHAT, measured_gains, resolved_texels
-from advsearch.evaluation.precision_image import with_formation
 from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.renderer import Renderer
 
@@ -31,7 +30,7 @@ def made(controls: Any, object: str = "mug", environment: str = "studio") -> Ren
 def test_nothing_that_is_left_out_changes_a_picture_or_a_gradient(control: str) -> None:
     renderer = made(control)
     loss, u = smooth_loss((SIZE, SIZE)), inside(renderer)
-    full = with_formation(renderer, renderer.scene.like(leave_out=NOTHING))
+    full = renderer.like(renderer.scene.like(leave_out=NOTHING))
     with torch.no_grad():
         noise = (renderer(u, 100, 4) - renderer(u, 101, 4)).norm()
         for seed in range(3):  # the second is replayed where the first was recorded

@@ -254,9 +254,15 @@ def _problem(job: _Job) -> Problem:
     resolution = config.resolution or (model.input_size[0], model.input_size[1])
     description = framed(description, resolution)
     space = make_space((*job.controls, *job.over), description)
-    left = EVERYTHING if config.specialise else NOTHING
     renderer = make_renderer(
-        description, space, resolution, config.denoise, config.seed, config.estimators, left, config.pixel_sampler
+        description,
+        space,
+        resolution,
+        config.denoise,
+        config.seed,
+        config.estimators,
+        leave_out=EVERYTHING if config.specialise else NOTHING,
+        sampler=config.pixel_sampler,
     )
     goal = _goal(model, labels, config)
     objective = _objective(job, goal, renderer)

@@ -23,7 +23,7 @@ from advsearch.evaluation.planning import measured_plan
 from advsearch.evaluation.precision import Budget, Rounds, in_rounds
 from advsearch.evaluation.precision_fits import UNKNOWN, Theory
 from advsearch.evaluation.precision_gradient import GradientBench, Part, parts_of, theory_of
-from advsearch.evaluation.precision_image import REFERENCE_SAMPLER, PictureBench, variants, with_formation
+from advsearch.evaluation.precision_image import REFERENCE_SAMPLER, PictureBench, variants
 from advsearch.evaluation.precision_machine import machine
 from advsearch.evaluation.precision_objective import ObjectiveBench, curve_of
 from advsearch.evaluation.precision_points import Point, Sample, Setting, point_of
@@ -131,10 +131,10 @@ class _Job:
         config, problem, renderer = self.config, self.problem, self.problem.renderer
         loss: Loss = problem.loss
         if config.loss == "linear":
-            renderer = with_formation(renderer, denoiser="none", transfer="linear")
+            renderer = renderer.like(denoiser="none", transfer="linear")
             loss = smooth_loss(renderer.formation.resolution, config.seed)
         u = inside(renderer)
-        exact = with_formation(renderer, renderer.scene.like(sampler=REFERENCE_SAMPLER))
+        exact = renderer.like(renderer.scene.like(sampler=REFERENCE_SAMPLER))
         parts = parts_of(renderer.plan.groups, linear=config.loss == "linear")
         for number, part in enumerate(parts):
             bench = GradientBench(renderer, loss, u, part, exact)

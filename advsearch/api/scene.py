@@ -52,8 +52,8 @@ class Scene:
             resolution: side, or (height, width), in pixels.
             denoise: "oidn" or "none".
             seed: root of the noise; the `seed` of each call counts on from it.
-            sampler: "independent" or "multijitter".
             estimators: how derivatives are obtained, by "control.parameter", "control" or "*"; see `advsearch plan`.
+            sampler: "independent" or "multijitter".
 
         Raises:
             InputError: a control is unknown or impossible in this scene, or an argument is out of range.

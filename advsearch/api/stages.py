@@ -103,6 +103,7 @@ class Attack:
         """Measure the gradient plan, or take the one that the run was begun with."""
         problem, stored = self.problem, self.memory.note(PLAN)
         if stored is None:
+            self._cut_paths()
             self._measure()
             chosen = {"plan": problem.plan.to_dict(), "spp": problem.spp, "search_depth": problem.search_depth}
             self.memory.set_note(PLAN, chosen)
@@ -110,11 +111,15 @@ class Attack:
         problem.plan = problem.plan.restored(stored["plan"])
         problem.spp, problem.search_depth = stored["spp"], stored.get("search_depth")
 
-    def _measure(self) -> None:
-        """Replace the first gradient plan by a measured one, as far as the configuration wants that."""
+    def _cut_paths(self) -> None:
+        """Leave bounces of light out of the search's renders, where it is long enough for that to pay."""
         problem, config = self.problem, self.config
         if config.specialise and (config.measure == "full" or config.steps >= WORTH):
             problem.search_depth = bounces_of(problem, config.seed).depth
+
+    def _measure(self) -> None:
+        """Replace the first gradient plan by a measured one, as far as the configuration wants that."""
+        problem, config = self.problem, self.config
         if config.measure == "no" or not self.policy.uses_gradient:
             return
         renderer, full = problem.renderer, config.measure == "full"

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.evaluation.precision_image import with_formation
 from advsearch.scene.renderer import Renderer
 
 SHORTEST = 2
@@ -87,14 +86,15 @@ def measured_bounces(
     Returns:
         The depth, with what was measured: from the full length downwards, to the first that misses the bound.
     """
-    full = renderer.scene.max_depth
+    raw = renderer.like(denoiser="none")  # a denoiser would spread a change over its neighbours
+    full = raw.scene.max_depth
     noises = [seeds.stream(seed, "half", half) for half in range(2)]
-    wholes = [[_pictures(renderer, u, noise, spp, full) for noise in noises] for u in configurations]
+    wholes = [[_pictures(raw, u, noise, spp, full) for noise in noises] for u in configurations]
     cuts, chosen = [], full
     for depth in range(full - 1, SHORTEST - 1, -1):
         light = levels = 0.0
         for u, whole in zip(configurations, wholes, strict=True):
-            cut = [_pictures(renderer, u, noise, spp, depth) for noise in noises]
+            cut = [_pictures(raw, u, noise, spp, depth) for noise in noises]
             light = max(light, _missing(whole, cut))
             levels = max(levels, LEVELS * _bias(whole, cut))
         cuts.append(Cut(depth, light, levels))
@@ -117,8 +117,7 @@ def _bias(whole: Sequence[tuple[Tensor, Tensor]], cut: Sequence[tuple[Tensor, Te
 
 
 def _pictures(renderer: Renderer, u: Tensor, seed: int, spp: int, depth: int) -> tuple[Tensor, Tensor]:
-    """Radiance and displayed picture, both without denoiser: it would spread a change over its neighbours."""
-    raw = with_formation(renderer, denoiser="none")
+    """Radiance and displayed picture."""
     with torch.no_grad(), renderer.scene.shorter(depth):
-        radiance = raw.radiance(u, seed, spp)
-        return radiance, raw.space.picture(u, raw.formation.display(radiance))
+        radiance = renderer.radiance(u, seed, spp)
+        return radiance, renderer.space.picture(u, renderer.formation.display(radiance))

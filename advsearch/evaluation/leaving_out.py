@@ -17,7 +17,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.evaluation.gradients import Loss
-from advsearch.evaluation.precision_image import with_formation
+from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.mitsuba_scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
@@ -82,13 +82,14 @@ def measured_gains(
     Returns:
         One row for each item, and one for all.
     """
-    shorter = depth is not None and depth < renderer.scene.max_depth
-    everyone: dict[str, tuple[Renderer, int | None]] = {"": (renderer, depth)}
+    scene = renderer.scene
+    depth = scene.max_depth if depth is None else depth
+    everyone = {"": renderer if depth == scene.max_depth else renderer.like(scene.like(max_depth=depth))}
     for item in ITEMS:
-        everyone[item] = with_formation(renderer, renderer.scene.like(leave_out=EVERYTHING - {item})), depth
-    if shorter:
-        everyone[BOUNCES] = renderer, None
-    everyone[ALL] = with_formation(renderer, renderer.scene.like(leave_out=NOTHING)), None
+        everyone[item] = renderer.like(scene.like(max_depth=depth, leave_out=EVERYTHING - {item}))
+    if depth < scene.max_depth:
+        everyone[BOUNCES] = renderer
+    everyone[ALL] = renderer.like(scene.like(leave_out=NOTHING))
     first = [_one(each, loss, u, seed, spp) for each in everyone.values()]  # compiles, and compares
     again = _one(everyone[""], loss, u, seeds.stream(seed, "another"), spp)
     noises = [seeds.stream(seed, "round", number) for number in range(repeats)]
@@ -102,21 +103,24 @@ def measured_gains(
     return rows
 
 
-def _one(which: tuple[Renderer, int | None], loss: Loss, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor]:
-    renderer, depth = which
-    with renderer.scene.shorter(depth):
-        with torch.no_grad():
-            picture = renderer(u, seed, spp)
-        return picture, renderer.gradient(loss, u, seed, spp)[1]
+def rows_of(gains: Sequence[Gain]) -> list[dict[str, object]]:
+    """Return rows for a file or a table."""
+    return [
+        {"item": one.item, "what": WHAT[one.item], "gain": one.gain}
+        | {"picture_difference": one.picture, "gradient_difference": one.gradient, "seconds": one.seconds}
+        for one in gains
+    ]
 
 
-def _seconds(
-    which: tuple[Renderer, int | None], loss: Loss, u: Tensor, seed: int, spp: int, tick: Callable[[], None]
-) -> float:
-    renderer, depth = which
+def _one(renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor]:
+    with torch.no_grad():
+        picture = renderer(u, seed, spp)
+    return picture, renderer.gradient(loss, u, seed, spp)[1]
+
+
+def _seconds(renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int, tick: Callable[[], None]) -> float:
     begun = time.perf_counter()
-    with renderer.scene.shorter(depth):
-        renderer.gradient(loss, u, seed, spp)
+    renderer.gradient(loss, u, seed, spp)
     tick()
     return time.perf_counter() - begun
 
@@ -156,8 +160,8 @@ def resolved_texels(renderer: Renderer, u: Tensor, *, seed: int, spp: int = 16) 
     """Return, for every searched texture, how its texels compare with the pixels that show them."""
     found = []
     groups = [group for group in renderer.plan.groups if group.parameter == "texels"]
-    inputs = {name: value.detach() for name, value in renderer.scene.assembly(renderer.space.inputs(u)).items()}
-    inputs = {name: value for name, value in inputs.items() if name in renderer.scene.names}
+    assembled = renderer.scene.assembly(renderer.space.inputs(u))
+    inputs = {name: value.detach() for name, value in assembled.items() if name not in ON_PICTURE}
     for group in groups:
         for name in sorted(renderer.routes.get(group.name, ())):
             found.append(_texels(renderer.scene, group.control, name, inputs, seed, spp))
@@ -176,12 +180,3 @@ def _texels(scene: MitsubaScene, control: str, name: str, inputs: dict[str, Tens
     while enough > 2 and seen * (enough / 2 / side) ** 2 >= PER_PIXEL * pixels:
         enough //= 2
     return Texels(control, side, seen, pixels, enough)
-
-
-def rows_of(gains: Sequence[Gain]) -> list[dict[str, object]]:
-    """Return rows for a file or a table."""
-    return [
-        {"item": one.item, "what": WHAT[one.item], "gain": one.gain}
-        | {"picture_difference": one.picture, "gradient_difference": one.gradient, "seconds": one.seconds}
-        for one in gains
-    ]

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -196,7 +195,7 @@ class PictureBench:
             scene = self._renderer.scene
             sampler, depth, integrator = key
             self._scenes[key] = scene.like(sampler=sampler, max_depth=depth, integrator=integrator)
-        return with_formation(self._renderer, self._scenes[key], denoiser=variant.denoiser)
+        return self._renderer.like(self._scenes[key], denoiser=variant.denoiser)
 
     def _radiance(self, renderer: Renderer, seed: int, spp: int) -> Tensor:
         with torch.no_grad():
@@ -208,15 +207,6 @@ class PictureBench:
 
     def _shown(self, mean: Array) -> Tensor:
         return self._picture(torch.from_numpy(mean).to(torch.float32).reshape(self._size))
-
-
-def with_formation(renderer: Renderer, scene: Any = None, **changes: Any) -> Renderer:
-    """Return a renderer of the same space with another scene or another image formation; counters are its own."""
-    other = copy.copy(renderer)
-    other.formation = replace(renderer.formation, **changes)
-    if scene is not None:
-        other.scene = scene
-    return other
 
 
 def _flat(picture: Tensor) -> Array:

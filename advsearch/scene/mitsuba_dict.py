@@ -13,14 +13,14 @@ from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.parts import PartInput, number, transform
 
 
-def scene_dict(description: SceneDescription, resolution: tuple[int, int], filter: str) -> dict[str, Any]:
+def scene_dict(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> dict[str, Any]:
     """Everything but the object and the parts."""
     mi = mitsuba()
     place = mi.ScalarTransform4f
     number = description.number
     scene: dict[str, Any] = {
         "type": "scene",
-        "camera": _camera(description, resolution, filter),
+        "camera": _camera(description, resolution, filter, sampler),
         "environment": {
             "type": "envmap",
             "bitmap": mi.Bitmap(np.ascontiguousarray(description.environment.radiance, dtype=np.float32)),
@@ -42,7 +42,7 @@ def scene_dict(description: SceneDescription, resolution: tuple[int, int], filte
     return scene
 
 
-def _camera(description: SceneDescription, resolution: tuple[int, int], filter: str) -> dict[str, Any]:
+def _camera(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> dict[str, Any]:
     height, width = resolution
     camera: dict[str, Any] = {
         "type": "thinlens" if description.thin_lens else "perspective",
@@ -59,7 +59,7 @@ def _camera(description: SceneDescription, resolution: tuple[int, int], filter: 
             "component_format": "float32",
             "rfilter": {"type": filter},
         },
-        "sampler": {"type": "independent"},
+        "sampler": {"type": sampler},
     }
     if description.thin_lens:
         camera |= {"aperture_radius": 1e-4, "focus_distance": 1.0}

@@ -89,8 +89,7 @@ class MitsubaScene:
         )
         parts = (object_part, *description.parts)
         self.volumetric = any(part.volumetric for part in parts)
-        plugins = scene_dict(description, resolution, filter)
-        plugins["camera"]["sampler"] = {"type": sampler}
+        plugins = scene_dict(description, resolution, filter, sampler)
         for part in parts:
             plugins |= part.plugins()
             plugins["camera"] |= part.sensor()
@@ -197,13 +196,11 @@ class MitsubaScene:
         mi = mitsuba()
         import drjit as dr
 
-        self._apply(inputs)
         wanted = tuple(inputs if wrt is None else wrt)
         method, beside = self._general(method, wanted)
-        values = {name: inputs[name] if name in inputs else self.base(name) for name in beside} if beside else {}
+        values = {name: inputs[name] if name in inputs else self.base(name) for name in beside}
         values |= {name: inputs[name] for name in wanted}
-        if beside:
-            self._apply(inputs)
+        self._apply(inputs)
         tracked = {name: mi.TensorXf(_contiguous(value)) for name, value in values.items()}
         try:
             for name, value in tracked.items():

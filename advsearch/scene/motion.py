@@ -21,8 +21,6 @@ POINTS = 400
 """Vertices of a mesh that are followed."""
 NUDGES = (2e-3, 2e-4, 2e-5, 2e-6)
 """Changes of u that the speed is measured over: the largest that leaves something in the frame."""
-
-
 DIRECTIONS = 4000
 """Directions in which the environment is followed: some hundred of them lie in a frame."""
 EDGE = 25
@@ -112,7 +110,7 @@ class Motion:
 
 def _edge_points(half: float) -> Tensor:
     """(N, 3) points along the edge of the ground plane, a square of half the side `half` at height 0."""
-    along = torch.linspace(-half, half, EDGE, dtype=torch.float64) if half > 0.0 else torch.zeros(0).double()
+    along = torch.linspace(-half, half, EDGE if half > 0.0 else 0, dtype=torch.float64)
     side, zero = torch.full_like(along, half), torch.zeros_like(along)
     sides = [(along, side), (along, -side), (side, along), (-side, along)]
     return torch.cat([torch.stack([x, y, zero], dim=1) for x, y in sides])

@@ -9,7 +9,9 @@ get their derivative from a second one, which is the identity in the forward pas
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
@@ -91,6 +93,16 @@ class Renderer:
     @property
     def start(self) -> Tensor:
         return self.space.start
+
+    def like(self, scene: MitsubaScene | None = None, **formation: Any) -> Renderer:
+        """Return a renderer of the same space with another scene, or other fields of the image formation.
+
+        It counts on from this one's counters, by itself.
+        """
+        other = copy.copy(self)
+        other.formation = replace(self.formation, **formation)
+        other.scene = self.scene if scene is None else scene
+        return other
 
     def __call__(self, u: Tensor, seed: int = 0, spp: int = 16) -> Tensor:
         """Render a configuration as the model would see it.

@@ -46,9 +46,9 @@ def clipped(domain: Domain, gradient: Tensor, lengths: tuple[float, ...]) -> tup
             some = sizes[sizes > 0]
             if some.numel():
                 limit = (CLIP if block.norm == "linf" else CLIP_L2) * float(some.median())
-                out = out.clone() if out is gradient else out
-                cut = cut or float(sizes.amax()) > limit
-                out[part] = out[part].clamp(-limit, limit)
+                if float(sizes.amax()) > limit:
+                    out, cut = out.clone() if out is gradient else out, True
+                    out[part] = out[part].clamp(-limit, limit)
     length = float(torch.linalg.vector_norm(out))
     lengths = (*lengths, length)[-MEMORY:]
     usual = sorted(lengths)[len(lengths) // 2]

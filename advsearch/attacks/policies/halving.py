@@ -6,10 +6,8 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor
 
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.evaluation import Evaluation
 from advsearch.attacks.policies import racing
 from advsearch.attacks.policies.base import Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.choices import with_choices
@@ -89,6 +87,3 @@ class Halving(Raced):
     def _samples(self, race: Race) -> int:
         """Return all that is left of the turn, or what keeps the evaluations of a round as many as before."""
         return min(MOST_SAMPLES, max(1, race.left) if self.policy is None else self.eta**race.round)
-
-    def update(self, state: Race, u: Tensor, evaluation: Evaluation) -> Race:
-        return racing.update(state, u, evaluation)
