@@ -80,7 +80,7 @@ GIVEN: dict[str, Any] = {
     "estimator": {"pose": "differences", "*": "adjoint"}, "measure": "no",
     "policy": {"name": "pgd", "momentum": 0.9},
     "steps": 3, "step_size": 0.5, "objective": "cross_entropy", "spp": 4, "denoise": "none",
-    "pixel_sampler": "multijitter",
+    "pixel_sampler": "independent",
     "specialise": False,
     "baseline": False, "verify_spp": 32, "trials": 7, "seed": 9, "threads": 1, "deterministic": True, "run": "x/y",
     "overwrite": True,

@@ -28,7 +28,7 @@ from advsearch.evaluation.precision_fits import (
     warning_of,
 )
 from advsearch.evaluation.precision_gradient import parts_of
-from advsearch.evaluation.precision_image import COUNTS, next_count, variants
+from advsearch.evaluation.precision_image import COUNTS, variants
 from advsearch.evaluation.precision_machine import machine
 from advsearch.evaluation.precision_objective import Curve, Mark, curve_of, marks_at, missing, sooner
 from advsearch.evaluation.precision_points import (
@@ -45,6 +45,7 @@ from advsearch.evaluation.precision_points import (
 )
 from advsearch.report.diagrams import precision_figures
 from advsearch.scene.plan import GroupPlan
+from advsearch.scene.samplers import next_count
 
 SIZE = 400
 """Numbers in a synthetic picture."""

@@ -258,7 +258,7 @@ def test_multijittered_samples_have_the_same_mean_and_less_noise() -> None:
     assert noise["better"] < 0.75 * noise["plain"]
     means = [found.mean(0) for found in pictures.values()]
     assert float((means[0] - means[1]).square().mean()) < (noise["plain"] + noise["better"]) / 8 * 1.5
-    assert better.scene.like(max_depth=3)._made[-1] == "multijitter"
+    assert better.scene.like(max_depth=3).sampler == "multijitter"
 
 
 def test_unknown_samplers_are_refused() -> None:

@@ -439,21 +439,21 @@ def test_counts_are_those_of_the_rows(tmp_path: Path) -> None:
 
 
 def test_the_worst_is_the_largest_margin_and_is_rendered_again(tmp_path: Path) -> None:
-    result = advsearch.sweep("mug", model(), GRID, run=tmp_path / "run", trials=7, verify_spp=32)
+    result = advsearch.sweep("mug", model(), GRID, run=tmp_path / "run", trials=7, verify_spp=36)
     rows = list(result.rows())
     worst = result.summary["worst"]
     best = max(rows, key=lambda row: row.objective or -math.inf)
     assert worst["configuration"] == best.step and worst["claimed"]["margin"] == best.objective
     assert worst["values"] == best.values and worst["seed"] == best.seed and worst["claimed"]["label"] == "vase"
     checked = worst["verified"]
-    assert (checked["successes"], checked["trials"], checked["spp"]) == (7, 7, 32) and checked["labels"] == {"vase": 7}
+    assert (checked["successes"], checked["trials"], checked["spp"]) == (7, 7, 36) and checked["labels"] == {"vase": 7}
     with RunDirectory.resume(tmp_path / "run") as run:
         trials = list(run.store.rows("verification"))
     assert [row.step for row in trials] == list(range(7)) and len({row.seed for row in trials}) == 7
     assert not {row.seed for row in trials} & {row.seed for row in rows}
     (renderer,) = FakeRenderer.made
     at = renderer.seen[best.step][0]
-    assert all(torch.equal(u, at) and spp == 32 for u, _, spp in renderer.seen[18:25])
+    assert all(torch.equal(u, at) and spp == 36 for u, _, spp in renderer.seen[18:25])
     assert (tmp_path / "run" / "images" / "worst.png").is_file()
     assert result.summary["renders"] == {"sweep": 18, "verification": 7}
 

@@ -17,6 +17,7 @@ from advsearch.api.naming import load_models, right_answers, scene_settings
 from advsearch.api.outcome import AttackResult, summarise
 from advsearch.api.problem import Problem
 from advsearch.api.record import Recorder, Stages
+from advsearch.api.samples import search_samples
 from advsearch.api.scene import Controls, Scene, as_controls, framed, load_scene, make_renderer
 from advsearch.api.stages import Attack
 from advsearch.attacks import Objective, Policy, get_objective, make_policy
@@ -273,7 +274,7 @@ def _problem(job: _Job) -> Problem:
         labels,
         objective,
         goal,
-        config.search_spp,
+        search_samples(config),
         config.seed,
         searched=len(job.controls),
         draws=config.draws if job.over else 1,

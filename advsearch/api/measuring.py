@@ -149,8 +149,8 @@ class _Job:
         said = bench.bias(budget, self.seed)
         self.section.warnings += [said] if said else []
         found = self._rounds(f"gradient of {part.name}", bench.settings, bench.measure, budget)
-        linear = self.config.loss == "linear"
-        self._take(found, "error", bench.floor, theory_of if linear else lambda series: UNKNOWN)
+        linear, sampler = self.config.loss == "linear", self.config.pixel_sampler
+        self._take(found, "error", bench.floor, lambda series: theory_of(series, sampler) if linear else UNKNOWN)
 
     def objective(self, budget: Budget, policies: dict[str, Any]) -> None:
         """The best verified objective of each policy."""

@@ -16,9 +16,10 @@ from advsearch.evaluation.precision_fits import (
     recommend,
     warning_of,
 )
-from advsearch.evaluation.precision_image import OIDN, next_count
+from advsearch.evaluation.precision_image import OIDN
 from advsearch.evaluation.precision_objective import Curve, missing, sooner
 from advsearch.evaluation.precision_points import Point, Reference, Setting
+from advsearch.scene.samplers import next_count
 
 Line = tuple[str, str, str]
 AGAINST: tuple[Against, ...] = ("samples", "seconds")

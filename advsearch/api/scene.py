@@ -17,6 +17,7 @@ from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_scene import MitsubaScene
 from advsearch.scene.motion import Motion
 from advsearch.scene.renderer import Renderer
+from advsearch.scene.samplers import SAMPLER
 
 Controls = str | Sequence[str | Control] | Mapping[str, Mapping[str, object]]
 """One control or several, by name or instance; a mapping gives each name its settings."""
@@ -43,7 +44,7 @@ class Scene:
         denoise: str = "oidn",
         seed: int = 0,
         estimators: Mapping[str, str] | None = None,
-        sampler: str = "independent",
+        sampler: str = SAMPLER,
     ) -> Renderer:
         """Return `render(u, seed, spp)` for the space of these controls.
 
@@ -53,7 +54,8 @@ class Scene:
             denoise: "oidn" or "none".
             seed: root of the noise; the `seed` of each call counts on from it.
             estimators: how derivatives are obtained, by "control.parameter", "control" or "*"; see `advsearch plan`.
-            sampler: "independent" or "multijitter".
+            sampler: "multijitter", or "independent", which has more noise; the first rounds sample counts up to
+                products of two near numbers.
 
         Raises:
             InputError: a control is unknown or impossible in this scene, or an argument is out of range.
@@ -107,7 +109,7 @@ def make_renderer(
     seed: int,
     estimators: Mapping[str, str] | None = None,
     leave_out: Collection[str] = EVERYTHING,
-    sampler: str = "independent",
+    sampler: str = SAMPLER,
 ) -> Renderer:
     """Put a described scene, with what the space's controls need in it, into Mitsuba at one size."""
     size = (resolution, resolution) if isinstance(resolution, int) else resolution

@@ -15,6 +15,7 @@ from advsearch.api.bounces import WORTH, bounces_of
 from advsearch.api.memory import PLAN, Frames, Memory
 from advsearch.api.problem import Problem
 from advsearch.api.record import Findings, Recorder, Stages
+from advsearch.api.samples import search_samples, verification_ladder
 from advsearch.attacks import (
     Domain,
     Ending,
@@ -33,7 +34,6 @@ from advsearch.attacks import (
 )
 from advsearch.attacks import search as run_search
 from advsearch.attacks import verify as run_verify
-from advsearch.attacks.sample_count import LADDER
 from advsearch.attacks.smallest import confirmed, scaled, smallest
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.config import AttackConfig
@@ -136,7 +136,7 @@ class Attack:
         """Look at the clean configuration; one that is wrong in every look goes through the full trials at once."""
         problem, config, findings = self.problem, self.config, self.findings
         seed, start = seeds.stream(config.seed, "first look"), problem.domain.start
-        findings.first_look = run_trials(problem.trial, start, spp=config.search_spp, seed=seed, trials=FIRST_LOOK)
+        findings.first_look = run_trials(problem.trial, start, spp=search_samples(config), seed=seed, trials=FIRST_LOOK)
         if not self.rule.control or any(trial.right for trial in findings.first_look):
             return True
         self.choose_spp({"clean": start})
@@ -238,10 +238,9 @@ class Attack:
 
             return margin
 
-        ladder = LADDER if self.config.verify_spp is None else (self.config.verify_spp,)
         self.stages.begin("verification", "sample count")
         margins = {name: margin_of(u) for name, u in candidates.items()}
-        self.findings.sample_count = choose_spp(margins, seed=self.config.seed, ladder=ladder)
+        self.findings.sample_count = choose_spp(margins, seed=self.config.seed, ladder=verification_ladder(self.config))
         self.findings.verification_renders += self.findings.sample_count.renders
 
     def clean_trials(self) -> None:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.api.record import Stages
+from advsearch.api.samples import search_samples
 from advsearch.api.sweep_job import Job, check_all
 from advsearch.api.sweep_points import Picks, Points
 from advsearch.api.sweep_summary import FINISHED, INTERRUPTED, Tally
@@ -89,6 +90,7 @@ class Sweep:
         self.points, self._shown = check_all(job)
         self.per_scene, self.models = self.points.count, len(job.models)
         self.total = len(job.places) * self.per_scene * self.models
+        self.samples = search_samples(job.config)
         self._seeds = Seeds(job.config.seed, KIND)
         self._kept: list[store.Row] = []
         self._view: View | None = None
@@ -140,12 +142,12 @@ class Sweep:
 
     def _batch(self, view: View, numbers: range, tally: Tally) -> None:
         """Render, classify and store neighbouring pictures of a scene, then count them."""
-        config, begun = self.job.config, time.perf_counter()
+        begun = time.perf_counter()
         before = view.number * self.per_scene
         picks = view.points.picks(numbers.start, len(numbers), before)
         u = view.points.configurations(picks)
         noise = [self._seeds(before + number) for number in numbers]
-        seen = view.look(u, noise, config.search_spp)
+        seen = view.look(u, noise, self.samples)
         values = view.points.values(u, picks)
         seconds = (time.perf_counter() - begun) / (len(numbers) * self.models)
         rows = [
@@ -178,7 +180,7 @@ class Sweep:
             kind=KIND,
             step=number * self.models + model,
             seed=seed,
-            spp=self.job.config.search_spp,
+            spp=self.samples,
             objective=trial.margin if known else None,
             success=trial.wrong if known else None,
             label=network.labels[trial.predicted],
@@ -284,7 +286,7 @@ class Sweep:
             "grid": {axis.name: len(axis.values) for axis in job.axes},
             "samples": job.samples,
             "sampler": config.sampler if job.controls else None,
-            "spp": config.search_spp,
+            "spp": self.samples,
             "renders": {
                 "sweep": tally.seen // self.models * len(set(job.sizes)),
                 "verification": checked["renders"] if checked else 0,

@@ -12,11 +12,11 @@ from typing import Any
 from torch import Tensor
 
 from advsearch.api.record import Stages, trial_row
+from advsearch.api.samples import verification_ladder
 from advsearch.api.sweep_job import Job
 from advsearch.api.sweep_summary import verified
 from advsearch.api.sweep_view import View
 from advsearch.attacks import Trial, choose_spp, run_trials
-from advsearch.attacks.sample_count import LADDER
 from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
 from advsearch.seeds import stream
@@ -46,7 +46,7 @@ def check_worst(
     config, network = job.config, job.models[model]
     if config.trials == 0:
         return None
-    ladder = LADDER if config.verify_spp is None else (config.verify_spp,)
+    ladder = verification_ladder(config)
 
     def margin_of(spp: int, seed: int) -> float:
         stages.progress.advance(1, samples=spp)

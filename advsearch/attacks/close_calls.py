@@ -11,6 +11,9 @@ That is the race of Maron and Moore (1994) with normal intervals in place of Hoe
 `most` renders a configuration, and what it saves is the samples of all others. On a smooth objective of two numbers in
 noise of 0.1, 0.3 and 1 of its range, at 60 and 240 renders, random search with `most=4` ended higher than random search
 with any fixed count of 1, 2, 4 or 8 (means of 120 searches); asking again only in *both* directions ended lower.
+
+A step of an ascent decides nothing: each is meant to be better than the one before, the next gradient corrects it, and
+the search ranks the last ones by fresh renders anyway. So what came with a gradient is not rendered again.
 """
 
 from __future__ import annotations
@@ -115,7 +118,8 @@ class Calls(Generic[State]):
 class CloseCalls(Policy[Calls[Any]]):
     """Another policy at few samples, which are raised where a configuration may be the best.
 
-    The policy underneath sees one evaluation a configuration: the mean of all its renders. Gradients are taken once.
+    The policy underneath sees one evaluation a configuration: the mean of all its renders. One that came with a gradient
+    is rendered once.
 
     Attributes:
         policy: what proposes.
@@ -168,6 +172,8 @@ class CloseCalls(Policy[Calls[Any]]):
     def update(self, state: Calls[Any], u: Tensor, evaluation: Evaluation) -> Calls[Any]:
         """Render it again while the decision is close, else tell the policy underneath."""
         spent, known = 1, state.noise
+        if state.pending is None and evaluation.gradient is not None:
+            return replace(state, inner=self.policy.update(state.inner, u, evaluation))
         if state.pending is not None:
             _, before, spent, _ = state.pending
             added = evaluation.cost  # the end of a budget may have allowed fewer than were asked for

@@ -98,10 +98,10 @@ class SceneConfig(Config):
         "oidn", "search", "denoiser of every render, in search and verification", "oidn or none"
     )
     pixel_sampler: Literal["independent", "multijitter"] = setting(
-        "independent",
+        "multijitter",
         "search",
-        "how samples are spread over a pixel, in search and verification; multijitter has less noise, and rounds "
-        "sample counts up to products of two near numbers",
+        "how samples are spread over a pixel, in search and verification; independent ones have more noise, but come "
+        "in any number: multijitter rounds up to products of two near numbers",
         "independent or multijitter",
     )
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.evaluation.gradients import EXPENSIVE, Loss, Probe, estimated, reference
 from advsearch.evaluation.precision import Budget, gather, part_samples
-from advsearch.evaluation.precision_fits import INDEPENDENT, UNKNOWN, Theory
+from advsearch.evaluation.precision_fits import INDEPENDENT, STRATIFIED, UNKNOWN, Theory
 from advsearch.evaluation.precision_points import Array, Reference, Setting, reference_of
 from advsearch.scene.plan import BY_ADJOINT, DIRECTIONS, GroupPlan
 from advsearch.scene.renderer import Renderer
@@ -81,13 +81,15 @@ def parts_of(groups: Sequence[GroupPlan], *, linear: bool) -> list[Part]:
     return found
 
 
-def theory_of(estimator: str) -> Theory:
-    """Return the slope that theory gives the error of an estimator against samples.
+def theory_of(estimator: str, sampler: str) -> Theory:
+    """Return the slope that theory gives the error of an estimator against samples of a sampler.
 
-    The interior adjoint is an unbiased mean of independent samples. Differences have the bias of their step, and one
+    The interior adjoint is an unbiased mean of samples. Differences have the bias of their step, and one
     sided ones more of it; random directions have the noise of what they skip; the material form has its limits.
     """
-    return INDEPENDENT if estimator == "adjoint" else UNKNOWN
+    if estimator != "adjoint":
+        return UNKNOWN
+    return INDEPENDENT if sampler == "independent" else STRATIFIED
 
 
 class GradientBench:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +19,6 @@ Margin = Callable[[Tensor], float]
 """From a picture (H, W, 3) sRGB to the model's margin in logits."""
 
 POWERS = (4, 16, 64, 256)
-PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53, 59, 61, 67, 71, 73, 79, 83, 89, 97, 101)
 COUNTS = {"independent": (4, 8, 16, 32, 64, 128, 256), "orthogonal": (4, 25, 121, 289)}
 """Sample counts of a line, which its sampler takes as they are; `POWERS` for all others. All but the independent
 sampler compile a kernel for each count."""
@@ -86,26 +84,6 @@ def variants(samplers: Sequence[str], depths: Sequence[int], own: int, *, volume
     found += [Variant(one + OIDN, "oidn", one, "oidn", own) for one in DENOISED if one in samplers]
     compared = sorted({*depths, own}) if depths else []
     return found + [Variant(f"depth {one}", "depth", "independent", "none", one) for one in compared]
-
-
-def next_count(sampler: str, samples: float) -> int:
-    """Return the number of samples that a sampler takes when it is asked for at least so many.
-
-    Independent samples come in any number; stratified ones in squares, multi-jittered ones in products of two near
-    numbers, orthogonal arrays in squares of primes, the low-discrepancy sequence in powers of four.
-    """
-    whole = max(1, math.ceil(samples - 1e-9))
-    root = math.isqrt(whole - 1) + 1
-    if sampler == "stratified":
-        return root**2
-    if sampler == "multijitter":
-        wide = max(1, math.isqrt(whole))
-        return wide * math.ceil(whole / wide)
-    if sampler == "orthogonal":
-        return next((prime for prime in PRIMES if prime >= root), PRIMES[-1]) ** 2
-    if sampler == "ldsampler":
-        return int(4 ** math.ceil(math.log(max(4, whole), 4) - 1e-9))
-    return whole
 
 
 class PictureBench:

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
+from advsearch.scene.samplers import SAMPLER, SAMPLERS
 
 DENOISERS = ("oidn", "none")
-SAMPLERS = ("independent", "multijitter")
 FILTERS = ("box", "gaussian")
 
 
@@ -27,8 +27,8 @@ class ImageFormation:
     Attributes:
         denoiser: "oidn" (Intel Open Image Denoise with albedo and normals as guides) or "none".
         filter: reconstruction filter, "box" or "gaussian"; a gaussian correlates pixels, so the denoiser refuses it.
-        sampler: how samples are spread over a pixel: "independent", or "multijitter" (Kensler 2013, Correlated
-            multi-jittered sampling), whose noise is less.
+        sampler: how samples are spread over a pixel: "multijitter" (Kensler 2013, Correlated multi-jittered
+            sampling), or "independent", whose noise is more.
         exposure: stops over the metered exposure; kept for the record, `gain` is what is applied.
         resolution: (height, width) in pixels.
         gain: factor from radiance to display-linear values.
@@ -38,7 +38,7 @@ class ImageFormation:
 
     denoiser: str = "oidn"
     filter: str = "box"
-    sampler: str = "independent"
+    sampler: str = SAMPLER
     exposure: float = 0.0
     resolution: tuple[int, int] = (128, 128)
     gain: float = 1.0

@@ -24,6 +24,7 @@ from advsearch.scene.leaving_out import EVERYTHING, IDLE_LOBES
 from advsearch.scene.mitsuba_dict import camera_inputs, scene_dict
 from advsearch.scene.parts import MeshPart, PartInput, as_is
 from advsearch.scene.population import population
+from advsearch.scene.samplers import SAMPLER, next_count
 
 MAX_DEPTH = 6
 """Longest light path in segments: five bounces off surfaces."""
@@ -54,7 +55,7 @@ class MitsubaScene:
         filter: reconstruction filter, "box" or "gaussian".
         leave_out: names from `advsearch.scene.leaving_out.ITEMS`; less than everything only to measure what it brings.
         max_depth: longest light path in segments.
-        sampler: Mitsuba's name of the sampler; some round sample counts up, see `advsearch.api.measuring`.
+        sampler: Mitsuba's name of the sampler; some round sample counts up, see `scene.samplers`.
         integrator: Mitsuba's name of the path integrator of primal renders, where there is no medium.
     """
 
@@ -66,12 +67,13 @@ class MitsubaScene:
         filter: str = "box",
         leave_out: Collection[str] = EVERYTHING,
         max_depth: int = MAX_DEPTH,
-        sampler: str = "independent",
+        sampler: str = SAMPLER,
         integrator: str = "prb",
     ) -> None:
         mi = mitsuba()
-        self._made = (description, resolution, filter, frozenset(leave_out), sampler)
+        self._made = (description, resolution, filter, frozenset(leave_out))
         self.resolution = resolution
+        self.sampler = sampler
         self.assembly = Assembly(description)
         self.max_depth = max_depth
         self._depth = max_depth
@@ -119,8 +121,8 @@ class MitsubaScene:
     def like(self, **changes: Any) -> MitsubaScene:
         """Return another scene made as this one was, but with another `max_depth`, `sampler`, `integrator`, or
         `leave_out`."""
-        description, resolution, filter, leave_out, sampler = self._made
-        settings = {"max_depth": self.max_depth, "leave_out": leave_out, "sampler": sampler, **changes}
+        description, resolution, filter, leave_out = self._made
+        settings = {"max_depth": self.max_depth, "leave_out": leave_out, "sampler": self.sampler, **changes}
         other = MitsubaScene(description, resolution, filter=filter, **settings)
         for what in ("path", "guides"):
             other._integrator(what)  # one that comes later makes the recordings of all scenes stale
@@ -200,6 +202,7 @@ class MitsubaScene:
         method, beside = self._general(method, wanted)
         values = {name: inputs[name] if name in inputs else self.base(name) for name in beside}
         values |= {name: inputs[name] for name in wanted}
+        spp = next_count(self.sampler, spp)
         self._apply(inputs)
         tracked = {name: mi.TensorXf(_contiguous(value)) for name, value in values.items()}
         try:
@@ -333,6 +336,7 @@ class MitsubaScene:
             sensor.sampler().seed(0, 1)  # otherwise the sampler's state keeps the whole render alive
             return image
 
+        spp = next_count(self.sampler, spp)
         integrator = self._integrator(what)
         function = self._function(what, spp, record)
         return _torch(function(self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)))
