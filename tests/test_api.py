@@ -261,11 +261,14 @@ def test_mistakes_are_explained_and_leave_nothing(scene: advsearch.Scene, level:
     assert (run / "mine.txt").read_text("utf-8") == "keep"
 
 
-def test_samples_are_spent_where_the_decision_is_close(scene: advsearch.Scene, level: float, tmp_path: Path) -> None:
+def test_auto_takes_half_of_the_samples_and_looks_again_where_it_is_close(
+    scene: advsearch.Scene, level: float, tmp_path: Path
+) -> None:
     run = tmp_path / "run"
     more: dict[str, Any] = {**FAST, "spp": "auto", "steps": 12, "policy": "random", "run": run}
     summary = advsearch.attack(scene, model(level + 0.03), **more).summary
     with Store(run / "results.sqlite", read_only=True) as store:
-        rows = [row for row in store.rows("search") if row.step < summary["steps"]]
-    assert sum(row.renders or 0 for row in rows) == 12, "the budget is one of renders, however they are shared out"
-    assert len(rows) < 12, "some configuration was rendered again"
+        rows = list(store.rows("search"))
+    looks = [row for row in rows if row.step >= summary["steps"]]
+    assert len(rows) - len(looks) == 12 and {row.spp for row in rows} == {4}
+    assert 8 <= len(looks) <= 4 * (2 + 4) and len(rows) == summary["renders"]["search"]

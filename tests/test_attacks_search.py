@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import pytest
@@ -27,7 +27,7 @@ from advsearch.attacks import (
     search,
     stop_at_margin,
 )
-from advsearch.attacks.candidates import Candidate, admit, best
+from advsearch.attacks.candidates import Candidate, admit, best, contenders
 from advsearch.errors import InputError
 
 DOMAIN = Domain(torch.full((3,), 0.5), (Block(3, "linf", 0.2),))
@@ -487,6 +487,7 @@ def test_a_gradient_that_is_missing_or_misshapen_is_a_bug(gradient: Tensor | Non
         ({"steps": 0}, "--steps: expected at least 1, got 0"),
         ({"steps": 1, "candidates": -1}, "candidates and repeats"),
         ({"steps": 1, "repeats": 0}, "candidates and repeats"),
+        ({"steps": 1, "close": -1}, "close: expected at least 0"),
         ({"steps": 1, "seconds": 0.0}, "--seconds: expected a number over 0, got 0.0"),
         ({"steps": 1, "seconds": math.nan}, "--seconds: expected a number over 0, got nan"),
     ],
@@ -523,3 +524,38 @@ def test_half_ranked_pools_fall_back_to_the_raw_order() -> None:
     first, second = Candidate(at(0.1), 2.0, True), Candidate(at(0.0), 1.0, True, again=(9.0,), successes=1)
     assert best((first, second)) is first
     assert best((Candidate(at(0.1), 2.0, True, again=(-1.0,)), second)) is second
+
+
+# ---- looks where it is close
+
+
+def test_who_is_clearly_worse_is_out() -> None:
+    leader = Candidate(at(0.3), 2.0, False, again=(1.0, 2.0, 3.0))
+    close = Candidate(at(0.2), 1.0, False, again=(1.5, 1.0, 3.0))
+    far = Candidate(at(0.1), 1.0, False, again=(0.0, 1.1, 2.0))
+    lucky = Candidate(at(0.0), 1.0, False, again=(0.0, 1.1, 2.0), successes=3)
+    broken = Candidate(at(0.4), 1.0, False, again=(9.0, -math.inf, 9.0))
+    assert contenders((far, leader, close, broken), 3) == (leader, close)
+    assert contenders((far, leader), 1) == (far, leader), "one difference says nothing of its noise"
+    assert contenders((far, lucky), 3) == (far, lucky) and contenders((far,), 3) == (far,)
+    assert contenders((leader, replace(close, again=(9.0, *close.again))), 3)[1].again[0] == 9.0, "an older look"
+
+
+def test_a_clear_decision_takes_no_look_more_and_a_close_one_is_settled() -> None:
+    def noisy(seed: int) -> Callable[..., Evaluation]:
+        noise = 0.1 * torch.randn(4, 100, generator=torch.Generator().manual_seed(seed))
+        return objective_is(lambda u, index: float(u[0]) + float(noise[round(float(u[0]) * 100) % 4, index]) - 9.0)
+
+    clear = search(noisy(0), DOMAIN, Script((at(-0.2), at(0.2))), steps=2, seed=0, close=20)
+    assert torch.equal(clear.best_u, at(0.2)) and len(clear.ranking) < 2 * 8
+    script = Script((at(0.0), at(0.05)))
+    right = {
+        close: sum(
+            bool(search(noisy(seed), DOMAIN, script, steps=2, seed=0, close=close).best_u[0] > 0.52)
+            for seed in range(60)
+        )
+        for close in (0, 20)
+    }
+    assert right[20] > right[0] + 3 and right[20] >= 45
+    found = search(noisy(3), DOMAIN, script, steps=2, seed=0, close=20)
+    assert found.renders <= planned_renders(2, close=20) and len({r.index for r in found.ranking}) >= 2

@@ -21,7 +21,6 @@ from advsearch.api.samples import search_samples
 from advsearch.api.scene import Controls, Scene, as_controls, framed, load_scene, make_renderer
 from advsearch.api.stages import Attack
 from advsearch.attacks import Objective, Policy, get_objective, make_policy
-from advsearch.attacks.close_calls import CloseCalls
 from advsearch.attacks.goal import Goal
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
 from advsearch.config import AttackConfig
@@ -317,8 +316,6 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
     for text in said:
         progress.message(text)
     policy = _policy(job, problem)
-    if job.config.spp == "auto":
-        policy = CloseCalls(policy)
     with _directory(job, run) as kept:
         memory = Memory(kept)
         attack = Attack(problem, job.config, policy, Recorder(kept, problem, memory), memory, stages)

@@ -151,12 +151,12 @@ class Attack:
         config, findings = self.config, self.findings
         frames = Frames(config.steps)
         findings.frames = frames.pictures
-        self.stages.begin("search", "search", planned_renders(config.steps))
+        self.stages.begin("search", "search", planned_renders(config.steps, close=config.close_looks))
         findings.search = self.one_search("search", self.policy, config.steps, config.seed, frames, config.seconds)
         if not config.baseline or self.policy.name == "random":
             return
         steps = config.steps if config.seconds is None else _spent(findings.search)
-        self.stages.begin("baseline", "random baseline", planned_renders(steps))
+        self.stages.begin("baseline", "random baseline", planned_renders(steps, close=config.close_looks))
         seed = seeds.stream(config.seed, "baseline")
         findings.baseline = self.one_search("baseline", make_policy("random"), steps, seed)
 
@@ -186,6 +186,7 @@ class Attack:
             policy,
             steps=steps,
             seed=seed,
+            close=self.config.close_looks,
             late=self.memory.clock(kind, steps, seconds),
             on_step=on_step,
         )
@@ -347,7 +348,7 @@ def find_smallest(attack: Attack) -> None:
     results: list[SearchResult] = []
 
     def found(inside: Domain, number: int) -> Tensor:
-        attack.stages.begin("search", f"search {number + 1}", planned_renders(config.steps))
+        attack.stages.begin("search", f"search {number + 1}", planned_renders(config.steps, close=config.close_looks))
         kind, seed = f"search {number}" if number else "search", seeds.stream(config.seed, "smallest", number)
         results.append(attack.one_search(kind, attack.policy, config.steps, seed, domain=inside))
         return results[-1].best_u

@@ -66,6 +66,32 @@ def admit(pool: tuple[Candidate, ...], new: Candidate, size: int) -> tuple[Candi
     return tuple(sorted((*pool, new), key=_raw, reverse=True)[:size])
 
 
+def contenders(pool: tuple[Candidate, ...], shared: int) -> tuple[Candidate, ...]:
+    """Return the winner so far and those that are not clearly worse, in their order.
+
+    One is clearly worse if the mean of its differences from the winner, seed by seed, is larger than the standard error
+    of that mean, and its success rate is no higher. (The race of Maron and Moore 1994, with normal intervals of one
+    deviation in place of Hoeffding's: a search needs the better of two, not a proof.)
+
+    Args:
+        pool: candidates that had the same seeds in their last renders.
+        shared: how many of these there were, at least 2 for anyone to be clearly worse.
+    """
+    if shared < 2 or len(pool) < 2:
+        return pool
+    leader = best(pool)
+    return tuple(one for one in pool if one is leader or not _worse(one, leader, shared))
+
+
+def _worse(one: Candidate, leader: Candidate, shared: int) -> bool:
+    behind = [a - b for a, b in zip(leader.again[-shared:], one.again[-shared:], strict=True)]
+    if not all(map(math.isfinite, behind)):
+        return not math.isfinite(one.believed)
+    mean = math.fsum(behind) / shared
+    variance = math.fsum((each - mean) ** 2 for each in behind) / (shared - 1)
+    return one.rate <= leader.rate and mean > math.sqrt(variance / shared)
+
+
 def _looked(old: Candidate, new: Candidate) -> Candidate:
     return replace(old, again=(*old.again, new.objective), successes=old.successes + new.success)
 

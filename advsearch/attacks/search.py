@@ -12,7 +12,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from advsearch.attacks.candidates import Candidate, admit, best
+from advsearch.attacks.candidates import Candidate, admit, best, contenders
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import TOLERANCE, Domain
 from advsearch.attacks.ending import Ending
@@ -111,9 +111,9 @@ class SearchResult:
     distribution: Distribution | None = None
 
 
-def planned_renders(steps: int, candidates: int = 4, repeats: int = 2) -> int:
+def planned_renders(steps: int, candidates: int = 4, repeats: int = 2, close: int = 0) -> int:
     """Return how many pictures `search` renders at most with these arguments."""
-    return steps + candidates * repeats
+    return steps + candidates * (repeats + close)
 
 
 def search(
@@ -125,6 +125,7 @@ def search(
     seed: int,
     candidates: int = 4,
     repeats: int = 2,
+    close: int = 0,
     stop_when: StopWhen | None = None,
     on_step: OnStep | None = None,
     seconds: float | None = None,
@@ -139,7 +140,8 @@ def search(
        after which none would be left to use it, so never in the last evaluation.
     2. The `candidates` best distinct configurations are each evaluated `repeats` times more, with new seed indices
        that are the same for all, without gradient. The best by these renders is the answer (see `candidates`). With
-       `candidates=0`, for an objective without noise, the raw best is the answer.
+       `candidates=0`, for an objective without noise, the raw best is the answer. Those that are not clearly worse
+       than the best by then are rendered again, up to `close` times more (see `candidates.contenders`).
 
     A policy that does not handle discrete choices is wrapped in `Choices` where the domain has some.
 
@@ -154,7 +156,8 @@ def search(
         steps: renders of the search, at least 1; as many evaluations where no gradient costs any. By default all are
             spent: the worst case is wanted, not the first.
         seed: root seed of this search's own randomness (not of the renders), at least 0.
-        candidates, repeats: see above; together they cost `candidates * repeats` renders on top of `steps`.
+        candidates, repeats, close: see above; together they cost at most `candidates * (repeats + close)` renders on
+            top of `steps`.
         stop_when: ends step 1 early where it returns true, e.g. `stop_at_margin(1.0, labels)`.
         on_step: called after every evaluation.
         seconds: end step 1 after the first evaluation that is done later than this, over 0; None for no limit. There
@@ -163,13 +166,15 @@ def search(
             after it was stopped.
 
     Raises:
-        InputError: steps, candidates, repeats or seconds out of range, or the policy cannot search this domain.
+        InputError: steps, candidates, repeats, close or seconds out of range, or the policy cannot search this domain.
         RuntimeError: the policy left the domain or `evaluate` broke its contract; a bug.
     """
     if steps < 1:
         raise InputError(f"--steps: expected at least 1, got {steps}")
     if candidates < 0 or repeats < 1:
         raise InputError(f"candidates and repeats: expected at least 0 and 1, got {candidates} and {repeats}")
+    if close < 0:
+        raise InputError(f"close: expected at least 0, got {close}")
     if seconds is not None and not seconds > 0.0:
         raise InputError(f"--seconds: expected a number over 0, got {seconds}")
     begun = time.perf_counter()
@@ -178,7 +183,7 @@ def search(
         in_time = math.inf if seconds is None else begun + seconds
         stopped = _explore(log, policy, steps, seed, stop_when, late or (lambda _: time.perf_counter() >= in_time))
         if candidates:
-            _rank(log, steps, repeats)
+            _rank(log, steps, repeats, close)
     except KeyboardInterrupt:
         stopped = Ending.INTERRUPTED
     return _result(log, stopped, time.perf_counter() - begun)
@@ -275,10 +280,19 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, stop_when: S
     return Ending.BUDGET_SPENT
 
 
-def _rank(log: _Log, first_index: int, repeats: int) -> None:
-    """Render every candidate again, all with the same new seeds."""
+def _rank(log: _Log, first_index: int, repeats: int, close: int) -> None:
+    """Render every candidate again, all with the same new seeds, and those that are close once more and once more."""
+    _look(log, range(first_index, first_index + repeats))
+    for index in range(first_index + repeats, first_index + repeats + close):
+        log.pool = contenders(log.pool, index - first_index)
+        if len(log.pool) < 2:
+            break
+        _look(log, range(index, index + 1))
+
+
+def _look(log: _Log, indices: range) -> None:
     for candidate in log.pool:
-        evaluations = [log.render(Proposal(candidate.u), first_index + r, "ranking") for r in range(repeats)]
+        evaluations = [log.render(Proposal(candidate.u), index, "ranking") for index in indices]
         again = (*candidate.again, *(e.objective for e in evaluations))
         successes = candidate.successes + sum(e.success for e in evaluations)
         ranked = replace(candidate, again=again, successes=successes)

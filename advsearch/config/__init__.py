@@ -10,11 +10,12 @@ from __future__ import annotations
 from advsearch.config.attack import TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.config.precision import QUANTITIES, SAMPLERS, PrecisionConfig
 from advsearch.config.questions import GapConfig, RegionConfig
-from advsearch.config.scene import AUTO_SHARE, SEARCH_SPP, SceneConfig
+from advsearch.config.scene import AUTO_SHARE, CLOSE_LOOKS, SEARCH_SPP, SceneConfig
 from advsearch.config.sweep import SweepConfig
 
 __all__ = [
     "AUTO_SHARE",
+    "CLOSE_LOOKS",
     "QUANTITIES",
     "SAMPLERS",
     "SEARCH_SPP",

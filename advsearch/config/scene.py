@@ -14,7 +14,9 @@ SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
 
 AUTO_SHARE = 2
-"""With `--spp auto` a search begins with the default's samples divided by this."""
+"""With `--spp auto` a search takes the default's samples divided by this."""
+CLOSE_LOOKS = 4
+"""Then a candidate is rendered so many times more, at most, while it is not clearly worse than the best."""
 
 
 class SceneConfig(Config):
@@ -89,7 +91,8 @@ class SceneConfig(Config):
     spp: int | Literal["auto"] | None = setting(
         None,
         "search",
-        "samples per pixel of a render of the search; auto begins with few and spends more where it is close",
+        "samples per pixel of a render of the search; auto takes half of the default, and looks again at the best ones "
+        "while it is close between them",
         "a whole number from 1 to 65536, or auto",
         otherwise="8 with the denoiser, 16 without",
         unit="samples",
@@ -128,6 +131,11 @@ class SceneConfig(Config):
         if self.spp == "auto":
             return SEARCH_SPP[self.denoise] // AUTO_SHARE
         return self.spp if isinstance(self.spp, int) else SEARCH_SPP[self.denoise]
+
+    @property
+    def close_looks(self) -> int:
+        """Renders more of a search's best configurations, at most, while it is close between them."""
+        return CLOSE_LOOKS if self.spp == "auto" else 0
 
     @property
     def objects(self) -> tuple[str, ...]:
