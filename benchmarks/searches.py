@@ -30,7 +30,7 @@ from advsearch.api.problem import Problem
 from advsearch.attacks import make_policy, search
 from advsearch.config import AttackConfig
 
-TRIALS, TRIAL_SPP, DENSE_TRIALS = 8, 64, 4
+TRIALS, TRIAL_SPP, DENSE_TRIALS = 12, 64, 12
 BLIND = ("random", "nes")
 """Policies without gradients that take a whole texture."""
 

@@ -13,6 +13,7 @@ from advsearch.api.planning import plan
 from advsearch.api.problem import OnImage
 from advsearch.cli.plan import text
 from advsearch.config import AttackConfig
+from advsearch.controls import LightControl, TextureControl
 from advsearch.evaluation.bounces import BOUND, measured_bounces
 from advsearch.evaluation.gradients import inside, smooth_loss
 from advsearch.evaluation.leaving_out import ALL, WHAT, measured_gains, resolved_texels
@@ -183,3 +184,27 @@ def test_a_shorter_path_is_only_for_the_block() -> None:
         with scene.shorter(50):
             assert scene.depth == scene.max_depth
     assert scene.depth == scene.max_depth
+
+
+def two_lamps(power: float) -> Renderer:
+    """The mug in the studio with a lamp, and another of some power."""
+    lamps = [LightControl(name="key", type="point", power=6.0), LightControl(name="fill", type="area", power=power)]
+    return load_scene("mug").renderer([TextureControl(resolution=16), *lamps], resolution=SIZE, denoise="none")
+
+
+def test_dark_lamps_get_no_samples_and_change_nothing_but_noise() -> None:
+    renderer = two_lamps(0.0)
+    full = renderer.like(renderer.scene.like(leave_out=EVERYTHING - {"emitters"}))
+    with torch.no_grad():
+        mine, theirs = (torch.stack([one(renderer.start, seed, 16) for seed in range(12)]) for one in (renderer, full))
+    noise, other = float(mine.var(0).mean()), float(theirs.var(0).mean())
+    assert 1.2 * noise < other
+    assert float((mine.mean(0) - theirs.mean(0)).square().mean()) < 1.5 * (noise + other) / 12
+
+
+def test_lamps_that_shine_or_may_shine_are_sampled() -> None:
+    def weights(renderer: Renderer) -> list[float]:
+        parameters = renderer.scene._parameters
+        return [float(parameters[key]) for key in sorted(parameters.keys()) if key.endswith("sampling_weight")]
+
+    assert sorted(weights(two_lamps(0.0)))[:2] == [0.0, 1.0] and min(weights(two_lamps(1.0))) == 1.0

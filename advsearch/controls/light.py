@@ -122,8 +122,9 @@ class LightControl(NumberControl):
         return None if is_point and parameter.name == "size" else parameter.search
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        point = self.chosen["type"] == "point"
-        return scene.with_part(PointLightPart(self.name) if point else BallLightPart(self.name))
+        lamp = PointLightPart if self.chosen["type"] == "point" else BallLightPart
+        power = self.specs.get("power")
+        return scene.with_part(lamp(self.name, dark=isinstance(power, Fixed) and power.value == 0.0))
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         place = torch.stack([values[axis] for axis in ("x", "y", "z")])

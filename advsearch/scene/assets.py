@@ -84,8 +84,7 @@ class EnvironmentAsset:
     Attributes:
         name: short name, used in paths.
         radiance: (H, W, 3) float32 linear radiance, finite and at least 0; row 0 looks straight up, and columns run as
-        in
-            a photograph (a file's own order).
+            in a photograph (a file's own order).
         source: where it came from.
         warnings: what the importer had to repair or leave out, one sentence each.
 

@@ -1,14 +1,18 @@
 """What a scene inside Mitsuba leaves out because a search doesn't need it; each item can be put back by name.
 
-None of it changes what is computed: pictures and gradients with and without agree to within their noise, which
+None of it changes what is computed: pictures and gradients with and without agree to within their noise, and where the
+random numbers are the same ones, to within rounding, which
 `advsearch plan` shows on the scene at hand. Bounces of light are another matter (`evaluation.bounces`): leaving those
 out has a bias, so only the search does it, within a measured bound, and the verification renders all of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, MutableMapping, Sequence
 from typing import Any
+
+from advsearch.scene.part_light import BallLightPart, PointLightPart
+from advsearch.scene.parts import Part
 
 ITEMS: Mapping[str, str] = {
     "tracing": "tracing a render anew: it is recorded once and replayed, until a shape moves",
@@ -16,6 +20,7 @@ ITEMS: Mapping[str, str] = {
     "gradients": "derivatives of inputs that no coordinate reaches",
     "boundary": "boundary terms of an adjoint where nothing that it differentiates moves an outline",
     "lobes": "lobes of the object's surface that have no strength",
+    "emitters": "samples of lamps that emit nothing",
 }
 """What can be left out, by name, and what that is."""
 
@@ -27,3 +32,19 @@ NOTHING: frozenset[str] = frozenset()
 _ABSENT = {"type": "uniform", "value": 0.0}
 IDLE_LOBES: Mapping[str, Any] = {name: _ABSENT for name in ("clearcoat", "sheen")}
 """Entries of the principled surface that give it lobes of strength 0."""
+
+
+def leave_dark_lamps_out(plugins: MutableMapping[str, Any], parts: Sequence[Part]) -> None:
+    """Take no samples towards lamps that emit nothing.
+
+    A path that arrives at one by chance still counts, with all of the weight, so that nothing is biased should it be
+    lit after all.
+
+    Args:
+        plugins: Mitsuba's dictionary of the scene; changed.
+        parts: of the scene.
+    """
+    for part in parts:
+        if isinstance(part, (PointLightPart, BallLightPart)) and part.dark:
+            plugin = plugins[part.name]
+            plugin.get("emitter", plugin)["sampling_weight"] = 0.0

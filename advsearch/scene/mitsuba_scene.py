@@ -20,7 +20,7 @@ from advsearch.scene.assembly import Assembly
 from advsearch.scene.backend import mitsuba
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import object_to_world
-from advsearch.scene.leaving_out import EVERYTHING, IDLE_LOBES
+from advsearch.scene.leaving_out import EVERYTHING, IDLE_LOBES, leave_dark_lamps_out
 from advsearch.scene.mitsuba_dict import camera_inputs, scene_dict
 from advsearch.scene.parts import MeshPart, PartInput, as_is
 from advsearch.scene.population import population
@@ -95,6 +95,8 @@ class MitsubaScene:
         for part in parts:
             plugins |= part.plugins()
             plugins["camera"] |= part.sensor()
+        if "emitters" in leave_out:
+            leave_dark_lamps_out(plugins, parts)
         self._path: dict[str, Any] = {"type": integrator}
         for part in parts:
             self._path |= part.integrator(plugins)

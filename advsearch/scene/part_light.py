@@ -24,9 +24,11 @@ class PointLightPart(Part):
 
     Attributes:
         name: of the lamp.
+        dark: its intensity is 0 whatever happens.
     """
 
     name: str
+    dark: bool = False
 
     def plugins(self) -> dict[str, Any]:
         return {self.name: {"type": "point", "position": [0.0, 0.0, 2.0], "intensity": BLACK}}
@@ -47,9 +49,11 @@ class BallLightPart(Part):
 
     Attributes:
         name: of the lamp.
+        dark: its radiance is 0 whatever happens.
     """
 
     name: str
+    dark: bool = False
 
     def plugins(self) -> dict[str, Any]:
         ball = {
