@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from advsearch.api.measuring_report import Section, _rounding
 from advsearch.cli.main import main
 from advsearch.config import PrecisionConfig
 from advsearch.errors import InputError
@@ -371,6 +372,12 @@ def test_every_count_that_is_measured_is_one_that_its_sampler_takes() -> None:
             count = next_count(one.sampler, wanted)
             sampler.set_sample_count(count)
             assert count >= wanted and sampler.sample_count() == count, one.series
+
+
+def test_a_gradient_is_recommended_in_counts_of_the_runs_sampler() -> None:
+    section = Section("multijitter")
+    assert _rounding(section, "gradient")("adjoint", 39) == 42 and _rounding(section, "image")("ldsampler", 39) == 64
+    assert _rounding(Section("independent"), "gradient")("adjoint", 39) == 39
 
 
 def test_parts_of_a_control_with_other_estimators_have_names_of_their_own() -> None:

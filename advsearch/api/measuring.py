@@ -94,7 +94,10 @@ class _Job:
     problem: Problem
     progress: Progress
     budget: Budget
-    section: Section = field(default_factory=Section)
+    section: Section = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.section = Section(self.config.pixel_sampler)
 
     @property
     def seed(self) -> int:

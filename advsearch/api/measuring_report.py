@@ -10,6 +10,7 @@ from typing import Any
 from advsearch.evaluation.precision_fits import (
     Against,
     Recommendation,
+    RoundUp,
     Slope,
     Theory,
     fit,
@@ -19,7 +20,7 @@ from advsearch.evaluation.precision_fits import (
 from advsearch.evaluation.precision_image import OIDN
 from advsearch.evaluation.precision_objective import Curve, missing, sooner
 from advsearch.evaluation.precision_points import Point, Reference, Setting
-from advsearch.scene.samplers import next_count
+from advsearch.scene.samplers import SAMPLER, next_count
 
 Line = tuple[str, str, str]
 AGAINST: tuple[Against, ...] = ("samples", "seconds")
@@ -32,6 +33,7 @@ class Section:
     """What was measured so far.
 
     Attributes:
+        sampler: of the run's pixels, which gradients are taken with.
         points: of each line and measure.
         theories: of each line.
         families: of each line of the image: what it is recommended among.
@@ -43,6 +45,7 @@ class Section:
         interrupted: whether the user stopped it.
     """
 
+    sampler: str = SAMPLER
     points: dict[tuple[Line, str], list[Point]] = field(default_factory=dict)
     theories: dict[Line, Theory] = field(default_factory=dict)
     families: dict[Line, str] = field(default_factory=dict)
@@ -180,11 +183,14 @@ def _recommended(section: Section, goal: float) -> list[tuple[Recommendation | N
         if measure == "margin_error" and family == "depth":
             continue
         asked.setdefault((line[0], line[1], measure, family), {})[line] = points
-    return [(recommend(lines, goal, _round_up), *what) for what, lines in asked.items()]
+    return [(recommend(lines, goal, _rounding(section, what[0])), *what) for what, lines in asked.items()]
 
 
-def _round_up(series: str, samples: float) -> int:
-    return next_count(series.removesuffix(OIDN), samples)
+def _rounding(section: Section, quantity: str) -> RoundUp:
+    """A line of the picture is named after its sampler; one of a gradient has that of the run."""
+    return lambda series, samples: next_count(
+        section.sampler if quantity == "gradient" else series.removesuffix(OIDN), samples
+    )
 
 
 def _recommendation(
