@@ -20,7 +20,7 @@ from advsearch.evaluation.precision_fits import (
 from advsearch.evaluation.precision_image import OIDN
 from advsearch.evaluation.precision_objective import Curve, missing, sooner
 from advsearch.evaluation.precision_points import Point, Reference, Setting
-from advsearch.scene.samplers import SAMPLER, next_count
+from advsearch.scene.samplers import next_count
 
 Line = tuple[str, str, str]
 AGAINST: tuple[Against, ...] = ("samples", "seconds")
@@ -45,7 +45,7 @@ class Section:
         interrupted: whether the user stopped it.
     """
 
-    sampler: str = SAMPLER
+    sampler: str
     points: dict[tuple[Line, str], list[Point]] = field(default_factory=dict)
     theories: dict[Line, Theory] = field(default_factory=dict)
     families: dict[Line, str] = field(default_factory=dict)

@@ -84,8 +84,8 @@ def parts_of(groups: Sequence[GroupPlan], *, linear: bool) -> list[Part]:
 def theory_of(estimator: str, sampler: str) -> Theory:
     """Return the slope that theory gives the error of an estimator against samples of a sampler.
 
-    The interior adjoint is an unbiased mean of samples. Differences have the bias of their step, and one
-    sided ones more of it; random directions have the noise of what they skip; the material form has its limits.
+    The interior adjoint is an unbiased mean of samples. Differences have the bias of their step, and one sided ones
+    more of it; random directions have the noise of what they skip; the material form has its limits.
     """
     if estimator != "adjoint":
         return UNKNOWN

@@ -1,9 +1,9 @@
 """What a scene inside Mitsuba leaves out because a search doesn't need it; each item can be put back by name.
 
 None of it changes what is computed: pictures and gradients with and without agree to within their noise, and where the
-random numbers are the same ones, to within rounding, which
-`advsearch plan` shows on the scene at hand. Bounces of light are another matter (`evaluation.bounces`): leaving those
-out has a bias, so only the search does it, within a measured bound, and the verification renders all of them.
+random numbers are the same ones, to within rounding, which `advsearch plan` shows on the scene at hand. Bounces of
+light are another matter (`evaluation.bounces`): leaving those out has a bias, so only the search does it, within a
+measured bound, and the verification renders all of them.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping, MutableMapping, Sequence
 from typing import Any
 
-from advsearch.scene.part_light import BallLightPart, PointLightPart
 from advsearch.scene.parts import Part
 
 ITEMS: Mapping[str, str] = {
@@ -45,6 +44,6 @@ def leave_dark_lamps_out(plugins: MutableMapping[str, Any], parts: Sequence[Part
         parts: of the scene.
     """
     for part in parts:
-        if isinstance(part, (PointLightPart, BallLightPart)) and part.dark:
+        if part.dark:
             plugin = plugins[part.name]
             plugin.get("emitter", plugin)["sampling_weight"] = 0.0

@@ -71,7 +71,7 @@ class MitsubaScene:
         integrator: str = "prb",
     ) -> None:
         mi = mitsuba()
-        self._made = (description, resolution, filter, frozenset(leave_out))
+        self._made = (description, filter)
         self.resolution = resolution
         self.sampler = sampler
         self.assembly = Assembly(description)
@@ -123,9 +123,9 @@ class MitsubaScene:
     def like(self, **changes: Any) -> MitsubaScene:
         """Return another scene made as this one was, but with another `max_depth`, `sampler`, `integrator`, or
         `leave_out`."""
-        description, resolution, filter, leave_out = self._made
-        settings = {"max_depth": self.max_depth, "leave_out": leave_out, "sampler": self.sampler, **changes}
-        other = MitsubaScene(description, resolution, filter=filter, **settings)
+        description, filter = self._made
+        settings = {"max_depth": self.max_depth, "leave_out": self._leave_out, "sampler": self.sampler, **changes}
+        other = MitsubaScene(description, self.resolution, filter=filter, **settings)
         for what in ("path", "guides"):
             other._integrator(what)  # one that comes later makes the recordings of all scenes stale
         return other

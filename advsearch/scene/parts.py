@@ -93,10 +93,12 @@ class Part(ABC):
     Attributes:
         name: unique in the scene; begins the names of its inputs and plugins.
         volumetric: needs an integrator that handles media.
+        dark: is a lamp that emits nothing, whatever its inputs are.
     """
 
     name: str
     volumetric: bool = False
+    dark: bool = False
 
     @abstractmethod
     def plugins(self) -> dict[str, Any]:
