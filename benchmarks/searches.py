@@ -1,14 +1,16 @@
 """Compares policies on bundled scenes at equal renders, by verified margin, with a dense sample of the space beside.
 
     python benchmarks/searches.py [--spaces pose camera light environment.rotation] [--policies auto random ...]
-                                  [--renders 60] [--seeds 10] [--dense 600] [--resolution 64]
+                                  [--renders 60] [--seeds 10] [--dense 600] [--dense-trials 12] [--resolution 64]
+                                  [--spp N]
                                   [--object FILE --environment FILE --model FILE --labels FILE --label NAME]
     python benchmarks/searches.py --texture [--seeds 10]
 
 The first prints, for each space and policy, the median over seeds of the verified margin (the mean of fresh trials at a
 high sample count, in logits; above 0 the model is wrong), how far `auto` is below the best single policy, and which
 share of a dense sample of the space, ten times as many configurations, has a lower margin than `auto`'s answer. Those
-are verified by `DENSE_TRIALS` trials each: the best of many noisy values is a noisy one.
+are verified by `--dense-trials` trials each: the best of many noisy values is a noisy one. `--spp` is what the searches
+render with; the trials always have 64 samples.
 
 The second compares the renders that gradient search needs with those of the best policy without gradients: the margin
 that `pgd` reaches within a tenth of the renders, and the margins of the others with all of them.
@@ -30,7 +32,7 @@ from advsearch.api.problem import Problem
 from advsearch.attacks import make_policy, search
 from advsearch.config import AttackConfig
 
-TRIALS, TRIAL_SPP, DENSE_TRIALS = 12, 64, 12
+TRIALS, TRIAL_SPP = 12, 64
 BLIND = ("random", "nes")
 """Policies without gradients that take a whole texture."""
 
@@ -48,7 +50,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--renders", type=int, default=60)
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--dense", type=int, default=600)
+    parser.add_argument("--dense-trials", type=int, default=TRIALS)
     parser.add_argument("--resolution", type=int, default=64)
+    parser.add_argument("--spp", type=int)
     parser.add_argument("--texture", action="store_true")
     args = parser.parse_args(argv)
     threads.configure(None)
@@ -65,6 +69,7 @@ def _problem(args: argparse.Namespace, control: str) -> Problem:
         label=args.label,
         controls={control: {}},
         resolution=args.resolution,
+        spp=args.spp,
         measure="no",
     )
     return problem_from_config(config)[0]
@@ -96,7 +101,7 @@ def _spaces(args: argparse.Namespace) -> None:
         }
         medians = {policy: statistics.median(values) for policy, values in margins.items()}
         generator = torch.Generator().manual_seed(5)
-        dense = [_verified(problem, u, DENSE_TRIALS) for u in problem.domain.sample(generator, args.dense)]
+        dense = [_verified(problem, u, args.dense_trials) for u in problem.domain.sample(generator, args.dense)]
         clean = _verified(problem, problem.domain.start)
         best = max(medians.values())
         cells = [
