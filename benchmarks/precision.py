@@ -23,14 +23,14 @@ from advsearch.api.attacking import problem_from_config  # noqa: E402
 from advsearch.api.measuring import precision  # noqa: E402
 from advsearch.config import PrecisionConfig  # noqa: E402
 from advsearch.evaluation.gradients import inside, smooth_loss  # noqa: E402
-from advsearch.evaluation.precision import Budget  # noqa: E402
-from advsearch.evaluation.precision_gradient import GradientBench, parts_of  # noqa: E402
-from advsearch.evaluation.precision_image import (  # noqa: E402
+from advsearch.evaluation.precision.gradient import GradientBench, parts_of  # noqa: E402
+from advsearch.evaluation.precision.image import (  # noqa: E402
     REFERENCE_SAMPLER,
     PictureBench,
     variants,
 )
-from advsearch.evaluation.precision_points import Sample, Setting, point_of  # noqa: E402
+from advsearch.evaluation.precision.points import Sample, Setting, point_of  # noqa: E402
+from advsearch.evaluation.precision.rounds import Budget  # noqa: E402
 
 SCENES = ("bowl/kitchen", "bottle/noon", "ball/studio")
 CONTROL = "environment"

@@ -26,11 +26,11 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.api import sweep_view  # noqa: E402
 from advsearch.api.scene import as_controls, framed, load_scene  # noqa: E402
-from advsearch.api.sweep_axes import read_axes  # noqa: E402
-from advsearch.api.sweep_job import Job, Place  # noqa: E402
-from advsearch.api.sweep_loop import Sweep  # noqa: E402
+from advsearch.api.sweeps import view  # noqa: E402
+from advsearch.api.sweeps.axes import read_axes  # noqa: E402
+from advsearch.api.sweeps.job import Job, Place  # noqa: E402
+from advsearch.api.sweeps.loop import Sweep  # noqa: E402
 from advsearch.config import SweepConfig  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
@@ -96,7 +96,7 @@ class Watch(NullProgress):
 
 def constant(configurations: int) -> None:
     """Print the speed of the loop and how much its memory grows, for a grid and for draws."""
-    sweep_view.make_renderer = lambda scene, space, size, *more, **named: ConstantRenderer(size)  # type: ignore[attr-defined]
+    view.make_renderer = lambda scene, space, size, *more, **named: ConstantRenderer(size)  # type: ignore[attr-defined]
     model = load_model(Trivial(), labels=("mug", "vase"), input_size=16, name="trivial")
     side = max(1, round(configurations**0.5))
     grid = {"pose.yaw": f"0:360:{side}", "camera.elevation": f"5:60:{side}"}

@@ -23,7 +23,7 @@ import advsearch
 import advsearch.config
 from advsearch.api import attacking, mapping, outcome, stages, studies
 from advsearch.api.scene import as_controls
-from advsearch.api.sweep_axes import read_axes
+from advsearch.api.sweeps.axes import read_axes
 from advsearch.attacks import (
     POLICIES,
     clopper_pearson,
@@ -48,8 +48,9 @@ from advsearch.controls import CONTROLS, texture
 from advsearch.evaluation import reference_scenes
 from advsearch.models import calibration, loading, reference
 from advsearch.runs import directory, export, store
-from advsearch.scene import description, environments, formation, importing, library, mitsuba_scene
-from advsearch.scene.import_images import TEXTURE_LIMIT
+from advsearch.scene import description, environments, formation, library, mitsuba_scene
+from advsearch.scene.importing import objects
+from advsearch.scene.importing.images import TEXTURE_LIMIT
 from advsearch.scene.settings import SETTINGS, resolve
 from advsearch.settings import parse_assignment, read_yaml, settings
 
@@ -155,7 +156,7 @@ def test_everything_bundled_and_every_scene_parameter_is_in_the_page_about_scene
     page = (DOCS / "scenes.md").read_text("utf-8")
     names = [*SETTINGS, *library.list_objects(), *library.list_environments()]
     assert not [name for name in names if f"| `{name}` |" not in page]
-    endings = (*importing.SUFFIXES, *environments.SUFFIXES)
+    endings = (*objects.SUFFIXES, *environments.SUFFIXES)
     assert not [ending for ending in endings if f"`{ending}`" not in page]
 
 
@@ -363,7 +364,7 @@ def check_names(config: SceneConfig) -> None:
     resolve(config.set_)  # type: ignore[arg-type]
     lights = config.environments if isinstance(config, SweepConfig) else (config.environment,)
     for name in config.objects:
-        assert name in library.list_objects() or Path(name).suffix in importing.SUFFIXES
+        assert name in library.list_objects() or Path(name).suffix in objects.SUFFIXES
         assert config.label is not None or name in library.list_objects(), "a file does not bring a label"
     for name in lights:
         assert name in library.list_environments() or Path(name).suffix in environments.SUFFIXES

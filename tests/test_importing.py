@@ -20,9 +20,9 @@ from trimesh.visual.material import PBRMaterial
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.assets import Material, Mesh, ObjectAsset
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.import_images import area_average, display_image
-from advsearch.scene.import_texture import sampled
-from advsearch.scene.importing import import_object
+from advsearch.scene.importing.images import area_average, display_image
+from advsearch.scene.importing.objects import import_object
+from advsearch.scene.importing.texture import sampled
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "objects"
 real_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the shared test data is not at {DATA}")
@@ -876,7 +876,7 @@ def test_texture_transform_is_said(tmp_path: Path) -> None:
 
 
 def test_importing_does_not_pull_in_the_renderer() -> None:
-    code = "import sys, advsearch.scene.importing, advsearch.scene.environments as e\n"
+    code = "import sys, advsearch.scene.importing.objects, advsearch.scene.environments as e\n"
     code += "print({'mitsuba', 'torch'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"

@@ -15,8 +15,7 @@ from advsearch.api.measuring_report import Section, _rounding
 from advsearch.cli.main import main
 from advsearch.config import PrecisionConfig
 from advsearch.errors import InputError
-from advsearch.evaluation.precision import LEAST, Budget, gather, in_rounds, part_samples
-from advsearch.evaluation.precision_fits import (
+from advsearch.evaluation.precision.fits import (
     FURTHEST,
     INDEPENDENT,
     STRATIFIED,
@@ -28,11 +27,11 @@ from advsearch.evaluation.precision_fits import (
     recommend,
     warning_of,
 )
-from advsearch.evaluation.precision_gradient import parts_of
-from advsearch.evaluation.precision_image import COUNTS, variants
-from advsearch.evaluation.precision_machine import machine
-from advsearch.evaluation.precision_objective import Curve, Mark, curve_of, marks_at, missing, sooner
-from advsearch.evaluation.precision_points import (
+from advsearch.evaluation.precision.gradient import parts_of
+from advsearch.evaluation.precision.image import COUNTS, variants
+from advsearch.evaluation.precision.machine import machine
+from advsearch.evaluation.precision.objective import Curve, Mark, curve_of, marks_at, missing, sooner
+from advsearch.evaluation.precision.points import (
     WARM_UP,
     Point,
     Reference,
@@ -44,6 +43,7 @@ from advsearch.evaluation.precision_points import (
     reference_through,
     typical_seconds,
 )
+from advsearch.evaluation.precision.rounds import LEAST, Budget, gather, in_rounds, part_samples
 from advsearch.report.diagrams import precision_figures
 from advsearch.scene.plan import GroupPlan
 from advsearch.scene.samplers import next_count

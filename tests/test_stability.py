@@ -14,12 +14,12 @@ import torch
 from advsearch.cli import stability as command
 from advsearch.cli.main import main
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.evaluation import stability
-from advsearch.evaluation.stability import CASES, FELL_SHORT, GROUPS, OK, Case, Check, Findings, chosen, run_case
-from advsearch.evaluation.stability_case import holds
-from advsearch.evaluation.stability_cases_noise import clipped_mean, median_of_means
-from advsearch.evaluation.stability_scene import sphere
-from advsearch.evaluation.stability_search import Toy, condition_number, hessian, numbers, quadratic
+from advsearch.evaluation.stability import suite
+from advsearch.evaluation.stability.case import holds
+from advsearch.evaluation.stability.cases_noise import clipped_mean, median_of_means
+from advsearch.evaluation.stability.scene import sphere
+from advsearch.evaluation.stability.search import Toy, condition_number, hessian, numbers, quadratic
+from advsearch.evaluation.stability.suite import CASES, FELL_SHORT, GROUPS, OK, Case, Check, Findings, chosen, run_case
 
 WANTED = {
     "radiometric": (
@@ -170,7 +170,7 @@ def test_an_exception_is_a_finding(error: Exception, ending: str, text: str) -> 
 def two_cases(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     good = made(Findings((Check("a", 1.0, most=2.0),), relative_error=0.02, ending="found"), "good")
     bad = replace(made(Findings((Check("a", 3.0, most=2.0),)), "bad"), group="stiff")
-    monkeypatch.setattr(stability, "CASES", (good, bad))
+    monkeypatch.setattr(suite, "CASES", (good, bad))
     yield
 
 

@@ -24,11 +24,11 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api import sweep_view
-from advsearch.api.sweep_axes import axis_values, on_grid, read_axes
-from advsearch.api.sweep_loop import KIND, Sweep
-from advsearch.api.sweep_points import BINS, Points
 from advsearch.api.sweeping import _job_of, resume_sweep, sweep_from_config
+from advsearch.api.sweeps import view
+from advsearch.api.sweeps.axes import axis_values, on_grid, read_axes
+from advsearch.api.sweeps.loop import KIND, Sweep
+from advsearch.api.sweeps.points import BINS, Points
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.draws import NET, Draws, Seeds
 from advsearch.attacks.product import Product, batches
@@ -102,7 +102,7 @@ def fake(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Non
     FakeRenderer.made, FakeRenderer.calls, FakeRenderer.stops_at, FakeRenderer.level = [], 0, None, None
     FakeRenderer.stops_with = KeyboardInterrupt
     if "really_rendered" not in request.node.name:
-        monkeypatch.setattr(sweep_view, "make_renderer", FakeRenderer)
+        monkeypatch.setattr(view, "make_renderer", FakeRenderer)
 
 
 def model(threshold: float = 0.55, name: str = "brightness", size: int = SIZE) -> advsearch.Model:
@@ -533,7 +533,7 @@ PICTURES, WHOLE = 2 * 6 * 3 * 3, 108 + 16 + 5 + 1
 def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[list[Any], dict[str, Any]]]:
     path = tmp_path_factory.mktemp("whole") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sweep_view, "make_renderer", FakeRenderer)
+        patch.setattr(view, "make_renderer", FakeRenderer)
         FakeRenderer.made, FakeRenderer.calls = [], 0
         summary = advsearch.sweep("mug", model(), run=path, **SURVIVES).summary
         assert FakeRenderer.calls == WHOLE

@@ -8,8 +8,8 @@ from advsearch.api.mapping import region_from_config
 from advsearch.api.outcome import AttackResult
 from advsearch.api.scene import Scene, load_scene
 from advsearch.api.studies import curve_from_config, gap_from_config
-from advsearch.api.sweep_loop import SweepResult
 from advsearch.api.sweeping import sweep, sweep_from_config
+from advsearch.api.sweeps.loop import SweepResult
 from advsearch.models import Model, load_model
 
 __all__ = [

@@ -20,13 +20,13 @@ from advsearch.config import PrecisionConfig
 from advsearch.errors import InputError
 from advsearch.evaluation.gradients import Loss, inside, smooth_loss
 from advsearch.evaluation.planning import measured_plan
-from advsearch.evaluation.precision import Budget, Rounds, in_rounds
-from advsearch.evaluation.precision_fits import UNKNOWN, Theory
-from advsearch.evaluation.precision_gradient import GradientBench, Part, parts_of, theory_of
-from advsearch.evaluation.precision_image import REFERENCE_SAMPLER, PictureBench, variants
-from advsearch.evaluation.precision_machine import machine
-from advsearch.evaluation.precision_objective import ObjectiveBench, curve_of
-from advsearch.evaluation.precision_points import Point, Sample, Setting, point_of
+from advsearch.evaluation.precision.fits import UNKNOWN, Theory
+from advsearch.evaluation.precision.gradient import GradientBench, Part, parts_of, theory_of
+from advsearch.evaluation.precision.image import REFERENCE_SAMPLER, PictureBench, variants
+from advsearch.evaluation.precision.machine import machine
+from advsearch.evaluation.precision.objective import ObjectiveBench, curve_of
+from advsearch.evaluation.precision.points import Point, Sample, Setting, point_of
+from advsearch.evaluation.precision.rounds import Budget, Rounds, in_rounds
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory, check_free, default_name
 from advsearch.runs.files import write_bytes, write_text

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from advsearch.evaluation.precision_fits import (
+from advsearch.evaluation.precision.fits import (
     Against,
     Recommendation,
     RoundUp,
@@ -17,9 +17,9 @@ from advsearch.evaluation.precision_fits import (
     recommend,
     warning_of,
 )
-from advsearch.evaluation.precision_image import OIDN
-from advsearch.evaluation.precision_objective import Curve, missing, sooner
-from advsearch.evaluation.precision_points import Point, Reference, Setting
+from advsearch.evaluation.precision.image import OIDN
+from advsearch.evaluation.precision.objective import Curve, missing, sooner
+from advsearch.evaluation.precision.points import Point, Reference, Setting
 from advsearch.scene.samplers import next_count
 
 Line = tuple[str, str, str]

@@ -10,9 +10,9 @@ from torch import nn
 
 from advsearch.api.naming import different, load_models, scene_settings
 from advsearch.api.scene import Controls, Scene, as_controls, load_scene
-from advsearch.api.sweep_axes import read_axes
-from advsearch.api.sweep_job import Job, Place
-from advsearch.api.sweep_loop import SweepResult, carry_out
+from advsearch.api.sweeps.axes import read_axes
+from advsearch.api.sweeps.job import Job, Place
+from advsearch.api.sweeps.loop import SweepResult, carry_out
 from advsearch.config import SweepConfig
 from advsearch.errors import InputError
 from advsearch.models import Model

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from advsearch.cli import output
 
 if TYPE_CHECKING:
-    from advsearch.evaluation.stability import Row
+    from advsearch.evaluation.stability.suite import Row
 
 HELP = "check numerical stability on stiff and extreme cases"
 EXIT_FELL_SHORT = 3
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from advsearch.cli.progress import at_work
 
     with at_work(as_json=args.json, quiet=args.quiet) as progress:
-        from advsearch.evaluation.stability import OK, chosen, run_cases
+        from advsearch.evaluation.stability.suite import OK, chosen, run_cases
 
         cases = chosen(args.case, args.group)
         rows = [] if args.list else list(run_cases(cases, progress))
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
 
 def table(rows: Sequence[Row]) -> str:
     """Return the rows as text: a table, what was measured, and the number that decides where a case fell short."""
-    from advsearch.evaluation.stability import OK
+    from advsearch.evaluation.stability.suite import OK
 
     heads = ["group", "case", "finite", "error", "ending", "seconds", "status"]
     body = [

@@ -35,7 +35,7 @@ from advsearch.controls.values import Choices, Fixed, Number, Range, read
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
-from advsearch.scene.import_images import display_image
+from advsearch.scene.importing.images import display_image
 from advsearch.scene.sticker import Sticker, towards_camera
 
 BASE_COLOR = "object.base_color"

@@ -15,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import InputError
-from advsearch.scene import environments, importing, library, settings
+from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
+from advsearch.scene.importing.objects import import_object
 from advsearch.scene.parts import Part
 
 Doubles = npt.NDArray[np.float64]
@@ -133,7 +134,7 @@ def _object(spec: str | Path | ObjectAsset, up: str | None) -> ObjectAsset:
     if isinstance(spec, ObjectAsset):
         return spec
     if _is_path(spec):
-        return importing.import_object(Path(spec), up="y" if up == "y" else "z" if up == "z" else None)
+        return import_object(Path(spec), up="y" if up == "y" else "z" if up == "z" else None)
     if up is not None:
         raise InputError(
             f"--up: bundled objects stand upright already; leave --up out, or give a file instead of {spec!r}"

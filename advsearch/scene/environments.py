@@ -15,9 +15,9 @@ import OpenEXR
 
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.import_files import damaged, looks_like, read_bytes, safe_name
-from advsearch.scene.import_images import area_average
-from advsearch.scene.import_radiance import read_radiance
+from advsearch.scene.importing.files import damaged, looks_like, read_bytes, safe_name
+from advsearch.scene.importing.images import area_average
+from advsearch.scene.importing.radiance import read_radiance
 
 Floats = npt.NDArray[np.float32]
 

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from advsearch.scene import importing, library
+from advsearch.scene import library
 from advsearch.scene.assets import Material, Mesh, ObjectAsset, normalised
+from advsearch.scene.importing.objects import import_object
 
 MADE = ("card", "sphere")
 
@@ -23,7 +24,7 @@ def loaded(spec: str) -> ObjectAsset:
         InputError: there is no such object, or the file cannot be used.
     """
     is_file = "/" in spec or "\\" in spec or Path(spec).suffix != ""
-    return centred(importing.import_object(Path(spec)) if is_file else library.load_object(spec))
+    return centred(import_object(Path(spec)) if is_file else library.load_object(spec))
 
 
 def centred(asset: ObjectAsset) -> ObjectAsset:

@@ -1,0 +1,1 @@
+"""Work-precision diagrams: error against run time, measured in interleaved rounds."""

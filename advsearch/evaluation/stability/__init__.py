@@ -1,0 +1,1 @@
+"""The stability suite: extreme cases, each with what must hold."""

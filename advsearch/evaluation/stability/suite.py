@@ -1,0 +1,78 @@
+"""The stability suite: extreme scenes, objectives and arithmetic, each with what must hold (`advsearch stability`).
+
+A case is data (`Case`): a name, a group, what must hold, what handles it, and a function that returns findings. The
+registry is `CASES`; nothing is found by its name.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+
+from advsearch.errors import AdvsearchError, UnknownNameError
+from advsearch.evaluation.stability import (
+    cases_geometry,
+    cases_materials,
+    cases_noise,
+    cases_objective,
+    cases_precision,
+    cases_radiometric,
+    cases_stiff,
+)
+from advsearch.evaluation.stability.case import FELL_SHORT, GROUPS, OK, Case, Check, Findings, Row
+from advsearch.progress import NullProgress, Progress
+
+CASES: tuple[Case, ...] = (
+    *cases_radiometric.CASES,
+    *cases_materials.CASES,
+    *cases_geometry.CASES,
+    *cases_objective.CASES,
+    *cases_stiff.CASES,
+    *cases_precision.CASES,
+    *cases_noise.CASES,
+)
+"""Every case, in the order in which they run."""
+
+
+def chosen(names: Sequence[str] = (), groups: Sequence[str] = ()) -> tuple[Case, ...]:
+    """Return the cases of these names and of these groups; all where neither is given.
+
+    Raises:
+        UnknownNameError: there is no such case or group.
+    """
+    known = {case.name for case in CASES}
+    for name in names:
+        if name not in known:
+            raise UnknownNameError("case", name, known)
+    for group in groups:
+        if group not in GROUPS:
+            raise UnknownNameError("group", group, GROUPS)
+    if not names and not groups:
+        return CASES
+    return tuple(case for case in CASES if case.name in names or case.group in groups)
+
+
+def run_case(case: Case) -> Row:
+    """Run one case. An exception is a finding like any other: the case falls short, and the exception says why."""
+    begun = time.perf_counter()
+    try:
+        findings = case.find()
+    except AdvsearchError as error:
+        findings = Findings((Check(f"refused: {error}", 1.0, 0.0, 0.0),), ending="refused")
+    except Exception as error:
+        what = f"raised {type(error).__name__}: {error}"
+        findings = Findings((Check(what, 1.0, 0.0, 0.0),), finite=False, ending="raised")
+    return Row(case, findings, time.perf_counter() - begun)
+
+
+def run_cases(cases: Sequence[Case] = CASES, progress: Progress | None = None) -> Iterator[Row]:
+    """Run cases one after the other and yield each row as it is done."""
+    progress = progress or NullProgress()
+    progress.stage("stability", len(cases))
+    for case in cases:
+        row = run_case(case)
+        progress.advance(1, case=case.name)
+        yield row
+
+
+__all__ = ["CASES", "FELL_SHORT", "GROUPS", "OK", "Case", "Check", "Findings", "Row", "chosen", "run_case", "run_cases"]

@@ -1,0 +1,1 @@
+"""Objects and environments from files: meshes, their surfaces and textures, radiance maps."""

@@ -1,0 +1,341 @@
+"""Repair of imported geometry: welding, faces without area, winding, normals.
+
+Everything works on a `Soup`: welded points, and attributes that belong to the corners of faces, so that no step has to
+care where a file splits its vertices. They are split again, where normals or UVs differ, when the mesh is assembled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array, csgraph
+from scipy.spatial import cKDTree
+
+from advsearch.errors import InputError
+from advsearch.scene.assets import Mesh
+from advsearch.scene.importing.parts import Part
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+
+WELD = 1e-6
+"""Points closer than this share of the largest extent are one point; text and 32-bit files round to about that."""
+
+FLAT = 1e-12
+"""Twice the area, in squared extents, up to which a face counts as having none."""
+
+CREASE_DEGREES = 40.0
+"""Where the normals of two neighbouring faces differ by more, a computed normal is not smoothed across their edge."""
+
+TRUSTED = 0.98
+"""Share of the surface on which a file's normals must face the same way as the faces for the normals to be kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class Soup:
+    """Triangles with welded points and per-corner attributes.
+
+    Attributes:
+        points: (P, 3) float64, the largest extent 1.
+        faces: (F, 3) int64 indices of points.
+        part: (F,) int64, the part of the file that the face belongs to.
+        normals: (F, 3, 3) float64 unit normals of the corners; NaN where unknown.
+        uvs: (F, 3, 2) float64; NaN where unknown.
+        colors: (F, 3, 3) float64 display-referred factors of the base colour; 1 where the file gives none.
+    """
+
+    points: Array
+    faces: Ints
+    part: Ints
+    normals: Array
+    uvs: Array
+    colors: Array
+
+    def only(self, keep: Bools) -> Soup:
+        """Return the soup with a part of its faces; `keep` is (F,)."""
+        return Soup(
+            self.points, self.faces[keep], self.part[keep], self.normals[keep], self.uvs[keep], self.colors[keep]
+        )
+
+    def reversed(self, turn: Bools) -> Soup:
+        """Return the soup with some faces turned over; `turn` is (F,). Normals stay as they are."""
+        order = np.where(turn[:, None], [0, 2, 1], [0, 1, 2])
+        rows = np.arange(len(order))[:, None]
+        return replace(
+            self,
+            faces=self.faces[rows, order],
+            normals=self.normals[rows, order],
+            uvs=self.uvs[rows, order],
+            colors=self.colors[rows, order],
+        )
+
+    def face_vectors(self) -> Array:
+        """Return (F, 3) vectors along the face normals, as long as twice the faces' areas."""
+        a, b, c = (self.points[self.faces[:, k]] for k in range(3))
+        return np.cross(b - a, c - a)
+
+
+def join(parts: Sequence[Part], source: str, *, y_up: bool) -> Soup:
+    """Join parts into one soup of unit extent, z up, with welded points.
+
+    Args:
+        parts: at least one.
+        source: the file, for messages.
+        y_up: whether the file's y axis points up; it is turned about x by 90 degrees, which keeps handedness.
+
+    Raises:
+        InputError: vertices that are NaN or infinite, faces that refer to none, or no extent.
+    """
+    vertices = np.concatenate([part.vertices for part in parts])
+    starts = np.cumsum([0] + [len(part.vertices) for part in parts])
+    for part in parts:
+        if part.faces.min() < 0 or part.faces.max() >= len(part.vertices):
+            raise InputError(
+                f"{source}: a face refers to a vertex that is not there; the file is damaged, export it again"
+            )
+    bad = ~np.isfinite(vertices).all(axis=1)
+    if bad.any():
+        first = int(bad.argmax())
+        raise InputError(
+            f"{source}: expected finite vertices, got {int(bad.sum())} of {len(vertices)} with NaN or infinite"
+            f" coordinates (the first: {vertices[first].tolist()}); repair the mesh or export it again"
+        )
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
+    turn = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]) if y_up else np.eye(3)
+    used = vertices[np.unique(faces)]
+    low, high = used.min(axis=0), used.max(axis=0)
+    size = float((high / 2 - low / 2).max()) * 2
+    if not 0.0 < size < np.inf:
+        what = "all vertices coincide" if size == 0.0 else "its extent is too large to compute with"
+        raise InputError(f"{source}: expected an object with a size, got a mesh in which {what}; export it again")
+    points, index = _welded((vertices - low) / size @ turn.T)
+    normals = unit_vectors(np.concatenate([_corners(part.normals, part.faces, 3) for part in parts])) @ turn.T
+    return Soup(
+        points=points,
+        faces=index[faces],
+        part=np.concatenate([np.full(len(part.faces), number) for number, part in enumerate(parts)]),
+        normals=normals,
+        uvs=np.concatenate([_corners(part.uvs, part.faces, 2) for part in parts]),
+        colors=np.concatenate([np.ones((len(p.faces), 3, 3)) if p.colors is None else p.colors for p in parts]),
+    )
+
+
+def repaired(soup: Soup, source: str) -> tuple[Soup, list[str]]:
+    """Drop faces without area, make the winding consistent and outward, and fill in or replace bad normals.
+
+    Args:
+        soup: as `join` gives it.
+        source: the file, for errors.
+
+    Returns:
+        The repaired soup, every normal of unit length and on the front of its face, and the warnings.
+
+    Raises:
+        InputError: no face has an area.
+    """
+    notes = []
+    flat = np.linalg.norm(soup.face_vectors(), axis=1) <= FLAT
+    if flat.all():
+        raise InputError(f"{source}: expected faces with an area, got {len(flat)} without; export it again")
+    if flat.any():
+        notes.append(f"{int(flat.sum())} faces without area were removed")
+        soup = soup.only(~flat)
+    soup, winding = _wound(soup)
+    soup, shading = _shaded(soup)
+    return soup, notes + winding + shading
+
+
+def assemble(soup: Soup) -> Mesh:
+    """Return the soup as a mesh: corners with the same point, normal and UV become one vertex."""
+    normals, uvs = soup.normals.astype(np.float32) + np.float32(0.0), soup.uvs.astype(np.float32) + np.float32(0.0)
+    corners = soup.faces.reshape(-1)
+    keys = np.column_stack([corners, normals.reshape(-1, 3).view(np.int32), uvs.reshape(-1, 2).view(np.int32)])
+    _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    return Mesh(
+        vertices=soup.points[corners[first]].astype(np.float32),
+        faces=index.reshape(-1, 3).astype(np.uint32),
+        normals=normals.reshape(-1, 3)[first],
+        uvs=uvs.reshape(-1, 2)[first],
+    )
+
+
+# --- winding ----------------------------------------
+
+
+def _wound(soup: Soup) -> tuple[Soup, list[str]]:
+    """Turn faces over until neighbours agree and closed shells, and sheets with normals, face outwards."""
+    left, right, same_way = neighbours(soup.faces)
+    area = np.linalg.norm(soup.face_vectors(), axis=1)
+    turn, shell, twisted = _agreement(area, left, right, same_way)
+    notes = []
+    if turn.any():
+        notes.append(f"{int(turn.sum())} faces wound against their neighbours were turned over")
+    if twisted:
+        notes.append("has a one-sided surface (a Moebius strip), so some faces show their backs")
+    soup = soup.reversed(turn)
+    inside_out = _inside_out(soup, shell, _closed(soup.faces, shell))
+    if inside_out.any():
+        notes.append(f"{int(inside_out[shell].sum())} faces were inside out and have been turned over")
+    return soup.reversed(inside_out[shell]), notes
+
+
+def neighbours(faces: Ints) -> tuple[Ints, Ints, Bools]:
+    """Return, for each edge of exactly two faces, the corner in each of them at which the edge starts (3 face + k).
+
+    The third array tells whether both faces run along the edge in the same direction, that is, disagree in winding.
+    """
+    start, end = faces.reshape(-1), np.roll(faces, -1, axis=1).reshape(-1)
+    low, high = np.minimum(start, end), np.maximum(start, end)
+    order = np.lexsort((high, low))
+    fresh = np.concatenate([[True], (np.diff(low[order]) != 0) | (np.diff(high[order]) != 0)])
+    first = np.flatnonzero(fresh)
+    pairs = first[np.diff(np.append(first, len(order))) == 2]
+    left, right = order[pairs], order[pairs + 1]
+    return left, right, start[left] == start[right]
+
+
+def _agreement(area: Array, left: Ints, right: Ints, same_way: Bools) -> tuple[Bools, Ints, bool]:
+    """Decide which faces to turn over so that neighbours agree, keeping the way of most of each shell's area.
+
+    Every face stands for two nodes of a graph, "as it is" and "turned"; neighbours that agree are linked like to like,
+    others crosswise. A shell is orientable when the two nodes of its faces fall into two components.
+
+    Returns:
+        turn (F,) bool, the shell that each face belongs to (F,) int64, and whether some shell is one-sided.
+    """
+    f, g, count = left // 3, right // 3, len(area)
+    a = np.concatenate([2 * f, 2 * f + 1])
+    b = np.concatenate([2 * g + same_way, 2 * g + 1 - same_way])
+    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(2 * count, 2 * count))
+    side = csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
+    kept, turned = side[0::2], side[1::2]
+    votes = np.bincount(kept, weights=area, minlength=int(side.max()) + 1)
+    turn = (votes[turned] > votes[kept]) | ((votes[turned] == votes[kept]) & (turned < kept))
+    _, shell = np.unique(np.minimum(kept, turned), return_inverse=True)
+    return turn, shell.astype(np.int64), bool((kept == turned).any())
+
+
+def _closed(faces: Ints, shell: Ints) -> Bools:
+    """Return, for each shell, whether all its edges belong to exactly two faces of it."""
+    left, _, _ = neighbours(faces)
+    paired = np.bincount(shell[left // 3], minlength=int(shell.max()) + 1) * 2
+    return np.equal(paired, 3 * np.bincount(shell))
+
+
+def _inside_out(soup: Soup, shell: Ints, closed: Bools) -> Bools:
+    """Return, for each shell, whether it must be turned over.
+
+    A closed shell must when its signed volume is negative, unless it lies within another closed shell (then it is the
+    wall of a hollow) and the file's normals do not object. An open sheet must when the file's normals point away from
+    its front.
+    """
+    count, vectors = len(closed), soup.face_vectors()
+    corners = soup.points[soup.faces]
+    middle = _per_shell(corners.mean(axis=1), shell) / np.bincount(shell)[:, None]
+    volume = np.bincount(shell, weights=((corners[:, 0] - middle[shell]) * vectors).sum(axis=1), minlength=count)
+    toward = np.nan_to_num((soup.normals * vectors[:, None]).sum(axis=2)).sum(axis=1)
+    agreement = np.bincount(shell, weights=toward, minlength=count)  # with the file's normals; 0 where it has none
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, shell, corners.min(axis=1))
+    np.maximum.at(high, shell, corners.max(axis=1))
+    mostly = volume[closed].sum() < 0.0  # then the whole object is inside out, hollows included
+    negative = (volume < 0.0) ^ mostly
+    for number in np.flatnonzero(closed & negative):
+        around = closed & (low < low[number]).all(axis=1) & (high > high[number]).all(axis=1)
+        negative[number] = not around.any() or (agreement[number] > 0.0 if mostly else agreement[number] < 0.0)
+    return np.where(closed, negative ^ mostly, agreement < 0.0)
+
+
+def _per_shell(values: Array, shell: Ints) -> Array:
+    """Sum (F, 3) values over the faces of each shell."""
+    return np.stack([np.bincount(shell, weights=values[:, k]) for k in range(3)], axis=1)
+
+
+# --- normals ----------------------------------------
+
+
+def _shaded(soup: Soup) -> tuple[Soup, list[str]]:
+    """Keep the file's normals where they are sound, and compute the others."""
+    vectors = soup.face_vectors()
+    area = np.linalg.norm(vectors, axis=1)
+    known = np.isfinite(soup.normals).all(axis=2)
+    front = (soup.normals * vectors[:, None]).sum(axis=2) > 0.0
+    notes, normals = [], soup.normals
+    if known.any():
+        weight = np.where(known, area[:, None], 0.0)
+        share = float((weight * front).sum() / weight.sum())
+        if share < 1.0 - TRUSTED:
+            notes.append("its normals pointed inwards and were turned around")
+            normals, front = -normals, known & ~front
+        elif share < TRUSTED:
+            notes.append("its normals contradict its faces and were computed anew")
+            front = np.zeros_like(front)
+    if not front.all():
+        normals = np.where((known & front)[:, :, None], normals, smooth_normals(soup))
+    return replace(soup, normals=normals), notes
+
+
+def smooth_normals(soup: Soup, crease_degrees: float = CREASE_DEGREES) -> Array:
+    """Compute corner normals, smooth except across creases.
+
+    At each point, the faces that can be reached from one another over edges with less than the crease angle share one
+    normal: the mean of their normals weighted by their angles at that point (Thuermer and Wuethrich 1998).
+
+    Returns:
+        (F, 3, 3) float64 unit normals.
+    """
+    unit = unit_vectors(soup.face_vectors())
+    left, right, same_way = neighbours(soup.faces)
+    gentle = (unit[left // 3] * unit[right // 3]).sum(axis=1) >= np.cos(np.radians(crease_degrees))
+    left, right = left[gentle & ~same_way], right[gentle & ~same_way]
+    after = [corner - corner % 3 + (corner + 1) % 3 for corner in (left, right)]
+    a, b = np.concatenate([left, after[0]]), np.concatenate([after[1], right])
+    count = soup.faces.size
+    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(count, count))
+    groups, group = csgraph.connected_components(graph, directed=False)
+    weighted = unit[:, None] * _angles(soup)[:, :, None]
+    sums: Array = np.stack([np.bincount(group, weighted[:, :, k].ravel(), groups) for k in range(3)], axis=1)
+    smooth = unit_vectors(sums)[group].reshape(-1, 3, 3)
+    sound = (smooth * unit[:, None]).sum(axis=2, keepdims=True) > 0.0  # NaN, where normals cancel, is not
+    return np.where(sound, smooth, unit[:, None])
+
+
+def _angles(soup: Soup) -> Array:
+    """Return the (F, 3) angles of the faces at their corners, in radians."""
+    corners = soup.points[soup.faces]
+    ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
+    angles: Array = np.arctan2(np.linalg.norm(np.cross(ahead, behind), axis=2), (ahead * behind).sum(axis=2))
+    return angles
+
+
+# --- small pieces ----------------------------------------
+
+
+def _welded(points: Array) -> tuple[Array, Ints]:
+    """Merge points closer than `WELD`; return the merged points, and for each old point its new index."""
+    unique, index = np.unique(points + 0.0, axis=0, return_inverse=True)
+    pairs = cKDTree(unique).query_pairs(WELD, output_type="ndarray")
+    if not len(pairs):
+        return unique, index.reshape(-1)
+    graph = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), shape=(len(unique),) * 2)
+    _, cluster = csgraph.connected_components(graph, directed=False)
+    _, first, merged = np.unique(cluster, return_index=True, return_inverse=True)
+    return unique[first], merged[index.reshape(-1)].astype(np.int64)
+
+
+def _corners(values: Array | None, faces: Ints, width: int) -> Array:
+    """Spread per-vertex values to the corners of faces; NaN where there are none."""
+    return np.full((len(faces), 3, width), np.nan) if values is None else values[faces]
+
+
+def unit_vectors(vectors: Array) -> Array:
+    """Scale vectors, along the last axis, to unit length; NaN where they have no direction."""
+    with np.errstate(all="ignore"):
+        largest = np.abs(vectors).max(axis=-1, keepdims=True)
+        scaled = vectors / largest
+        result = scaled / np.linalg.norm(scaled, axis=-1, keepdims=True)
+    return np.where(np.isfinite(result).all(axis=-1, keepdims=True), result, np.nan)

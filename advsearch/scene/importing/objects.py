@@ -1,0 +1,88 @@
+"""Objects from mesh files: ``--object path.obj|.ply|.glb|.gltf|.stl``."""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from advsearch.errors import InputError
+from advsearch.scene.assets import Material, ObjectAsset, normalised
+from advsearch.scene.importing.files import read_bytes, safe_name
+from advsearch.scene.importing.geometry import Soup, assemble, join, repaired
+from advsearch.scene.importing.parts import GLTF, read_parts
+from advsearch.scene.importing.surfaces import Surface
+from advsearch.scene.importing.texture import textured
+
+SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl")
+"""The mesh files that can be imported."""
+
+
+def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = None) -> ObjectAsset:
+    """Read an object from a mesh file, repaired, normalised and with a texture.
+
+    - All geometry in the file is joined, with the transforms of its scene graph.
+    - Axes: y up for .glb and .gltf, as their specification says, and z up for the formats that leave it open; `up`
+      overrides. y up is turned to z up by 90 degrees about x. Then the object is scaled to a largest extent of 1 and
+      set on z = 0.
+    - Faces without area are removed, the winding is made consistent, closed shells that are inside out are turned over.
+    - Normals are the file's; where it has none, or they contradict the faces, they are computed: smooth, with creases
+      where faces meet at more than 40 degrees.
+    - UVs are the file's, moved into [0, 1] where that takes little. Where it has none, where they repeat a texture or
+      are squashed, and where there are several materials, xatlas makes new ones and the colours are baked into a map.
+    - Base colour: the material's texture (averaged down to at most 1024 texels on its long side; alpha is dropped),
+      otherwise the material's colour, otherwise vertex or face colours, otherwise grey of display-referred 0.5. A glTF
+      texture is multiplied by its linear factor. The ``Kd`` of an .mtl is taken as display-referred, and ignored beside
+      a ``map_Kd``. Where a texture is missing, the colour takes its place, or grey if that is plain white, with a
+      warning.
+    - Roughness and metallic are those of glTF where given, their mean over several materials, and else `Material`'s.
+
+    The same file gives the same bytes every time.
+
+    Args:
+        path: a file that ends in one of `SUFFIXES`; files that it refers to are looked up beside it.
+        up: the axis that points up in the file, or None for the format's own.
+
+    Raises:
+        FileFormatError: the file is missing, of another kind, damaged, or holds no faces; the message names it.
+        InputError: `up` is neither, or the geometry has NaN, infinite, or coincident vertices only.
+    """
+    if up not in (None, "y", "z"):
+        raise InputError(f"up axis: expected 'y' or 'z', got {up!r}")
+    file = Path(path)
+    data = read_bytes(file, "object", SUFFIXES)
+    parts, notes = read_parts(file, data)
+    y_up = up == "y" or (up is None and file.suffix.lower() in GLTF)
+    soup, repairs = repaired(join(parts, str(file), y_up=y_up), str(file))
+    surfaces = [part.surface for part in parts]
+    soup, base_color, bakes = textured(soup, surfaces)
+    material, blends = _material(soup, surfaces)
+    return ObjectAsset(
+        name=safe_name(file),
+        mesh=normalised(assemble(soup)),
+        base_color=base_color,
+        material=material,
+        source=str(file),
+        warnings=(*notes, *(f"{file.name}: {note}" for note in repairs + bakes + blends)),
+    )
+
+
+def _material(soup: Soup, surfaces: list[Surface]) -> tuple[Material, list[str]]:
+    """Return the mean of the parts' roughness and metallic, weighted by area, and a warning where they differ."""
+    area = np.bincount(soup.part, weights=np.linalg.norm(soup.face_vectors(), axis=1), minlength=len(surfaces))
+    default = Material()
+    values = np.array(
+        [
+            [
+                default.roughness if surface.roughness is None else surface.roughness,
+                default.metallic if surface.metallic is None else surface.metallic,
+            ]
+            for surface in surfaces
+        ]
+    )
+    same = bool((values[area > 0] == values[area > 0][0]).all())
+    roughness, metallic = values[area > 0][0] if same else (values * area[:, None]).sum(axis=0) / area.sum()
+    notes = [] if same else ["the roughness and metallic of its materials are replaced by their means"]
+    return Material(roughness=float(roughness), metallic=float(metallic)), notes

@@ -1,0 +1,289 @@
+"""Mesh files as a list of parts: one piece of geometry with one surface each, in the file's own coordinates.
+
+trimesh does the parsing. What it invents where a file is silent (a grey texture, a default colour, normals made on
+demand) is told apart from what the file says here and in `surfaces`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import re
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+from trimesh.resolvers import FilePathResolver
+
+from advsearch.errors import FileFormatError
+from advsearch.scene.color import linear_to_srgb
+from advsearch.scene.importing.checks import checked, gltf_header
+from advsearch.scene.importing.files import damaged, text_of
+from advsearch.scene.importing.surfaces import UNNAMED, Named, Surface, SurfaceReader, plain_name
+
+Array = npt.NDArray[np.float64]
+
+GLTF = (".glb", ".gltf")
+"""Endings of glTF files, which have conventions of their own: y up, linear colours."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One piece of a mesh file, with the transform of its place in the file applied.
+
+    Attributes:
+        vertices: (V, 3) float64 positions in the file's axes and units; may hold NaN.
+        faces: (F, 3) int64 vertex indices, F > 0.
+        normals: (V, 3) float64 of the file, not necessarily unit length or finite; None when the file gives none.
+        uvs: (V, 2) float64 of the file, v = 0 at the bottom row; None when the file gives none.
+        colors: (F, 3, 3) float64 display-referred sRGB of each corner, which multiply the base colour in linear light;
+            None when the file gives none.
+        surface: the part's material.
+    """
+
+    vertices: Array
+    faces: npt.NDArray[np.int64]
+    normals: Array | None
+    uvs: Array | None
+    colors: Array | None
+    surface: Surface
+
+
+class _Resolver:
+    """Finds the files that a mesh file names, and remembers what it found in material files and what is missing.
+
+    Attributes:
+        missing: names that were asked for and are not there.
+        materials: names of the materials in the .mtl files read.
+        named: for each material that names a texture: the file that names it, and the texture's name.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._files = FilePathResolver(str(path), allow_anywhere=True)
+        self.missing: list[str] = []
+        self.materials: set[str] = set()
+        self.named: Named = {}
+
+    def get(self, name: str) -> bytes:
+        """Return the content of a named file; after the name as it stands, its usual distortions are tried."""
+        plain = plain_name(name)
+        options_dropped = plain.split()[-1] if plain.split() else plain  # map_Kd -s 1 1 1 wood.png
+        for candidate in (name, plain, options_dropped):
+            try:
+                data = bytes(self._files.get(candidate))
+            except (OSError, ValueError):
+                continue
+            return self._noted(candidate, data) if candidate.lower().endswith(".mtl") else data
+        self.missing.append(plain)
+        raise FileNotFoundError(name)
+
+    __getitem__ = get
+
+    def _noted(self, name: str, data: bytes) -> bytes:
+        """Note the materials of a material file and the textures they name; return it as UTF-8."""
+        current = None
+        for line in text_of(data).splitlines():
+            key, _, rest = line.strip().partition(" ")
+            if key.lower() == "newmtl":
+                current = " ".join(rest.split())
+                self.materials.add(current)
+            elif key.lower() == "map_kd" and current is not None and rest.strip():
+                self.named[current] = (Path(name).name, rest.strip())
+        return text_of(data).encode()
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Keep trimesh's log messages, some with tracebacks, and numpy's warnings about damaged files to ourselves."""
+    logger, handler = logging.getLogger("trimesh"), logging.NullHandler()
+    propagate, logger.propagate = logger.propagate, False
+    logger.addHandler(handler)  # without any, Python would print them
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.removeHandler(handler)
+        logger.propagate = propagate
+
+
+@_silent()
+def read_parts(path: Path, data: bytes) -> tuple[list[Part], list[str]]:
+    """Parse a mesh file.
+
+    Args:
+        path: the file; its ending names the format, and files that it refers to are looked up beside it.
+        data: its content.
+
+    Returns:
+        The parts that have faces (at least one), always in the same order, and the warnings.
+
+    Raises:
+        FileFormatError: the file is damaged, not a mesh, refers to missing geometry, or has no faces.
+    """
+    resolver = _Resolver(path)
+    found = _parse(path, checked(path, data), resolver)
+    meshes = [(mesh, matrix) for mesh, matrix in found if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
+    if any(np.shape(mesh.vertices)[1:] != (3,) for mesh, _ in meshes):
+        raise damaged(path, "vertices with 3 coordinates", "another number")
+    if not meshes:
+        got = "points or lines only" if found else "none"
+        raise FileFormatError(f"{path}: expected a mesh with faces, got {got}; export triangles")
+    notes = _file_notes(path, data, resolver)
+    if len(meshes) < len(found):
+        notes.append(f"{path.name}: {len(found) - len(meshes)} parts without faces (points, lines) are left out")
+    reader = SurfaceReader(path.name, _named_textures(path, data, resolver), set(resolver.missing))
+    parts = []
+    for mesh, matrix in meshes:
+        part = _part(mesh, reader.surface(mesh.visual), linear=path.suffix.lower() in GLTF)
+        if _has_face_uvs(path, data):  # trimesh has shuffled the vertices, but not what belongs to them
+            part = replace(part, normals=None, colors=None)
+        parts.append(_placed(part, matrix))
+    return parts, notes + reader.notes
+
+
+def _parse(path: Path, data: bytes, resolver: _Resolver) -> list[tuple[Any, Array]]:
+    """Run trimesh's parser; return what it found with the transforms (4, 4), always in the same order."""
+    kind = path.suffix.lower().lstrip(".")
+    options: dict[str, Any] = {"process": False}
+    if kind == "ply":  # with fix_texture, vertices are shuffled and their normals are not
+        options["fix_texture"] = _has_face_uvs(path, data)
+    try:
+        scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, **options)
+        found = []
+        for node in scene.graph.nodes_geometry:
+            matrix, name = scene.graph.get(node)
+            found.append((str(name), np.asarray(matrix, dtype=np.float64)))
+        found.sort(key=lambda item: (item[0], item[1].tobytes()))  # the names of nodes can be random
+        return [(scene.geometry[name], matrix) for name, matrix in found]
+    except Exception as error:
+        if resolver.missing:
+            message = f"{path}: needs {resolver.missing[0]!r}, which is missing; put that file beside it"
+        else:
+            reason = " ".join(str(error).split())[:120] or type(error).__name__
+            message = f"{path}: is not readable {kind.upper()} ({reason}); it is damaged or cut short, export it again"
+        raise FileFormatError(message) from error
+
+
+def _has_face_uvs(path: Path, data: bytes) -> bool:
+    """Tell whether a PLY file keeps texture coordinates with its faces, not with its vertices."""
+    return path.suffix.lower() == ".ply" and b"texcoord" in data.split(b"end_header")[0]
+
+
+def _file_notes(path: Path, data: bytes, resolver: _Resolver) -> list[str]:
+    """Return the warnings about material files, and about features of the file that are not carried over."""
+    notes = []
+    for name in resolver.missing:
+        if name.lower().endswith(".mtl"):
+            notes.append(
+                f"{path.name} names the material file {name!r}, which is missing; neutral grey is used instead"
+            )
+    if path.suffix.lower() == ".obj" and resolver.materials:
+        used = set(re.findall(r"^\s*usemtl\s+(.*?)\s*$", text_of(data), re.MULTILINE))
+        for name in sorted(used - resolver.materials):
+            notes.append(
+                f"{path.name} uses the material {name!r}, which its .mtl file lacks; neutral grey is used instead"
+            )
+    if path.suffix.lower() in GLTF:
+        if "KHR_texture_transform" in gltf_header(path, data).get("extensionsUsed", ()):
+            notes.append(f"{path.name} moves its textures with KHR_texture_transform, which is not applied")
+    return notes
+
+
+def _named_textures(path: Path, data: bytes, resolver: _Resolver) -> Named:
+    """Return, for each material that names a base colour texture, the file that names it and the texture's name."""
+    if path.suffix.lower() == ".ply":
+        found = re.search(r"^comment TextureFile\s+(.*?)\s*$", text_of(data.split(b"end_header")[0]), re.MULTILINE)
+        return {UNNAMED: (path.name, found[1])} if found else {}
+    if path.suffix.lower() not in GLTF:
+        return resolver.named
+    header = gltf_header(path, data)
+    images: dict[str | None, str | None] = {}
+    for material in header.get("materials", []):
+        name, texture = material.get("name"), _gltf_texture(header, material)
+        images[name] = texture if name not in images or images[name] else None
+    return {name: (path.name, image) for name, image in images.items() if image}
+
+
+def _gltf_texture(header: dict[str, Any], material: dict[str, Any]) -> str | None:
+    """Return a name for the base colour image of a glTF material, or None when it has none."""
+    try:
+        texture = header["textures"][material["pbrMetallicRoughness"]["baseColorTexture"]["index"]]
+        uri = str(header["images"][texture["source"]].get("uri", "data:"))
+    except (KeyError, IndexError, TypeError):
+        return None
+    return "(embedded)" if uri.startswith("data:") else uri
+
+
+def _part(mesh: Any, surface: Surface, *, linear: bool) -> Part:
+    """Return what the file says about a parsed mesh; `linear` tells how its vertex colours are encoded."""
+    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
+    normals = mesh._cache.cache.get("vertex_normals")  # the public property would make normals up
+    uvs = getattr(mesh.visual, "uv", None)
+    plain = surface.color is None and surface.texture is None
+    colors = _corner_colors(mesh, faces, plain=plain, linear=linear)
+    if plain and colors is not None:  # they are the base colour then, and not its factor
+        surface = replace(surface, color=np.ones(3, np.float32))
+    return Part(
+        vertices=vertices,
+        faces=faces,
+        normals=None if normals is None else np.asarray(normals, dtype=np.float64),
+        uvs=np.asarray(uvs, dtype=np.float64) if uvs is not None and uvs.shape == (len(vertices), 2) else None,
+        colors=colors,
+        surface=surface,
+    )
+
+
+def _placed(part: Part, matrix: Array) -> Part:
+    """Return a part moved to its place in the file by an affine transform (4, 4)."""
+    if np.array_equal(matrix, np.eye(4)):
+        return part
+    turn, normals = matrix[:3, :3], part.normals
+    with np.errstate(all="ignore"):
+        vertices = part.vertices @ turn.T + matrix[:3, 3]
+        if normals is not None:  # a normal turns with the cofactors of the matrix
+            normals = normals @ np.cross(turn[[1, 2, 0]], turn[[2, 0, 1]]).T
+    if not np.linalg.det(turn) < 0.0:
+        return replace(part, vertices=vertices, normals=normals)
+    colors = None if part.colors is None else part.colors[:, ::-1]  # a mirror turns faces over, and cofactors normals
+    return replace(
+        part,
+        vertices=vertices,
+        faces=part.faces[:, ::-1],
+        normals=None if normals is None else -normals,
+        colors=colors,
+    )
+
+
+def _corner_colors(mesh: Any, faces: npt.NDArray[np.int64], *, plain: bool, linear: bool) -> Array | None:
+    """Return the colours that the file gives to vertices or faces.
+
+    Args:
+        mesh: as trimesh parsed it.
+        faces: (F, 3) its faces.
+        plain: whether it has no material; beside one, only the colours of glTF count.
+        linear: whether the colours are linear, as in glTF, or display-referred.
+
+    Returns:
+        (F, 3, 3) float64 display-referred, or None.
+    """
+    visual, at = mesh.visual, faces
+    if visual.kind == "vertex":
+        given = visual.vertex_colors
+    elif visual.kind == "face":
+        given, at = visual.face_colors, np.repeat(np.arange(len(faces))[:, None], 3, axis=1)
+    elif visual.kind == "texture" and "color" in visual.vertex_attributes:
+        given = visual.vertex_attributes["color"]
+    else:
+        given = mesh.vertex_attributes.get("color") if plain else None
+    if np.ndim(given) != 2 or len(given) <= int(at.max()) or given.shape[1] < 3:
+        return None
+    scale = 1.0 if given.dtype.kind == "f" else float(np.iinfo(given.dtype).max)
+    colors = np.clip(np.nan_to_num(given[:, :3].astype(np.float32) / np.float32(scale)), 0.0, 1.0)
+    return np.asarray((linear_to_srgb(colors) if linear else colors)[at], dtype=np.float64)

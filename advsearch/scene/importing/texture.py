@@ -1,0 +1,253 @@
+"""The base colour map of an imported object, and texture coordinates that fit it.
+
+The file's own UVs and texture are kept where they can be used as they are. Otherwise the mesh is unwrapped with xatlas
+and whatever colours the file has (repeating textures, several materials, vertex colours) are baked into one texture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse import coo_array, csgraph
+
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
+from advsearch.scene.importing.geometry import Array, Ints, Soup
+from advsearch.scene.importing.images import TEXTURE_LIMIT
+from advsearch.scene.importing.surfaces import NEUTRAL, Surface
+from advsearch.scene.importing.unwrap import unwrapped
+
+Floats = npt.NDArray[np.float32]
+
+PLAIN_SIZE = 8
+"""Width and height, in texels, of the base colour map of an object of one colour."""
+
+BAKED_SIZE = 512
+"""Width and height of the smallest base colour map that is baked."""
+
+_SLACK = 1e-4  # how far UVs may overstep [0, 1] and still be clipped
+_SQUASHED = 0.05  # share of the surface that may have no area in UV space
+_CRAMPED = 0.02  # share of the unit square that UVs must cover in all
+_WINDOW = 1.5  # how many textures wide and high UVs may be and still keep their layout
+_FILLED = 0.5  # share of an atlas that its charts fill, about
+_CHUNK = 1 << 21  # candidate texels that are rasterised at a time
+
+
+def textured(soup: Soup, surfaces: Sequence[Surface]) -> tuple[Soup, Floats, list[str]]:
+    """Return the soup with UVs in [0, 1] on every corner, the base colour map that fits them, and the warnings.
+
+    Args:
+        soup: repaired geometry.
+        surfaces: the surface of each part.
+
+    Returns:
+        The soup, a (H, W, 3) float32 display-referred map in [0, 1] with row 0 on top, and sentences.
+    """
+    used = [surfaces[number] for number in np.unique(soup.part)]
+    uniform = all(surface.same_color(used[0]) for surface in used)
+    colored = uniform and _one_factor(soup)
+    texture = used[0].texture
+    if colored and texture is None:
+        color = _plain(used[0]) if soup.colors.min() == 1.0 else _tinted(_plain(used[0]), soup.colors[0, 0])
+        kept = _usable(soup, soup.uvs)
+        soup = replace(soup, uvs=np.clip(soup.uvs, 0.0, 1.0)) if kept else unwrapped(soup)
+        return soup, np.full((PLAIN_SIZE, PLAIN_SIZE, 3), color, dtype=np.float32), []
+    if colored and texture is not None and soup.colors.min() == 1.0 and np.isfinite(soup.uvs).all():
+        uvs, texture = _windowed(_into_unit_square(soup), texture)
+        if _usable(soup, uvs):
+            return replace(soup, uvs=np.clip(uvs, 0.0, 1.0)), texture, []
+    fresh = unwrapped(soup)
+    return fresh, baked(fresh.uvs, soup, surfaces), [_why(soup, used, uniform)]
+
+
+def _why(soup: Soup, used: Sequence[Surface], uniform: bool) -> str:
+    """Return the sentence that says why the object was unwrapped anew."""
+    if not uniform:
+        return f"the colours of its {len(used)} parts were baked into one texture"
+    if not _one_factor(soup) or soup.colors.min() < 1.0:
+        return "its vertex or face colours were baked into a texture"
+    if not np.isfinite(soup.uvs).all():
+        return "it has a texture but lacks texture coordinates; where it does, the texture's mean colour is used"
+    return "its texture coordinates repeat or hardly use the texture; it was unwrapped anew and its texture resampled"
+
+
+def _one_factor(soup: Soup) -> bool:
+    """Tell whether the same colour factor holds everywhere."""
+    return bool((soup.colors == soup.colors[0, 0]).all())
+
+
+def _plain(surface: Surface) -> Floats:
+    """Return the base colour of a surface without texture, (3,) display-referred."""
+    return np.full(3, NEUTRAL, dtype=np.float32) if surface.color is None else surface.color
+
+
+def _tinted(color: npt.NDArray[np.floating], factor: npt.NDArray[np.floating]) -> Floats:
+    """Multiply display-referred colours (..., 3) in linear light."""
+    product = srgb_to_linear(np.asarray(color, np.float32)) * srgb_to_linear(np.asarray(factor, np.float32))
+    return linear_to_srgb(product.astype(np.float32))
+
+
+# --- the file's UVs ----------------------------------------
+
+
+def uv_areas(uvs: Array) -> Array:
+    """Return the (F,) signed areas of the faces in UV space, for uvs of shape (F, 3, 2)."""
+    a, b = uvs[:, 1] - uvs[:, 0], uvs[:, 2] - uvs[:, 0]
+    return (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2.0
+
+
+def _usable(soup: Soup, uvs: Array) -> bool:
+    """Tell whether UVs are known, inside the unit square, not squashed to lines, and use the square."""
+    if not np.isfinite(uvs).all() or uvs.min() < -_SLACK or uvs.max() > 1.0 + _SLACK:
+        return False
+    flat, surface = np.abs(uv_areas(uvs)), np.linalg.norm(soup.face_vectors(), axis=1)
+    return bool(surface[flat < 1e-12].sum() <= _SQUASHED * surface.sum() and flat.sum() >= _CRAMPED)
+
+
+def _into_unit_square(soup: Soup) -> Array:
+    """Move each chart by whole textures so that it starts in the unit square; a repeating texture looks the same."""
+    corners = np.column_stack([soup.faces.reshape(-1), soup.uvs.reshape(-1, 2)])
+    _, vertex = np.unique(corners, axis=0, return_inverse=True)
+    vertex = vertex.reshape(-1, 3)
+    a, b = np.concatenate([vertex[:, 0], vertex[:, 1]]), np.concatenate([vertex[:, 1], vertex[:, 2]])
+    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(int(vertex.max()) + 1,) * 2)
+    charts, chart = csgraph.connected_components(graph, directed=False)
+    low = np.full((charts, 2), np.inf)
+    np.minimum.at(low, chart[vertex.reshape(-1)], soup.uvs.reshape(-1, 2))
+    moved: Array = soup.uvs - np.floor(low + _SLACK)[chart[vertex]]
+    return moved
+
+
+def _windowed(uvs: Array, texture: Floats) -> tuple[Array, Floats]:
+    """Cut the texture to the window that UVs span where they overstep the unit square a little or use a corner of it.
+
+    The layout of the charts stays. Windows larger than `_WINDOW` textures are left alone: there the texture repeats.
+
+    Returns:
+        The UVs and the texture, unchanged or both made to fit the window.
+    """
+    texel = 1.0 / np.array(texture.shape[1::-1])
+    low, high = uvs.min(axis=(0, 1)) - texel, uvs.max(axis=(0, 1)) + texel
+    size = high - low
+    inside = low.min() >= -_SLACK - texel.max() and high.max() <= 1.0 + _SLACK + texel.max()
+    if size.max() > _WINDOW or (inside and np.abs(uv_areas(uvs)).sum() >= _CRAMPED):
+        return uvs, texture
+    width, height = np.clip(np.ceil(size / texel), 1, TEXTURE_LIMIT).astype(int)
+    columns = low[0] + (np.arange(width) + 0.5) / width * size[0]
+    rows = high[1] - (np.arange(height) + 0.5) / height * size[1]
+    grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    return (uvs - low) / size, sampled(texture, grid).reshape(height, width, 3)
+
+
+# --- baking ----------------------------------------
+
+
+def baked(uvs: Array, soup: Soup, surfaces: Sequence[Surface]) -> Floats:
+    """Paint the colours of a soup into a texture for new UVs.
+
+    Args:
+        uvs: (F, 3, 2) new UVs in [0, 1], without overlaps.
+        soup: the geometry with the file's UVs (NaN where it has none) and colour factors.
+        surfaces: the surface of each part.
+
+    Returns:
+        (N, N, 3) float32 display-referred map. Texels outside every chart repeat the nearest one inside, so that
+        filtering finds no seam.
+    """
+    size = _baked_size(soup, surfaces)
+    rows, columns, face, weights = _rasterised(uvs, size)
+    image, inside = np.zeros((size, size, 3), np.float32), np.zeros((size, size), np.bool_)
+    factor = np.einsum("tk,tkc->tc", weights, soup.colors[face])
+    for number in np.unique(soup.part):
+        here = soup.part[face] == number
+        surface, at = surfaces[number], np.einsum("tk,tkc->tc", weights[here], soup.uvs[face[here]])
+        if surface.texture is None or not np.isfinite(at).all():
+            color: Floats = (
+                np.broadcast_to(_plain(surface), (len(at), 3)) if surface.texture is None else _mean(surface.texture)
+            )
+        else:
+            color = sampled(surface.texture, at)
+        image[rows[here], columns[here]] = _tinted(color, factor[here])
+    inside[rows, columns] = True
+    nearest = distance_transform_edt(~inside, return_distances=False, return_indices=True)
+    return np.ascontiguousarray(image[nearest[0], nearest[1]])
+
+
+def _baked_size(soup: Soup, surfaces: Sequence[Surface]) -> int:
+    """Return a power of two, `BAKED_SIZE` to `TEXTURE_LIMIT`, that has room for the texels that the object shows."""
+    texels, areas = 0.0, np.nan_to_num(np.abs(uv_areas(soup.uvs)))
+    for number in np.unique(soup.part):
+        texture = surfaces[number].texture
+        if texture is not None:
+            texels += float(areas[soup.part == number].sum()) * texture.shape[0] * texture.shape[1]
+    size = BAKED_SIZE
+    while size < TEXTURE_LIMIT and size * size * _FILLED < texels:
+        size *= 2
+    return size
+
+
+def _mean(texture: Floats) -> Floats:
+    """Return the mean colour (1, 3) of a texture, taken in linear light."""
+    return linear_to_srgb(srgb_to_linear(texture).mean(axis=(0, 1), dtype=np.float64).astype(np.float32))[None]
+
+
+def _rasterised(uvs: Array, size: int) -> tuple[Ints, Ints, Ints, Array]:
+    """Find the face under each texel centre of a size x size texture.
+
+    Returns:
+        For each of T covered texels: row (T,), column (T,), face (T,), and the weights of the face's corners (T, 3).
+    """
+    corners = np.stack([uvs[:, :, 0] * size - 0.5, (1.0 - uvs[:, :, 1]) * size - 0.5], axis=2)
+    low = np.clip(np.ceil(corners.min(axis=1)), 0, size - 1).astype(np.int64)
+    high = np.clip(np.floor(corners.max(axis=1)), -1, size - 1).astype(np.int64)
+    extent = np.maximum(high - low + 1, 0)
+    counts = extent.prod(axis=1)
+    found = []
+    chunk = np.cumsum(counts) // _CHUNK
+    for number in np.unique(chunk):
+        faces = np.flatnonzero((chunk == number) & (counts > 0))
+        face = np.repeat(faces, counts[faces])
+        if not len(face):
+            continue
+        place = np.arange(len(face)) - np.repeat(np.cumsum(counts[faces]) - counts[faces], counts[faces])
+        column, row = low[face, 0] + place % extent[face, 0], low[face, 1] + place // extent[face, 0]
+        weights = _barycentric(corners[face], column, row)
+        inside = (weights >= -1e-9).all(axis=1)
+        found.append((row[inside], column[inside], face[inside], weights[inside]))
+    row, column, face, weights = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
+    return row, column, face, weights
+
+
+def _barycentric(corners: Array, x: Ints, y: Ints) -> Array:
+    """Return the (T, 3) weights of triangles (T, 3, 2) at points (x, y); NaN for triangles without area."""
+    origin, a, b = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    px, py = x - origin[:, 0], y - origin[:, 1]
+    with np.errstate(all="ignore"):
+        scale = 1.0 / (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+        second = (px * b[:, 1] - py * b[:, 0]) * scale
+        third = (a[:, 0] * py - a[:, 1] * px) * scale
+    return np.stack([1.0 - second - third, second, third], axis=1)
+
+
+def sampled(texture: Floats, uvs: Array) -> Floats:
+    """Look a repeating texture up with bilinear interpolation of its display-referred values.
+
+    Args:
+        texture: (H, W, 3) float32, row 0 on top.
+        uvs: (T, 2), any finite values; v = 0 is the bottom.
+
+    Returns:
+        (T, 3) float32.
+    """
+    height, width = texture.shape[:2]
+    x, y = uvs[:, 0] * width - 0.5, (1.0 - uvs[:, 1]) * height - 0.5
+    left, top = np.floor(x), np.floor(y)
+    fx, fy = (x - left).astype(np.float32)[:, None], (y - top).astype(np.float32)[:, None]
+    columns = [((left + k) % width).astype(np.int64) for k in (0, 1)]
+    rows = [((top + k) % height).astype(np.int64) for k in (0, 1)]
+    upper = texture[rows[0], columns[0]] * (1 - fx) + texture[rows[0], columns[1]] * fx
+    lower = texture[rows[1], columns[0]] * (1 - fx) + texture[rows[1], columns[1]] * fx
+    return np.asarray(upper * (1 - fy) + lower * fy, dtype=np.float32)

@@ -1,0 +1,83 @@
+"""New texture coordinates, made with xatlas."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import xatlas
+from scipy.sparse import coo_array, csgraph
+
+from advsearch.scene.importing.geometry import Array, Ints, Soup, neighbours, unit_vectors
+
+ATLAS_SIZE = 512
+ATLAS_PADDING = 4
+"""Charts are kept so many texels apart in an atlas of about `ATLAS_SIZE`: two texels in a texture of half that size."""
+
+_SCALE = 100.0  # xatlas takes faces under about 1e-7 square units for empty
+_FLUSH = 1.0 - 1.5e-4  # xatlas takes neighbours whose normals have a product over 1 - 1e-4 for one plane
+_PLANE = np.cos(np.radians(10.0))  # how far the normals of what it takes for a plane may stray before it matters
+_MANY = 20_000  # faces that xatlas gets at a time, about; its time grows faster than their number
+_SMOOTHING = 10  # rounds of averaging normals, so that noise does not fray the borders of patches
+
+
+def unwrapped(soup: Soup) -> Soup:
+    """Return the soup with UVs from xatlas: charts that do not overlap, inside the unit square; deterministic."""
+    patch = _patches(soup)
+    groups = np.split(np.argsort(patch, kind="stable"), np.cumsum(np.bincount(patch))[:-1])
+    for size in (ATLAS_SIZE, 0):  # 0: one atlas, however large
+        atlas = xatlas.Atlas()
+        for group in groups:
+            used, corners = np.unique(soup.faces[group], return_inverse=True)
+            atlas.add_mesh((soup.points[used] * _SCALE).astype(np.float32), corners.reshape(-1, 3).astype(np.uint32))
+        options = xatlas.PackOptions()
+        options.resolution, options.padding = size, ATLAS_PADDING
+        atlas.generate(xatlas.ChartOptions(), options)
+        if atlas.atlas_count == 1:
+            break
+    result = np.empty((len(soup.faces), 3, 2))
+    for number, group in enumerate(groups):
+        _, corners, uvs = atlas[number]
+        result[group] = np.asarray(uvs, dtype=np.float64)[np.asarray(corners)]
+    return replace(soup, uvs=np.clip(result, 0.0, 1.0))
+
+
+def _patches(soup: Soup) -> Ints:
+    """Cut a mesh that xatlas cannot unwrap well in one piece; return the patch of each face (F,), numbered from 0.
+
+    xatlas 0.0.11 takes neighbouring faces that hardly bend for one plane. On a finely tessellated smooth surface that
+    goes on from face to face around the whole object, which is then flattened like a sheet of paper; where a closed
+    surface leaves no border, the process crashes. Such meshes, and large ones for the sake of speed, are cut where the
+    surface turns from one of 14 directions to another.
+    """
+    unit: Array = unit_vectors(soup.face_vectors())
+    left, right, _ = neighbours(soup.faces)
+    f, g = left // 3, right // 3
+    flush = (unit[f] * unit[g]).sum(axis=1) > _FLUSH
+    plane = _connected(len(unit), f[flush], g[flush])
+    mean: Array = np.stack([np.bincount(plane, unit[:, k]) for k in range(3)], axis=1)
+    straight = (unit * unit_vectors(mean)[plane]).sum(axis=1) > _PLANE
+    if straight.all() and len(unit) <= _MANY:
+        return np.zeros(len(unit), dtype=np.int64)
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(-1, 3) / np.sqrt(3.0)
+    facing = _smoothed(unit, f, g) @ np.concatenate([axes, corners]).T
+    direction = facing.argmax(axis=1)
+    same = direction[f] == direction[g]
+    return _connected(len(unit), f[same], g[same])
+
+
+def _smoothed(unit: Array, f: Ints, g: Ints) -> Array:
+    """Average the normals (F, 3) of faces with their neighbours', a few times."""
+    count = len(unit)
+    links = np.concatenate([f, g, np.arange(count)]), np.concatenate([g, f, np.arange(count)])
+    average = coo_array((np.ones(len(links[0])), links), shape=(count, count)).tocsr()
+    for _ in range(_SMOOTHING):
+        unit = np.nan_to_num(unit_vectors(average @ unit))
+    return unit
+
+
+def _connected(count: int, a: Ints, b: Ints) -> Ints:
+    """Return the component (count,) of each node of a graph with edges between a and b."""
+    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(count, count))
+    return np.asarray(csgraph.connected_components(graph, directed=False)[1], dtype=np.int64)
