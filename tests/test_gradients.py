@@ -25,7 +25,7 @@ from advsearch.evaluation.gradients import (
     smooth_loss,
     verdict,
 )
-from advsearch.evaluation.planning import Cosine, contested, measured_plan, tuned
+from advsearch.evaluation.planning import TELLS, Cosine, contested, measured_plan, tuned
 from advsearch.scene.plan import ESTIMATORS, GroupPlan, first_plan
 from advsearch.scene.renderer import Renderer
 
@@ -285,6 +285,35 @@ def test_the_cheapest_setting_that_reaches_the_goal_is_taken() -> None:
     poor, spp = tuned(plan, rows[:1])
     assert spp == 8 and "below 0.9, the best that was found" in poor.groups[0].reason
     assert tuned(plan, [])[1] is None
+
+
+@pytest.mark.parametrize(
+    ("cosine", "converged", "status"),
+    [
+        (0.95, 0.99, "ok"),
+        (0.95, 0.6, "ok"),
+        (0.8, 0.99, "noisy"),
+        (0.8, 0.6, "reference unusable"),
+        (0.95, -0.8, "reference unusable"),
+        (float("nan"), float("nan"), "reference unusable"),
+    ],
+)
+def test_a_cosine_counts_only_where_converged_gradients_agree(cosine: float, converged: float, status: str) -> None:
+    assert Cosine("haze", 1.0, 8, cosine, converged, 1.0).status == status
+
+
+def test_a_noisy_reference_only_lowers_a_cosine() -> None:
+    """The bound of `TELLS`: working gradients of cosine 0.95 with the truth, references of noise as large as makes two
+    agree to a half. What is measured stays below, and below the bound times 0.95."""
+    generator = torch.Generator().manual_seed(3)
+    truth, n = torch.randn(50, generator=generator), 50
+    noise = float(truth.norm()) / n**0.5  # as large as the truth: two such references have a cosine of a half
+    measured = []
+    for _ in range(400):
+        working = truth + 0.33 * noise * torch.randn(n, generator=generator)
+        one, other = (truth + noise * torch.randn(n, generator=generator) for _ in range(2))
+        measured.append(float(torch.cosine_similarity(working, (one + other) / 2.0, dim=0)))
+    assert sum(measured) / len(measured) == pytest.approx(0.95 * (2 * TELLS / (1 + TELLS)) ** 0.5, abs=0.02)
 
 
 # ---- settings of controls -------------------------------------------------------------------------------------------

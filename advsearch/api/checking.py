@@ -97,8 +97,7 @@ def _model(config: AttackConfig, progress: Progress) -> list[dict[str, Any]]:
     rows = []
     for row in table:
         progress.advance(1)
-        status = "ok" if row.cosine >= 0.9 else "reference unusable" if row.converged < 0.9 else "noisy"
-        rows.append({**_place(config, "model"), **vars(row), "parameter": "*", "status": status})
+        rows.append({**_place(config, "model"), **vars(row), "parameter": "*", "status": row.status})
     return rows
 
 

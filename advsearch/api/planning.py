@@ -106,7 +106,7 @@ def quieter(tables: Mapping[str, Sequence[Cosine]], asked: str) -> dict[str, str
             max((row for row in tables[name] if row.control == control), key=lambda row: row.cosine)
             for control in dict.fromkeys(row.control for row in tables[name])
         ]
-        reached = all(min(row.cosine, row.converged) >= GOAL for row in best)
+        reached = all(row.status == "ok" for row in best)
         return not reached, sum(row.seconds for row in best) if reached else -min(row.cosine for row in best)
 
     measured = [name for name in tables if tables[name]]

@@ -11,6 +11,7 @@ import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -28,8 +29,14 @@ COUNTS = (8, 16, 32, 64)
 """Sample counts that are tried."""
 ADJOINT_RENDERS = 3.0
 """Renders that take about as long as an adjoint."""
-CONVERGED = 128
-"""Samples a pixel of a gradient that counts as converged."""
+CONVERGED, AGAIN = 128, 4
+"""Samples a pixel of a gradient that counts as converged, and times as many where two of these do not agree."""
+TELLS = 0.5
+"""Two converged gradients whose cosine is less than this tell nothing: the cosine of their mean with the truth
+is then about sqrt(2 c / (1 + c)) (Spearman and Brown), 0.82 and less. Above it the noise of the converged one, which is
+independent of the working one's, only makes the measured cosine smaller: what is called `ok` is so."""
+
+Status = Literal["ok", "noisy", "reference unusable"]
 
 
 @dataclass(frozen=True)
@@ -51,6 +58,16 @@ class Cosine:
     cosine: float
     converged: float
     seconds: float
+
+    @property
+    def status(self) -> Status:
+        """Whether it is good enough; "reference unusable" where the converged gradients don't agree well enough to
+        tell."""
+        if not self.converged >= TELLS:
+            return "reference unusable"
+        if self.cosine >= GOAL:
+            return "ok"
+        return "noisy" if self.converged >= GOAL else "reference unusable"
 
 
 def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[GroupPlan, ...], tuple[str, ...]]]:
@@ -214,9 +231,13 @@ def _cosines_at(
     goal: float,
     converged: int,
 ) -> list[Cosine]:
-    ends = [renderer.gradient(loss, u, seeds.stream(seed, "converged", number), converged)[1] for number in range(2)]
-    truth = (ends[0] + ends[1]) / 2.0
-    agreement = _cosine(ends[0], ends[1])
+    def pair(spp: int) -> tuple[Tensor, float]:
+        one, other = (renderer.gradient(loss, u, seeds.stream(seed, "converged", k), spp)[1] for k in range(2))
+        return (one + other) / 2.0, _cosine(one, other)
+
+    truth, agreement = pair(converged)
+    if agreement < goal:
+        truth, agreement = pair(AGAIN * converged)
     found = []
     for spp in counts:
         values, times = [], []
@@ -237,7 +258,7 @@ def _cosine(one: Tensor, other: Tensor) -> float:
     return float(one @ other) / size if size > 0.0 else float("nan")
 
 
-def tuned(plan: GradientPlan, table: Sequence[Cosine], goal: float = GOAL) -> tuple[GradientPlan, int | None]:
+def tuned(plan: GradientPlan, table: Sequence[Cosine]) -> tuple[GradientPlan, int | None]:
     """Return the plan with each control's step chosen from measured cosines, and the sample count that all then need.
 
     The cheapest setting that reaches the goal wins; where none does, the one with the greatest cosine, and the reason
@@ -248,11 +269,11 @@ def tuned(plan: GradientPlan, table: Sequence[Cosine], goal: float = GOAL) -> tu
         rows = [row for row in table if row.control == control and row.cosine == row.cosine]
         if not rows:
             continue
-        good = [row for row in rows if row.cosine >= goal]
+        good = [row for row in rows if row.status == "ok"]
         chosen = min(good, key=lambda row: row.seconds) if good else max(rows, key=lambda row: row.cosine)
         counts.append(chosen.spp)
         said = f"cosine {chosen.cosine:.2f} with the converged gradient at {chosen.spp} samples"
-        said += f" and {chosen.factor:g} x the step" + ("" if good else f": below {goal:g}, the best that was found")
+        said += f" and {chosen.factor:g} x the step" + ("" if good else f": {_shortfall(chosen)}")
         scaled = {one.name: one.step for one in plan.with_steps(chosen.factor).groups}
         groups = tuple(
             replace(one, step=scaled[one.name], reason=f"{one.reason}; {said}") if one.control == control else one
@@ -260,3 +281,9 @@ def tuned(plan: GradientPlan, table: Sequence[Cosine], goal: float = GOAL) -> tu
         )
         plan = replace(plan, groups=groups)
     return plan, max(counts) if counts else None
+
+
+def _shortfall(chosen: Cosine) -> str:
+    if chosen.converged < TELLS:
+        return f"which says little, two converged ones have {chosen.converged:.2f}"
+    return f"below {GOAL:g}, the best that was found"
