@@ -25,7 +25,7 @@ GOAL = 0.9
 """Cosine with the converged gradient that a working gradient should have."""
 FACTORS = (1.0, 3.0)
 """Steps that are tried, as multiples of the one that moves an outline by a pixel."""
-COUNTS = (8, 16, 32, 64)
+COUNTS = (8, 16, 32, 64, 128)
 """Sample counts that are tried."""
 ADJOINT_RENDERS = 3.0
 """Renders that take about as long as an adjoint."""
