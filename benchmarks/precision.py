@@ -1,6 +1,6 @@
 """Whether recommended settings keep their promise on scenes that nobody tuned them on.
 
-    python benchmarks/precision.py [--error 0.1] [--seconds 60] [--resolution 128] [--scene bowl/kitchen ...]
+    python benchmarks/precision.py [--error 0.1] [--seconds 120] [--resolution 128] [--scene bowl/kitchen ...]
 
 For each scene: the settings that `advsearch precision` recommends for the picture and for the gradient, then the error
 that they really have, measured anew with other seeds against a reference with other seeds. The ratio of that to the
@@ -43,7 +43,7 @@ SEED = 1_000_003
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--error", type=float, default=0.1, help="promised relative error (default 0.1)")
-    parser.add_argument("--seconds", type=float, default=60.0, help="for each scene's recommendation (default 60)")
+    parser.add_argument("--seconds", type=float, default=120.0, help="for each scene's recommendation (default 120)")
     parser.add_argument("--resolution", type=int, default=128)
     parser.add_argument("--control", default=CONTROL)
     parser.add_argument("--scene", nargs="+", default=SCENES, metavar="OBJECT/ENVIRONMENT")

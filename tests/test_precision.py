@@ -20,6 +20,7 @@ from advsearch.evaluation.precision.fits import (
     INDEPENDENT,
     STRATIFIED,
     Recommendation,
+    confirmed,
     fit,
     fixed_seconds,
     levels_off,
@@ -240,6 +241,41 @@ def test_a_line_that_explains_all_points_overrules_a_lucky_one() -> None:
     assert found is not None and found.basis == "fitted" and found.spp == pytest.approx(100, rel=0.15)
     bent = [Point(one.setting, "error", max(one.error, 0.2), (0.19, 0.21), True, 0.0, 1.0, 6) for one in true]
     assert reaching(bent, 0.1) is None
+
+
+def up(_: str, samples: float) -> int:
+    return math.ceil(samples - 1e-9)
+
+
+@pytest.mark.parametrize(("error", "times", "promised"), [(0.08, 1, 0.08), (0.2, 4, 0.1), (10.0, FURTHEST, 2.5)])
+def test_new_measurements_of_a_recommended_setting_are_what_is_promised(
+    error: float, times: int, promised: float
+) -> None:
+    one = reaching(measured(exact()), 0.1)
+    assert one is not None
+    found = confirmed(one, Point(setting(one.spp), "error", error, (0.0, 1.0), True, 0.0, 0.5, 12), up)
+    assert (found.basis, found.repeats, found.spp) == ("confirmed", 12, times * one.spp)
+    assert found.error == pytest.approx(promised) and found.seconds == pytest.approx(0.5 * times)
+
+
+def test_what_is_chosen_among_noisy_points_looks_better_than_it_is_until_it_is_measured_again() -> None:
+    """Three lines of the same true error, root mean squares of four: the promise of the cheapest is too good."""
+    rng = np.random.default_rng(5)
+
+    def point(series: str, spp: int, repeats: int) -> Point:
+        squares = rng.normal(0.0, spp**-0.5, repeats) ** 2
+        return point_of(setting(spp, series), [Sample({"error": math.sqrt(one)}, 1e-3 * spp) for one in squares])
+
+    before, after = [], []
+    for _ in range(200):
+        lines = {name: [point(name, spp, 4) for spp in (4, 16, 64, 256)] for name in "abc"}
+        one = recommend({setting(4, name).line: points for name, points in lines.items()}, 0.1)
+        assert one is not None
+        again = confirmed(one, point(one.line[2], one.spp, 24), up)
+        before.append(math.log(one.spp**-0.5 / one.error))
+        after.append(math.log(again.spp**-0.5 / again.error))
+    assert np.mean(before) > 0.2
+    assert abs(np.mean(after)) < 0.05 and np.quantile(np.abs(after), 0.95) < math.log(1.5)
 
 
 def test_beyond_the_last_point_it_says_so_and_not_too_far() -> None:
@@ -469,6 +505,8 @@ def test_a_tiny_scene_from_end_to_end(
     assert report["machine"]["cpu"] and report["machine"]["threads"]["render"] >= 1
     assert report["seconds"]["total"] < 40.0
     slopes = {(one["quantity"], one["estimator"], one["measure"], one["against"]): one for one in report["slopes"]}
+    for one in report["recommendations"]:
+        assert one.get("basis") != "confirmed" or one["repeats"] >= 4
     independent = slopes.get(("image", "independent", "error", "samples"))
     if independent is not None:  # a slow machine measures too few points
         assert independent["slope"] == pytest.approx(-0.5, abs=0.15)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,9 @@ SHARES = {"image": 0.45, "gradient": 0.3, "objective": 0.25}
 """Of the time, by quantity; what one doesn't use is the others'."""
 REFERENCE_SHARE = 0.35
 """Of the time of a quantity, for its reference."""
+CONFIRM_SHARE, CONFIRM_LEAST, CONFIRM_MOST = 0.4, 4, 32
+"""Of the time of a gradient's measurements, for measuring the recommended setting again; how often at least for that to
+count, and at most."""
 VERIFY_SPP, VERIFY_RENDERS = 64, 4
 """Samples a pixel, and fresh renders, that verify what a search held."""
 NUMBERS, FIGURE = "precision.json", "precision"
@@ -151,9 +154,32 @@ class _Job:
         self.section.refer("gradient", bench.by, part.name, bench.reference, bench.part_spp)
         said = bench.bias(budget, self.seed)
         self.section.warnings += [said] if said else []
-        found = self._rounds(f"gradient of {part.name}", bench.settings, bench.measure, budget)
+        share = budget.share(1.0 - CONFIRM_SHARE)
+        found = self._rounds(f"gradient of {part.name}", bench.settings, bench.measure, share)
         linear, sampler = self.config.loss == "linear", self.config.pixel_sampler
         self._take(found, "error", bench.floor, lambda series: theory_of(series, sampler) if linear else UNKNOWN)
+        self._confirm(bench, part, budget)
+
+    def _confirm(self, bench: GradientBench, part: Part, budget: Budget) -> None:
+        """Measure the setting that is recommended so far again, with seeds of its own."""
+        one = self.section.recommended("gradient", part.name, self.config.error)
+        if one is None:
+            return
+        like = next(setting for setting in bench.settings if setting.line == one.line)
+        setting = replace(like, spp=one.spp, cost=like.cost / like.spp * one.spp)
+        self.progress.stage(f"gradient of {part.name}: {one.line[2]} with {one.spp} samples again", CONFIRM_MOST)
+        found = in_rounds(
+            [setting],
+            bench.measure,
+            budget,
+            rounds=CONFIRM_MOST,
+            seed=seeds.stream(self.seed, "confirm"),
+            on_done=lambda _: self._tick(),
+        )
+        samples = [Sample(numbers, seconds) for numbers, seconds in found.results.get(setting, [])]
+        if len(samples) >= CONFIRM_LEAST:
+            floor = bench.floor(setting, "error")
+            self.section.again[one.line, "error"] = point_of(setting, samples, "error", floor)
 
     def objective(self, budget: Budget, policies: dict[str, Any]) -> None:
         """The best verified objective of each policy."""

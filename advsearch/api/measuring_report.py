@@ -13,6 +13,7 @@ from advsearch.evaluation.precision.fits import (
     RoundUp,
     Slope,
     Theory,
+    confirmed,
     fit,
     recommend,
     warning_of,
@@ -37,6 +38,7 @@ class Section:
         points: of each line and measure.
         theories: of each line.
         families: of each line of the image: what it is recommended among.
+        again: points of settings that were recommended, from measurements after that.
         references: as the report holds them.
         curves: of each policy.
         start: verified objective before any search.
@@ -49,6 +51,7 @@ class Section:
     points: dict[tuple[Line, str], list[Point]] = field(default_factory=dict)
     theories: dict[Line, Theory] = field(default_factory=dict)
     families: dict[Line, str] = field(default_factory=dict)
+    again: dict[tuple[Line, str], Point] = field(default_factory=dict)
     references: list[dict[str, Any]] = field(default_factory=list)
     curves: list[tuple[Setting, Curve]] = field(default_factory=list)
     start: float = math.nan
@@ -60,6 +63,11 @@ class Section:
         """Keep the points of one line, all of one measure."""
         self.points[line, points[0].measure] = sorted(points, key=lambda point: point.setting.spp)
         self.theories[line] = theory
+
+    def recommended(self, quantity: str, control: str, goal: float) -> Recommendation | None:
+        """Return the setting that reaches a goal soonest, by what was measured so far."""
+        found = (one for one, *what in _recommended(self, goal) if what[:2] == [quantity, control])
+        return next(found, None)
 
     def refer(
         self, quantity: str, name: str, control: str, one: Reference, spp: int, margin: Reference | None = None
@@ -183,7 +191,15 @@ def _recommended(section: Section, goal: float) -> list[tuple[Recommendation | N
         if measure == "margin_error" and family == "depth":
             continue
         asked.setdefault((line[0], line[1], measure, family), {})[line] = points
-    return [(recommend(lines, goal, _rounding(section, what[0])), *what) for what, lines in asked.items()]
+    found = []
+    for what, lines in asked.items():
+        round_up = _rounding(section, what[0])
+        one = recommend(lines, goal, round_up)
+        again = None if one is None else section.again.get((one.line, one.measure))
+        if one is not None and again is not None and again.setting.spp == one.spp:
+            one = confirmed(one, again, round_up)
+        found.append((one, *what))
+    return found
 
 
 def _rounding(section: Section, quantity: str) -> RoundUp:
@@ -207,6 +223,7 @@ def _recommendation(
         "seconds": one.seconds,
         "error": one.error,
         "basis": one.basis,
+        **({"repeats": one.repeats} if one.repeats else {}),
     }
 
 

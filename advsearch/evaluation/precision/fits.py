@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
 
@@ -181,7 +181,9 @@ class Recommendation:
         spp: samples a pixel.
         seconds: how long it takes.
         error: what it should have.
-        basis: "measured", "fitted", "interpolated" or "extrapolated".
+        basis: "measured", "fitted", "interpolated" or "extrapolated"; "confirmed" where it was measured after it was
+            chosen.
+        repeats: measurements that confirm it.
     """
 
     line: tuple[str, str, str]
@@ -191,6 +193,7 @@ class Recommendation:
     seconds: float
     error: float
     basis: str
+    repeats: int = 0
 
 
 def recommend(
@@ -227,6 +230,31 @@ def reaching(points: Sequence[Point], goal: float, round_up: RoundUp | None = No
     spp = (round_up or (lambda _, samples: math.ceil(samples - 1e-9)))(series, count)
     error = _at(ordered, spp, "error") if fitted is None else _line_at(fitted, spp)
     return Recommendation(line, measure, goal, spp, _at(ordered, spp, "seconds"), error, basis)
+
+
+def confirmed(one: Recommendation, point: Point, round_up: RoundUp) -> Recommendation:
+    """Return a recommendation that rests on measurements made after it was chosen, with seeds of their own.
+
+    What looks cheapest among noisy points is mostly a lucky one, and its error looks smaller than it is. New
+    measurements don't have that bias: what they say is promised. Where it is more than the goal, the sample count grows
+    as independent samples need it, by (error / goal)^2, at most `FURTHEST` times, and the error shrinks by the root.
+
+    Args:
+        one: what was chosen.
+        point: of its setting, from new measurements.
+        round_up: what sample counts a series takes.
+    """
+    more = min(FURTHEST, max(1.0, (point.error / one.goal) ** 2))
+    spp = one.spp if more == 1.0 else round_up(one.line[2], one.spp * more)
+    times = spp / one.spp
+    return replace(
+        one,
+        spp=spp,
+        seconds=point.seconds * times,
+        error=point.error / math.sqrt(times),
+        basis="confirmed",
+        repeats=point.repeats,
+    )
 
 
 def _explaining(ordered: Sequence[Point]) -> Slope | None:
