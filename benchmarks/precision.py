@@ -34,7 +34,7 @@ from advsearch.evaluation.precision.rounds import Budget  # noqa: E402
 
 SCENES = ("bowl/kitchen", "bottle/noon", "ball/studio")
 CONTROL = "environment"
-REPEATS = 24
+REPEATS = 64
 FACTOR, SLOPE = 1.5, 0.1
 SEED = 1_000_003
 """Of the new measurement; the recommendation was made with seed 0."""

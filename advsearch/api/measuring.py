@@ -37,7 +37,7 @@ SHARES = {"image": 0.45, "gradient": 0.3, "objective": 0.25}
 """Of the time, by quantity; what one doesn't use is the others'."""
 REFERENCE_SHARE = 0.35
 """Of the time of a quantity, for its reference."""
-CONFIRM_SHARE, CONFIRM_LEAST, CONFIRM_MOST = 0.4, 4, 32
+CONFIRM_SHARE, CONFIRM_LEAST, CONFIRM_MOST = 0.4, 4, 64
 """Of the time of a gradient's measurements, for measuring the recommended setting again; how often at least for that to
 count, and at most."""
 VERIFY_SPP, VERIFY_RENDERS = 64, 4
