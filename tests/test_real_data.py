@@ -12,6 +12,7 @@ import pytest
 
 CASES = {
     "mug": ("mug.obj", "comfy_cafe_1k.hdr", "coffee mug,cup", 0.03, []),
+    "mug-wide": ("mug.obj", "comfy_cafe_1k.hdr", "coffee mug,cup", 0.1, []),
     "teapot": ("teapot.obj", "artist_workshop_1k.hdr", "teapot,coffeepot", 0.1, ["--up", "y"]),
 }
 """By name: mesh, environment, right answers, epsilon, more flags."""
@@ -30,7 +31,7 @@ def attack(data: Path, run: Path, case: str) -> dict[str, Any]:
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", ["mug", pytest.param("mug-wide", marks=pytest.mark.slow), "teapot"])
 def test_a_real_object_is_fooled_and_verified(case: str, real_data: Path, tmp_path: Path) -> None:
     summary = attack(real_data, tmp_path / case, case)
     assert summary["ending"] == "found"

@@ -196,7 +196,7 @@ def _recommended(section: Section, goal: float) -> list[tuple[Recommendation | N
         round_up = _rounding(section, what[0])
         one = recommend(lines, goal, round_up)
         again = None if one is None else section.again.get((one.line, one.measure))
-        if one is not None and again is not None and again.setting.spp == one.spp:
+        if one is not None and again is not None:
             one = confirmed(one, again, round_up)
         found.append((one, *what))
     return found

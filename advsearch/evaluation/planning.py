@@ -189,8 +189,6 @@ def cosines(
     factors: Sequence[float] = FACTORS,
     counts: Sequence[int] = COUNTS,
     repeats: int = 3,
-    goal: float = GOAL,
-    converged: int = CONVERGED,
 ) -> list[Cosine]:
     """Measure, control by control, the cosine of working gradients with the converged one at the same step.
 
@@ -206,7 +204,7 @@ def cosines(
             by_steps = any(one.estimator in BY_DIFFERENCES for one in base.groups if one.control == control)
             for factor in factors if by_steps else factors[:1]:
                 renderer.plan = _silenced(base.with_steps(factor), names)
-                found += _cosines_at(renderer, loss, u, control, factor, seed, counts, repeats, goal, converged)
+                found += _cosines_at(renderer, loss, u, control, factor, seed, counts, repeats)
     finally:
         renderer.plan = base
     return found
@@ -228,16 +226,14 @@ def _cosines_at(
     seed: int,
     counts: Sequence[int],
     repeats: int,
-    goal: float,
-    converged: int,
 ) -> list[Cosine]:
     def pair(spp: int) -> tuple[Tensor, float]:
         one, other = (renderer.gradient(loss, u, seeds.stream(seed, "converged", k), spp)[1] for k in range(2))
         return (one + other) / 2.0, _cosine(one, other)
 
-    truth, agreement = pair(converged)
-    if agreement < goal:
-        truth, agreement = pair(AGAIN * converged)
+    truth, agreement = pair(CONVERGED)
+    if agreement < GOAL:
+        truth, agreement = pair(AGAIN * CONVERGED)
     found = []
     for spp in counts:
         values, times = [], []
@@ -248,7 +244,7 @@ def _cosines_at(
             values.append(_cosine(gradient, truth))
         mean = statistics.fmean(values)
         found.append(Cosine(control, factor, spp, mean, agreement, statistics.median(times)))
-        if mean >= goal:
+        if mean >= GOAL:
             break
     return found
 

@@ -245,7 +245,7 @@ def confirmed(one: Recommendation, point: Point, round_up: RoundUp) -> Recommend
         round_up: what sample counts a series takes.
     """
     more = min(FURTHEST, max(1.0, (point.error / one.goal) ** 2))
-    spp = one.spp if more == 1.0 else round_up(one.line[2], one.spp * more)
+    spp = round_up(one.line[2], one.spp * more)
     times = spp / one.spp
     return replace(
         one,
