@@ -48,13 +48,13 @@ typecheck: $(STAMP) ## mypy, strict, on the package
 	@$(BIN)/mypy
 
 # what compares answers and not times, and takes long
-STUDIES := searches close_calls closed_form policies precision kill
+STUDIES := searches every_control rotation close_calls closed_form policies precision kill
 
 bench: $(STAMP) ## the benchmarks: ratios against a floor measured in the same run
 	@set -e; for file in $(filter-out $(STUDIES:%=benchmarks/%.py),$(wildcard benchmarks/[!_]*.py)); do \
 	  echo "== $$file"; $(BIN)/python $$file $(ARGS); done
 
-study: $(STAMP) ## the slow studies: policies at equal renders, stated budgets, promised errors, kills (an hour)
+study: $(STAMP) ## the slow studies: policies at equal renders, stated budgets, promised errors, kills (over an hour)
 	@set -e; for name in $(STUDIES); do echo "== $$name"; $(BIN)/python benchmarks/$$name.py $(ARGS); done
 
 reference: $(STAMP) ## render, train and evaluate the bundled classifier again (some 45 minutes)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 from torch import Tensor
 
 from advsearch.api import load_scene
+from advsearch.api.checking import attempts
 from advsearch.controls import make_control
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.evaluation.gradients import (
@@ -25,7 +27,7 @@ from advsearch.evaluation.gradients import (
     smooth_loss,
     verdict,
 )
-from advsearch.evaluation.planning import TELLS, Cosine, contested, measured_plan, tuned
+from advsearch.evaluation.planning import TELLS, Cosine, contested, cosines, measured_plan, tuned
 from advsearch.scene.plan import ESTIMATORS, GroupPlan, first_plan
 from advsearch.scene.renderer import Renderer
 
@@ -262,6 +264,53 @@ def test_a_reference_of_a_parabola_has_its_bias_taken_off() -> None:
     assert found.steps[0] == pytest.approx(0.75 + 0.04, abs=1e-4)
 
 
+def test_a_reference_takes_wider_steps_where_narrow_ones_are_noise() -> None:
+    class Curve:
+        """A slope of 1 under noise that does not depend on the step, so that wide differences see less of it."""
+
+        renders = 0
+
+        def __call__(self, u: Tensor, seed: int, spp: int) -> Tensor:
+            self.renders += 1
+            return u[0] + 0.004 * math.sin(seed * 1e3 + float(u[0]) * 1e5)
+
+    one = group("a.b", 0, 1, ("differences",), step=0.01)
+    probe = Probe(one, "a.b", torch.ones(1), 0.01)
+
+    def found(factors: Sequence[float]) -> Reference:
+        curve: Any = Curve()
+        return reference(
+            curve, lambda image: image, torch.tensor([0.5]), probe, seed=0, spp=1, repeats=(6, 6), factors=factors
+        )
+
+    narrow, wide = found((1.0,)), found((1.0, 3.0, 9.0))
+    assert narrow.noise > 0.1 and narrow.factor == 1.0 and narrow.renders == 24
+    assert wide.factor > 1.0 and wide.renders > 24
+    assert abs(wide.value - 1.0) <= 3.0 * wide.noise < 0.5 * narrow.noise
+
+
+def test_what_is_noisy_at_a_pixel_is_tried_with_wider_steps_and_says_so() -> None:
+    several = group("a.b", 0, 1, ("secant", "differences", "guided"))
+    assert attempts(several) == [("secant", 1.0), ("differences", 1.0), ("differences", 3.0), ("differences", 9.0)]
+    assert attempts(group("a.b", 0, 1, ("adjoint",))) == [("adjoint", 1.0)]
+    forced = replace(several, estimator="secant", reason="forced by name")
+    assert [name for name, _ in attempts(forced)] == ["secant"] * 3
+
+
+def test_a_wider_step_of_one_gradient_leaves_the_plan_as_it_was() -> None:
+    render = renderer({"pose": {"yaw": [0, 360]}})
+    steps = []
+
+    def loss(image: Tensor) -> Tensor:
+        steps.append(render.plan.groups[0].step)
+        return image.sum()
+
+    before = render.plan
+    estimated(render, loss, inside(render), "secant", ["pose.yaw"], 0, 1, 3.0)
+    assert render.plan is before
+    assert max(steps) == pytest.approx(3.0 * before.groups[0].step)
+
+
 def test_a_measured_plan_keeps_what_was_forced_and_says_what_it_measured() -> None:
     render = renderer({"environment": {"rotation": [0, 360], "exposure": [-1, 1]}})
     plan = measured_plan(render, smooth_loss((SIZE, SIZE)), inside(render), seed=0, spp=4, repeats=2)
@@ -271,6 +320,38 @@ def test_a_measured_plan_keeps_what_was_forced_and_says_what_it_measured() -> No
         assert "least squared error x time" in one.reason
     forced = renderer({"environment": {"rotation": [0, 360]}}, estimators={"environment": "adjoint"})
     assert contested(forced.plan) == []
+
+
+class Told:
+    """A renderer whose gradients are told: by sample count, one for each call in turn."""
+
+    def __init__(self, gradients: dict[int, list[list[float]]]) -> None:
+        self.plan = first_plan((group("haze.density", 0, 2, ("adjoint",)),), torch.tensor([0.01, 0.01]))
+        self.gradients, self.asked = gradients, list[int]()
+
+    def gradient(self, loss: Any, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor]:
+        self.asked.append(spp)
+        told = self.gradients[spp]
+        return torch.zeros(()), torch.tensor(told[self.asked.count(spp) % len(told)])
+
+
+def test_converged_gradients_of_which_one_disagrees_get_more_samples() -> None:
+    """Two of three agree to 1 here, as they do by luck where there are few numbers."""
+    right, wrong = [1.0, 0.0], [-1.0, 0.1]
+    told: Any = Told({128: [right, right, wrong], 512: [right], 8: [right]})
+    (row,) = cosines(told, lambda image: image, torch.zeros(2), seed=0, counts=(8,))
+    assert told.asked == [128, 128, 128, 512, 512, 512, 8, 8, 8]
+    assert (row.status, row.cosine, row.converged) == ("ok", 1.0, 1.0)
+    agreed: Any = Told({128: [right], 8: [right]})
+    cosines(agreed, lambda image: image, torch.zeros(2), seed=0, counts=(8,))
+    assert 512 not in agreed.asked
+
+
+def test_a_working_gradient_is_not_held_against_one_of_fewer_samples() -> None:
+    right, across = [1.0, 0.0], [0.0, 1.0]
+    told: Any = Told({128: [across], 512: [right], 64: [right], 256: [right]})
+    dear = cosines(told, lambda image: image, torch.zeros(2), seed=0, counts=(64, 256))
+    assert [(row.spp, row.cosine) for row in dear] == [(64, 0.0), (256, 1.0)]
 
 
 def test_the_cheapest_setting_that_reaches_the_goal_is_taken() -> None:

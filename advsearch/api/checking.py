@@ -13,8 +13,11 @@ from advsearch.config import AttackConfig
 from advsearch.controls import CONTROLS
 from advsearch.evaluation.gradients import (
     EXPENSIVE,
+    FACTORS,
+    Estimate,
     Loss,
     Probe,
+    Reference,
     estimates,
     inside,
     probes,
@@ -25,14 +28,19 @@ from advsearch.evaluation.gradients import (
 )
 from advsearch.evaluation.planning import COUNTS, cosines
 from advsearch.progress import NullProgress, Progress
+from advsearch.scene.plan import GroupPlan
 
 SCENES = (("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"))
 """Bundled scenes that `check --all` goes through."""
 LOSSES = ("linear", "model")
 RAW_SPP = 16
 """Samples a pixel of a working gradient of the linear loss, which is taken without denoiser."""
-REFERENCE_SPP = 64
-"""Samples a pixel of a reference render; seeds are added until the reference's noise is small."""
+MOST = 256
+"""Samples a pixel of the dearest gradient of the model's loss that is tried; `advsearch plan` stops before."""
+REFERENCE_SPP, SEEDS = 64, (6, 16)
+"""Samples a pixel of a reference render, and how many seeds it gets: until its noise is small."""
+REPEATS, AGAIN = 6, 8
+"""Gradients of one estimator, from which its mean and its noise come; and of one with a wider step."""
 
 
 def check(
@@ -92,7 +100,7 @@ def _linear(config: AttackConfig, progress: Progress) -> list[dict[str, Any]]:
 def _model(config: AttackConfig, progress: Progress) -> list[dict[str, Any]]:
     problem, _ = problem_from_config(config)
     renderer = problem.renderer
-    counts = tuple(count for count in COUNTS if count >= problem.spp) or (problem.spp,)
+    counts = tuple(count for count in (*COUNTS, MOST) if count >= problem.spp) or (problem.spp,)
     table = cosines(renderer, problem.loss, inside(renderer), seed=config.seed, counts=counts)
     rows = []
     for row in table:
@@ -106,37 +114,70 @@ def _rows(
 ) -> list[dict[str, Any]]:
     renderer, seed = problem.renderer, seeds.stream(config.seed, "check")
     u = inside(renderer)
+    along = probes(renderer, loss, u, seed, spp)
+    references = {
+        probe.name: reference(
+            renderer,
+            loss,
+            u,
+            probe,
+            seed=seed,
+            # what acts on the picture clips: its mean depends on the noise, so both get the same
+            spp=spp if probe.group.estimator == "image" else max(spp, REFERENCE_SPP),
+            repeats=SEEDS,
+            factors=FACTORS[:2],
+        )
+        for probe in along
+    }
     found = []
-    for group in _sets(probes(renderer, loss, u, seed, spp)):
-        on_picture = group[0].group.estimator == "image"  # clips: its mean depends on the noise, so both get the same
-        high = spp if on_picture else max(spp, REFERENCE_SPP)
-        references = [reference(renderer, loss, u, one, seed=seed, spp=high) for one in group]
-        forced = "forced" in group[0].group.reason
-        wanted = [group[0].group.estimator] if forced else [one for one in group[0].group.valid if one not in EXPENSIVE]
-        for estimator in wanted:
-            measured = estimates(renderer, loss, u, estimator, group, seed=seed, spp=spp)
-            for probe, against, estimate in zip(group, references, measured, strict=True):
-                size = scale_of(against, references)
-                status, error = verdict(estimate, against, size)
-                found.append(
-                    {
-                        **_place(config, name),
-                        "control": probe.group.control,
-                        "parameter": probe.name.partition(".")[2],
-                        "estimator": estimator,
-                        "gradient": estimate.value,
-                        "reference": against.value,
-                        "reference_steps": list(against.steps),
-                        "reference_noise": against.noise,
-                        "relative_error": error,
-                        "noise": estimate.noise / size if size else float("inf"),
-                        "spp": spp,
-                        "seconds": estimate.seconds,
-                        "status": status,
-                    }
-                )
+    for group in _sets(along):
+        beside = [references[one.name] for one in along if one.group.control == group[0].group.control]
+        good: set[str] = set()
+        for estimator, factor in attempts(group[0].group):
+            wanted = group if factor == 1.0 else [one for one in group if one.name not in good]
+            if not wanted:
+                break
+            repeats = REPEATS if factor == 1.0 else AGAIN  # another try has to be surer
+            measured = estimates(
+                renderer, loss, u, estimator, wanted, seed=seed, spp=spp, repeats=repeats, factor=factor
+            )
+            for probe, estimate in zip(wanted, measured, strict=True):
+                against = references[probe.name]
+                row = _row(probe, estimate, against, scale_of(against, beside))
+                good |= {probe.name} if row["status"] == "ok" else set()
+                found.append({**_place(config, name), **row, "spp": spp})
                 progress.advance(1)
     return found
+
+
+def attempts(group: GroupPlan) -> list[tuple[str, float]]:
+    """Estimators to measure on a group, with the multiple of the step; wider ones for what falls short with the first.
+
+    Differences of the loss and of the picture are the same for a linear loss, so that wider steps are tried with one.
+    """
+    forced = "forced" in group.reason
+    names = [group.estimator] if forced else [one for one in group.valid if one not in EXPENSIVE]
+    wide = next((one for one in ("differences", "secant", "forward") if one in names), None)
+    return [(one, 1.0) for one in names] + [(wide, factor) for factor in FACTORS[1:] if wide is not None]
+
+
+def _row(probe: Probe, estimate: Estimate, against: Reference, size: float) -> dict[str, Any]:
+    status, error = verdict(estimate, against, size)
+    return {
+        "control": probe.group.control,
+        "parameter": probe.name.partition(".")[2],
+        "estimator": estimate.estimator,
+        "factor": estimate.factor,
+        "gradient": estimate.value,
+        "reference": against.value,
+        "reference_steps": list(against.steps),
+        "reference_factor": against.factor,
+        "reference_noise": against.noise,
+        "relative_error": error,
+        "noise": estimate.noise / size if size else float("inf"),
+        "seconds": estimate.seconds,
+        "status": status,
+    }
 
 
 def _sets(found: Sequence[Probe]) -> list[list[Probe]]:

@@ -86,12 +86,14 @@ def table(rows: list[dict[str, Any]]) -> str:
     parts = []
     linear = [row for row in rows if row["loss"] == "linear"]
     if linear:
-        heads = ["object", "parameter", "estimator", "gradient", "reference", "error", "noise", "seconds", "status"]
+        heads = ["object", "parameter", "estimator", "step"]
+        heads += ["gradient", "reference", "error", "noise", "seconds", "status"]
         body = [
             [
                 row["object"],
                 f"{row['control']}.{row['parameter']}",
                 row["estimator"],
+                f"x {row['factor']:g}",
                 f"{row['gradient']:.3g}",
                 f"{row['reference']:.3g} +- {row['reference_noise']:.1g}",
                 f"{100 * row['relative_error']:.1f} %",

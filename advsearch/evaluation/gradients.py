@@ -11,13 +11,13 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.scene.plan import GradientPlan, GroupPlan
+from advsearch.scene.plan import STEP_RANGE, GradientPlan, GroupPlan
 from advsearch.scene.renderer import Renderer
 
 Loss = Callable[[Tensor], Tensor]
@@ -37,6 +37,9 @@ TURNED = 0.0317
 """Share of a full turn by which periodic coordinates are off their start where gradients are measured."""
 EXPENSIVE = frozenset({"guided", "boundary"})
 """Estimators that are measured only when asked for."""
+FACTORS = (1.0, 3.0, 9.0)
+"""Steps of differences that are tried, narrow first, as multiples of the plan's. A step that moves an outline by a
+pixel is as wide as a classifier's loss allows; a smooth loss allows more, and noise falls with the step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +67,7 @@ class Reference:
         value: mean over seeds, extrapolated from the two steps to a step of zero (Richardson).
         noise: its standard error together with a quarter of the steps' disagreement.
         steps: value at the larger and at the smaller step.
+        factor: the larger step as a multiple of the probe's.
         renders: primal renders spent.
     """
 
@@ -71,6 +75,7 @@ class Reference:
     noise: float
     steps: tuple[float, float]
     renders: int
+    factor: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -83,6 +88,7 @@ class Estimate:
         noise: standard deviation of one estimate.
         repeats: how many there were.
         seconds: median time of one gradient of the group.
+        factor: step of its differences as a multiple of the plan's.
     """
 
     estimator: str
@@ -90,6 +96,7 @@ class Estimate:
     noise: float
     repeats: int
     seconds: float
+    factor: float = 1.0
 
     @property
     def standard_error(self) -> float:
@@ -173,11 +180,19 @@ def only(plan: GradientPlan, names: Collection[str], estimator: str) -> Gradient
 
 
 def estimated(
-    renderer: Renderer, loss: Loss, u: Tensor, estimator: str, names: Collection[str], seed: int, spp: int
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    estimator: str,
+    names: Collection[str],
+    seed: int,
+    spp: int,
+    factor: float = 1.0,
 ) -> Tensor:
-    """Return one gradient (d,) of the groups of these names by one estimator; zero elsewhere."""
+    """Return one gradient (d,) of the groups of these names by one estimator, its differences `factor` times as wide
+    as planned; zero elsewhere."""
     before = renderer.plan
-    renderer.plan = only(before, names, estimator)
+    renderer.plan = only(before.with_steps(factor), names, estimator)
     try:
         return renderer.gradient(loss, u, seed, spp)[1]
     finally:
@@ -194,19 +209,24 @@ def estimates(
     seed: int,
     spp: int,
     repeats: int = 6,
+    factor: float = 1.0,
 ) -> list[Estimate]:
-    """Measure one estimator of one control's groups along some probes of them."""
+    """Measure one estimator of one control's groups along some probes of them; `factor` as in `estimated`."""
     values: list[list[float]] = [[] for _ in along]
     seconds = []
     names = {probe.group.name for probe in along}
     for number in range(repeats):
         begun = time.perf_counter()
-        gradient = estimated(renderer, loss, u, estimator, names, seeds.stream(seed, estimator, number), spp)
+        noise = seeds.stream(seed, estimator if factor == 1.0 else f"{estimator} x {factor:g}", number)
+        gradient = estimated(renderer, loss, u, estimator, names, noise, spp, factor)
         seconds.append(time.perf_counter() - begun)
         for found, probe in zip(values, along, strict=True):
             found.append(float(gradient @ probe.direction))
     typical = statistics.median(seconds)
-    return [Estimate(estimator, statistics.fmean(found), statistics.stdev(found), repeats, typical) for found in values]
+    return [
+        Estimate(estimator, statistics.fmean(found), statistics.stdev(found), repeats, typical, factor)
+        for found in values
+    ]
 
 
 def reference(
@@ -219,23 +239,73 @@ def reference(
     spp: int,
     goal: float = 0.02,
     repeats: tuple[int, int] = (3, 16),
+    factors: Sequence[float] = (1.0,),
 ) -> Reference:
     """Return the derivative along a probe by central differences at two steps, with its noise.
 
-    Seeds are added until the standard error is below `goal` of the value, between the two numbers of `repeats`.
+    Seeds are added until the standard error is below `goal` of the value, between the two numbers of `repeats`. With
+    several `factors`, each gets the smaller number of seeds, both steps so many times wider, until one is sure enough;
+    if none is, the one with the least noise goes on.
     """
     before = renderer.renders
-    wide, narrow = [], []
-    for number in range(repeats[1]):
-        noise = seeds.stream(seed, "reference", number)
-        wide.append(_difference(renderer, loss, u, probe, probe.step, noise, spp))
-        narrow.append(_difference(renderer, loss, u, probe, 0.5 * probe.step, noise, spp))
-        sure = [(4.0 * fine - coarse) / 3.0 for coarse, fine in zip(wide, narrow, strict=True)]
-        if number + 1 >= repeats[0] and _error(sure) <= goal * abs(statistics.fmean(sure)):
+    pairs = {factor: _Pairs(_widened(probe, factor)) for factor in factors}
+    for factor, tried in pairs.items():
+        tried.extend(renderer, loss, u, seed, spp, until=repeats[0])
+        if tried.error <= goal * abs(tried.value):
+            best = factor
             break
-    both = statistics.fmean(wide), statistics.fmean(narrow)
-    left = abs(both[0] - both[1]) / 4.0
-    return Reference(statistics.fmean(sure), math.hypot(_error(sure), left), both, renderer.renders - before)
+    else:
+        best = min(pairs, key=lambda factor: pairs[factor].noise)
+        while pairs[best].error > goal * abs(pairs[best].value) and len(pairs[best].wide) < repeats[1]:
+            pairs[best].extend(renderer, loss, u, seed, spp, until=len(pairs[best].wide) + 1)
+    found = pairs[best]
+    return Reference(found.value, found.noise, found.both, renderer.renders - before, best)
+
+
+def _widened(probe: Probe, factor: float) -> Probe:
+    return probe if factor == 1.0 else replace(probe, step=min(STEP_RANGE[1], factor * probe.step))
+
+
+@dataclass
+class _Pairs:
+    """Differences at a probe's step and at half of it, with the same seeds."""
+
+    probe: Probe
+    wide: list[float] = field(default_factory=list)
+    narrow: list[float] = field(default_factory=list)
+
+    def extend(self, renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int, *, until: int) -> None:
+        """Add seeds until there are so many."""
+        for number in range(len(self.wide), until):
+            noise = seeds.stream(seed, "reference", number)
+            self.wide.append(_difference(renderer, loss, u, self.probe, self.probe.step, noise, spp))
+            self.narrow.append(_difference(renderer, loss, u, self.probe, 0.5 * self.probe.step, noise, spp))
+
+    @property
+    def both(self) -> tuple[float, float]:
+        """Mean at the larger and at the smaller step."""
+        return statistics.fmean(self.wide), statistics.fmean(self.narrow)
+
+    @property
+    def _at_zero(self) -> list[float]:
+        """Extrapolated to a step of zero (Richardson)."""
+        return [(4.0 * fine - coarse) / 3.0 for coarse, fine in zip(self.wide, self.narrow, strict=True)]
+
+    @property
+    def value(self) -> float:
+        """Mean of the extrapolated ones."""
+        return statistics.fmean(self._at_zero)
+
+    @property
+    def error(self) -> float:
+        """Standard error of `value`."""
+        return _error(self._at_zero)
+
+    @property
+    def noise(self) -> float:
+        """Standard error together with a quarter of the steps' disagreement."""
+        wide, narrow = self.both
+        return math.hypot(self.error, 0.25 * (wide - narrow))
 
 
 def _error(values: Sequence[float]) -> float:

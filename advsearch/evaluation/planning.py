@@ -7,6 +7,7 @@ own loss (DESIGN 5.2: over poses that loss is rough at the scale of a pixel and 
 
 from __future__ import annotations
 
+import itertools
 import statistics
 import time
 from collections.abc import Sequence
@@ -30,11 +31,14 @@ COUNTS = (8, 16, 32, 64, 128)
 ADJOINT_RENDERS = 3.0
 """Renders that take about as long as an adjoint."""
 CONVERGED, AGAIN = 128, 4
-"""Samples a pixel of a gradient that counts as converged, and times as many where two of these do not agree."""
+"""Samples a pixel of a gradient that counts as converged, and times as many where these do not agree, or where a
+working gradient has more."""
+WITNESSES = 3
+"""Converged gradients that are taken. Two of a few numbers can agree by luck."""
 TELLS = 0.5
-"""Two converged gradients whose cosine is less than this tell nothing: the cosine of their mean with the truth
-is then about sqrt(2 c / (1 + c)) (Spearman and Brown), 0.82 and less. Above it the noise of the converged one, which is
-independent of the working one's, only makes the measured cosine smaller: what is called `ok` is so."""
+"""Converged gradients of which two have a smaller cosine than this tell nothing: the cosine of the mean of three with
+the truth is then about sqrt(3 c / (1 + 2 c)) (Spearman and Brown), 0.87 and less. Above it the noise of the converged
+one, which is independent of the working one's, only makes the measured cosine smaller: what is called `ok` is so."""
 
 Status = Literal["ok", "noisy", "reference unusable"]
 
@@ -48,7 +52,7 @@ class Cosine:
         factor: step as a multiple of the plan's.
         spp: samples a pixel of the working gradient.
         cosine: mean over seeds; NaN where the converged gradient is zero.
-        converged: cosine of two converged gradients of different seeds: no working gradient can be expected above it.
+        converged: smallest cosine of two of the converged gradients, of different seeds.
         seconds: median time of one working gradient.
     """
 
@@ -227,15 +231,18 @@ def _cosines_at(
     counts: Sequence[int],
     repeats: int,
 ) -> list[Cosine]:
-    def pair(spp: int) -> tuple[Tensor, float]:
-        one, other = (renderer.gradient(loss, u, seeds.stream(seed, "converged", k), spp)[1] for k in range(2))
-        return (one + other) / 2.0, _cosine(one, other)
+    def converged(spp: int) -> tuple[Tensor, float]:
+        found = [renderer.gradient(loss, u, seeds.stream(seed, "converged", k), spp)[1] for k in range(WITNESSES)]
+        agreements = torch.tensor([_cosine(*pair) for pair in itertools.combinations(found, 2)])
+        return torch.stack(found).mean(dim=0), float(agreements.min())  # NaN if one is
 
-    truth, agreement = pair(CONVERGED)
-    if agreement < GOAL:
-        truth, agreement = pair(AGAIN * CONVERGED)
+    many = CONVERGED
+    truth, agreement = converged(many)
     found = []
     for spp in counts:
+        if many == CONVERGED and (agreement < GOAL or spp > CONVERGED):
+            many = AGAIN * CONVERGED
+            truth, agreement = converged(many)
         values, times = [], []
         for number in range(repeats):
             begun = time.perf_counter()

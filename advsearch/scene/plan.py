@@ -43,7 +43,7 @@ DEFAULT_STEP, TURN_STEP = 0.05, 0.005
 """Half of a difference's width in u, for coordinates that move nothing in the picture: of a range, of a full turn."""
 DEFAULT_PIXELS = 1.0
 """How far the fastest point of an outline moves over half a difference, in pixels (DESIGN 5.1)."""
-STEP_RANGE = (1e-6, 0.1)
+STEP_RANGE = (1e-6, 0.15)
 """Smallest and largest step in u."""
 
 
