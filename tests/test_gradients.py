@@ -354,6 +354,19 @@ def test_a_working_gradient_is_not_held_against_one_of_fewer_samples() -> None:
     assert [(row.spp, row.cosine) for row in dear] == [(64, 0.0), (256, 1.0)]
 
 
+def test_the_widest_step_is_tried_only_where_no_other_will_do() -> None:
+    right, across = [1.0, 0.0], [0.0, 1.0]
+
+    def factors(working: list[list[float]]) -> list[float]:
+        told: Any = Told({128: [right], 8: working})
+        told.plan = first_plan((group("pose.x", 0, 2, ("secant",)),), torch.tensor([0.01, 0.01]))
+        rows = cosines(told, lambda image: image, torch.zeros(2), seed=0, counts=(8,))
+        return [row.factor for row in rows]
+
+    assert factors([right]) == [1.0, 3.0]
+    assert factors([across]) == [1.0, 3.0, 9.0]
+
+
 def test_the_cheapest_setting_that_reaches_the_goal_is_taken() -> None:
     plan = first_plan((group("pose.yaw", 0, 1, ("secant",)),), torch.tensor([0.01]))
     rows = [

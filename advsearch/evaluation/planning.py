@@ -24,8 +24,9 @@ from advsearch.scene.renderer import Renderer
 
 GOAL = 0.9
 """Cosine with the converged gradient that a working gradient should have."""
-FACTORS = (1.0, 3.0)
-"""Steps that are tried, as multiples of the one that moves an outline by a pixel."""
+FACTORS = (1.0, 3.0, 9.0)
+"""Steps that are tried, as multiples of the one that moves an outline by a pixel; the last only where no other will do:
+it smooths away all but the coarse shape of the loss."""
 COUNTS = (8, 16, 32, 64, 128)
 """Sample counts that are tried."""
 ADJOINT_RENDERS = 3.0
@@ -206,9 +207,13 @@ def cosines(
             if not names:
                 continue
             by_steps = any(one.estimator in BY_DIFFERENCES for one in base.groups if one.control == control)
+            mine: list[Cosine] = []
             for factor in factors if by_steps else factors[:1]:
+                if factor == FACTORS[-1] and any(row.status == "ok" for row in mine):
+                    break
                 renderer.plan = _silenced(base.with_steps(factor), names)
-                found += _cosines_at(renderer, loss, u, control, factor, seed, counts, repeats)
+                mine += _cosines_at(renderer, loss, u, control, factor, seed, counts, repeats)
+            found += mine
     finally:
         renderer.plan = base
     return found
