@@ -289,12 +289,13 @@ def test_a_reference_takes_wider_steps_where_narrow_ones_are_noise() -> None:
     assert abs(wide.value - 1.0) <= 3.0 * wide.noise < 0.5 * narrow.noise
 
 
-def test_what_is_noisy_at_a_pixel_is_tried_with_wider_steps_and_says_so() -> None:
+def test_what_falls_short_at_a_pixel_is_tried_with_other_steps() -> None:
     several = group("a.b", 0, 1, ("secant", "differences", "guided"))
-    assert attempts(several) == [("secant", 1.0), ("differences", 1.0), ("differences", 3.0), ("differences", 9.0)]
+    assert attempts(several)[:2] == [("secant", 1.0), ("differences", 1.0)]
+    assert attempts(several)[2:] == [("differences", factor) for factor in (3.0, 9.0, 1.0 / 3.0)]
     assert attempts(group("a.b", 0, 1, ("adjoint",))) == [("adjoint", 1.0)]
     forced = replace(several, estimator="secant", reason="forced by name")
-    assert [name for name, _ in attempts(forced)] == ["secant"] * 3
+    assert [name for name, _ in attempts(forced)] == ["secant"] * 4
 
 
 def test_a_wider_step_of_one_gradient_leaves_the_plan_as_it_was() -> None:

@@ -151,7 +151,7 @@ def _rows(
 
 
 def attempts(group: GroupPlan) -> list[tuple[str, float]]:
-    """Estimators to measure on a group, with the multiple of the step; wider ones for what falls short with the first.
+    """Estimators to measure on a group, with the multiple of the step; other steps for what falls short with the first.
 
     Differences of the loss and of the picture are the same for a linear loss, so that wider steps are tried with one.
     """

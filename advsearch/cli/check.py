@@ -93,7 +93,7 @@ def table(rows: list[dict[str, Any]]) -> str:
                 row["object"],
                 f"{row['control']}.{row['parameter']}",
                 row["estimator"],
-                f"x {row['factor']:g}",
+                f"x {row['factor']:.2g}",
                 f"{row['gradient']:.3g}",
                 f"{row['reference']:.3g} +- {row['reference_noise']:.1g}",
                 f"{100 * row['relative_error']:.1f} %",
