@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from advsearch.api import load_scene
-from advsearch.api.checking import attempts
+from advsearch.api.checking import attempts, check
+from advsearch.config import AttackConfig
 from advsearch.controls import make_control
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.evaluation.gradients import (
@@ -535,3 +536,19 @@ def test_the_smooth_loss_does_not_see_the_edge_of_the_picture() -> None:
     framed[0], framed[-1], framed[:, 0], framed[:, -1] = 100.0, 100.0, 100.0, 100.0
     assert float(loss(framed)) == pytest.approx(float(loss(picture)), abs=1e-4)
     assert abs(float(loss(picture))) > 1e-4
+
+
+# ---- the whole check ------------------------------------------------------------------------------------------------
+
+
+def test_a_check_says_of_both_losses_how_good_a_gradient_is() -> None:
+    config = AttackConfig(object="mug", controls={"background": {}}, resolution=(24, 24), spp=4)
+    rows = check(config)
+    linear = [row for row in rows if row["loss"] == "linear"]
+    assert {row["parameter"] for row in linear} >= {"hue", "saturation", "value"}
+    for row in linear:
+        assert row["status"] == "ok", row
+        assert row["noise"] <= 0.2 and row["spp"] == 4
+    (model,) = {row["control"]: row for row in rows if row["loss"] == "model"}.values()
+    assert model["parameter"] == "*" and model["estimator"] in ESTIMATORS
+    assert (model["status"] == "ok") == (model["cosine"] >= 0.9 and model["converged"] >= TELLS)

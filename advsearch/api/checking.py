@@ -26,7 +26,7 @@ from advsearch.evaluation.gradients import (
     smooth_loss,
     verdict,
 )
-from advsearch.evaluation.planning import COUNTS, cosines
+from advsearch.evaluation.planning import COUNTS, cosines, measured_plan
 from advsearch.progress import NullProgress, Progress
 from advsearch.scene.plan import GroupPlan
 
@@ -99,13 +99,19 @@ def _linear(config: AttackConfig, progress: Progress) -> list[dict[str, Any]]:
 
 def _model(config: AttackConfig, progress: Progress) -> list[dict[str, Any]]:
     problem, _ = problem_from_config(config)
-    renderer = problem.renderer
+    renderer, u = problem.renderer, inside(problem.renderer)
     counts = tuple(count for count in (*COUNTS, MOST) if count >= problem.spp) or (problem.spp,)
-    table = cosines(renderer, problem.loss, inside(renderer), seed=config.seed, counts=counts)
+    # the estimators that a run would take
+    measuring = seeds.stream(config.seed, "measure")
+    renderer.plan = measured_plan(renderer, problem.loss, u, seed=measuring, spp=problem.spp, counted=True)
+    taken: dict[str, list[str]] = {}
+    for group in renderer.plan.groups:
+        taken.setdefault(group.control, []).append(group.estimator)
     rows = []
-    for row in table:
+    for row in cosines(renderer, problem.loss, u, seed=config.seed, counts=counts):
         progress.advance(1)
-        rows.append({**_place(config, "model"), **vars(row), "parameter": "*", "status": row.status})
+        names = {"parameter": "*", "estimator": ", ".join(dict.fromkeys(taken[row.control]))}
+        rows.append({**_place(config, "model"), **vars(row), **names, "status": row.status})
     return rows
 
 

@@ -106,11 +106,12 @@ def table(rows: list[dict[str, Any]]) -> str:
         parts.append("smooth linear loss of the raw picture:\n" + output.columns([heads, *body]))
     cosine = [row for row in rows if row["loss"] == "model"]
     if cosine:
-        heads = ["object", "control", "step", "samples", "cosine", "converged", "seconds", "status"]
+        heads = ["object", "control", "estimator", "step", "samples", "cosine", "converged", "seconds", "status"]
         body = [
             [
                 row["object"],
                 row["control"],
+                row["estimator"],
                 f"x {row['factor']:g}",
                 str(row["spp"]),
                 f"{row['cosine']:.3f}",
