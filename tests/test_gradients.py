@@ -324,6 +324,23 @@ def test_a_measured_plan_keeps_what_was_forced_and_says_what_it_measured() -> No
     assert contested(forced.plan) == []
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_random_directions_do_not_judge_an_adjoint_over_many_coordinates(seed: int) -> None:
+    """What differs from the mean of a few is not wrong for that, and each takes eight renders, an adjoint about three."""
+
+    class Shape:
+        plan = first_plan((group("geometry.amplitudes", 0, 24, ("material", "simultaneous")),), torch.full((24,), 0.01))
+
+        def gradient(self, loss: Any, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor]:
+            noise = torch.randn(24, generator=torch.Generator().manual_seed(seed % 2**31))
+            loud = self.plan.groups[0].estimator == "simultaneous"
+            return torch.zeros(()), 1.0 + (2.5 if loud else 1.5) * noise
+
+    shape: Any = Shape()
+    plan = measured_plan(shape, lambda image: image, torch.full((24,), 0.5), seed=seed, spp=4, counted=True)
+    assert plan.groups[0].estimator == "material"
+
+
 class Told:
     """A renderer whose gradients are told: by sample count, one for each call in turn."""
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.evaluation.gradients import EXPENSIVE, Loss, estimated
-from advsearch.scene.plan import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, GroupPlan
+from advsearch.scene.plan import BY_ADJOINT, BY_DIFFERENCES, DIRECTIONS, GradientPlan, GroupPlan
 from advsearch.scene.renderer import Renderer
 
 GOAL = 0.9
@@ -156,7 +156,8 @@ def _scores(
     counted: bool,
 ) -> dict[str, float]:
     """Squared error x seconds of each candidate. The reference is the mean of the differences among them, whose own
-    noise is taken off the others' errors."""
+    noise is taken off the others' errors. Random directions are no reference: over many coordinates, where no other
+    differences are tried, each has its own scatter for an error."""
     names = {group.name for group in groups}
     gradients: dict[str, Tensor] = {}
     seconds: dict[str, float] = {}
@@ -169,19 +170,20 @@ def _scores(
             times.append(time.perf_counter() - begun)
         cost = 1.0 + sum(replace(group, estimator=estimator).renders for group in groups)
         cost += ADJOINT_RENDERS if estimator in BY_ADJOINT else 0.0
+        cost += 2.0 * DIRECTIONS if estimator == "simultaneous" else 0.0
         gradients[estimator], seconds[estimator] = torch.stack(found), cost if counted else statistics.median(times)
-    judge = next((one for one in candidates if one in BY_DIFFERENCES), candidates[0])
+    own = {
+        estimator: float((found - found.mean(dim=0)).square().sum() / max(1, repeats - 1))
+        for estimator, found in gradients.items()
+    }
+    judge = next((one for one in candidates if one in BY_DIFFERENCES - {"simultaneous"}), None)
+    if judge is None:
+        return {estimator: own[estimator] * seconds[estimator] for estimator in gradients}
     truth = gradients[judge].mean(dim=0)
-    spread = float((gradients[judge] - truth).square().sum() / max(1, repeats - 1))
     scores = {}
     for estimator, found_all in gradients.items():
-        if estimator == judge:
-            error = spread
-        else:
-            error = float((found_all - truth).square().sum(dim=1).mean()) - spread / repeats
-            own = float((found_all - found_all.mean(dim=0)).square().sum() / max(1, repeats - 1))
-            error = max(error, own)
-        scores[estimator] = error * seconds[estimator]
+        error = float((found_all - truth).square().sum(dim=1).mean()) - own[judge] / repeats
+        scores[estimator] = (own[judge] if estimator == judge else max(error, own[estimator])) * seconds[estimator]
     return scores
 
 
