@@ -326,7 +326,7 @@ def test_a_measured_plan_keeps_what_was_forced_and_says_what_it_measured() -> No
 
 @pytest.mark.parametrize("seed", range(8))
 def test_random_directions_do_not_judge_an_adjoint_over_many_coordinates(seed: int) -> None:
-    """What differs from the mean of a few is not wrong for that; and they take eight renders, an adjoint about three."""
+    """What differs from the mean of a few is not wrong for that. They take eight renders, an adjoint about three."""
 
     class Shape:
         plan = first_plan((group("geometry.amplitudes", 0, 24, ("material", "simultaneous")),), torch.full((24,), 0.01))
