@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from advsearch.api import load_scene
-from advsearch.api.checking import attempts, check
+from advsearch.api.checking import WHOLE, attempts, check
+from advsearch.cli.check import table
 from advsearch.config import AttackConfig
 from advsearch.controls import make_control
 from advsearch.errors import InputError, UnknownNameError
@@ -566,6 +567,13 @@ def test_a_check_says_of_both_losses_how_good_a_gradient_is() -> None:
     for row in linear:
         assert row["status"] == "ok", row
         assert row["noise"] <= 0.2 and row["spp"] == 4
-    (model,) = {row["control"]: row for row in rows if row["loss"] == "model"}.values()
-    assert model["parameter"] == "*" and model["estimator"] in ESTIMATORS
-    assert (model["status"] == "ok") == (model["cosine"] >= 0.9 and model["converged"] >= TELLS)
+    whole = [row for row in rows if row["loss"] == "model" and row["parameter"] == WHOLE]
+    assert {row["control"] for row in whole} == {"background"} and whole[0]["estimator"] in ESTIMATORS
+    assert (whole[-1]["status"] == "ok") == (whole[-1]["cosine"] >= 0.9 and whole[-1]["converged"] >= TELLS)
+    single = {row["parameter"]: row for row in rows if row["loss"] == "model" and row["parameter"] != WHOLE}
+    assert set(single) == {row["parameter"] for row in linear}
+    for row in single.values():
+        assert row["reference_noise"] >= 0.0 and row["noise"] >= 0.0 and math.isfinite(row["gradient"])
+        assert row["status"] in ("ok", "noisy", "biased", "reference unusable")
+    text = table(rows)
+    assert "smooth linear loss" in text and "each parameter" in text and "cosine with the converged" in text

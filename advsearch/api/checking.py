@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -26,7 +26,7 @@ from advsearch.evaluation.gradients import (
     smooth_loss,
     verdict,
 )
-from advsearch.evaluation.planning import COUNTS, cosines, measured_plan
+from advsearch.evaluation.planning import CONVERGED, COUNTS, cosines, measured_plan, tuned
 from advsearch.progress import NullProgress, Progress
 from advsearch.scene.plan import GroupPlan
 
@@ -39,6 +39,10 @@ MOST = 256
 """Samples a pixel of the dearest gradient of the model's loss that is tried; `advsearch plan` stops before."""
 REFERENCE_SPP, SEEDS = 64, (6, 16)
 """Samples a pixel of a reference render, and how many seeds it gets: until its noise is small."""
+FEW_SEEDS = (3, 6)
+"""Seeds of a reference of the model's loss, whose renders have more samples."""
+WHOLE = "*"
+"""What stands for the parameter in rows about a whole control."""
 REPEATS, AGAIN = 6, 8
 """Gradients of one estimator, from which its mean and its noise come; and of one with a wider step."""
 
@@ -56,8 +60,9 @@ def check(
         progress: told how far it is.
 
     Returns:
-        One row for each parameter, estimator and loss, as DESIGN section 6 lists them, and for the model's loss one
-        row for each control with the cosine of a working gradient with the converged one.
+        One row for each parameter, estimator and loss, as DESIGN section 6 lists them. For the model's loss the
+        estimator, the step and the samples are those that reach the goal soonest, and rows with `WHOLE` for their
+        parameter have the cosine of a control's working gradients with the converged one.
     """
     progress = progress or NullProgress()
     rows: list[dict[str, Any]] = []
@@ -94,30 +99,68 @@ def _linear(config: AttackConfig, progress: Progress) -> list[dict[str, Any]]:
     problem, _ = problem_from_config(config, denoise="none")
     problem.renderer.formation = replace(problem.renderer.formation, transfer="linear")
     loss = smooth_loss(problem.renderer.formation.resolution, config.seed)
-    return _rows(problem, config, loss, "linear", config.spp if isinstance(config.spp, int) else RAW_SPP, progress)
+    return _rows(
+        problem,
+        config,
+        loss,
+        "linear",
+        config.spp if isinstance(config.spp, int) else RAW_SPP,
+        progress,
+        tried=attempts,
+        high=REFERENCE_SPP,
+        repeats=SEEDS,
+        factors=FACTORS[:2],
+    )
 
 
 def _model(config: AttackConfig, progress: Progress) -> list[dict[str, Any]]:
     problem, _ = problem_from_config(config)
     renderer, u = problem.renderer, inside(problem.renderer)
     counts = tuple(count for count in (*COUNTS, MOST) if count >= problem.spp) or (problem.spp,)
-    # the estimators that a run would take
     measuring = seeds.stream(config.seed, "measure")
     renderer.plan = measured_plan(renderer, problem.loss, u, seed=measuring, spp=problem.spp, counted=True)
-    taken: dict[str, list[str]] = {}
-    for group in renderer.plan.groups:
-        taken.setdefault(group.control, []).append(group.estimator)
+    steps = {group.name: group.step for group in renderer.plan.groups}
+    table = cosines(renderer, problem.loss, u, seed=config.seed, counts=counts)
+    renderer.plan, spp = tuned(renderer.plan, table)
     rows = []
-    for row in cosines(renderer, problem.loss, u, seed=config.seed, counts=counts):
+    for row in table:
         progress.advance(1)
-        names = {"parameter": "*", "estimator": ", ".join(dict.fromkeys(taken[row.control]))}
+        taken = [group.estimator for group in renderer.plan.groups if group.control == row.control]
+        names = {"parameter": WHOLE, "estimator": ", ".join(dict.fromkeys(taken))}
         rows.append({**_place(config, "model"), **vars(row), **names, "status": row.status})
-    return rows
+    single = _rows(
+        problem,
+        config,
+        problem.loss,
+        "model",
+        spp or problem.spp,
+        progress,
+        tried=lambda group: [(group.estimator, 1.0)],
+        high=CONVERGED,
+        repeats=FEW_SEEDS,
+        factors=(1.0,),
+    )
+    wider = {group.name: group.step / steps[group.name] for group in renderer.plan.groups if steps[group.name]}
+    for one in single:
+        group = f"{one['control']}.{one['parameter'].partition('.')[0]}"  # coordinates of one have a number behind it
+        one["factor"] = one["reference_factor"] = wider.get(group, 1.0)
+    return rows + single
 
 
 def _rows(
-    problem: Problem, config: AttackConfig, loss: Loss, name: str, spp: int, progress: Progress
+    problem: Problem,
+    config: AttackConfig,
+    loss: Loss,
+    name: str,
+    spp: int,
+    progress: Progress,
+    *,
+    tried: Callable[[GroupPlan], list[tuple[str, float]]],
+    high: int,
+    repeats: tuple[int, int],
+    factors: Sequence[float],
 ) -> list[dict[str, Any]]:
+    """Rows of single parameters, with references of `high` samples, so many seeds, and steps so many times as wide."""
     renderer, seed = problem.renderer, seeds.stream(config.seed, "check")
     u = inside(renderer)
     along = probes(renderer, loss, u, seed, spp)
@@ -129,9 +172,9 @@ def _rows(
             probe,
             seed=seed,
             # what acts on the picture clips: its mean depends on the noise, so both get the same
-            spp=spp if probe.group.estimator == "image" else max(spp, REFERENCE_SPP),
-            repeats=SEEDS,
-            factors=FACTORS[:2],
+            spp=spp if probe.group.estimator == "image" else max(spp, high),
+            repeats=repeats,
+            factors=factors,
         )
         for probe in along
     }
@@ -139,14 +182,12 @@ def _rows(
     for group in _sets(along):
         beside = [references[one.name] for one in along if one.group.control == group[0].group.control]
         good: set[str] = set()
-        for estimator, factor in attempts(group[0].group):
+        for estimator, factor in tried(group[0].group):
             wanted = group if factor == 1.0 else [one for one in group if one.name not in good]
             if not wanted:
                 break
-            repeats = REPEATS if factor == 1.0 else AGAIN  # another try has to be surer
-            measured = estimates(
-                renderer, loss, u, estimator, wanted, seed=seed, spp=spp, repeats=repeats, factor=factor
-            )
+            many = REPEATS if factor == 1.0 else AGAIN  # another try has to be surer
+            measured = estimates(renderer, loss, u, estimator, wanted, seed=seed, spp=spp, repeats=many, factor=factor)
             for probe, estimate in zip(wanted, measured, strict=True):
                 against = references[probe.name]
                 row = _row(probe, estimate, against, scale_of(against, beside))

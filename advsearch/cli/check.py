@@ -23,6 +23,19 @@ FIELDS = (
 )
 """The settings of `attack` that matter here, beside those of scene and model."""
 FELL_SHORT = 3
+SINGLE = (
+    "object",
+    "parameter",
+    "estimator",
+    "step",
+    "gradient",
+    "reference",
+    "error",
+    "noise",
+    "seconds",
+    "status",
+)
+"""Heads of a table of single parameters."""
 
 _EXAMPLES = """examples:
   advsearch check --object mug --control pose
@@ -71,7 +84,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _best(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """For each parameter and loss the row with the best status: an estimator that no plan would take may fall short."""
+    """For each parameter and loss the row with the best status: an estimator that no plan would take may fall short.
+
+    Of the model's loss the rows of whole controls count: what matters is where their gradient points.
+    """
+    rows = [row for row in rows if row["loss"] == "linear" or "cosine" in row]
     order = ("ok", "reference unusable", "noisy", "biased")
     best: dict[tuple[str, ...], dict[str, Any]] = {}
     for row in rows:
@@ -84,27 +101,14 @@ def _best(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def table(rows: list[dict[str, Any]]) -> str:
     """Return the rows as text: one table for each loss."""
     parts = []
-    linear = [row for row in rows if row["loss"] == "linear"]
-    if linear:
-        heads = ["object", "parameter", "estimator", "step"]
-        heads += ["gradient", "reference", "error", "noise", "seconds", "status"]
-        body = [
-            [
-                row["object"],
-                f"{row['control']}.{row['parameter']}",
-                row["estimator"],
-                f"x {row['factor']:.2g}",
-                f"{row['gradient']:.3g}",
-                f"{row['reference']:.3g} +- {row['reference_noise']:.1g}",
-                f"{100 * row['relative_error']:.1f} %",
-                f"{100 * row['noise']:.0f} %",
-                f"{row['seconds']:.2f}",
-                row["status"],
-            ]
-            for row in linear
-        ]
-        parts.append("smooth linear loss of the raw picture:\n" + output.columns([heads, *body]))
-    cosine = [row for row in rows if row["loss"] == "model"]
+    for loss, title in (
+        ("linear", "smooth linear loss of the raw picture"),
+        ("model", "the model's loss, each parameter in the setting that is taken"),
+    ):
+        single = [row for row in rows if row["loss"] == loss and "cosine" not in row]
+        if single:
+            parts.append(f"{title}:\n" + output.columns([SINGLE, *map(_single, single)]))
+    cosine = [row for row in rows if "cosine" in row]
     if cosine:
         heads = ["object", "control", "estimator", "step", "samples", "cosine", "converged", "seconds", "status"]
         body = [
@@ -123,3 +127,18 @@ def table(rows: list[dict[str, Any]]) -> str:
         ]
         parts.append("the model's loss, cosine with the converged gradient:\n" + output.columns([heads, *body]))
     return "\n\n".join(parts)
+
+
+def _single(row: dict[str, Any]) -> list[str]:
+    return [
+        row["object"],
+        f"{row['control']}.{row['parameter']}",
+        row["estimator"],
+        f"x {row['factor']:.2g}",
+        f"{row['gradient']:.3g}",
+        f"{row['reference']:.3g} +- {row['reference_noise']:.1g}",
+        f"{100 * row['relative_error']:.1f} %",
+        f"{100 * row['noise']:.0f} %",
+        f"{row['seconds']:.2f}",
+        row["status"],
+    ]
