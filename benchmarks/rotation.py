@@ -1,6 +1,6 @@
 """Measures the error of the derivative of an environment's rotation: its sign, its bias, and the noise of one gradient.
 
-    python benchmarks/rotation.py [--environments studio kitchen noon FILE] [--size 96] [--seconds 240]
+    python benchmarks/rotation.py [--environments studio kitchen noon FILE] [--size 96] [--seconds 600]
 
 Mitsuba's own derivative of an environment's turn has the wrong sign (DESIGN 5). The plan takes central differences of
 1.8 degrees, or the adjoint of texels that are resampled along the azimuth. Here the loss is linear and smooth, the
@@ -40,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--environments", nargs="+", default=["studio", "kitchen", "noon"])
     parser.add_argument("--size", type=int, default=96, help="side of the picture (default 96)")
-    parser.add_argument("--seconds", type=float, default=240.0, help="most time for each (default 240)")
+    parser.add_argument("--seconds", type=float, default=600.0, help="most time for each (default 600)")
     args = parser.parse_args(argv)
     good = [measured(one, args.size, args.seconds) for one in args.environments]
     return 0 if all(good) else 3

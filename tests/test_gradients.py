@@ -292,9 +292,11 @@ def test_a_reference_takes_wider_steps_where_narrow_ones_are_noise() -> None:
 
 
 def test_what_falls_short_at_a_pixel_is_tried_with_other_steps() -> None:
-    several = group("a.b", 0, 1, ("secant", "differences", "guided"))
+    several = group("a.b", 0, 1, ("secant", "differences", "guided"), step=0.01)
     assert attempts(several)[:2] == [("secant", 1.0), ("differences", 1.0)]
     assert attempts(several)[2:] == [("differences", factor) for factor in (3.0, 9.0, 1.0 / 3.0)]
+    factors = [factor for _, factor in attempts(replace(several, step=0.05))]
+    assert factors == [1.0, 1.0, 3.0, 1.0 / 3.0]  # 9 times would be as wide as 3 times
     assert attempts(group("a.b", 0, 1, ("adjoint",))) == [("adjoint", 1.0)]
     forced = replace(several, estimator="secant", reason="forced by name")
     assert [name for name, _ in attempts(forced)] == ["secant"] * 4
@@ -377,14 +379,15 @@ def test_a_working_gradient_is_not_held_against_one_of_fewer_samples() -> None:
 def test_the_widest_step_is_tried_only_where_no_other_will_do() -> None:
     right, across = [1.0, 0.0], [0.0, 1.0]
 
-    def factors(working: list[list[float]]) -> list[float]:
+    def factors(working: list[list[float]], step: float = 0.01) -> list[float]:
         told: Any = Told({128: [right], 8: working})
-        told.plan = first_plan((group("pose.x", 0, 2, ("secant",)),), torch.tensor([0.01, 0.01]))
+        told.plan = first_plan((group("pose.x", 0, 2, ("secant",)),), torch.tensor([step, step]))
         rows = cosines(told, lambda image: image, torch.zeros(2), seed=0, counts=(8,))
         return [row.factor for row in rows]
 
     assert factors([right]) == [1.0, 3.0]
     assert factors([across]) == [1.0, 3.0, 9.0]
+    assert factors([across], step=0.05) == [1.0, 3.0]  # as wide as a step may be
 
 
 def test_the_cheapest_setting_that_reaches_the_goal_is_taken() -> None:

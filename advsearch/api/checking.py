@@ -28,7 +28,7 @@ from advsearch.evaluation.gradients import (
 )
 from advsearch.evaluation.planning import CONVERGED, COUNTS, cosines, measured_plan, tuned
 from advsearch.progress import NullProgress, Progress
-from advsearch.scene.plan import GroupPlan
+from advsearch.scene.plan import STEP_RANGE, GroupPlan
 
 SCENES = (("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"))
 """Bundled scenes that `check --all` goes through."""
@@ -205,7 +205,16 @@ def attempts(group: GroupPlan) -> list[tuple[str, float]]:
     forced = "forced" in group.reason
     names = [group.estimator] if forced else [one for one in group.valid if one not in EXPENSIVE]
     wide = next((one for one in ("differences", "secant", "forward") if one in names), None)
-    return [(one, 1.0) for one in names] + [(wide, factor) for factor in FACTORS[1:] if wide is not None]
+    found = [(one, 1.0) for one in names]
+    if wide is None:
+        return found
+    tried = {group.step}
+    for factor in FACTORS[1:]:
+        step = min(factor * group.step, STEP_RANGE[1])
+        if step not in tried:
+            tried.add(step)
+            found.append((wide, factor))
+    return found
 
 
 def _row(probe: Probe, estimate: Estimate, against: Reference, size: float) -> dict[str, Any]:

@@ -210,10 +210,14 @@ def cosines(
                 continue
             by_steps = any(one.estimator in BY_DIFFERENCES for one in base.groups if one.control == control)
             mine: list[Cosine] = []
+            tried: list[GradientPlan] = []
             for factor in factors if by_steps else factors[:1]:
                 if factor == FACTORS[-1] and any(row.status == "ok" for row in mine):
                     break
                 renderer.plan = _silenced(base.with_steps(factor), names)
+                if renderer.plan in tried:  # no step can be wider
+                    continue
+                tried.append(renderer.plan)
                 mine += _cosines_at(renderer, loss, u, control, factor, seed, counts, repeats)
             found += mine
     finally:
