@@ -328,20 +328,25 @@ def test_a_measured_plan_keeps_what_was_forced_and_says_what_it_measured() -> No
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_random_directions_do_not_judge_an_adjoint_over_many_coordinates(seed: int) -> None:
+def test_random_directions_do_not_judge_an_adjoint(seed: int) -> None:
     """What differs from the mean of a few is not wrong for that. They take eight renders, an adjoint about three."""
 
     class Shape:
-        plan = first_plan((group("geometry.amplitudes", 0, 24, ("material", "simultaneous")),), torch.full((24,), 0.01))
+        plan = first_plan((group("texture.colors", 0, 12, ("adjoint", "simultaneous")),), torch.full((12,), 0.01))
 
         def gradient(self, loss: Any, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor]:
-            noise = torch.randn(24, generator=torch.Generator().manual_seed(seed % 2**31))
+            noise = torch.randn(12, generator=torch.Generator().manual_seed(seed % 2**31))
             loud = self.plan.groups[0].estimator == "simultaneous"
             return torch.zeros(()), 1.0 + (2.5 if loud else 1.5) * noise
 
     shape: Any = Shape()
-    plan = measured_plan(shape, lambda image: image, torch.full((24,), 0.5), seed=seed, spp=4, counted=True)
-    assert plan.groups[0].estimator == "material"
+    plan = measured_plan(shape, lambda image: image, torch.full((12,), 0.5), seed=seed, spp=4, counted=True)
+    assert plan.groups[0].estimator == "adjoint"
+
+
+def test_over_many_coordinates_an_adjoint_is_not_contested_by_random_directions() -> None:
+    many = first_plan((group("geometry.amplitudes", 0, 24, ("material", "simultaneous")),), torch.full((24,), 0.01))
+    assert contested(many) == contested(many, every=True) == []
 
 
 class Told:

@@ -31,6 +31,10 @@ COUNTS = (8, 16, 32, 64, 128)
 """Sample counts that are tried."""
 ADJOINT_RENDERS = 3.0
 """Renders that take about as long as an adjoint."""
+MANY = 16
+"""Coordinates of one control over which differences are not compared with an adjoint: one by one they take too many
+renders, and the error of random directions is which ones they skip (DESIGN 5.1), so that no number of samples brings
+them to the goal."""
 CONVERGED, AGAIN = 128, 4
 """Samples a pixel of a gradient that counts as converged, and times as many where these do not agree, or where a
 working gradient has more."""
@@ -93,8 +97,8 @@ def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Gr
         usable = [one for one in valid if one not in EXPENSIVE]
         by_differences = [one for one in usable if one in BY_DIFFERENCES]
         size = sum(group.size for group in groups)
-        if size > 16:
-            by_differences = [one for one in by_differences if one == "simultaneous"]
+        if size > MANY:
+            by_differences = []
         adjoints = [one for one in usable if one in BY_ADJOINT]
         candidates = tuple(adjoints + (by_differences if every else by_differences[:1]))
         if len(candidates) > 1 and (every or valid[0] in BY_ADJOINT):
@@ -156,8 +160,8 @@ def _scores(
     counted: bool,
 ) -> dict[str, float]:
     """Squared error x seconds of each candidate. The reference is the mean of the differences among them, whose own
-    noise is taken off the others' errors. Random directions are no reference: over many coordinates, where no other
-    differences are tried, each has its own scatter for an error."""
+    noise is taken off the others' errors. Random directions are no reference: where there are no other differences,
+    each has its own scatter for an error."""
     names = {group.name for group in groups}
     gradients: dict[str, Tensor] = {}
     seconds: dict[str, float] = {}
