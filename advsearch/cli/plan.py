@@ -63,7 +63,7 @@ def text(chosen: dict[str, Any]) -> str:
             "step",
             "samples",
             "cosine with the converged gradient",
-            "of two converged",
+            "of converged ones",
             "seconds",
         ]
         body = [
