@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.evaluation.gradients import EXPENSIVE, Loss, estimated
-from advsearch.scene.plan import BY_ADJOINT, BY_DIFFERENCES, DIRECTIONS, GradientPlan, GroupPlan
+from advsearch.evaluation.gradients import EXPENSIVE, Loss, estimated, only
+from advsearch.scene.plan import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, GroupPlan
 from advsearch.scene.renderer import Renderer
 
 GOAL = 0.9
@@ -172,9 +172,8 @@ def _scores(
             noise = seeds.stream(seed, "plan", number)
             found.append(estimated(renderer, loss, u, estimator, names, noise, spp))
             times.append(time.perf_counter() - begun)
-        cost = 1.0 + sum(replace(group, estimator=estimator).renders for group in groups)
+        cost = 1.0 + only(renderer.plan, names, estimator).renders
         cost += ADJOINT_RENDERS if estimator in BY_ADJOINT else 0.0
-        cost += 2.0 * DIRECTIONS if estimator == "simultaneous" else 0.0
         gradients[estimator], seconds[estimator] = torch.stack(found), cost if counted else statistics.median(times)
     own = {
         estimator: float((found - found.mean(dim=0)).square().sum() / max(1, repeats - 1))
