@@ -1,0 +1,148 @@
+"""Reading what others have written: only ordinary files, never more of them than a limit, JSON no deeper than one.
+
+Every file that a user names, and every file that such a file names, is opened here. A device, a pipe or a socket is
+refused before a byte of it is read: it may never end, or wait for ever.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import stat
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from advsearch.errors import FileFormatError, InputError
+
+FACTOR = "ADVSEARCH_LIMITS"
+"""Environment variable with a number that all limits on the size of input are multiplied by."""
+
+DEPTH = 100
+"""Deepest nesting of JSON, in lists and objects."""
+
+DIGITS = 300
+"""Most digits of a whole number; more than these have no floating-point form."""
+
+_KINDS = (
+    (stat.S_ISDIR, "a directory; name a file inside it"),
+    (stat.S_ISFIFO, "a pipe; write what it yields to a file and name that"),
+    (stat.S_ISSOCK, "a socket; name an ordinary file"),
+    (stat.S_ISCHR, "a device; name an ordinary file"),
+    (stat.S_ISBLK, "a device; name an ordinary file"),
+)
+
+
+def scaled(limit: int) -> int:
+    """Return a limit on the size of input (bytes, pixels, faces, ...) times `ADVSEARCH_LIMITS`, which is 1 by default.
+
+    Raises:
+        InputError: `ADVSEARCH_LIMITS` is not a number greater than 0.
+    """
+    text = os.environ.get(FACTOR, "") or "1"
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = math.nan
+    if not 0 < factor < math.inf:
+        raise InputError(f"{FACTOR}: expected a number greater than 0, by which limits are multiplied, got {text!r}")
+    return int(limit * factor)
+
+
+def too_large(path: Path | str, expected: str, size: str) -> FileFormatError:
+    """Return the error for input over a limit; it names the setting that raises the limit.
+
+    Args:
+        path: the file.
+        expected: what was expected, with the limit: ``"a mesh of at most 100 faces"``.
+        size: what was got: ``"120"``.
+    """
+    return FileFormatError(
+        f"{path}: expected {expected}, got {size}; if you trust it, {FACTOR}=10 in the environment makes all limits "
+        "ten times as large"
+    )
+
+
+def open_regular(path: Path, expected: str, limit: int) -> BinaryIO:
+    """Return an ordinary file opened for reading; close it.
+
+    Args:
+        path: the file; links are followed.
+        expected: what it should be, for messages: ``"a label file"``.
+        limit: the most bytes it may have, before `scaled`.
+
+    Raises:
+        FileFormatError: a directory, a pipe, a socket or a device, none of which is read; or too large.
+        OSError: as for `open`: it is not there, or there is no permission.
+    """
+    if "\0" in str(path):
+        raise FileFormatError(f"{path}: expected the name of a file, got one with a zero byte in it")
+    _check(path, os.stat(path), expected, limit)  # before it is opened: to open a device or a pipe may change it
+    # Not blocking, for whatever has taken its place since.
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
+    try:
+        _check(path, os.fstat(descriptor), expected, limit)
+        return os.fdopen(descriptor, "rb")
+    except BaseException:
+        os.close(descriptor)
+        raise
+
+
+def read_bytes(path: Path, expected: str, limit: int) -> bytes:
+    """Return the content of an ordinary file; arguments and errors as for `open_regular`."""
+    most = scaled(limit)
+    with open_regular(path, expected, limit) as file:
+        data = file.read(most + 1)  # a file may grow, and those of /proc give no size
+    if len(data) > most:
+        raise too_large(path, f"{expected} of at most {most:,} bytes", "more")
+    return data
+
+
+def read_text(path: Path, expected: str, limit: int) -> str:
+    """Return the text of an ordinary file in UTF-8, without a byte order mark.
+
+    Raises:
+        FileFormatError: as for `open_regular`, or the bytes are not UTF-8.
+        OSError: as for `open_regular`.
+    """
+    try:
+        return read_bytes(path, expected, limit).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise FileFormatError(f"{path}: expected {expected} in UTF-8, got bytes that are not text") from None
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Return the value of a JSON text.
+
+    Raises:
+        ValueError: it is not JSON, is nested deeper than `DEPTH`, or has a number of thousands of digits; the message
+            is short.
+    """
+    try:
+        value = json.loads(text, parse_int=_whole_number)
+    except RecursionError:
+        raise ValueError(f"lists or objects nested deeper than {DEPTH}") from None
+    level = [value]
+    for _ in range(DEPTH):
+        level = [inner for outer in level if isinstance(outer, (list, dict)) for inner in _inside(outer)]
+        if not level:
+            return value
+    raise ValueError(f"lists or objects nested deeper than {DEPTH}")
+
+
+def _whole_number(text: str) -> int:
+    if len(text) > DIGITS:
+        raise ValueError(f"a whole number of {len(text)} digits")
+    return int(text)
+
+
+def _inside(value: list[Any] | dict[str, Any]) -> list[Any]:
+    return value if isinstance(value, list) else list(value.values())
+
+
+def _check(path: Path, status: os.stat_result, expected: str, limit: int) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        got = next((words for is_kind, words in _KINDS if is_kind(status.st_mode)), "something else")
+        raise FileFormatError(f"{path}: expected {expected}, got {got}")
+    if status.st_size > scaled(limit):
+        raise too_large(path, f"{expected} of at most {scaled(limit):,} bytes", f"{status.st_size:,}")
