@@ -14,7 +14,7 @@ SOURCES := advsearch scenes tests benchmarks docs
 export TORCH_INDEX
 
 .DEFAULT_GOAL := help
-.PHONY: help setup attack test test-slow check lint format typecheck bench study reference wheel check-wheel clean
+.PHONY: help setup attack test test-slow check lint format typecheck docs bench study reference wheel check-wheel clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -46,6 +46,10 @@ format: $(STAMP) ## format the code and mend what can be mended
 
 typecheck: $(STAMP) ## mypy, strict, on the package
 	@$(BIN)/mypy
+
+docs: $(STAMP) ## build the documentation into build/site; fails on a broken link
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check --no-build-isolation -c constraints.txt -e '.[docs]'
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # what compares answers and not times, and takes long
 STUDIES := searches every_control rotation close_calls closed_form policies precision kill

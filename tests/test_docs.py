@@ -56,7 +56,7 @@ from advsearch.settings import parse_assignment, read_yaml, settings
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+PAGES = [*(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")), *sorted(DOCS.rglob("*.md"))]
 every_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 
 
@@ -240,7 +240,7 @@ def test_every_control_and_policy_with_options_has_a_made_part() -> None:
     own_pages = [name for name in POLICIES if (DOCS / "policies" / f"{name}.md").exists()]
     pages += [f"policies/{name}.md" for name in own_pages if inspect.signature(POLICIES[name]).parameters]
     assert not [page for page in pages if page not in {page for page, _ in made}]
-    for path in PAGES[1:]:
+    for path in sorted(DOCS.rglob("*.md")):
         page = path.relative_to(DOCS).as_posix()
         marked = re.findall(r"<!-- made by docs/make_figures\.py: ([a-z-]+) -->", path.read_text("utf-8"))
         assert set(marked) == {name for known, name in made if known == page}
