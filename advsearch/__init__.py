@@ -12,11 +12,33 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from advsearch.api import AttackResult, Model, Scene, SweepResult, attack, load_model, load_scene, sweep
+    from advsearch.api import (
+        AttackResult,
+        Model,
+        Rendering,
+        Scene,
+        SweepResult,
+        attack,
+        load_model,
+        load_scene,
+        render,
+        sweep,
+    )
 
 __version__ = "0.1.0"
 
-__all__ = ["AttackResult", "Model", "Scene", "SweepResult", "attack", "load_model", "load_scene", "sweep"]
+__all__ = [
+    "AttackResult",
+    "Model",
+    "Rendering",
+    "Scene",
+    "SweepResult",
+    "attack",
+    "load_model",
+    "load_scene",
+    "render",
+    "sweep",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -23,7 +23,7 @@ from typing import Any
 
 from advsearch.cli.flags import GROUPS, help_text
 from advsearch.cli.main import COMMANDS
-from advsearch.config import AttackConfig, GapConfig, PrecisionConfig, RegionConfig, SweepConfig
+from advsearch.config import AttackConfig, GapConfig, PrecisionConfig, RegionConfig, RenderConfig, SweepConfig
 from advsearch.controls import OWN
 from advsearch.scene.settings import SETTINGS
 from advsearch.settings import Config, Setting, settings
@@ -99,6 +99,7 @@ def flags(record: Record) -> str:
 FLAG_HEADS = ("flag", "what", "values", "default")
 
 CONFIGS: dict[str, type[Config]] = {
+    "render": RenderConfig,
     "sweep": SweepConfig,
     "gap": GapConfig,
     "region": RegionConfig,

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from advsearch.cli import flags
 from advsearch.cli.sweep import axes_as_text
-from advsearch.config import AttackConfig, GapConfig, PrecisionConfig, RegionConfig, SweepConfig
+from advsearch.config import AttackConfig, GapConfig, PrecisionConfig, RegionConfig, RenderConfig, SweepConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.settings import Config, flag, parse_assignment, read_yaml, settings
 
@@ -150,7 +150,7 @@ def test_every_setting_is_documented_and_has_a_flag_of_its_own() -> None:
     assert flag("texture_resolution") == "--texture-resolution"
 
 
-CONFIGS = (AttackConfig, GapConfig, PrecisionConfig, RegionConfig, SweepConfig)
+CONFIGS = (AttackConfig, GapConfig, PrecisionConfig, RegionConfig, RenderConfig, SweepConfig)
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.command)

@@ -43,7 +43,7 @@ from advsearch.cli.list import REGISTRIES
 from advsearch.cli.main import COMMANDS, _parse
 from advsearch.cli.run import COMMANDS as IN_FILES
 from advsearch.cli.sweep import axes_as_text
-from advsearch.config import TRIALS, TRIALS_OVER, AttackConfig, RegionConfig, SceneConfig, SweepConfig
+from advsearch.config import TRIALS, TRIALS_OVER, AttackConfig, RegionConfig, RenderConfig, SceneConfig, SweepConfig
 from advsearch.controls import CONTROLS, texture
 from advsearch.evaluation import reference_scenes
 from advsearch.models import calibration, loading, reference
@@ -365,7 +365,8 @@ def check_names(config: SceneConfig) -> None:
     lights = config.environments if isinstance(config, SweepConfig) else (config.environment,)
     for name in config.objects:
         assert name in library.list_objects() or Path(name).suffix in objects.SUFFIXES
-        assert config.label is not None or name in library.list_objects(), "a file does not bring a label"
+        needs_label = not isinstance(config, RenderConfig) and name not in library.list_objects()
+        assert config.label is not None or not needs_label, "a file does not bring a label"
     for name in lights:
         assert name in library.list_environments() or Path(name).suffix in environments.SUFFIXES
     if isinstance(config, AttackConfig):
@@ -385,7 +386,7 @@ def check_advsearch(words: list[str], folder: Path) -> None:
     if args.command in CONFIGS:
         if "grid" in args:
             args.grid = axes_as_text(args.grid)
-        otherwise = {} if args.command in ("attack", "sweep", "gap") else {"object": "mug"}
+        otherwise = {} if args.command in ("attack", "render", "sweep", "gap") else {"object": "mug"}
         check_names(config_from(args, CONFIGS[args.command], **otherwise))
     if args.command == "run":
         recipe = folder / "run.yaml"

@@ -6,6 +6,7 @@ from advsearch import threads as threads  # before torch: it sets how OpenMP wai
 from advsearch.api.attacking import attack, attack_from_config, resume_attack
 from advsearch.api.mapping import region_from_config
 from advsearch.api.outcome import AttackResult
+from advsearch.api.rendering import Rendering, render, render_from_config
 from advsearch.api.scene import Scene, load_scene
 from advsearch.api.studies import curve_from_config, gap_from_config
 from advsearch.api.sweeping import sweep, sweep_from_config
@@ -15,6 +16,7 @@ from advsearch.models import Model, load_model
 __all__ = [
     "AttackResult",
     "Model",
+    "Rendering",
     "Scene",
     "SweepResult",
     "attack",
@@ -24,6 +26,8 @@ __all__ = [
     "load_model",
     "load_scene",
     "region_from_config",
+    "render",
+    "render_from_config",
     "resume_attack",
     "sweep",
     "sweep_from_config",

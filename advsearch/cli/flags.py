@@ -18,6 +18,7 @@ GROUPS = {
     "search": "search",
     "sweep": "sweep",
     "region": "region",
+    "picture": "picture",
     "verification": "verification",
     "run": "run",
 }

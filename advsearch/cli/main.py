@@ -23,6 +23,7 @@ from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 
 COMMANDS = {
     "attack": "advsearch.cli.attack",
+    "render": "advsearch.cli.render",
     "sweep": "advsearch.cli.sweep",
     "run": "advsearch.cli.run",
     "gap": "advsearch.cli.gap",

@@ -10,6 +10,7 @@ from __future__ import annotations
 from advsearch.config.attack import TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.config.precision import QUANTITIES, SAMPLERS, PrecisionConfig
 from advsearch.config.questions import GapConfig, RegionConfig
+from advsearch.config.rendering import RenderConfig
 from advsearch.config.scene import AUTO_SHARE, CLOSE_LOOKS, SEARCH_SPP, SceneConfig
 from advsearch.config.sweep import SweepConfig
 
@@ -25,6 +26,7 @@ __all__ = [
     "GapConfig",
     "PrecisionConfig",
     "RegionConfig",
+    "RenderConfig",
     "SceneConfig",
     "SweepConfig",
 ]

@@ -150,13 +150,29 @@ def gathered(asked: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, o
 
 
 def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
-    """Let controls prepare a scene, bind them to it and compose them.
+    """Let controls prepare a scene, bind them to it and compose them into something that can be searched.
 
     Raises:
-        InputError: no control, two of one name, or one that the scene cannot take.
+        InputError: no control, two of one name, one that the scene cannot take, or nothing that varies.
     """
     if not controls:
         raise InputError(f"--control: expected at least one of {', '.join(CONTROLS)}")
+    space = compose(controls, scene)
+    if not len(space.start):
+        names = ", ".join(control.name for control in controls)
+        raise InputError(
+            f"--control {names}: every parameter is fixed, so there is nothing to search; give one a range, "
+            f"such as {_suggestion(controls[0])}"
+        )
+    return space
+
+
+def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
+    """Let controls prepare a scene, bind them to it and compose them; none, or only fixed ones, will do.
+
+    Raises:
+        InputError: two controls of one name, or one that the scene cannot take.
+    """
     names = [control.name for control in controls]
     if len(set(names)) != len(names):
         raise InputError(
@@ -165,13 +181,7 @@ def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
         )
     for control in controls:
         scene = control.prepare(scene)
-    space = Space(tuple(control.bind(scene) for control in controls), scene)
-    if not len(space.start):
-        raise InputError(
-            f"--control {', '.join(names)}: every parameter is fixed, so there is nothing to search; give one a range, "
-            f"such as {_suggestion(controls[0])}"
-        )
-    return space
+    return Space(tuple(control.bind(scene) for control in controls), scene)
 
 
 def _suggestion(control: Control) -> str:
@@ -199,6 +209,7 @@ __all__ = [
     "NumberControl",
     "Parameter",
     "Space",
+    "compose",
     "gathered",
     "make_control",
     "make_space",

@@ -26,6 +26,21 @@ class ModelWarning(UserWarning):
     """A model that works, but not as an attack would like it to (probabilities, randomness, no gradient)."""
 
 
+@dataclass(frozen=True)
+class Answer:
+    """One class as an answer to a picture.
+
+    Attributes:
+        label: its name.
+        index: its number.
+        probability: in [0, 1].
+    """
+
+    label: str
+    index: int
+    probability: float
+
+
 @final
 @dataclass(frozen=True, eq=False)
 class Model:
@@ -88,6 +103,18 @@ class Model:
     def label_set(self, text: str | int | Sequence[str | int]) -> LabelSet:
         """Return the classes that `text` names, e.g. ``"coffee mug,cup"`` or ``"#504"``; see `find_label_set`."""
         return find_label_set(text, self.labels, named=self.named)
+
+    def answers(self, image: Tensor, count: int = 5) -> tuple[Answer, ...]:
+        """Return what the model says of one picture: its likeliest classes, the first one first.
+
+        Args:
+            image: (H, W, 3), as for a call.
+            count: how many, at most as many as there are classes.
+        """
+        with torch.no_grad():
+            likeliest = self(image)[0].softmax(dim=0).topk(min(count, self.classes))
+        pairs = zip(likeliest.indices.tolist(), likeliest.values.tolist(), strict=True)
+        return tuple(Answer(self.labels[index], index, probability) for index, probability in pairs)
 
     def batches(self, images: Tensor) -> Iterator[tuple[Tensor, int]]:
         """Yield what the network is given for images (N, H, W, 3), and how many rows of each part count.

@@ -1,0 +1,62 @@
+"""What `render` needs to know."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pydantic import field_validator
+
+from advsearch.config.scene import SceneConfig
+from advsearch.settings import setting
+
+PICTURE_SPP = 64
+"""Samples a pixel of a picture that is made to be looked at."""
+PICTURES = (".png", ".exr")
+"""The pictures that can be written."""
+
+
+class RenderConfig(SceneConfig):
+    """Everything that decides what `render` does: pictures of a scene, and what the model says of them."""
+
+    command: ClassVar[str] = "render"
+
+    controls: dict[str, dict[str, Any]] = setting(
+        dict,
+        "picture",
+        "what differs from the scene, separated by commas; a range stays where a search would start",
+        "names of controls, or NAME={PARAMETER: VALUE}",
+    )
+    around: int | None = setting(
+        None,
+        "picture",
+        "one sheet of so many views, from azimuths all around the object",
+        "a whole number from 2 to 64",
+        otherwise="one view",
+        unit="views",
+        ge=2,
+        le=64,
+    )
+    spp: int = setting(
+        PICTURE_SPP,
+        "picture",
+        "samples per pixel",
+        "a whole number from 1 to 65536",
+        unit="samples",
+        ge=1,
+        le=65536,
+    )
+    out: str = setting(
+        ...,
+        "picture",
+        "the file to write: a .png holds what the model sees, an .exr linear radiance times the gain",
+        "the path of a .png or .exr file",
+    )
+
+    @field_validator("out", mode="before")
+    @classmethod
+    def _picture_file(cls, value: Any) -> Any:
+        text = str(value) if isinstance(value, Path) else value
+        if not isinstance(text, str) or "\0" in text or Path(text).suffix.lower() not in PICTURES:
+            raise ValueError("not a picture")
+        return text
