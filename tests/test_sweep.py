@@ -364,6 +364,28 @@ def test_the_fast_way_says_what_the_control_says(scene: advsearch.Scene, control
         assert said == space.describe(one)
 
 
+def test_what_a_row_says_of_an_occluder_is_true_of_its_own_camera() -> None:
+    grid = {"camera.distance": [2, 4], "occlusion.coverage": [0.3]}
+    found = advsearch.sweep("mug", model(), grid, trials=0, resolution=SIZE)
+    near, far = (float(row.values["occlusion.true_distance"]["value"]) for row in found.rows())
+    assert near == pytest.approx(1.0, abs=0.1) and far == pytest.approx(2.0, abs=0.1)
+    rows = {row.step: row for row in found.rows()}
+    assert found.summary["worst"]["values"] == rows[found.summary["worst"]["configuration"]].values
+
+
+def test_what_a_row_says_is_true_of_the_picture_that_its_model_was_shown() -> None:
+    wide = advsearch.load_model(Brightness(), labels=LABELS, input_size=(SIZE, 2 * SIZE), name="wide")
+    drawn = {"camera": {}}
+    both = advsearch.sweep("mug", [model(), wide], controls=drawn, samples=2, trials=0)
+    alone = [
+        row.values["camera.distance"]
+        for one in (model(), wide)
+        for row in advsearch.sweep("mug", one, controls=drawn, samples=2, trials=0).rows()
+    ]
+    found = [row.values["camera.distance"] for row in both.rows()]
+    assert [found[0], found[2], found[1], found[3]] == alone and found[0] != found[1]
+
+
 def test_draws_stay_in_their_budget_and_cover_it(scene: advsearch.Scene) -> None:
     drawn = (
         make_control("texture", {"resolution": 16, "epsilon": 0.1}),

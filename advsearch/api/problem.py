@@ -138,16 +138,20 @@ class Problem:
         score, right = float(self.goal.score(logits)[0]), bool(self.goal.right(logits)[0])
         return Trial(score, predicted, float(probabilities[predicted]), right)
 
-    def describe(self, u: Tensor) -> dict[str, Value]:
-        """Say a configuration of the searched controls in named values with units."""
-        return self.searched_space.describe(u)
+    def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Value]:
+        """Say a configuration of the searched controls in named values with units, under the conditions of a draw.
 
-    def conditions_of(self, seed: int) -> dict[str, Value]:
+        Args:
+            u: (d,) of the searched controls.
+            draw: seed of the conditions; None for those that the scene comes with.
+        """
+        return self.space.describe(self.whole(u, draw), self.space.controls[: self.searched])
+
+    def conditions_of(self, u: Tensor, draw: int) -> dict[str, Value]:
         """Say the conditions of a draw in named values with units; empty where there are none."""
         if self.conditions is None:
             return {}
-        others = replace(self.space, controls=self.space.controls[self.searched :])
-        return others.describe(self.whole(torch.zeros(0), seed))
+        return self.space.describe(self.whole(u, draw), self.space.controls[self.searched :])
 
     # ---- evaluations ------------------------------------------------------------------------------------------------
 

@@ -142,7 +142,7 @@ class Recorder:
         )
 
     def trial(
-        self, kind: str, number: int, spp: int, trial: Trial, seed: int, values: Mapping[str, Any] | None = None
+        self, kind: str, number: int, spp: int, trial: Trial, seed: int, u: Tensor, *, described: bool = False
     ) -> None:
         """Keep one trial.
 
@@ -152,12 +152,13 @@ class Recorder:
             spp: samples a pixel.
             trial: what came out.
             seed: of its render.
-            values: the configuration, where it is not the same in all trials of the kind.
+            u: (d,) of the searched controls.
+            described: whether to say u, which the trials of one kind may have in common, beside the conditions.
         """
         if self.run is None or self._memory.holds(kind, number):
             return
         labels = self._problem.model.labels
-        told = {**(values or {}), **self._problem.conditions_of(seed)}
+        told = {**(self._problem.describe(u, seed) if described else {}), **self._problem.conditions_of(u, seed)}
         self.run.record(trial_row(kind, number, seed, spp, trial, labels, told))
 
 

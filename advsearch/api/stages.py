@@ -260,7 +260,7 @@ class Attack:
             seed=self.config.seed,
             trials=self.config.trial_count,
             group="clean",
-            on_trial=self._teller(kind),
+            on_trial=self._teller(kind, self.problem.domain.start),
         )
 
     def verified(self, kind: str, found: SearchResult) -> Verification:
@@ -275,7 +275,7 @@ class Attack:
             trials=self.config.trial_count,
             clean=self.findings.clean,
             rule=self.rule,
-            on_trial=self._teller(kind),
+            on_trial=self._teller(kind, self.problem.domain.project(found.best_u)),
         )
 
     def _trial(self, kind: str) -> Callable[[Tensor, int, int], Trial]:
@@ -293,8 +293,7 @@ class Attack:
         """One trial of a configuration of its own, with a seed of its own; read back if it is stored."""
         seed, spp = seeds.stream(self.config.seed, kind, number), self.findings.spp
         trial = self.memory.trial(kind, number, self.problem.goal) or self.problem.trial(u, seed, spp)
-        values = {} if self.problem.domain.dim > MANY else self.problem.describe(u)
-        self.recorder.trial(kind, number, spp, trial, seed, values)
+        self.recorder.trial(kind, number, spp, trial, seed, u, described=self.problem.domain.dim <= MANY)
         self.findings.verification_renders += 1
         self.stages.progress.advance(1)
         return trial
@@ -311,10 +310,10 @@ class Attack:
             found.append(self.one_trial("average", number, u))
         self.findings.average = tuple(found)
 
-    def _teller(self, kind: str) -> Callable[[str, int, Trial], None]:
+    def _teller(self, kind: str, u: Tensor) -> Callable[[str, int, Trial], None]:
         def on_trial(group: str, number: int, trial: Trial) -> None:
             seed = seeds.stream(self.config.seed, "verification", number)
-            self.recorder.trial(kind, number, self.findings.spp, trial, seed)
+            self.recorder.trial(kind, number, self.findings.spp, trial, seed, u)
             self.findings.verification_renders += 1
             self.stages.progress.advance(1)
 

@@ -103,7 +103,7 @@ class BackgroundControl(NumberControl):
             return {}
         return {COLOR: srgb_to_linear(hsv_to_rgb(values["hue"], values["saturation"], values["value"]))}
 
-    def measured(self, scene: SceneDescription, values: Values) -> dict[str, Value]:
+    def measured(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         color = hsv_to_rgb(values["hue"], values["saturation"], values["value"])
         names = ("red", "green", "blue")
         return {name: {"value": float(one), "unit": "sRGB"} for name, one in zip(names, color, strict=True)}

@@ -125,7 +125,8 @@ class BoundControl(ABC):
         name: the instance's name.
         start: (d,) float32 in [0, 1], the value that leaves the scene as it is.
         groups: the coordinates of the slice in order; their sizes add up to d.
-        refines: the scene inputs that this control takes from the ones before it and changes (a patch on a texture).
+        refines: the scene inputs that this control takes from the ones before it, and may change (a patch on a
+            texture).
     """
 
     name: str
@@ -152,15 +153,18 @@ class BoundControl(ABC):
         return image
 
     @abstractmethod
-    def describe(self, u: Tensor) -> dict[str, Value]:
-        """Say a configuration in a few named values with units, small enough for one row of a table."""
+    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
+        """Say a configuration in a few named values with units, small enough for one row of a table.
 
-    def artifacts(self, u: Tensor) -> dict[str, Tensor]:
-        """Return pictures worth keeping, by file stem: (h, w, 3) display-referred sRGB in [0, 1]."""
+        It is a function of its arguments alone; arguments as for `inputs`.
+        """
+
+    def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
+        """Return pictures worth keeping, by file stem: (h, w, 3) display-referred sRGB in [0, 1]; see `describe`."""
         return {}
 
-    def files(self, u: Tensor) -> dict[str, bytes]:
-        """Return other files worth keeping, by name with ending: a mesh as PLY, say."""
+    def files(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, bytes]:
+        """Return other files worth keeping, by name with ending: a mesh as PLY, say; see `describe`."""
         return {}
 
 

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Parameter, Value
+from advsearch.controls.base import NOTHING, Parameter, Value
 from advsearch.controls.numbers import BoundNumbers, NumberControl, Values
 from advsearch.controls.values import Choices, Fixed, Number, Range, Spec
 from advsearch.errors import InputError
@@ -216,9 +216,9 @@ class BoundContents(BoundNumbers):
         values = super().values(u)
         return {**values, **self.control.proportions(values)}
 
-    def describe(self, u: Tensor) -> dict[str, Value]:
+    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
         values = self.values(u.detach())
-        said = super().describe(u)
+        said = super().describe(u, so_far)
         for name in INGREDIENTS:
             said[f"{self.name}.{name}"] = {"value": float(values[name]), "unit": "1"}
         return said

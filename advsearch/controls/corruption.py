@@ -125,7 +125,7 @@ class CorruptionControl(NumberControl):
         seed = int(self.chosen["seed"])  # type: ignore[call-overload]
         return corrupted(image, NAMES[int(values["which"])], values["severity"], seed)
 
-    def measured(self, scene: SceneDescription, values: Values) -> dict[str, Value]:
+    def measured(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         severity = values["severity"]
         applied = nearest(severity) if NAMES[int(values["which"])] in STEPPED else float(severity)
         return {"applied": {"value": float(applied), "unit": "1"}}

@@ -195,7 +195,7 @@ class BoundGeometry(BoundControl):
         """Displacement of each place, (P, 3) float64."""
         return self._limits.held(self._shaper.field(u))
 
-    def describe(self, u: Tensor) -> dict[str, Value]:
+    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
         offsets = self._offsets(u.detach())
         lengths = offsets.norm(dim=1)
         return {
@@ -204,7 +204,7 @@ class BoundGeometry(BoundControl):
             f"{self.name}.thinnest": {"value": self._limits.thinnest(offsets), "unit": "1"},
         }
 
-    def files(self, u: Tensor) -> dict[str, bytes]:
+    def files(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, bytes]:
         moving = MovingMesh(self._mesh, np.eye(4))
         vertices, normals = moving.place(None, self.inputs(u.detach())[OFFSETS])
         return {f"{self.name}.obj": obj_bytes(vertices, normals, self._mesh)}

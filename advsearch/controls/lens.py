@@ -108,7 +108,7 @@ class LensControl(NumberControl):
     def on_picture(self, scene: SceneDescription, values: Values, image: Tensor) -> Tensor:
         return with_dots(image, self._placed(values))
 
-    def kept_pictures(self, scene: SceneDescription, values: Values) -> dict[str, Tensor]:
+    def kept_pictures(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {self.name: with_dots(_board(), self._placed(values))}
 
     def _placed(self, values: Values) -> dict[str, Tensor]:

@@ -93,10 +93,10 @@ class MaterialControl(NumberControl):
             inputs[BASE_COLOR] = srgb_to_linear(tint) * self._reflectance(scene, which, so_far)
         return inputs
 
-    def kept_pictures(self, scene: SceneDescription, values: Values) -> dict[str, Tensor]:
+    def kept_pictures(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         if not self._colours():
             return {}
-        return {self.name: linear_to_srgb(self.scene_inputs(scene, values, {})[BASE_COLOR])}
+        return {self.name: linear_to_srgb(self.scene_inputs(scene, values, so_far)[BASE_COLOR])}
 
     # ---- inside -----------------------------------------------------------------------------------------------------
 

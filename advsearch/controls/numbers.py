@@ -111,18 +111,18 @@ class NumberControl(Control, ABC):
         return image
 
     def refines(self, scene: SceneDescription) -> frozenset[str]:
-        """Return the scene inputs that `scene_inputs` takes from the controls before and changes."""
+        """Return the scene inputs that `scene_inputs` and `measured` take from the controls before, and may change."""
         return frozenset()
 
-    def measured(self, scene: SceneDescription, values: Values) -> dict[str, Value]:
+    def measured(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         """Return further values worth storing with a configuration, by name without the instance's."""
         return {}
 
-    def kept_pictures(self, scene: SceneDescription, values: Values) -> dict[str, Tensor]:
+    def kept_pictures(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return pictures worth keeping, by file stem: (h, w, 3) sRGB in [0, 1]."""
         return {}
 
-    def kept_files(self, scene: SceneDescription, values: Values) -> dict[str, bytes]:
+    def kept_files(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, bytes]:
         """Return other files worth keeping, by name with ending."""
         return {}
 
@@ -241,7 +241,7 @@ class BoundNumbers(BoundControl):
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
         return self.control.on_picture(self.scene, self.values(u), image)
 
-    def describe(self, u: Tensor) -> dict[str, Value]:
+    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
         u = u.detach()
         values = self.values(u)
         said: dict[str, Value] = {}
@@ -256,12 +256,12 @@ class BoundNumbers(BoundControl):
             else:
                 for number, one in enumerate(value):
                     said[f"{self.name}.{parameter.name}.{number}"] = {"value": float(one), "unit": parameter.unit}
-        for name, one_value in self.control.measured(self.scene, values).items():
+        for name, one_value in self.control.measured(self.scene, values, so_far).items():
             said[f"{self.name}.{name}"] = one_value
         return said
 
-    def artifacts(self, u: Tensor) -> dict[str, Tensor]:
-        return self.control.kept_pictures(self.scene, self.values(u.detach()))
+    def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
+        return self.control.kept_pictures(self.scene, self.values(u.detach()), so_far)
 
-    def files(self, u: Tensor) -> dict[str, bytes]:
-        return self.control.kept_files(self.scene, self.values(u.detach()))
+    def files(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, bytes]:
+        return self.control.kept_files(self.scene, self.values(u.detach()), so_far)

@@ -22,8 +22,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import NOTHING, Choice, Parameter, Value
-from advsearch.controls.numbers import BoundNumbers, NumberControl, Values
+from advsearch.controls.base import Choice, Parameter, Value
+from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Choices, Fixed
 from advsearch.errors import InputError
 from advsearch.scene.assets import ObjectAsset
@@ -44,8 +44,6 @@ CLEARANCE = 0.05
 """Smallest distance in object sizes between the camera and the occluder."""
 PARKED = 1e-3
 """Size of an occluder that is put away, behind the camera."""
-REMEMBERED = 256
-"""Configurations whose camera and pose are kept for `describe`."""
 SURROUNDINGS = ("camera.to_world", "camera.fov", "camera.shift", "object.to_world", "object.offsets")
 """Inputs of other controls that an occluder goes by."""
 
@@ -176,9 +174,6 @@ class OcclusionControl(NumberControl):
             scene = scene.with_part(part)
         return scene
 
-    def bind(self, scene: SceneDescription) -> BoundOcclusion:
-        return BoundOcclusion(self, super().bind(scene))
-
     def refines(self, scene: SceneDescription) -> frozenset[str]:
         """Nothing is changed; but it has to come after whatever moves the camera or the object."""
         return frozenset(SURROUNDINGS)
@@ -191,6 +186,18 @@ class OcclusionControl(NumberControl):
         if not placed.away:
             inputs[f"{self._part(chosen)}.to_world"] = _matrix(camera, placed, values)
         return inputs
+
+    def measured(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+        """What is hidden of the object, and what became of the size and the distance that were asked for."""
+        placed = self.placement(scene, values, so_far)
+        hidden: dict[str, Value] = {"hidden": {"value": placed.hidden, "unit": "1"}}
+        if placed.away:
+            return hidden
+        return {
+            **hidden,
+            "true_size": {"value": placed.size, "unit": "object sizes"},
+            "true_distance": {"value": placed.distance, "unit": "object sizes"},
+        }
 
     # ---- inside -----------------------------------------------------------------------------------------------------
 
@@ -231,41 +238,6 @@ class OcclusionControl(NumberControl):
         if cover is None:
             return Placement(np.eye(3), 0.0, size, distance, 0.0, True)
         return _solved(seen, cover, asked, size, distance)
-
-
-class BoundOcclusion(BoundNumbers):
-    """An occluder in a scene; it reports what it hides under the camera and pose that a configuration was mapped with.
-
-    Args:
-        control: the control.
-        bound: the same, bound as plain numbers.
-    """
-
-    control: OcclusionControl
-
-    def __init__(self, control: OcclusionControl, bound: BoundNumbers) -> None:
-        super().__init__(control, bound.scene, bound._slots)
-        self._around: dict[bytes, dict[str, Tensor]] = {}
-
-    def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
-        around = {name: so_far[name].detach() for name in SURROUNDINGS if name in so_far}
-        key = u.detach().numpy().tobytes()
-        self._around.pop(key, None)
-        if around:
-            self._around[key] = around
-            if len(self._around) > REMEMBERED:
-                self._around.pop(next(iter(self._around)))
-        return super().inputs(u, so_far)
-
-    def describe(self, u: Tensor) -> dict[str, Value]:
-        said = super().describe(u)
-        around = self._around.get(u.detach().numpy().tobytes(), {})
-        placed = self.control.placement(self.scene, self.values(u.detach()), around)
-        said[f"{self.name}.hidden"] = {"value": placed.hidden, "unit": "1"}
-        if not placed.away:
-            said[f"{self.name}.true_size"] = {"value": placed.size, "unit": "object sizes"}
-            said[f"{self.name}.true_distance"] = {"value": placed.distance, "unit": "object sizes"}
-        return said
 
 
 # ---- what the camera sees -------------------------------------------------------------------------------------------

@@ -292,7 +292,7 @@ class BoundPatch(BoundControl):
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         return {BASE_COLOR: self._sticker.paint(so_far.get(BASE_COLOR), self.pixels(u), self.numbers(u))}
 
-    def describe(self, u: Tensor) -> dict[str, Value]:
+    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
         u = u.detach()
         said: dict[str, Value] = {}
         if self._searched:
@@ -303,7 +303,7 @@ class BoundPatch(BoundControl):
             said.update(self._numbers.describe(u[self._searched :]))
         return said
 
-    def artifacts(self, u: Tensor) -> dict[str, Tensor]:
+    def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         pixels = self.pixels(u.detach())
         return {self.name: enlarged(pixels, PRINT_SIDE), f"{self.name}-pixels": pixels}
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import BoundControl, Group, Value
+from advsearch.controls.base import NOTHING, BoundControl, Group, Value
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.plan import WITH_BOUNDARY, GroupPlan
@@ -76,12 +76,24 @@ class Space:
             InputError: two controls set one input.
         """
         merged: dict[str, Tensor] = {}
-        for control, part in sorted(self.slices(u), key=lambda one: bool(one[0].refines)):
-            for name, tensor in control.inputs(part, merged).items():
-                if name in merged and name not in control.refines:
-                    raise InputError(f"--control: two controls set {name}; leave one of them out")
-                merged[name] = tensor
+        for control, part in self._in_turn(u):
+            merged = _with_inputs(control, part, merged)
         return merged
+
+    def _in_turn(self, u: Tensor) -> Sequence[tuple[BoundControl, Tensor]]:
+        """Controls with their slices of u, those last that refine what others set."""
+        return sorted(self.slices(u), key=lambda one: bool(one[0].refines))
+
+    def _among_others(self, u: Tensor) -> dict[BoundControl, tuple[Tensor, Mapping[str, Tensor]]]:
+        """Each control's slice of u and the inputs of the controls before it, for those that take any."""
+        turns = self._in_turn(u.detach())
+        found: dict[BoundControl, tuple[Tensor, Mapping[str, Tensor]]] = {}
+        so_far: Mapping[str, Tensor] = NOTHING
+        for number, (control, part) in enumerate(turns):
+            found[control] = part, so_far if control.refines else NOTHING
+            if any(later.refines for later, _ in turns[number + 1 :]):
+                so_far = _with_inputs(control, part, so_far)
+        return {control: found[control] for control in self.controls}
 
     def picture(self, u: Tensor, image: Tensor) -> Tensor:
         """Apply what controls do to the finished picture (H, W, 3) sRGB, in their order; differentiable in both."""
@@ -89,14 +101,33 @@ class Space:
             image = control.picture(part, image)
         return image
 
-    def describe(self, u: Tensor) -> dict[str, Value]:
-        """Say a configuration in a few named values with units."""
-        return {name: value for control, part in self.slices(u) for name, value in control.describe(part).items()}
+    def describe(self, u: Tensor, controls: Sequence[BoundControl] | None = None) -> dict[str, Value]:
+        """Say a configuration in a few named values with units: what some of the controls say of it, or else all."""
+        found: dict[str, Value] = {}
+        for control, arguments in self._among_others(u).items():
+            if controls is None or control in controls:
+                found.update(control.describe(*arguments))
+        return found
 
     def artifacts(self, u: Tensor) -> dict[str, Tensor]:
         """Return the pictures worth keeping of a configuration, by file stem."""
-        return {name: image for control, part in self.slices(u) for name, image in control.artifacts(part).items()}
+        parts = self._among_others(u).items()
+        return {name: image for control, arguments in parts for name, image in control.artifacts(*arguments).items()}
 
     def files(self, u: Tensor) -> dict[str, bytes]:
         """Return the other files worth keeping of a configuration, by name."""
-        return {name: data for control, part in self.slices(u) for name, data in control.files(part).items()}
+        parts = self._among_others(u).items()
+        return {name: data for control, arguments in parts for name, data in control.files(*arguments).items()}
+
+
+def _with_inputs(control: BoundControl, u: Tensor, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the inputs of the controls before one with its own laid over them.
+
+    Raises:
+        InputError: it sets what one before has set, and does not refine it.
+    """
+    own = control.inputs(u, so_far)
+    for name in own:
+        if name in so_far and name not in control.refines:
+            raise InputError(f"--control: two controls set {name}; leave one of them out")
+    return {**so_far, **own}

@@ -300,14 +300,14 @@ class BoundTexture(BoundControl):
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         return {f"{self._on}.base_color": srgb_to_linear(self._painter.texels(u))}
 
-    def describe(self, u: Tensor) -> dict[str, Value]:
+    def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
         change = self._painter.texels(u.detach()) - self._original
         return {
             f"{self.name}.linf": {"value": float(change.abs().max()), "unit": "sRGB"},
             f"{self.name}.rms": {"value": float(change.pow(2).mean().sqrt()), "unit": "sRGB"},
         }
 
-    def artifacts(self, u: Tensor) -> dict[str, Tensor]:
+    def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         return {self.name: self._painter.texels(u.detach()), f"{self.name}-original": self._original}
 
 

@@ -96,26 +96,26 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
     """Bind every scene once, so that what is wrong is said before anything is rendered.
 
     Returns:
-        The points of the first scene, and what the table shows of the draws: shares of the range where scenes have
-        different ones.
+        The points of the first scene, and what the table shows of the draws: shares of the range where scenes, or
+        pictures of different shapes, have different ones.
 
     Raises:
         InputError: a scene cannot take a control, or a label does not fit a model.
     """
     found = []
     for place in job.places:
-        found.append(job.points(job.space(place, job.sizes[0])))
+        found += [(place, job.points(job.space(place, size))) for size in dict.fromkeys(job.sizes)]
         for model in job.models:
             job.label_set(place, model)
-    first = found[0]
-    for place, points in zip(job.places, found, strict=True):
+    first = found[0][1]
+    for place, points in found:
         if points.drawn_numbers != first.drawn_numbers:
             raise InputError(
                 f"--object {place.object}: its controls draw other numbers than those of {job.places[0].object}; sweep "
                 "the two by themselves"
             )
     drawn = []
-    for versions in zip(*(points.drawn for points in found), strict=True):
+    for versions in zip(*(points.drawn for _, points in found), strict=True):
         same = all(one.parts == versions[0].parts for one in versions)
         drawn.append(versions[0] if same else replace(versions[0], unit="of its range", parts=_shares()))
     return first, tuple(drawn)

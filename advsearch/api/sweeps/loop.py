@@ -144,14 +144,12 @@ class Sweep:
         """Render, classify and store neighbouring pictures of a scene, then count them."""
         begun = time.perf_counter()
         before = view.number * self.per_scene
-        picks = view.points.picks(numbers.start, len(numbers), before)
-        u = view.points.configurations(picks)
+        picks = self.points.picks(numbers.start, len(numbers), before)
         noise = [self._seeds(before + number) for number in numbers]
-        seen = view.look(u, noise, self.samples)
-        values = view.points.values(u, picks)
+        seen, values = view.look(picks, noise, self.samples)
         seconds = (time.perf_counter() - begun) / (len(numbers) * self.models)
         rows = [
-            self._row(before + number, model, noise[k], seen[model][k], values[k], seconds)
+            self._row(before + number, model, noise[k], seen[model][k], values[model][k], seconds)
             for k, number in enumerate(numbers)
             for model in range(self.models)
         ]
@@ -259,7 +257,7 @@ class Sweep:
         """A configuration by its number: its scene's points, its picture, its model."""
         number, model = divmod(index, self.models)
         scene, local = divmod(number, self.per_scene)
-        points = self.job.points(self.job.space(self.job.places[scene], self.job.sizes[0]))
+        points = self.job.points(self.job.space(self.job.places[scene], self.job.sizes[model]))
         return points, points.picks(local, 1, scene * self.per_scene), model
 
     # ---- the answer -------------------------------------------------------------------------------------------------

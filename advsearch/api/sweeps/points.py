@@ -21,7 +21,7 @@ from advsearch.attacks import Block, Domain
 from advsearch.attacks.draws import Draws
 from advsearch.attacks.product import Product
 from advsearch.controls import NumberControl, Parameter, Space
-from advsearch.controls.base import Value
+from advsearch.controls.base import BoundControl, Value
 from advsearch.controls.numbers import BoundNumbers
 from advsearch.controls.values import Choices, Fixed, Range, to_value
 
@@ -114,7 +114,10 @@ class Points:
         self.drawn_numbers = (small, shown)
         self._tellers = [
             _teller(
-                control, part, [(number, axis) for number, axis in enumerate(axes) if axis.instance == control.name]
+                space,
+                control,
+                part,
+                [(number, axis) for number, axis in enumerate(axes) if axis.instance == control.name],
             )
             for control, part in zip(space.controls, _slices(space), strict=True)
         ]
@@ -227,11 +230,13 @@ def _spec(bound: BoundNumbers, name: str) -> tuple[Parameter, Range | Choices]:
     return parameter, Range(low, high)
 
 
-def _teller(control: Any, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
+def _teller(space: Space, control: BoundControl, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
     """Return what says the values of one control for many configurations."""
     if type(control) is BoundNumbers and type(control.control).measured is NumberControl.measured:
         return _by_column(control, part, axes)
-    return _by_description(control, part, axes)
+    if control.refines:
+        return _by_description(lambda u: space.describe(u, (control,)), axes, keep=False)
+    return _by_description(lambda u: control.describe(u[part]), axes, keep=len(axes) == len(control.groups))
 
 
 def _by_column(control: BoundNumbers, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
@@ -284,19 +289,26 @@ def _drawn(
     return [column(number) for number in range(size)]
 
 
-def _by_description(control: Any, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
-    """What the control itself says, one configuration after the other; kept where only the grid moves it."""
+def _by_description(
+    describe: Callable[[Tensor], Mapping[str, Value]], axes: Sequence[tuple[int, Axis]], *, keep: bool
+) -> Tell:
+    """What the control itself says, one configuration after the other.
+
+    Args:
+        describe: from a configuration of the whole space.
+        axes: those of the control, with their numbers.
+        keep: whether these axes are all that the description depends on, so that it can be kept for the next time.
+    """
     kept: dict[tuple[int, ...], dict[str, Value]] = {}
-    only_grid = len(axes) == len(control.groups)
 
     def one(u: Tensor, digits: tuple[int, ...]) -> Mapping[str, Value]:
         key = tuple(digits[number] for number, _ in axes)
-        if only_grid and key in kept:
+        if keep and key in kept:
             return kept[key]
-        said: dict[str, Value] = dict(control.describe(u[part]))
+        said: dict[str, Value] = dict(describe(u))
         for number, axis in axes:
             said[axis.name] = {"value": axis.values[digits[number]], "unit": axis.unit}
-        if only_grid and len(kept) < MOST_KEPT:
+        if keep and len(kept) < MOST_KEPT:
             kept[key] = said
         return said
 

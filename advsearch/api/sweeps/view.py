@@ -10,10 +10,14 @@ from torch import Tensor
 
 from advsearch.api.scene import framed, make_renderer
 from advsearch.api.sweeps.job import Job
+from advsearch.api.sweeps.points import Picks, Points
 from advsearch.attacks import Trial, margin
+from advsearch.controls.base import Value
 from advsearch.models import Model
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
+
+Values = dict[str, Value]
 
 
 class View:
@@ -24,8 +28,8 @@ class View:
         number: of the scene.
 
     Attributes:
-        points: its configurations.
-        renderers: for each size of picture.
+        points: its configurations for each size of picture, on which what a control frames may depend.
+        renderers: likewise.
         labels: indices of the right answers for each model.
         not_finite: whether a picture had values that are not finite, which were set to 0.
     """
@@ -33,6 +37,7 @@ class View:
     def __init__(self, job: Job, number: int) -> None:
         place, config = job.places[number], job.config
         self.number, self._job = number, job
+        self.points: dict[tuple[int, int], Points] = {}
         self.renderers: dict[tuple[int, int], Renderer] = {}
         for size in dict.fromkeys(job.sizes):
             space = job.space(place, size)
@@ -40,28 +45,32 @@ class View:
             self.renderers[size] = make_renderer(
                 description, space, size, config.denoise, config.seed, sampler=config.pixel_sampler
             )
-            if len(self.renderers) == 1:
-                self.points = job.points(space)
+            self.points[size] = job.points(space)
         self.labels = tuple(job.label_set(place, model).indices for model in job.models)
 
     @property
     def not_finite(self) -> bool:
         return any(renderer.non_finite for renderer in self.renderers.values())
 
-    def look(self, u: Tensor, noise: Sequence[int], spp: int) -> list[list[Trial]]:
+    def look(self, picks: Picks, noise: Sequence[int], spp: int) -> tuple[list[list[Trial]], list[list[Values]]]:
         """Render configurations, round to 8 bits and classify.
 
         Args:
-            u: (n, d).
+            picks: n of them.
             noise: a seed for each.
             spp: samples a pixel.
 
         Returns:
-            For each model, what it says of each picture.
+            For each model, what it says of each picture; and what is stored of each picture that it was shown.
         """
-        pictures = {size: self._pictures(renderer, u, noise, spp) for size, renderer in self.renderers.items()}
+        pictures, values = {}, {}
+        for size, renderer in self.renderers.items():
+            u = self.points[size].configurations(picks)
+            pictures[size] = self._pictures(renderer, u, noise, spp)
+            values[size] = self.points[size].values(u, picks)
         models = zip(self._job.models, self._job.sizes, self.labels, strict=True)
-        return [judge(model, labels, pictures[size]) for model, size, labels in models]
+        seen = [judge(model, labels, pictures[size]) for model, size, labels in models]
+        return seen, [values[size] for size in self._job.sizes]
 
     def trial(self, number: int, u: Tensor, seed: int, spp: int) -> Trial:
         """What one model says of one configuration."""
