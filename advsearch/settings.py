@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -64,13 +64,10 @@ class SettingsError(InputError):
         problems: pairs of a setting's name and what is wrong with it.
     """
 
-    def __init__(self, problems: tuple[tuple[str, str], ...], spell: Callable[[str], str] = str) -> None:
-        super().__init__("; ".join(f"{spell(name)}: {text}" for name, text in problems))
+    def __init__(self, problems: tuple[tuple[str, str], ...], file: str | Path = "") -> None:
+        where = f"{file}: " if file else ""
+        super().__init__("; ".join(f"{where}{name}: {text}" for name, text in problems))
         self.problems = problems
-
-    def spelled(self, spell: Callable[[str], str]) -> SettingsError:
-        """Return the same error with each setting's name as `spell` writes it: ``--epsilon`` for ``epsilon``, say."""
-        return SettingsError(self.problems, spell)
 
 
 def setting(
@@ -119,18 +116,6 @@ class Config(BaseModel):
         return value
 
     @classmethod
-    def from_flags(cls, data: Mapping[str, Any]) -> Self:
-        """Return the configuration for settings given as flags; errors name the flag.
-
-        Raises:
-            InputError: as for the class.
-        """
-        try:
-            return cls(**data)
-        except SettingsError as error:
-            raise error.spelled(flag) from None
-
-    @classmethod
     def from_yaml(cls, path: str | Path, overrides: Mapping[str, Any] | None = None) -> Self:
         """Return the configuration that the YAML file at `path` describes, with `overrides` put over it.
 
@@ -149,7 +134,7 @@ class Config(BaseModel):
         try:
             return cls(**data)
         except SettingsError as error:
-            raise error.spelled(lambda name: f"{path}: {name}") from None
+            raise SettingsError(error.problems, path) from None
 
     def to_yaml(self) -> str:
         """Return the YAML form; `from_yaml` of it gives an equal configuration."""

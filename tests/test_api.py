@@ -239,10 +239,10 @@ def test_nan_logits_during_the_search_end_it_and_are_counted(
 def test_mistakes_are_explained_and_leave_nothing(scene: advsearch.Scene, level: float, tmp_path: Path) -> None:
     run = tmp_path / "run"
     victim = model(level)
-    with pytest.raises(InputError, match="--label"):
+    with pytest.raises(InputError, match="label"):
         advsearch.attack(scene, victim, label="teapot", run=run, **FAST)
     with pytest.raises(
-        InputError, match="the label of teapot itself does not fit the model; say which is right with --label"
+        InputError, match="the label of teapot itself does not fit the model; say which is right with `label`"
     ):
         advsearch.attack("teapot", victim, run=run, **FAST)
     with pytest.raises(UnknownNameError, match=r"unknown policy 'pgdd'. Did you mean 'pgd'"):

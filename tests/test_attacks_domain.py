@@ -240,7 +240,7 @@ def test_a_box_step_does_not_push_against_a_bound() -> None:
 @pytest.mark.parametrize("epsilon", [0.0, -0.1, math.nan, math.inf, None])
 @pytest.mark.parametrize("norm", ["linf", "l2"])
 def test_a_bad_epsilon_names_the_flag(norm: str, epsilon: float | None) -> None:
-    with pytest.raises(InputError, match=r"--epsilon of 'texture': expected a finite number over 0 .* got"):
+    with pytest.raises(InputError, match=r"`epsilon` of 'texture': expected a finite number over 0 .* got"):
         Block(3, norm, epsilon, name="texture")  # type: ignore[arg-type]
 
 
@@ -248,8 +248,8 @@ def test_a_bad_epsilon_names_the_flag(norm: str, epsilon: float | None) -> None:
     ("make", "message"),
     [
         (lambda: Block(0), "expected a size of at least 1, got 0"),
-        (lambda: Block(3, "l1", 0.1), "--norm: expected one of linf, l2, box, got 'l1'"),  # type: ignore[arg-type]
-        (lambda: Block(3, "box", 0.1), "has bounds and no norm budget; leave --epsilon out"),
+        (lambda: Block(3, "l1", 0.1), "`norm`: expected one of linf, l2, box, got 'l1'"),  # type: ignore[arg-type]
+        (lambda: Block(3, "box", 0.1), "has bounds and no norm budget; leave `epsilon` out"),
         (lambda: Block(3, low=0.5, high=0.5), r"expected 0 <= low < high <= 1, got \[0.5, 0.5\]"),
         (lambda: Block(3, "linf", 0.1, periodic=True), "a periodic block cannot have a norm budget"),
         (lambda: Block(2, options=3), "expected a discrete choice to have at least one option, size 1, norm 'box'"),

@@ -142,11 +142,10 @@ def test_dlr_has_a_gradient_where_the_published_ratio_is_constant() -> None:
     assert slope(dlr, third, (0,))[0].tolist() == pytest.approx([-2 / 9, 1 / 9, 0.0, 1 / 9], rel=10 * RELIEF, abs=1e-6)
 
 
-@pytest.mark.parametrize(("function", "flag"), [(dlr, "--label"), (targeted_dlr, "--target")])
-def test_dlr_needs_two_classes_beside_the_label_set(function: Callable[..., Tensor], flag: str) -> None:
-    with pytest.raises(
-        InputError, match=f"at least 2 classes beside the 3 of {flag}, got 1; .* use --objective margin"
-    ):
+@pytest.mark.parametrize(("function", "setting"), [(dlr, "label"), (targeted_dlr, "target")])
+def test_dlr_needs_two_classes_beside_the_label_set(function: Callable[..., Tensor], setting: str) -> None:
+    message = f"at least 2 classes beside the 3 of `{setting}`, got 1; .* use `objective=margin`"
+    with pytest.raises(InputError, match=message):
         function(LOGITS, IMAGES, (0, 1, 2))
     assert function(LOGITS, IMAGES, (0, 1)).shape == (2,)
 
@@ -376,8 +375,8 @@ def test_feature_distance_refuses_what_it_cannot_measure() -> None:
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        ({"targeted": True}, "--target: expected --objective margin or .* got feature_distance; it leads away"),
-        ({"minimise": True}, "--minimise: expected --objective margin or .* it is least at the start"),
+        ({"targeted": True}, "target: expected `objective` margin or .* got feature_distance; it leads away"),
+        ({"minimise": True}, "minimise: expected `objective` margin or .* it is least at the start"),
     ],
 )
 def test_feature_distance_knows_no_class_and_no_way_back(asked: dict[str, bool], message: str) -> None:
@@ -392,7 +391,7 @@ def test_feature_distance_knows_no_class_and_no_way_back(asked: dict[str, bool],
 @pytest.mark.parametrize(
     ("labels", "message"),
     [
-        ((), r"--label: expected class indices from 0 to 3, got \(\)"),
+        ((), r"label: expected class indices from 0 to 3, got \(\)"),
         ((4,), "expected class indices from 0 to 3"),
         ((-1,), "expected class indices from 0 to 3"),
         ((0, 1, 2, 3), "holds all 4 classes, so no answer could be wrong"),
@@ -405,11 +404,11 @@ def test_a_bad_label_set_is_refused(name: str, labels: tuple[int, ...], message:
 
 
 def test_a_bad_target_is_refused() -> None:
-    with pytest.raises(InputError, match=r"--target: expected class indices from 0 to 3, got \(9,\)"):
+    with pytest.raises(InputError, match=r"target: expected class indices from 0 to 3, got \(9,\)"):
         get_objective("margin", target=(9,))(LOGITS, IMAGES, (0,))
-    with pytest.raises(InputError, match="--target: expected classes that are wrong, got #1, which --label names as"):
+    with pytest.raises(InputError, match="target: expected classes that are wrong, got #1, which `label` names as"):
         get_objective("margin", target=(1, 2))(LOGITS, IMAGES, (0, 1))
-    with pytest.raises(InputError, match="--minimise: expected no --target beside it"):
+    with pytest.raises(InputError, match="minimise: expected no `target` beside it"):
         get_objective("margin", target=(1,), minimise=True)
 
 

@@ -602,8 +602,8 @@ def test_unknown_policies_and_options_name_their_neighbours() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"step_size": 0.0}, r"--step-size: expected a number in \(0, 2\]"),
-        ({"step_size": math.nan}, "--step-size: expected a number in"),
+        ({"step_size": 0.0}, r"step_size: expected a number in \(0, 2\]"),
+        ({"step_size": math.nan}, "step_size: expected a number in"),
         ({"step_size": 3.0}, "got 3.0; try 0.5"),
         ({"momentum": 1.0}, r"momentum: expected a number in \[0, 1\), got 1.0"),
         ({"momentum": -0.1}, "momentum: expected a number"),

@@ -86,7 +86,7 @@ def test_clopper_pearson_covers_at_least_as_often_as_it_says(rate: float) -> Non
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((1, 0), "--trials: expected at least 1, got 0"),
+        ((1, 0), "trials: expected at least 1, got 0"),
         ((3, 2), "successes: expected a number from 0 to 2, got 3"),
         ((1, 2, 1.0), "confidence: expected a number between 0 and 1, got 1.0"),
     ],
@@ -172,7 +172,7 @@ def test_a_single_rung_is_taken_unmeasured() -> None:
 
 @pytest.mark.parametrize("ladder", [(), (0, 4), (16, 16), (64, 16)])
 def test_a_bad_ladder_is_refused(ladder: tuple[int, ...]) -> None:
-    with pytest.raises(InputError, match="--verify-spp: expected rising sample counts"):
+    with pytest.raises(InputError, match="verify_spp: expected rising sample counts"):
         choose_spp({}, seed=0, ladder=ladder)
 
 
@@ -261,7 +261,7 @@ def test_both_groups_get_the_same_fresh_seeds_and_the_control_can_be_shared() ->
     assert seeds[:6] == seeds[6:]
     assert len(set(seeds[:6])) == 6
     assert (shared.renders, shared.ending) == (6, Ending.FOUND)
-    with pytest.raises(InputError, match="clean trials: expected 20, as many as --trials, got 6"):
+    with pytest.raises(InputError, match="clean trials: expected 20, as many as `trials`, got 6"):
         verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=8, seed=5, clean=clean)
 
 
@@ -291,8 +291,8 @@ def test_a_nan_margin_is_neither_right_nor_wrong() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"trials": 0}, "--trials: expected at least 1, got 0"),
-        ({"spp": 0}, "--verify-spp: expected at least 1, got 0"),
+        ({"trials": 0}, "trials: expected at least 1, got 0"),
+        ({"spp": 0}, "verify_spp: expected at least 1, got 0"),
     ],
 )
 def test_bad_trial_counts_are_refused(options: dict[str, int], message: str) -> None:

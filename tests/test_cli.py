@@ -21,8 +21,10 @@ from rich.progress import Progress as Bars
 from rich.progress import TextColumn
 from test_report import AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, changed, make_run
 
+import advsearch
 from advsearch import __version__
 from advsearch.cli import list as listing
+from advsearch.cli.flags import with_flags
 from advsearch.cli.main import COMMANDS, main
 from advsearch.cli.output import columns
 from advsearch.cli.progress import BarProgress, LineProgress, watching
@@ -168,6 +170,36 @@ def test_bad_input_is_one_line_and_status_2(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("message", "shown"),
+    [
+        ("epsilon: expected a number; steps: expected more", "--epsilon: expected a number; --steps: expected more"),
+        ("x.yaml: epsilon: expected a number", "x.yaml: epsilon: expected a number"),
+        ("lower `verify_spp` or use `denoise=none`", "lower --verify-spp or use --denoise none"),
+        ("add `overwrite=True` or leave `baseline=False` out", "add --overwrite or leave --no-baseline out"),
+        ("`controls` key: taken; leave `set` out", "--control key: taken; leave --set out"),
+        ("`grid` pose.yaw: several", "--grid pose.yaw: several"),
+        ("model x.pt2: `value_range` is for the network", "model x.pt2: `value_range` is for the network"),
+    ],
+)
+def test_settings_in_messages_become_flags(message: str, shown: str) -> None:
+    assert with_flags(message) == shown
+
+
+def test_a_message_names_the_argument_in_python_and_the_flag_on_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"^up: bundled objects stand upright already; leave `up` out"):
+        advsearch.attack("mug", up="z")
+    assert main(["attack", "--object", "mug", "--up", "z"]) == 2
+    assert "error: --up: bundled objects stand upright already; leave --up out" in capsys.readouterr().err
+    with pytest.raises(InputError, match=r"^smallest: finds one epsilon by itself; give one `epsilon` as the largest"):
+        advsearch.attack("mug", smallest=True, epsilon=(0.1, 0.2))
+    assert main(["attack", "--object", "mug", "--smallest", "--epsilon", "0.1,0.2"]) == 2
+    assert "error: --smallest: finds one epsilon by itself; give one --epsilon as" in capsys.readouterr().err
+
+
 def test_a_bug_keeps_its_traceback_and_ends_with_1() -> None:
     code = (
         "import sys, test_cli\n"
@@ -294,7 +326,7 @@ def test_run_reads_a_file_and_puts_changes_over_it(asked: list[AttackConfig], tm
             [],
             "unknown command 'atack'. Did you mean 'attack'? Known: attack, gap, precision, region, sweep. It stands ",
         ),
-        ("object: mug\n", ["steps"], "steps: expected NAME=VALUE such as camera.azimuth=130, got 'steps'"),
+        ("object: mug\n", ["steps"], "change 'steps': expected NAME=VALUE such as camera.azimuth=130, got 'steps'"),
         ("object: mug\n", ["step=3"], "unknown setting 'step'. Did you mean 'steps'"),
         ("object: mug\n", ["steps=0"], "run.yaml: steps: expected a whole number from 1 to 1000000, got 0"),
     ],

@@ -141,7 +141,7 @@ def test_two_lamps_stand_side_by_side(scene: SceneDescription) -> None:
     )
     assert names == {"key.ball", "key.radiance", "fill.position", "fill.intensity"}
     assert names <= MitsubaScene(prepared, (8, 8)).names
-    with pytest.raises(InputError, match="--control key: the scene has something of that name"):
+    with pytest.raises(InputError, match="`controls` key: the scene has something of that name"):
         LightControl("key").prepare(prepared)
 
 

@@ -298,7 +298,7 @@ def test_settings_make_the_same_control_again(scene: SceneDescription) -> None:
         ({"size": 2.0}, r"patch.size: expected a number from 0.05 to 0.6 \(object sizes\), got 2"),
         ({"pixels": [0.1, 0.2, 0.3]}, r"patch.pixels: expected \[low, high\] or one number, got a list of 3"),
         ({"pixels": 0.5, "picture": "a.png"}, r"patch.pixels: expected none beside patch.picture"),
-        ({"pixels": 0.5}, r"--control patch: the pixels are fixed, so there is nothing to search"),
+        ({"pixels": 0.5}, r"`controls` patch: the pixels are fixed, so there is nothing to search"),
     ],
 )
 def test_what_cannot_be_is_refused(scene: SceneDescription, given: dict[str, object], message: str) -> None:

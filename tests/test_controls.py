@@ -126,25 +126,25 @@ def test_names_and_settings_that_do_not_exist_are_explained() -> None:
         UnknownNameError, match=r"unknown setting of control texture 'epsilonn'. Did you mean 'epsilon'"
     ):
         make_control("texture", {"epsilonn": 0.1})
-    with pytest.raises(InputError, match="--control: every instance needs a name of its own"):
+    with pytest.raises(InputError, match="controls: every instance needs a name of its own"):
         make_space([TextureControl(), TextureControl()], describe("mug"))
-    with pytest.raises(InputError, match=r"--control: two controls set object.base_color"):
+    with pytest.raises(InputError, match=r"controls: two controls set object.base_color"):
         space = make_space([TextureControl(), TextureControl(name="second")], describe("mug"))
         space.inputs(space.start)
-    with pytest.raises(InputError, match="--control: expected at least one"):
+    with pytest.raises(InputError, match="controls: expected at least one"):
         make_space([], describe("mug"))
 
 
 @pytest.mark.parametrize("epsilon", [0.0, -0.1, math.nan, math.inf])
 def test_a_radius_that_is_no_radius_is_refused(epsilon: float) -> None:
-    with pytest.raises(InputError, match="--epsilon: expected a finite number greater than 0"):
+    with pytest.raises(InputError, match="epsilon: expected a finite number greater than 0"):
         TextureControl(epsilon=epsilon)
 
 
 def test_other_settings_out_of_range_are_refused() -> None:
-    with pytest.raises(InputError, match="--norm: expected one of linf, l2, got 'l1'"):
+    with pytest.raises(InputError, match="norm: expected one of linf, l2, got 'l1'"):
         TextureControl(norm="l1")
-    with pytest.raises(InputError, match="--texture-resolution: expected 2 to 4096"):
+    with pytest.raises(InputError, match="texture_resolution: expected 2 to 4096"):
         TextureControl(resolution=1)
 
 

@@ -32,9 +32,9 @@ def test_a_score_over_zero_is_a_success(goal: Goal, scores: list[float]) -> None
 
 
 def test_a_target_must_be_wrong_and_there_is_none_to_minimise() -> None:
-    with pytest.raises(InputError, match=r"--target: expected classes that are not right answers, got \[1\]"):
+    with pytest.raises(InputError, match=r"target: expected classes that are not right answers, got \[1\]"):
         Goal((0, 1), targets=(1, 2))
-    with pytest.raises(InputError, match="--minimise"):
+    with pytest.raises(InputError, match="minimise"):
         Goal((0,), targets=(1,), minimise=True)
 
 

@@ -71,8 +71,8 @@ def test_the_first_plan_takes_what_is_preferred_and_obeys_force() -> None:
     ("forced", "message"),
     [
         ({"pose": "magic"}, "unknown estimator for pose 'magic'"),
-        ({"poze": "secant"}, "unknown control in --estimator 'poze'"),
-        ({"pose.yaw": "adjoint"}, "--estimator pose.yaw=adjoint: not valid there; expected one of secant, material"),
+        ({"poze": "secant"}, "unknown control in `estimators` 'poze'"),
+        ({"pose.yaw": "adjoint"}, "`estimators` pose.yaw=adjoint: not valid there; expected one of secant, material"),
     ],
 )
 def test_an_estimator_that_cannot_be_is_refused(forced: dict[str, str], message: str) -> None:
@@ -464,7 +464,7 @@ def test_bad_settings_say_what_to_do(settings: dict[str, object], message: str) 
 
 def test_a_control_with_nothing_to_search_says_so() -> None:
     fixed = {name: 0.0 for name in ("yaw", "pitch", "roll", "x", "y", "z")} | {"scale": 1.0}
-    with pytest.raises(InputError, match="--control pose: every parameter is fixed, so there is nothing to search"):
+    with pytest.raises(InputError, match="`controls` pose: every parameter is fixed, so there is nothing to search"):
         load_scene("mug").renderer({"pose": fixed}, resolution=16)
 
 

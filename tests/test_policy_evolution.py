@@ -228,7 +228,7 @@ def test_a_texture_takes_a_few_vectors_of_memory_only() -> None:
         ("cmaes", {"population": 1}, "population: expected at least 2, or 0 for the default, got 1"),
         ("nes", {"sigma": math.nan}, r"sigma: expected a number in \(0, 2\]"),
         ("nes", {"population": 5}, "population: expected an even number of at least 4, or 0, got 5"),
-        ("adam", {"step_size": 0.0}, r"--step-size: expected a number in \(0, 2\], a share of half the range, got 0.0"),
+        ("adam", {"step_size": 0.0}, r"step_size: expected a number in \(0, 2\], a share of half the range, got 0.0"),
         ("adam", {"beta1": 1.0}, r"beta1: expected a number in \[0, 1\), got 1.0"),
         ("adam", {"beta2": -0.1}, r"beta2: expected a number in \[0, 1\)"),
     ],

@@ -197,13 +197,13 @@ def test_what_cannot_be_rendered_is_refused(raw: Renderer) -> None:
         raw(raw.start + 2.0)
     with pytest.raises(InputError, match=r"in \[0, 1\]"):
         raw(torch.full_like(raw.start, float("nan")))
-    with pytest.raises(InputError, match="--spp: expected 1 to 65536"):
+    with pytest.raises(InputError, match="spp: expected 1 to 65536"):
         raw(raw.start, spp=0)
     with pytest.raises(InputError, match="the denoiser needs the box filter"):
         ImageFormation(denoiser="oidn", filter="gaussian")
-    with pytest.raises(InputError, match="--denoise: expected one of oidn, none"):
+    with pytest.raises(InputError, match="denoise: expected one of oidn, none"):
         ImageFormation(denoiser="median")
-    with pytest.raises(InputError, match="--resolution: expected 8 to 4096"):
+    with pytest.raises(InputError, match="resolution: expected 8 to 4096"):
         make_renderer(describe("mug"), make_space([TextureControl()], describe("mug")), 4, "none", 0)
 
 
@@ -262,5 +262,5 @@ def test_multijittered_samples_have_the_same_mean_and_less_noise() -> None:
 
 
 def test_unknown_samplers_are_refused() -> None:
-    with pytest.raises(InputError, match="--pixel-sampler: expected one of independent, multijitter, got 'halton'"):
+    with pytest.raises(InputError, match="pixel_sampler: expected one of independent, multijitter, got 'halton'"):
         load_scene("mug").renderer("camera", resolution=SIZE, sampler="halton")

@@ -263,7 +263,7 @@ def test_a_run_in_work_is_not_overwritten(run: RunDirectory) -> None:
 
 def test_a_file_system_without_locks_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fcntl.flock", _raises(errno.ENOLCK))
-    with pytest.raises(StorageError, match="the file system has no locks; choose a local disk with --run"):
+    with pytest.raises(StorageError, match="the file system has no locks; choose a local disk with `run`"):
         RunLock(tmp_path)
 
 
@@ -313,7 +313,7 @@ def test_an_existing_run_is_refused_and_overwritten_on_request(tmp_path: Path) -
         run.write_summary({"ending": "found"})
     (path / "notes.txt").write_text("mine")
     with pytest.raises(
-        RunExistsError, match="the run exists already; add --overwrite or choose another name with --run"
+        RunExistsError, match="the run exists already; add `overwrite=True` or choose another name with `run`"
     ):
         RunDirectory.create(path)
     with RunDirectory.create(path, overwrite=True) as run:
@@ -326,7 +326,7 @@ def test_an_existing_run_is_refused_and_overwritten_on_request(tmp_path: Path) -
 @pytest.mark.parametrize("name", ["run.yaml", "results.sqlite", "images"])
 def test_a_folder_that_is_no_run_is_never_touched(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("model: mine\n")
-    with pytest.raises(RunExistsError, match="the folder is not empty and not a run; choose another name with --run"):
+    with pytest.raises(RunExistsError, match="the folder is not empty and not a run; choose another name with `run`"):
         RunDirectory.create(tmp_path, overwrite=True)
     assert (tmp_path / name).read_text() == "model: mine\n"
     assert not (tmp_path / ".lock").exists()
@@ -399,11 +399,11 @@ def test_a_file_is_replaced_only_when_all_went_well(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("number", "advice"),
     [
-        (errno.ENOSPC, "the disk is full; free some space or choose another place with --run"),
-        (errno.EDQUOT, "the disk quota is used up; free some space or choose another place with --run"),
-        (errno.EROFS, "the file system is read-only; choose another place with --run"),
-        (errno.EACCES, "there is no permission to write there; choose another place with --run"),
-        (errno.EIO, "Input/output error; choose another place with --run"),
+        (errno.ENOSPC, "the disk is full; free some space or choose another place with `run`"),
+        (errno.EDQUOT, "the disk quota is used up; free some space or choose another place with `run`"),
+        (errno.EROFS, "the file system is read-only; choose another place with `run`"),
+        (errno.EACCES, "there is no permission to write there; choose another place with `run`"),
+        (errno.EIO, "Input/output error; choose another place with `run`"),
     ],
 )
 def test_a_bad_disk_is_said_and_leaves_nothing(
@@ -429,7 +429,7 @@ def test_a_bad_disk_is_said_and_leaves_nothing(
 def test_a_run_cannot_be_made_on_a_bad_disk(home: Path, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
     monkeypatch.setattr("pathlib.Path.mkdir", _raises(number))
     for name in (None, "first"):
-        with pytest.raises(StorageError, match=r"cannot write runs.*with --run"):
+        with pytest.raises(StorageError, match=r"cannot write runs.*with `run`"):
             RunDirectory.create(name)
     assert not list(home.iterdir())
 
@@ -714,7 +714,7 @@ def test_without_pyarrow_parquet_says_what_to_do_and_leaves_nothing(
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     (tmp_path / "rows.parquet").write_text("mine")
-    with pytest.raises(InputError, match="--format parquet: needs pyarrow; pip install pyarrow, or choose csv or json"):
+    with pytest.raises(InputError, match="format parquet: needs pyarrow; pip install pyarrow, or choose csv or json"):
         export(filled, "parquet", tmp_path / "rows.parquet", io.BytesIO())
     assert (tmp_path / "rows.parquet").read_text() == "mine"
     assert not list(tmp_path.glob(f"{PART}*"))

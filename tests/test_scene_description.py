@@ -71,7 +71,7 @@ def test_a_wrong_setting_is_explained() -> None:
         UnknownNameError, match=r"unknown scene parameter 'camera.azimut'. Did you mean 'camera.azimuth'"
     ):
         resolve({"camera.azimut": 1.0})
-    with pytest.raises(InputError, match=r"--set camera.fov: expected a number from 1 to 170 \(degrees\), got 200"):
+    with pytest.raises(InputError, match=r"`set` camera.fov: expected a number from 1 to 170 \(degrees\), got 200"):
         resolve({"camera.fov": 200.0})
     with pytest.raises(InputError, match="got nan"):
         resolve({"pose.x": float("nan")})
@@ -84,5 +84,5 @@ def test_unknown_names_and_a_needless_up_are_explained() -> None:
         describe("mugg")
     with pytest.raises(UnknownNameError, match=r"unknown environment 'studo'. Did you mean 'studio'"):
         describe("mug", "studo")
-    with pytest.raises(InputError, match="--up: bundled objects stand upright already"):
+    with pytest.raises(InputError, match="up: bundled objects stand upright already"):
         describe("mug", up="y")

@@ -143,9 +143,9 @@ def test_a_region_is_told_in_the_units_of_its_parameters(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("more", "error", "message"),
     [
-        ({"vary": "pose.yawn"}, UnknownNameError, "unknown parameter in --vary 'pose.yawn'. Did you mean 'pose.yaw'"),
-        ({"map": 4, "vary": "pose.yaw"}, InputError, "--map: expected two parameters in --vary, got 1"),
-        ({"controls": {"texture": {"resolution": 4}}}, InputError, "--vary: expected 1 to 8 parameters, got "),
+        ({"vary": "pose.yawn"}, UnknownNameError, "unknown parameter in `vary` 'pose.yawn'. Did you mean 'pose.yaw'"),
+        ({"map": 4, "vary": "pose.yaw"}, InputError, "map: expected two parameters in `vary`, got 1"),
+        ({"controls": {"texture": {"resolution": 4}}}, InputError, "vary: expected 1 to 8 parameters, got "),
     ],
 )
 def test_a_region_refuses_what_does_not_fit(more: dict[str, Any], error: Any, message: str, tmp_path: Path) -> None:

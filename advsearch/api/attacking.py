@@ -213,7 +213,7 @@ def _check_budgets(config: AttackConfig) -> None:
     known = {instance_name(asked): asked for asked in config.controls}
     for name in config.epsilon:
         if name not in known:
-            raise UnknownNameError("control in --epsilon", name, known)
+            raise UnknownNameError("control in `epsilon`", name, known)
         if not _has_epsilon(known[name], config.controls[known[name]]):
             raise _no_epsilon(name)
 
@@ -225,8 +225,8 @@ def _has_epsilon(asked: str, given: Mapping[str, Any]) -> bool:
 
 def _no_epsilon(name: str) -> InputError:
     return InputError(
-        f"--epsilon {name}: the control has ranges and no epsilon; give its ranges, as in "
-        f"--control '{name}={{PARAMETER: [LOW, HIGH]}}'"
+        f"`epsilon` {name}: the control has ranges and no epsilon; give its ranges, as in "
+        f"`controls` '{name}={{PARAMETER: [LOW, HIGH]}}'"
     )
 
 
@@ -300,7 +300,7 @@ def _goal(model: Model, labels: LabelSet, config: AttackConfig) -> Goal:
     try:
         targets = model.label_set(config.target)
     except InputError as error:
-        raise InputError(f"--target: {error}") from None
+        raise InputError(f"target: {error}") from None
     return Goal(labels.indices, targets.indices)
 
 

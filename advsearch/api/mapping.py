@@ -133,8 +133,8 @@ def _centre(problem: Problem, config: RegionConfig) -> Tensor:
     values = None if text is None else torch.tensor(json.loads(text), dtype=torch.float32)
     if values is None or values.shape != problem.domain.start.shape:
         raise InputError(
-            f"--around {config.around}: expected a finished run over the same controls with at most a few thousand "
-            "numbers, got another one; leave --control out so that the run's own are taken"
+            f"`around` {config.around}: expected a finished run over the same controls with at most a few thousand "
+            "numbers, got another one; leave `controls` out so that the run's own are taken"
         )
     return problem.domain.project(values)
 
@@ -153,11 +153,11 @@ def _varied(problem: Problem, config: RegionConfig) -> Varied:
     names = tuple(places) if config.vary is None else split_names(config.vary)
     for name in names:
         if name not in places:
-            raise UnknownNameError("parameter in --vary", name, places)
+            raise UnknownNameError("parameter in `vary`", name, places)
     if not 1 <= len(names) <= MOST:
-        raise InputError(f"--vary: expected 1 to {MOST} parameters, got {len(names)}; name some of {', '.join(places)}")
+        raise InputError(f"vary: expected 1 to {MOST} parameters, got {len(names)}; name some of {', '.join(places)}")
     if config.map and len(names) != 2:
-        raise InputError(f"--map: expected two parameters in --vary, got {len(names)}: {', '.join(names)}")
+        raise InputError(f"map: expected two parameters in `vary`, got {len(names)}: {', '.join(names)}")
     return Varied(names, torch.cat([places[name] for name in names]))
 
 
@@ -172,7 +172,7 @@ def _verdict(attack: Attack, centre: Tensor) -> bool:
     if AT_CENTRE - needed < wrong < needed:
         raise InputError(
             f"the model is wrong in {wrong} of {AT_CENTRE} trials at the centre, so its verdict there depends on the "
-            "noise; choose another centre, or more samples with --verify-spp"
+            "noise; choose another centre, or more samples with `verify_spp`"
         )
     return wrong >= needed
 

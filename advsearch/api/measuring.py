@@ -72,7 +72,7 @@ def precision(config: PrecisionConfig, *, progress: Progress | None = None) -> d
     wanted = [name for name in ("image", "gradient", "objective") if name in split_names(config.quantities)]
     if "gradient" in wanted and not any(group.valid for group in problem.renderer.plan.groups):
         raise InputError(
-            f"--control {','.join(config.controls)}: has no derivative; leave gradient out of --quantities"
+            f"`controls` {','.join(config.controls)}: has no derivative; leave gradient out of `quantities`"
         )
     measure: dict[str, Callable[[Budget], None]] = {
         "image": job.image,

@@ -21,7 +21,7 @@ def scene_settings(fixed: Mapping[str, Any] | None, exposure: float | None) -> d
     given = dict(fixed or {})
     if exposure:
         if "camera.exposure" in given:
-            raise InputError("--exposure and --set camera.exposure say the same thing; leave one of them out")
+            raise InputError("`exposure` and `set` camera.exposure say the same thing; leave one of them out")
         given["camera.exposure"] = exposure
     return given
 
@@ -39,7 +39,7 @@ def load_models(models: Sequence[Any], config: SceneConfig) -> tuple[tuple[Model
     return loaded, said
 
 
-def different(names: Sequence[str], flag: str) -> Sequence[str]:
+def different(names: Sequence[str], setting: str) -> Sequence[str]:
     """Return the names.
 
     Raises:
@@ -47,7 +47,9 @@ def different(names: Sequence[str], flag: str) -> Sequence[str]:
     """
     twice = [name for name in names if names.count(name) > 1]
     if twice or not names:
-        raise InputError(f"{flag}: expected different names, got {','.join(names)!r}; leave {', '.join(twice[:1])} out")
+        raise InputError(
+            f"{setting}: expected different names, got {','.join(names)!r}; leave {', '.join(twice[:1])} out"
+        )
     return names
 
 
@@ -65,14 +67,13 @@ def right_answers(model: Model, asked: str | None, object: str, own: str | None)
     """
     if asked is None and own is None:
         raise InputError(
-            f'--label: expected the right answers for {object}, got none; add --label "name" with a class of model '
-            f"{model.name}"
+            f"label: expected the right answers for {object}, got none; name classes of model {model.name}"
         )
     try:
         return model.label_set(str(own) if asked is None else asked)
     except InputError as error:
         if asked is not None:
-            raise InputError(f"--label: {error}") from None
+            raise InputError(f"label: {error}") from None
         raise InputError(
-            f"the label of {object} itself does not fit the model; say which is right with --label ({error})"
+            f"the label of {object} itself does not fit the model; say which is right with `label` ({error})"
         ) from None

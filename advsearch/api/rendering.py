@@ -145,7 +145,7 @@ def render(
     model = model if isinstance(model, Model) else load_model(model)
     instances = as_controls(controls)
     if around is not None and any(_turns(one) for one in instances):
-        raise InputError("--around: sets camera.azimuth itself, and --control fixes it; leave one of them out")
+        raise InputError("around: sets camera.azimuth itself, and `controls` fixes it; leave one of them out")
     size = resolution or (model.input_size[0], model.input_size[1])
     progress = progress or NullProgress()
     progress.stage("pictures", around or 1)
@@ -180,7 +180,7 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
     out = _writable(config.out, config.around or 1)
     for spec in (config.object, config.environment, config.model, config.labels):
         if spec is not None and out.exists() and Path(spec).exists() and out.samefile(spec):
-            raise InputError(f"--out: would replace {spec}, which is read; choose another name")
+            raise InputError(f"out: would replace {spec}, which is read; choose another name")
     progress.stage("set-up")
     controls = as_controls(config.controls)
     given = scene_settings(config.set_, config.exposure)
@@ -211,11 +211,11 @@ def _writable(path: str | Path, views: int) -> Path:
     file = Path(path)
     suffix = file.suffix.lower()
     if suffix not in PICTURES:
-        raise InputError(f"--out: expected the path of a .png or .exr file, got {str(path)!r}")
+        raise InputError(f"out: expected the path of a .png or .exr file, got {str(path)!r}")
     if suffix == ".exr" and views > 1:
-        raise InputError("--out: a sheet of several views has text in it and is a .png; leave --around out for an .exr")
+        raise InputError("out: a sheet of several views has text in it and is a .png; leave `around` out for an .exr")
     if file.is_dir():
-        raise InputError(f"--out: expected the name of a file, got the folder {file}")
+        raise InputError(f"out: expected the name of a file, got the folder {file}")
     return file
 
 

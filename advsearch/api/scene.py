@@ -143,6 +143,6 @@ def as_controls(controls: Controls) -> tuple[Control, ...]:
             return ready
         names = [one for one in controls if isinstance(one, str)]
         if len(set(names)) != len(names):
-            raise InputError(f"--control: every instance needs a name of its own, got {', '.join(names)}")
+            raise InputError(f"controls: every instance needs a name of its own, got {', '.join(names)}")
         return ready + as_controls({one: {} for one in names})
     return tuple(make_control(name, given) for name, given in gathered(controls).items())

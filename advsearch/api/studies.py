@@ -129,7 +129,7 @@ def _as_attack(config: AttackConfig, **update: Any) -> AttackConfig:
 def _curve(config: AttackConfig, parts: _Parts) -> Summary:
     epsilons: Sequence[float | None] = sorted(config.epsilons) or [None]
     rows = []
-    for place, name in enumerate(different(config.objects, "--object")):
+    for place, name in enumerate(different(config.objects, "object")):
         row: Summary = {"object": name, "clean": None, "flips_at": None}
         for epsilon in epsilons:
             label = f"{place:02d}-" + default_name(
@@ -200,9 +200,9 @@ def _accuracy(rows: Sequence[Summary], epsilon: float | None) -> Summary:
 
 def _gap(config: GapConfig, parts: _Parts) -> Summary:
     if config.epsilons or config.smallest:
-        raise InputError("advsearch gap: compares over one space; give one --epsilon, and leave --smallest out")
+        raise InputError("advsearch gap: compares over one space; give one `epsilon`, and leave `smallest` out")
     rows = []
-    for place, name in enumerate(different(config.objects, "--object")):
+    for place, name in enumerate(different(config.objects, "object")):
         for number, (control, settings) in enumerate(config.controls.items()):
             epsilon = config.epsilon
             if isinstance(epsilon, dict):

@@ -148,7 +148,7 @@ def _job_of(config: SweepConfig) -> Job:
     """Find and load everything that a configuration names."""
     fixed = sorted(set(config.grid) & set(config.set_))
     if fixed:
-        raise InputError(f"--grid {fixed[0]}: --set fixes it already; leave it out of one of the two")
+        raise InputError(f"`grid` {fixed[0]}: `set` fixes it already; leave it out of one of the two")
     return _job(config, _places(config), config.models, config.controls)
 
 
@@ -157,13 +157,13 @@ def _job(config: SweepConfig, places: Sequence[Place], models: Sequence[AnyModel
     axes = read_axes(config.grid, drawn)
     if config.samples is not None and not drawn:
         raise InputError(
-            "--samples: expected --control beside it, which says what is drawn by chance; add --control pose, say, or "
-            "leave --samples out"
+            "samples: expected `controls` beside it, which says what is drawn by chance; add `controls=pose`, say, or "
+            "leave `samples` out"
         )
     if not axes and not drawn and len(places) * len(models) == 1:
         raise InputError(
-            "--grid: expected something that varies, got nothing; add an axis such as --grid pose.yaw=0:360:24, or "
-            "--control pose --samples 100"
+            "grid: expected something that varies, got nothing; add an axis such as `grid` pose.yaw=0:360:24, or "
+            "`controls=pose` `samples=100`"
         )
     samples = config.samples or (SAMPLES if drawn and not axes else 1)
     networks, said = _models(models, config)
@@ -185,7 +185,7 @@ def _with_texture_size(controls: Controls, config: SweepConfig) -> Controls:
 def _places(config: SweepConfig) -> tuple[Place, ...]:
     """Every object under every environment; each is loaded once."""
     given = scene_settings(config.set_, config.exposure)
-    objects, environments = different(config.objects, "--object"), different(config.environments, "--environment")
+    objects, environments = different(config.objects, "object"), different(config.environments, "environment")
     firsts = {name: load_scene(name, environments[0], up=config.up, settings=given) for name in objects}
     lights = {environments[0]: firsts[objects[0]].description.environment}
     for name in environments[1:]:
@@ -202,7 +202,7 @@ def _models(models: Sequence[AnyModel], config: SweepConfig) -> tuple[tuple[Mode
     names = [_model_name(one) for one in models]
     if len(set(names)) < len(names):
         raise InputError(
-            f"--model: expected models with different names, got {', '.join(names)}; from Python, "
+            f"model: expected models with different names, got {', '.join(names)}; from Python, "
             "load_model(..., name=...) gives one"
         )
     return load_models(models, config)

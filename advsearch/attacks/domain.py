@@ -33,7 +33,6 @@ class Block:
         name: for messages, e.g. "texture".
         options: over 0 for a discrete choice among so many: u means option floor(u * options). Such a block has
             size 1, norm "box" and the whole unit interval; it has no direction that is uphill.
-        flag: the command-line flag that sets epsilon, for messages.
         reach: length of one whole step in a "box", over 0; None for half the diagonal of the bounds.
 
     Raises:
@@ -47,7 +46,6 @@ class Block:
     high: float = 1.0
     periodic: bool = False
     name: str = ""
-    flag: str = "--epsilon"
     options: int = 0
     reach: float | None = None
 
@@ -56,16 +54,16 @@ class Block:
         if self.size < 1:
             raise InputError(f"block{where}: expected a size of at least 1, got {self.size}")
         if self.norm not in NORMS:
-            raise InputError(f"--norm{where}: expected one of {', '.join(NORMS)}, got {self.norm!r}")
+            raise InputError(f"`norm`{where}: expected one of {', '.join(NORMS)}, got {self.norm!r}")
         if not 0.0 <= self.low < self.high <= 1.0:
             raise InputError(f"bounds{where}: expected 0 <= low < high <= 1, got [{self.low}, {self.high}]")
         if self.norm == "box":
             if self.epsilon is not None:
-                raise InputError(f"{self.flag}{where}: has bounds and no norm budget; leave {self.flag} out")
+                raise InputError(f"`epsilon`{where}: has bounds and no norm budget; leave `epsilon` out")
         elif self.epsilon is None or not (math.isfinite(self.epsilon) and self.epsilon > 0.0):
             raise InputError(
-                f"{self.flag}{where}: expected a finite number over 0 (the {self.norm} radius, in units where the "
-                f"parameter's whole range is 1), got {self.epsilon}; try {self.flag} 0.1"
+                f"`epsilon`{where}: expected a finite number over 0 (the {self.norm} radius, in units where the "
+                f"parameter's whole range is 1), got {self.epsilon}; try `epsilon=0.1`"
             )
         if self.periodic and self.norm != "box":
             raise InputError(f"block{where}: a periodic block cannot have a norm budget; use norm 'box'")

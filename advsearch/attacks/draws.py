@@ -46,11 +46,11 @@ class Draws:
 
     def __init__(self, dimensions: int, sampler: str, seed: int, name: str = "draws") -> None:
         if sampler not in SAMPLERS:
-            raise InputError(f"--sampler: expected one of {', '.join(SAMPLERS)}, got {sampler!r}")
+            raise InputError(f"sampler: expected one of {', '.join(SAMPLERS)}, got {sampler!r}")
         if sampler == "sobol" and dimensions > qmc.Sobol.MAXDIM:
             raise InputError(
-                f"--sampler sobol: expected at most {qmc.Sobol.MAXDIM} numbers to draw, got {dimensions}; use "
-                "--sampler random"
+                f"`sampler` sobol: expected at most {qmc.Sobol.MAXDIM} numbers to draw, got {dimensions}; use "
+                "`sampler=random`"
             )
         self.dimensions = dimensions
         self._sampler, self._seed, self._name = sampler, seed, name

@@ -30,11 +30,9 @@ class Goal:
     def __post_init__(self) -> None:
         both = sorted(set(self.labels) & set(self.targets))
         if both:
-            raise InputError(
-                f"--target: expected classes that are not right answers, got {both}, which --label has too"
-            )
+            raise InputError(f"target: expected classes that are not right answers, got {both}, which `label` has too")
         if self.targets and self.minimise:
-            raise InputError("--minimise: makes the right answer easier to give; leave --target out")
+            raise InputError("minimise: makes the right answer easier to give; leave `target` out")
 
     def score(self, logits: Tensor) -> Tensor:
         """Return (N,) in logits: over 0 exactly where the model's answer is a success. Ties and NaN are none."""

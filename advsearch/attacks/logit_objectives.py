@@ -46,7 +46,7 @@ def margin(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
 
 def targeted_margin(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
     """max over t in T of z_t, minus max over j not in T of z_j: over 0 exactly where the answer is in T."""
-    hit = members(logits, target, "--target")
+    hit = members(logits, target, "target")
     return _largest(logits, hit) - _largest(logits, ~hit)
 
 
@@ -63,7 +63,7 @@ def log_odds(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
 
 def targeted_log_odds(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
     """log(p / (1 - p)) with p the total probability of T."""
-    return _log_odds(logits, members(logits, target, "--target"))
+    return _log_odds(logits, members(logits, target, "target"))
 
 
 def cross_entropy(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
@@ -105,7 +105,7 @@ def dlr(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
         InputError: fewer than two wrong classes. Of two numbers only the order is left without scale and offset.
     """
     right = members(logits, labels)
-    _check_rivals(right, "--label")
+    _check_rivals(right, "label")
     difference = margin(logits, images, labels)
     top, spread = _sorted(logits, right)
     wide = top[:, 0] - top[:, 2]
@@ -118,8 +118,8 @@ def targeted_dlr(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
     The targeted ratio of Croce and Hein 2020, section 4, whose numerator is z_t - z_y instead: that is over 0 also
     where a third class wins. Otherwise as `dlr`.
     """
-    hit = members(logits, target, "--target")
-    _check_rivals(hit, "--target")
+    hit = members(logits, target, "target")
+    _check_rivals(hit, "target")
     top, spread = _sorted(logits, hit)
     return targeted_margin(logits, images, target) / _safe(_wider(top), spread)
 
@@ -127,13 +127,13 @@ def targeted_dlr(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
 # ---- parts ----------------------------------------------------------------------------------------------------------
 
 
-def members(logits: Tensor, labels: Labels, flag: str = "--label") -> Tensor:
+def members(logits: Tensor, labels: Labels, setting: str = "label") -> Tensor:
     """Return (C,) bool, true for the classes of a label set; checks the logits and the labels.
 
     Args:
         logits: (N, C).
         labels: class indices.
-        flag: what an error names.
+        setting: what an error names.
 
     Raises:
         InputError: logits of another shape, no index, one out of range, or all classes.
@@ -142,12 +142,12 @@ def members(logits: Tensor, labels: Labels, flag: str = "--label") -> Tensor:
         raise InputError(f"model output: expected logits of shape (N, classes), got {tuple(logits.shape)}")
     classes = logits.shape[1]
     if not labels or not all(0 <= label < classes for label in labels):
-        raise InputError(f"{flag}: expected class indices from 0 to {classes - 1}, got {tuple(labels)}")
+        raise InputError(f"{setting}: expected class indices from 0 to {classes - 1}, got {tuple(labels)}")
     found = torch.zeros(classes, dtype=torch.bool, device=logits.device)
     found[list(labels)] = True
     if bool(found.all()):
-        outcome = "no answer could be wrong" if flag == "--label" else "every answer would be a hit"
-        raise InputError(f"{flag}: the label set holds all {classes} classes, so {outcome}")
+        outcome = "no answer could be wrong" if setting == "label" else "every answer would be a hit"
+        raise InputError(f"{setting}: the label set holds all {classes} classes, so {outcome}")
     return found
 
 
@@ -166,13 +166,13 @@ def _softplus(x: Tensor) -> Tensor:
     return torch.where(x < SUREST, value + slope * (x - SUREST), functional.softplus(x))
 
 
-def _check_rivals(members_: Tensor, flag: str) -> None:
+def _check_rivals(members_: Tensor, setting: str) -> None:
     """Refuse a label set that leaves fewer than two other classes."""
     classes, size = len(members_), int(members_.sum())
     if classes - size < 2:
         raise InputError(
-            f"--objective dlr: expected at least 2 classes beside the {size} of {flag}, got {classes - size}; without "
-            "their scale, two logits say no more than which is larger: use --objective margin"
+            f"`objective` dlr: expected at least 2 classes beside the {size} of `{setting}`, got {classes - size}; "
+            "without their scale, two logits say no more than which is larger: use `objective=margin`"
         )
 
 

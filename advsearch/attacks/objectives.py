@@ -221,8 +221,8 @@ def check_objective(objective: object, *, targeted: bool = False, minimise: bool
     """
     if targeted and minimise:
         raise InputError(
-            "--minimise: expected no --target beside it; to make the object easier to recognise as something else, "
-            "give that as --label"
+            "minimise: expected no `target` beside it; to make the object easier to recognise as something else, "
+            "give that as `label`"
         )
     if isinstance(objective, str) and objective not in OBJECTIVE_KINDS:
         hint = "From Python, objective= also takes a function (logits, images, labels)."
@@ -233,11 +233,11 @@ def check_objective(objective: object, *, targeted: bool = False, minimise: bool
     if kind is None:
         _check_signature(objective)  # type: ignore[arg-type]
     elif kind.needs_features and (targeted or minimise):
-        flag, reason = "--minimise", "it is least at the start already"
+        setting, reason = "minimise", "it is least at the start already"
         if targeted:
-            flag, reason = "--target", "it leads away from the clean picture, to no class in particular"
-        expected = f"expected --objective {' or '.join(OBJECTIVES)}"
-        raise InputError(f"{flag}: {expected}, got {kind.name}; {reason}")
+            setting, reason = "target", "it leads away from the clean picture, to no class in particular"
+        expected = f"expected `objective` {' or '.join(OBJECTIVES)}"
+        raise InputError(f"{setting}: {expected}, got {kind.name}; {reason}")
 
 
 def _kind_of(objective: object) -> ObjectiveKind | None:
@@ -254,7 +254,7 @@ def _aimed(objective: Objective, target: Labels) -> Objective:
         both = sorted(set(labels) & set(target))
         if both:
             listed = ", ".join(f"#{index}" for index in both)
-            raise InputError(f"--target: expected classes that are wrong, got {listed}, which --label names as right")
+            raise InputError(f"target: expected classes that are wrong, got {listed}, which `label` names as right")
         return objective(logits, images, target)
 
     return aimed

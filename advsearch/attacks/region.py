@@ -78,7 +78,7 @@ def grow(
         InputError: the centre is not in the unit box, or samples is under 1.
     """
     if samples < 1:
-        raise InputError(f"--samples: expected at least 1, got {samples}")
+        raise InputError(f"samples: expected at least 1, got {samples}")
     if not bool(((centre >= 0.0) & (centre <= 1.0)).all()):
         raise InputError("the centre of a region has to lie inside the ranges of its parameters")
     judge = _Judge(same, seed)

@@ -98,7 +98,7 @@ def choose_spp(
         InputError: ladder, seeds or drift out of range.
     """
     if not ladder or ladder[0] < 1 or any(b <= a for a, b in pairwise(ladder)):
-        raise InputError(f"--verify-spp: expected rising sample counts of at least 1, got {list(ladder)}")
+        raise InputError(f"verify_spp: expected rising sample counts of at least 1, got {list(ladder)}")
     if seeds < 2 or not 0.0 < drift < 1.0:
         raise InputError(f"seeds and drift: expected at least 2 and a number in (0, 1), got {seeds} and {drift}")
     if len(ladder) == 1:

@@ -170,13 +170,13 @@ def search(
         RuntimeError: the policy left the domain or `evaluate` broke its contract; a bug.
     """
     if steps < 1:
-        raise InputError(f"--steps: expected at least 1, got {steps}")
+        raise InputError(f"steps: expected at least 1, got {steps}")
     if candidates < 0 or repeats < 1:
         raise InputError(f"candidates and repeats: expected at least 0 and 1, got {candidates} and {repeats}")
     if close < 0:
         raise InputError(f"close: expected at least 0, got {close}")
     if seconds is not None and not seconds > 0.0:
-        raise InputError(f"--seconds: expected a number over 0, got {seconds}")
+        raise InputError(f"seconds: expected a number over 0, got {seconds}")
     begun = time.perf_counter()
     log = _Log(evaluate, domain, on_step, max(1, candidates))
     try:

@@ -66,7 +66,7 @@ def scaled(domain: Domain, scale: float) -> Domain:
     bare = [block.name or "a block" for block in domain.blocks if block.epsilon is None]
     if bare:
         raise InputError(
-            f"--smallest: expected controls with a budget (texture, geometry, patch, ...), got {', '.join(bare)}, "
+            f"smallest: expected controls with a budget (texture, geometry, patch, ...), got {', '.join(bare)}, "
             "whose parameters have ranges and no epsilon; leave it out"
         )
     blocks = tuple(replace(block, epsilon=float(block.epsilon or 0.0) * scale) for block in domain.blocks)

@@ -33,7 +33,7 @@ def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE)
         InputError: an argument is out of range.
     """
     if trials < 1:
-        raise InputError(f"--trials: expected at least 1, got {trials}")
+        raise InputError(f"trials: expected at least 1, got {trials}")
     if not 0 <= successes <= trials:
         raise InputError(f"successes: expected a number from 0 to {trials}, got {successes}")
     if not 0.0 < confidence < 1.0:

@@ -164,9 +164,9 @@ def run_trials(
         InputError: trials or spp under 1.
     """
     if trials < 1:
-        raise InputError(f"--trials: expected at least 1, got {trials}")
+        raise InputError(f"trials: expected at least 1, got {trials}")
     if spp < 1:
-        raise InputError(f"--verify-spp: expected at least 1, got {spp}")
+        raise InputError(f"verify_spp: expected at least 1, got {spp}")
     done = []
     for number in range(trials):
         trial = Trial(*render_margin(u, stream(seed, "verification", number), spp))
@@ -228,7 +228,7 @@ def verify(
             on_trial=on_trial,
         )
     if len(clean) != trials:
-        raise InputError(f"clean trials: expected {trials}, as many as --trials, got {len(clean)}")
+        raise InputError(f"clean trials: expected {trials}, as many as `trials`, got {len(clean)}")
     u = domain.project(u)
     adversarial = run_trials(render_margin, u, spp=spp, seed=seed, trials=trials, on_trial=on_trial)
     control = count_right(clean, spp)

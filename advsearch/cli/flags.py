@@ -6,9 +6,11 @@ Values stay text until the configuration reads them, so that a wrong one is repo
 from __future__ import annotations
 
 import argparse
+import re
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
+from advsearch import config as configurations
 from advsearch.config import AttackConfig
 from advsearch.settings import Config, Setting, parse_assignment, settings
 
@@ -78,7 +80,7 @@ def config_from(args: argparse.Namespace, config: type[Given], **otherwise: Any)
         **otherwise: values for settings that were not given.
 
     Raises:
-        InputError: a value is not allowed; the message names the flag.
+        InputError: a value is not allowed.
     """
     known = {setting.field for setting in settings(config)}
     data: dict[str, Any] = {name: value for name, value in vars(args).items() if name in known}
@@ -91,8 +93,26 @@ def config_from(args: argparse.Namespace, config: type[Given], **otherwise: Any)
     if "estimators" in data:
         pairs = [text if "=" in text else f"*={text}" for text in data["estimators"]]
         data["estimators"] = dict(parse_assignment(text, "--estimator") for text in pairs)
-    made: Given = config.from_flags({**otherwise, **data})
-    return made
+    return config(**{**otherwise, **data})
+
+
+def with_flags(message: str) -> str:
+    """Return an error's message with the flags of the settings that it names.
+
+    Messages name a setting as Python and YAML do: before a colon at their beginning, or else in backticks, with a value
+    or without. ``epsilon: ...; lower `steps` or use `denoise=none` `` becomes
+    ``--epsilon: ...; lower --steps or use --denoise none``.
+    """
+    every = [getattr(configurations, name) for name in configurations.__all__ if name.endswith("Config")]
+    found = {one.name: one for config in every for one in settings(config)}
+
+    def named(match: re.Match[str]) -> str:
+        one, value = found[match["name"]], match["value"]
+        return one.flag if value is None or one.is_switch else f"{one.flag} {value}"
+
+    names = f"(?P<name>{'|'.join(found)})"
+    message = re.sub(rf"`{names}(=(?P<value>[^`]*))?`", named, message)
+    return re.sub(rf"(?P<before>^|; ){names}(?=: )", lambda match: match["before"] + found[match["name"]].flag, message)
 
 
 def help_text(setting: Setting) -> str:

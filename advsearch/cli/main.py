@@ -67,7 +67,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         return status
     except AdvsearchError as error:
-        print(f"advsearch: error: {error}", file=sys.stderr)
+        from advsearch.cli.flags import with_flags
+
+        print(f"advsearch: error: {with_flags(str(error))}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
         print("advsearch: interrupted", file=sys.stderr)

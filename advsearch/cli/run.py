@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     from advsearch.settings import parse_assignment, read_yaml
 
     command = str(read_yaml(args.file).get("command", "attack"))
-    changes = dict(parse_assignment(text, text) for text in args.change)
+    changes = dict(parse_assignment(text, f"change {text!r}") for text in args.change)
     if args.run is not None:
         changes["run"] = args.run
     if args.overwrite:

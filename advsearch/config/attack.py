@@ -138,7 +138,7 @@ class AttackConfig(SceneConfig):
         if isinstance(value, str):
             parts = [part.strip() for part in value.split(",") if part.strip()]
             if any("=" in part for part in parts):
-                value = dict(parse_assignment(part, "--epsilon") for part in parts)
+                value = dict(parse_assignment(part, "epsilon") for part in parts)
             else:
                 value = parts[0] if len(parts) == 1 else tuple(parts)
         if isinstance(value, list) and len(value) == 1:
@@ -153,7 +153,7 @@ class AttackConfig(SceneConfig):
         """Accept ``policy: {name: pgd, steps: 80, momentum: 0.9}``, ``pgd={momentum: 0.9}`` and a name."""
         policy = data.get("policy")
         if isinstance(policy, str) and "=" in policy:
-            name, options = parse_assignment(policy, "--policy")
+            name, options = parse_assignment(policy, "policy")
             policy = {"name": name, **(options if isinstance(options, Mapping) else {"": options})}
         if not isinstance(policy, Mapping):
             return data
@@ -166,22 +166,22 @@ class AttackConfig(SceneConfig):
     def _together(self) -> AttackConfig:
         """Refuse settings that exclude each other."""
         if self.smallest and self.epsilons:
-            raise InputError("--smallest: finds one epsilon by itself; give one --epsilon as the largest, or none")
+            raise InputError("smallest: finds one epsilon by itself; give one `epsilon` as the largest, or none")
         if self.smallest and self.is_study:
-            raise InputError("--smallest: is about one object; name one --object, and one --epsilon as the largest")
+            raise InputError("smallest: is about one object; name one `object`, and one `epsilon` as the largest")
         if self.minimise and self.is_study:
-            raise InputError("--minimise: has no robust accuracy; name one --object and one --epsilon")
+            raise InputError("minimise: has no robust accuracy; name one `object` and one `epsilon`")
         if self.smallest and self.seconds is not None:
-            raise InputError("--smallest: takes several searches; give --steps for each, and leave --seconds out")
+            raise InputError("smallest: takes several searches; give `steps` for each, and leave `seconds` out")
         if self.smallest and self.over:
-            raise InputError("--smallest: cannot be combined with --over yet; leave one of them out")
+            raise InputError("smallest: cannot be combined with `over` yet; leave one of them out")
         if self.minimise and self.target:
-            raise InputError("--minimise: makes the right answer easier to give; leave --target out")
+            raise InputError("minimise: makes the right answer easier to give; leave `target` out")
         if self.minimise and self.smallest:
-            raise InputError("--minimise: has no smallest change; leave --smallest out")
+            raise InputError("minimise: has no smallest change; leave `smallest` out")
         twice = set(self.over) & set(self.controls)
         if twice:
-            raise InputError(f"--over: {', '.join(sorted(twice))} is searched already; leave it out of one of the two")
+            raise InputError(f"over: {', '.join(sorted(twice))} is searched already; leave it out of one of the two")
         return self
 
     @property

@@ -116,7 +116,7 @@ def _read_name(asked: str, given: dict[str, object]) -> tuple[str, str, str | No
     if said is not None:
         return str(said), asked, None
     if colon and not name.isidentifier():
-        raise InputError(f"--control {asked}: expected a name of letters, digits and _ after the colon, got {name!r}")
+        raise InputError(f"`controls` {asked}: expected a name of letters, digits and _ after the colon, got {name!r}")
     return kind, name or kind, parameter if dot else None
 
 
@@ -156,12 +156,12 @@ def make_space(controls: Sequence[Control], scene: SceneDescription) -> Space:
         InputError: no control, two of one name, one that the scene cannot take, or nothing that varies.
     """
     if not controls:
-        raise InputError(f"--control: expected at least one of {', '.join(CONTROLS)}")
+        raise InputError(f"controls: expected at least one of {', '.join(CONTROLS)}")
     space = compose(controls, scene)
     if not len(space.start):
         names = ", ".join(control.name for control in controls)
         raise InputError(
-            f"--control {names}: every parameter is fixed, so there is nothing to search; give one a range, "
+            f"`controls` {names}: every parameter is fixed, so there is nothing to search; give one a range, "
             f"such as {_suggestion(controls[0])}"
         )
     return space
@@ -176,7 +176,7 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
     names = [control.name for control in controls]
     if len(set(names)) != len(names):
         raise InputError(
-            f"--control: every instance needs a name of its own, got {', '.join(names)}; write KIND:NAME, such as "
+            f"controls: every instance needs a name of its own, got {', '.join(names)}; write KIND:NAME, such as "
             f"light:key,light:fill"
         )
     for control in controls:

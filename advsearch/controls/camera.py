@@ -72,11 +72,11 @@ class CameraControl(NumberControl):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         if "fov" in self.specs and "focal_length" in self.specs:
-            raise InputError(f"--control {self.name}: fov and focal_length say the same thing; leave one of them out")
+            raise InputError(f"`controls` {self.name}: fov and focal_length say the same thing; leave one of them out")
         wanted = "aperture" in self.specs or "focus" in self.specs
         if wanted and ("shift_x" in self.specs or "shift_y" in self.specs):
             raise InputError(
-                f"--control {self.name}: a shifted picture together with an aperture is not supported; leave one out"
+                f"`controls` {self.name}: a shifted picture together with an aperture is not supported; leave one out"
             )
         return replace(scene, thin_lens=True) if wanted else scene
 

@@ -128,7 +128,7 @@ class ContentsControl(NumberControl):
         if least > 1.0 + TOTAL or (len(bounds) == len(INGREDIENTS) and most < 1.0 - TOTAL):
             said = ", ".join(f"{name} {_said(*bounds[name])}" for name in INGREDIENTS if name in bounds)
             raise InputError(
-                f"--control {self.name}: expected proportions of water, milk and coffee that add up to 1, got {said}; "
+                f"`controls` {self.name}: expected proportions of water, milk and coffee that add up to 1, got {said}; "
                 "change one of them or leave one out"
             )
         searched = not self.asked or any(isinstance(self.specs.get(name), Range) for name in INGREDIENTS)
@@ -188,7 +188,7 @@ class ContentsControl(NumberControl):
         found = interior(scene.object)
         if found is None:
             raise InputError(
-                f"--control {self.name}: expected a vessel, open at the top and closed around and below (a mug, a "
+                f"`controls` {self.name}: expected a vessel, open at the top and closed around and below (a mug, a "
                 f"bowl, a glass), got {scene.object.name!r}; choose another object or leave the control out"
             )
         return found

@@ -189,8 +189,8 @@ class PatchControl(Control):
         spec, placed = self._pixels, self._placement.placed(scene)
         if isinstance(spec, Fixed) and not self._placement.asked:
             raise InputError(
-                f"--control {self.name}: the pixels are fixed, so there is nothing to search; give another parameter a "
-                f"range, such as {self.name}={{azimuth: [0, 360]}}"
+                f"`controls` {self.name}: the pixels are fixed, so there is nothing to search; give another parameter "
+                f"a range, such as {self.name}={{azimuth: [0, 360]}}"
             )
         resting = placed.values(placed.start) if isinstance(placed, BoundNumbers) else placed
         side = int(self.resolution)

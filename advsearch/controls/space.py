@@ -32,7 +32,7 @@ class Space:
     def __post_init__(self) -> None:
         names = [control.name for control in self.controls]
         if len(set(names)) != len(names):
-            raise InputError(f"--control: every instance needs a name of its own, got {', '.join(names)}")
+            raise InputError(f"controls: every instance needs a name of its own, got {', '.join(names)}")
 
     @property
     def start(self) -> Tensor:
@@ -129,5 +129,5 @@ def _with_inputs(control: BoundControl, u: Tensor, so_far: Mapping[str, Tensor])
     own = control.inputs(u, so_far)
     for name in own:
         if name in so_far and name not in control.refines:
-            raise InputError(f"--control: two controls set {name}; leave one of them out")
+            raise InputError(f"controls: two controls set {name}; leave one of them out")
     return {**so_far, **own}

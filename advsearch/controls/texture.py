@@ -133,11 +133,11 @@ class TextureControl(Control):
 
     def __post_init__(self) -> None:
         if self.norm not in NORMS:
-            raise InputError(f"--norm: expected one of {', '.join(NORMS)}, got {self.norm!r}")
+            raise InputError(f"norm: expected one of {', '.join(NORMS)}, got {self.norm!r}")
         if self.epsilon is not None and not (_is_number(self.epsilon) and self.epsilon > 0.0):
-            raise InputError(f"--epsilon: expected a finite number greater than 0, got {self.epsilon}")
+            raise InputError(f"epsilon: expected a finite number greater than 0, got {self.epsilon}")
         if self.resolution is not None and not _is_count(self.resolution, 2, 4096):
-            raise InputError(f"--texture-resolution: expected 2 to 4096 texels, got {self.resolution}")
+            raise InputError(f"texture_resolution: expected 2 to 4096 texels, got {self.resolution}")
         object.__setattr__(self, "form", self._form())
         for choice, largest in (("colors", LARGEST_PALETTE), ("waves", LARGEST_WAVES)):
             if not _is_count(getattr(self, choice), 1, largest):

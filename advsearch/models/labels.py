@@ -86,7 +86,7 @@ def _unknown(term: str, table: dict[str, list[int]], labels: Sequence[str], name
     message = f"the model has no label {term!r}."
     if not named:
         return (
-            f"{message} Its {len(labels)} classes have no names: give a label file (--labels), or an index such as '#0'"
+            f"{message} Its {len(labels)} classes have no names: give a label file (`labels`), or an index such as '#0'"
         )
     near = difflib.get_close_matches(_key(term), table, n=4, cutoff=0.6)
     if near:

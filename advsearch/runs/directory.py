@@ -284,15 +284,15 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
     """
     path = run_path(run)
     if path.exists() and not path.is_dir():
-        raise RunExistsError(f"{path}: expected a folder for the run, got a file; choose another name with --run")
+        raise RunExistsError(f"{path}: expected a folder for the run, got a file; choose another name with `run`")
     with storage_errors(path):
         bare = not path.exists() or all(_is_leftover(found) for found in path.iterdir())
     if bare:
         return
     if not is_run(path):
-        raise RunExistsError(f"{path}: the folder is not empty and not a run; choose another name with --run")
+        raise RunExistsError(f"{path}: the folder is not empty and not a run; choose another name with `run`")
     if not overwrite:
-        raise RunExistsError(f"{path}: the run exists already; add --overwrite or choose another name with --run")
+        raise RunExistsError(f"{path}: the run exists already; add `overwrite=True` or choose another name with `run`")
 
 
 def _numbered(default: str) -> Path:

@@ -116,7 +116,7 @@ def _parquet(records: Iterable[Mapping[str, Any]], names: list[str], stream: IO[
         import pyarrow
         import pyarrow.parquet
     except ImportError:
-        raise InputError("--format parquet: needs pyarrow; pip install pyarrow, or choose csv or json") from None
+        raise InputError("format parquet: needs pyarrow; pip install pyarrow, or choose csv or json") from None
     rows = iter(records)
     first = list(itertools.islice(rows, GROUP))
     schema = pyarrow.schema([(name, _arrow_type(name, first, pyarrow)) for name in names])

@@ -20,14 +20,14 @@ PART = ".part-"
 """Prefix of a file that is still being written; what a killed process may leave behind."""
 
 _ADVICE = {
-    errno.ENOSPC: "the disk is full; free some space or choose another place with --run",
-    errno.EDQUOT: "the disk quota is used up; free some space or choose another place with --run",
-    errno.EROFS: "the file system is read-only; choose another place with --run",
-    errno.EACCES: "there is no permission to write there; choose another place with --run",
-    errno.EPERM: "writing there is not permitted; choose another place with --run",
-    errno.ENOTDIR: "a part of the path is a file, not a folder; choose another place with --run",
-    errno.EEXIST: "a file of that name stands where a folder is needed; choose another place with --run",
-    errno.ENAMETOOLONG: "the name is too long; choose a shorter one with --run",
+    errno.ENOSPC: "the disk is full; free some space or choose another place with `run`",
+    errno.EDQUOT: "the disk quota is used up; free some space or choose another place with `run`",
+    errno.EROFS: "the file system is read-only; choose another place with `run`",
+    errno.EACCES: "there is no permission to write there; choose another place with `run`",
+    errno.EPERM: "writing there is not permitted; choose another place with `run`",
+    errno.ENOTDIR: "a part of the path is a file, not a folder; choose another place with `run`",
+    errno.EEXIST: "a file of that name stands where a folder is needed; choose another place with `run`",
+    errno.ENAMETOOLONG: "the name is too long; choose a shorter one with `run`",
 }
 
 _SQLITE_ADVICE = {
@@ -110,8 +110,8 @@ def _flush(path: Path) -> None:
 
 def _advice(error: OSError | sqlite3.Error) -> str:
     if isinstance(error, OSError):
-        return _ADVICE.get(error.errno or 0, f"{error.strerror or error}; choose another place with --run")
+        return _ADVICE.get(error.errno or 0, f"{error.strerror or error}; choose another place with `run`")
     for words, advice in _SQLITE_ADVICE.items():
         if words in str(error):
             return advice
-    return f"{error}; choose another place with --run"
+    return f"{error}; choose another place with `run`"

@@ -62,7 +62,7 @@ def is_held(folder: Path) -> bool:
 
 def _refusal(error: OSError, folder: Path, owner: str) -> Exception:
     if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
-        return InputError(f"{folder}: {owner} is working on this run; wait for it or choose another name with --run")
+        return InputError(f"{folder}: {owner} is working on this run; wait for it or choose another name with `run`")
     if error.errno in (errno.ENOLCK, errno.EOPNOTSUPP):
-        return StorageError(f"{folder}: the file system has no locks; choose a local disk with --run")
-    return StorageError(f"cannot lock {folder}: {error.strerror}; choose another place with --run")
+        return StorageError(f"{folder}: the file system has no locks; choose a local disk with `run`")
+    return StorageError(f"cannot lock {folder}: {error.strerror}; choose another place with `run`")

@@ -41,7 +41,7 @@ class Denoiser:
             import mitsuba_oidn
         except ImportError as error:
             raise EnvironmentSetupError(
-                f"the denoiser cannot be loaded ({error}): pip install mitsuba-oidn, or use --denoise none"
+                f"the denoiser cannot be loaded ({error}): pip install mitsuba-oidn, or use `denoise=none`"
             ) from error
         color, guide, direction, output = self._buffers
         for buffer, image in ((color, radiance), (guide, albedo), (direction, normal)):

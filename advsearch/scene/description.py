@@ -64,7 +64,7 @@ class SceneDescription:
             InputError: its name is taken.
         """
         if part.name in ("object", "environment", "ground", "camera", *(one.name for one in self.parts)):
-            raise InputError(f"--control {part.name}: the scene has something of that name already; choose another")
+            raise InputError(f"`controls` {part.name}: the scene has something of that name already; choose another")
         return replace(self, parts=(*self.parts, part))
 
     def with_values(self, **given: float | None) -> SceneDescription:
@@ -137,7 +137,7 @@ def _object(spec: str | Path | ObjectAsset, up: str | None) -> ObjectAsset:
         return import_object(Path(spec), up="y" if up == "y" else "z" if up == "z" else None)
     if up is not None:
         raise InputError(
-            f"--up: bundled objects stand upright already; leave --up out, or give a file instead of {spec!r}"
+            f"up: bundled objects stand upright already; leave `up` out, or give a file instead of {spec!r}"
         )
     return library.load_object(str(spec))
 

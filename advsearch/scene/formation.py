@@ -46,17 +46,17 @@ class ImageFormation:
 
     def __post_init__(self) -> None:
         if self.denoiser not in DENOISERS:
-            raise InputError(f"--denoise: expected one of {', '.join(DENOISERS)}, got {self.denoiser!r}")
+            raise InputError(f"denoise: expected one of {', '.join(DENOISERS)}, got {self.denoiser!r}")
         if self.sampler not in SAMPLERS:
-            raise InputError(f"--pixel-sampler: expected one of {', '.join(SAMPLERS)}, got {self.sampler!r}")
+            raise InputError(f"pixel_sampler: expected one of {', '.join(SAMPLERS)}, got {self.sampler!r}")
         if self.filter not in FILTERS:
             raise InputError(f"reconstruction filter: expected one of {', '.join(FILTERS)}, got {self.filter!r}")
         if self.denoiser == "oidn" and self.filter != "box":
             raise InputError(
-                "the denoiser needs the box filter: any other correlates pixels; use --denoise none with it"
+                "the denoiser needs the box filter: any other correlates pixels; use `denoise=none` with it"
             )
         if min(self.resolution) < 8 or max(self.resolution) > 4096:
-            raise InputError(f"--resolution: expected 8 to 4096 pixels, got {self.resolution}")
+            raise InputError(f"resolution: expected 8 to 4096 pixels, got {self.resolution}")
 
     def display(self, radiance: Tensor) -> Tensor:
         """Map linear radiance (..., 3) to display-referred sRGB in [0, 1]; differentiable, flat where clipped."""

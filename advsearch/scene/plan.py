@@ -194,7 +194,7 @@ def first_plan(
     names = {key for group in groups for key in (group.name, group.control)}
     for name in forced:
         if name != "*" and name not in names:
-            raise UnknownNameError("control in --estimator", name, sorted(names))
+            raise UnknownNameError("control in `estimators`", name, sorted(names))
     return GradientPlan(tuple(_first(group, steps, forced) for group in groups), spp)
 
 
@@ -206,7 +206,7 @@ def _first(group: GroupPlan, steps: Tensor, forced: Mapping[str, str]) -> GroupP
     if wanted is not None:
         if wanted not in group.valid and wanted not in ALWAYS_VALID:
             raise InputError(
-                f"--estimator {group.name}={wanted}: not valid there; expected one of "
+                f"`estimators` {group.name}={wanted}: not valid there; expected one of "
                 f"{', '.join(dict.fromkeys((*group.valid, *ALWAYS_VALID)))}"
             )
         return replace(group, estimator=wanted, step=step, reason="forced by name")

@@ -171,7 +171,7 @@ class Renderer:
         if u.shape != self.start.shape:
             raise InputError(f"render: expected u of shape {tuple(self.start.shape)}, got {tuple(u.shape)}")
         if not 1 <= spp <= MAX_SPP:
-            raise InputError(f"--spp: expected 1 to {MAX_SPP} samples a pixel, got {spp}")
+            raise InputError(f"spp: expected 1 to {MAX_SPP} samples a pixel, got {spp}")
         values = u.detach()
         if not bool((values >= 0.0).all() & (values <= 1.0).all()):
             raise InputError("render: expected every entry of u in [0, 1]; project u before you render it")

@@ -80,13 +80,13 @@ def resolve(given: Mapping[str, float]) -> dict[str, float | None]:
 
 def _checked(name: str, value: object) -> float:
     if name not in SETTINGS:
-        raise UnknownNameError("scene parameter", name, SETTINGS, "Write it as --set NAME=VALUE.")
+        raise UnknownNameError("scene parameter", name, SETTINGS, "Write it as `set` NAME=VALUE.")
     setting = SETTINGS[name]
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(f"--set {name}: expected a number in {setting.unit}, got {value!r}")
+        raise InputError(f"`set` {name}: expected a number in {setting.unit}, got {value!r}")
     number = float(value)
     if not math.isfinite(number) or not setting.low <= number <= setting.high:
         raise InputError(
-            f"--set {name}: expected a number from {setting.low:g} to {setting.high:g} ({setting.unit}), got {number:g}"
+            f"`set` {name}: expected a number from {setting.low:g} to {setting.high:g} ({setting.unit}), got {number:g}"
         )
     return number

@@ -24,7 +24,7 @@ MOST_VALUES = 100_000
 TURN = 360.0
 """Degrees after which a periodic parameter is the same again."""
 
-_OUTER = {"object": "--object mug,bowl", "environment": "--environment studio,noon", "model": "--model a.pt2,b.pt2"}
+_OUTER = {"object": "`object` mug,bowl", "environment": "`environment` studio,noon", "model": "`model` a.pt2,b.pt2"}
 
 
 @dataclass(frozen=True)
@@ -74,12 +74,12 @@ def read_axes(grid: Mapping[str, Any], controls: Sequence[Control]) -> tuple[Axi
     for name, given in grid.items():
         axis = _read_axis(name, given, instances)
         if axis.name in found:
-            raise InputError(f"--grid {name}: {axis.name} is an axis already; leave one of the two out")
+            raise InputError(f"`grid` {name}: {axis.name} is an axis already; leave one of the two out")
         drawn = instances.get(axis.instance)
         if isinstance(drawn, NumberControl) and axis.parameter.name in drawn.specs:
             raise InputError(
-                f"--grid {name}: --control {axis.instance} says what {axis.parameter.name} is already; leave it out of "
-                "one of the two"
+                f"`grid` {name}: `controls` {axis.instance} says what {axis.parameter.name} is already; leave it "
+                "out of one of the two"
             )
         found[axis.name] = axis
     return tuple(found.values())
@@ -92,27 +92,27 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
     kind, early_colon, early = head.partition(":")
     instance = late or early or kind
     if head in _OUTER and not dot:
-        raise InputError(f"--grid {name}: several of them are given as a list: {_OUTER[head]}")
+        raise InputError(f"`grid` {name}: several of them are given as a list: {_OUTER[head]}")
     control: Any = type(instances[instance]) if instance in instances else CONTROLS.get(kind)
     if control is None:
-        hint = f"It stands in --grid {name}; write --grid CONTROL.PARAMETER=VALUES, such as pose.yaw=0:360:24."
+        hint = f"It stands in `grid` {name}; write `grid` CONTROL.PARAMETER=VALUES, such as pose.yaw=0:360:24."
         raise UnknownNameError("control", kind, {*CONTROLS, *instances}, hint)
     known = [one.name for one in control.parameters]
     if not parameter_name:
         raise InputError(
-            f"--grid {name}: expected CONTROL.PARAMETER, got no parameter; choose one of {', '.join(known)}"
+            f"`grid` {name}: expected CONTROL.PARAMETER, got no parameter; choose one of {', '.join(known)}"
         )
     if (colon or early_colon) and not instance.isidentifier():
-        raise InputError(f"--grid {name}: expected a name of letters, digits and _ after the colon, got {instance!r}")
+        raise InputError(f"`grid` {name}: expected a name of letters, digits and _ after the colon, got {instance!r}")
     if parameter_name not in known:
-        raise UnknownNameError(f"parameter of control {control.kind}", parameter_name, known, f"In --grid {name}.")
+        raise UnknownNameError(f"parameter of control {control.kind}", parameter_name, known, f"In `grid` {name}.")
     parameter = control.parameters[known.index(parameter_name)]
     if not issubclass(control, NumberControl) or parameter.shape != ():
         raise InputError(
-            f"--grid {name}: expected a parameter that is one number or name, got one that is many numbers; draw it "
-            f"by chance with --control {instance} --samples 100"
+            f"`grid` {name}: expected a parameter that is one number or name, got one that is many numbers; draw it "
+            f"by chance with `controls` {instance} `samples=100`"
         )
-    return Axis(control.kind, instance, parameter, axis_values(f"--grid {name}", parameter, given))
+    return Axis(control.kind, instance, parameter, axis_values(f"`grid` {name}", parameter, given))
 
 
 def axis_values(where: str, parameter: Parameter, given: Any) -> tuple[Number, ...]:
@@ -122,7 +122,7 @@ def axis_values(where: str, parameter: Parameter, given: Any) -> tuple[Number, .
     a whole turn, LAST would repeat FIRST and is left out.
 
     Args:
-        where: what errors name: ``"--grid pose.yaw"``.
+        where: what errors name: ``"`grid` pose.yaw"``.
         parameter: says what is allowed.
         given: the text, a value, or a list of values.
 
@@ -178,7 +178,7 @@ def _spaced(where: str, parameter: Parameter, text: str) -> list[float]:
 def _too_many(where: str, count: int) -> str:
     return (
         f"{where}: expected at most {MOST_VALUES} values on an axis, got {count}; draw the parameter by chance "
-        "instead, with --control and --samples"
+        "instead, with `controls` and `samples`"
     )
 
 

@@ -111,7 +111,7 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
     for place, points in found:
         if points.drawn_numbers != first.drawn_numbers:
             raise InputError(
-                f"--object {place.object}: its controls draw other numbers than those of {job.places[0].object}; sweep "
+                f"`object` {place.object}: its controls draw other numbers than those of {job.places[0].object}; sweep "
                 "the two by themselves"
             )
     drawn = []

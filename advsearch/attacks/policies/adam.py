@@ -89,7 +89,7 @@ class Adam(Policy[AdamState]):
     def __post_init__(self) -> None:
         if not 0.0 < self.step_size <= 2.0:
             raise InputError(
-                f"--step-size: expected a number in (0, 2], a share of half the range, got {self.step_size}; try 0.3"
+                f"step_size: expected a number in (0, 2], a share of half the range, got {self.step_size}; try 0.3"
             )
         for name, value in (("beta1", self.beta1), ("beta2", self.beta2)):
             if not 0.0 <= value < 1.0:

@@ -91,7 +91,7 @@ def _counts(domain: Domain, steps: int, points: int) -> list[int]:
         more = f" and {combinations} combinations of options" if combinations > 1 else ""
         raise InputError(
             f"policy 'grid': {points or 2} values for each of {numbers} numbers{more} are {_many(least)} renders, and "
-            f"there are {steps}; use policy sobol, cmaes, nes, pgd or auto, or give more --steps"
+            f"there are {steps}; use policy sobol, cmaes, nes, pgd or auto, or give more `steps`"
         )
     each = points or max(2, int((steps // combinations) ** (1.0 / max(numbers, 1)) * (1 - 1e-9)))
     counts = [n or each for n in options]

@@ -155,7 +155,7 @@ class PGD(Policy[PGDState]):
     def __post_init__(self) -> None:
         if not 0.0 < self.step_size <= 2.0:
             raise InputError(
-                f"--step-size: expected a number in (0, 2], a fraction of epsilon, got {self.step_size}; try 0.5"
+                f"step_size: expected a number in (0, 2], a fraction of epsilon, got {self.step_size}; try 0.5"
             )
         if not 0.0 <= self.momentum < 1.0:
             raise InputError(f"momentum: expected a number in [0, 1), got {self.momentum}; try 0.5")

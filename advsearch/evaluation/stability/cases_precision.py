@@ -250,7 +250,7 @@ def changed_threads(counts: Sequence[int] = (2, 1, 2, 1, 2, 1)) -> None:
 
 
 def threads_under_a_scene() -> Findings:
-    """A scene that lives while the number of threads is changed, as a second search with --deterministic does."""
+    """A scene that lives while the number of threads is changed, as a deterministic second search does."""
     status, said = _in_a_process(f"from {__name__} import changed_threads; changed_threads()")
     return Findings(
         (Check("exit status of the process" + (f" ({said})" if said else ""), float(status), 0.0, 0.0),),
@@ -315,7 +315,7 @@ CASES = (
         "precision",
         "determinism under 1 and 2 threads",
         "The same bits every time with one thread; with two, moved meshes and adjoints may differ in the last.",
-        "box filter; --deterministic takes one thread",
+        "box filter; `deterministic` takes one thread",
         one_and_two_threads,
         "texture, pose",
         cheap=False,
