@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 import torch
 
-from advsearch import controls
 from advsearch.api import load_scene
 from advsearch.controls import CONTROLS, BoundControl, TextureControl, make_control, make_space
 from advsearch.errors import InputError, UnknownNameError
@@ -192,29 +191,3 @@ def test_the_worked_example_is_a_control_that_renders() -> None:
     spread = [float((one.amax(dim=-1) - one.amin(dim=-1)).mean()) for one in (plain, faded)]
     assert spread[1] < 0.8 * spread[0]
     assert [one.estimator for one in render.plan.groups] == ["adjoint"]
-
-
-def test_an_entry_point_adds_a_control(monkeypatch: pytest.MonkeyPatch) -> None:
-    fade = worked_example()
-
-    class Point:
-        name, value = "fade", "worked_example:FadeControl"
-        loads: Any = fade
-
-        def load(self) -> Any:
-            return self.loads
-
-    point = Point()
-    monkeypatch.setattr(controls, "entry_points", lambda group: [point] if group == "advsearch.controls" else [])
-    controls._outside.cache_clear()
-    try:
-        assert list(CONTROLS)[-1] == "fade" and CONTROLS["fade"] is fade and len(CONTROLS) == len(controls.OWN) + 1
-        assert make_control("fade:pale", {"amount": [0, 0.5]}).name == "pale"
-        controls._outside.cache_clear()
-        point.loads = int
-        with pytest.raises(
-            InputError, match=r"entry point fade = worked_example:FadeControl of group advsearch\.controls"
-        ):
-            make_control("nothing")
-    finally:
-        controls._outside.cache_clear()

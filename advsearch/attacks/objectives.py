@@ -32,6 +32,7 @@ from advsearch.attacks.logit_objectives import (
     targeted_margin,
 )
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.registry import Registry
 
 __all__ = [
     "OBJECTIVES",
@@ -97,7 +98,7 @@ class ObjectiveKind:
         return found
 
 
-OBJECTIVE_KINDS: dict[str, ObjectiveKind] = {
+_OWN = {
     kind.name: kind
     for kind in (
         ObjectiveKind(
@@ -136,12 +137,17 @@ OBJECTIVE_KINDS: dict[str, ObjectiveKind] = {
         ),
     )
 }
+
+OBJECTIVE_KINDS: Registry[ObjectiveKind] = Registry(
+    "advsearch.objectives",
+    _OWN,
+    "an ObjectiveKind whose name is that of the entry point",
+    lambda name, entry: isinstance(entry, ObjectiveKind) and entry.name == name,
+)
 """Every objective that has a name."""
 
-OBJECTIVES: dict[str, Objective] = {
-    name: kind.plain for name, kind in OBJECTIVE_KINDS.items() if kind.plain is not None
-}
-"""Those that need nothing but logits, in their plain form."""
+OBJECTIVES: dict[str, Objective] = {name: kind.plain for name, kind in _OWN.items() if kind.plain is not None}
+"""Those of our own that need nothing but logits, in their plain form."""
 
 
 def objective_summaries() -> dict[str, str]:

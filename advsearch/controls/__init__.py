@@ -1,23 +1,19 @@
 """Controls: the families of scene parameters that may vary. `CONTROLS` is the registry.
 
-A package outside adds its own through the entry-point group `advsearch.controls` (docs/controls/writing.md).
+A package outside adds its own (docs/controls/writing.md).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
+from collections.abc import Mapping, Sequence
 from importlib import import_module
-from importlib.metadata import entry_points
 
 from advsearch.controls.base import BoundControl, Budget, Choice, Control, Group, Parameter
 from advsearch.controls.numbers import NumberControl
 from advsearch.controls.space import Space
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.registry import Registry
 from advsearch.scene.description import SceneDescription
-
-ENTRY_POINTS = "advsearch.controls"
-"""Group of entry points that name further controls: `NAME = module:Class`."""
 
 OWN = {
     "pose": "PoseControl",
@@ -38,46 +34,13 @@ OWN = {
 }
 """The package's own controls: the word on the command line is the module's name, and this is its class."""
 
-
-class _Registry(Mapping[str, type[Control]]):
-    """Every control by its word, imported when it is asked for; those of other packages after our own."""
-
-    def __getitem__(self, kind: str) -> type[Control]:
-        if kind in OWN:
-            found: type[Control] = getattr(import_module(f"{__name__}.{kind}"), OWN[kind])
-            return found
-        if kind in _outside():
-            return _outside()[kind]
-        raise KeyError(kind)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter([*OWN, *(kind for kind in _outside() if kind not in OWN)])
-
-    def __len__(self) -> int:
-        return len(list(iter(self)))
-
-
-@cache
-def _outside() -> dict[str, type[Control]]:
-    """Controls of other packages.
-
-    Raises:
-        InputError: an entry point is not a control.
-    """
-    found = {}
-    for point in entry_points(group=ENTRY_POINTS):
-        control = point.load()
-        if not (isinstance(control, type) and issubclass(control, Control)) or control.kind != point.name:
-            raise InputError(
-                f"entry point {point.name} = {point.value} of group {ENTRY_POINTS}: expected a subclass of Control "
-                f"whose kind is {point.name!r}; repair or uninstall the package that declares it"
-            )
-        found[point.name] = control
-    return found
-
-
-CONTROLS: Mapping[str, type[Control]] = _Registry()
-"""Every control by its word on the command line."""
+CONTROLS: Registry[type[Control]] = Registry(
+    "advsearch.controls",
+    {kind: f"{__name__}.{kind}:{name}" for kind, name in OWN.items()},
+    "a subclass of Control whose kind is the name of the entry point",
+    lambda name, entry: isinstance(entry, type) and issubclass(entry, Control) and entry.kind == name,
+)
+"""Every control by its word on the command line, imported when it is asked for."""
 
 
 def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Control:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,18 @@ from advsearch.models.model import Model
 from advsearch.models.preprocessing import Preprocessing
 from advsearch.models.probe import probe
 from advsearch.models.source import Source, source_of
+from advsearch.registry import Registry
 
 #: Size of the input where neither the model nor the caller says.
 DEFAULT_INPUT_SIZE = (224, 224)
+
+SOURCES: Registry[Callable[[str], Source | Model]] = Registry(
+    "advsearch.models",
+    {"torchvision": imported.load_torchvision},
+    "a function from the whole text, such as 'zoo:resnet18', to a Source or a Model",
+    lambda name, entry: callable(entry),
+)
+"""What loads ``SOURCE:NAME``, by source."""
 
 FORMS = (
     "A model is 'reference', a file (.pt2 or TorchScript), 'package.module:callable', "
@@ -109,8 +118,9 @@ def _find(spec: object) -> Source | Model:
     text = spec.strip()
     if text == "reference":
         return reference.load()
-    if text.lower().startswith("torchvision:"):
-        return imported.load_torchvision(text)
+    source = text.partition(":")[0].lower()
+    if ":" in text and source in SOURCES:
+        return SOURCES[source](text)
     if re.fullmatch(r"[\w.-]+\.py:[\w.]+", text):
         raise InputError(f"model {text!r}: write {text.replace('.py:', ':')!r}, without the '.py'")
     if re.fullmatch(r"[^\W\d][\w.]*:[^\W\d][\w.]*(@.+)?", text):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 from advsearch.attacks.policies.adam import Adam
@@ -20,20 +20,34 @@ from advsearch.attacks.policies.random import Random
 from advsearch.attacks.policies.restarts import Restarts
 from advsearch.attacks.policies.sobol import Sobol
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.registry import Registry
 
-POLICIES: dict[str, type[Policy[Any]]] = {
-    "adam": Adam,
-    "auto": Auto,
-    "cmaes": CMAES,
-    "grid": Grid,
-    "halving": Halving,
-    "nes": NES,
-    "pgd": PGD,
-    "portfolio": Portfolio,
-    "random": Random,
-    "restarts": Restarts,
-    "sobol": Sobol,
-}
+
+def _is_policy(name: str, entry: Any) -> bool:
+    if not isinstance(entry, type) or not is_dataclass(entry):
+        return False
+    return issubclass(entry, Policy) and entry.name == name
+
+
+POLICIES: Registry[type[Policy[Any]]] = Registry(
+    "advsearch.policies",
+    {
+        "adam": Adam,
+        "auto": Auto,
+        "cmaes": CMAES,
+        "grid": Grid,
+        "halving": Halving,
+        "nes": NES,
+        "pgd": PGD,
+        "portfolio": Portfolio,
+        "random": Random,
+        "restarts": Restarts,
+        "sobol": Sobol,
+    },
+    "a dataclass over Policy whose name is that of the entry point",
+    _is_policy,
+)
+"""Every policy by its word on the command line."""
 
 Spec = str | Mapping[str, Any] | Policy[Any]
 """A policy inside another one: its name, a mapping with its `name` and options, or the policy itself."""

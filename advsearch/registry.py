@@ -1,0 +1,69 @@
+"""Registries: things of one kind by their word on the command line, our own and those of other packages.
+
+A package adds to a registry through an entry point of the registry's group, as `docs/extending.md` shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any, Generic, TypeVar
+
+from advsearch.errors import InputError
+
+Entry = TypeVar("Entry")
+
+
+class Registry(Mapping[str, Entry], Generic[Entry]):
+    """Entries by name: our own first, in the order given, then those of installed packages; ours win a name.
+
+    Args:
+        group: of entry points: "advsearch.policies".
+        own: our entries; one given as text, "module:attribute", is imported when it is asked for.
+        expected: what an entry is, for messages: "a subclass of Policy whose name is that of the entry point".
+        fits: whether an object under a name is one.
+    """
+
+    def __init__(
+        self, group: str, own: Mapping[str, Entry | str], expected: str, fits: Callable[[str, Any], bool]
+    ) -> None:
+        self.group = group
+        self._own, self._expected, self._fits = own, expected, fits
+
+    def __getitem__(self, name: str) -> Entry:
+        if name not in self._own:
+            return self._installed[name]
+        entry = self._own[name]
+        if isinstance(entry, str):
+            module, _, attribute = entry.partition(":")
+            imported: Entry = getattr(import_module(module), attribute)
+            return imported
+        return entry
+
+    def __iter__(self) -> Iterator[str]:
+        return iter([*self._own, *(name for name in self._installed if name not in self._own)])
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    @cached_property
+    def _installed(self) -> dict[str, Entry]:
+        """Entries of other packages.
+
+        Raises:
+            InputError: what an entry point names cannot be imported, or is something else.
+        """
+        found: dict[str, Entry] = {}
+        for point in entry_points(group=self.group):
+            where = f"entry point {point.name} = {point.value} of group {self.group}"
+            mend = "repair or uninstall the package that declares it"
+            try:
+                entry = point.load()
+            except (ImportError, AttributeError) as error:
+                raise InputError(f"{where}: cannot be imported ({error}); {mend}") from None
+            if not self._fits(point.name, entry):
+                raise InputError(f"{where}: expected {self._expected}; {mend}")
+            found[point.name] = entry
+        return found

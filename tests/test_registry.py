@@ -1,0 +1,120 @@
+"""Registries: our own entries, those of installed packages, and a package made from the pages that say how."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from advsearch import registry
+from advsearch.attacks.objectives import OBJECTIVE_KINDS
+from advsearch.attacks.policies import POLICIES
+from advsearch.controls import CONTROLS
+from advsearch.errors import InputError
+from advsearch.models.loading import SOURCES
+from advsearch.registry import Registry
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+
+
+class Point:
+    """An entry point."""
+
+    def __init__(self, name: str, entry: Any) -> None:
+        self.name, self.value, self._entry = name, f"other:{name}", entry
+
+    def load(self) -> Any:
+        if isinstance(self._entry, Exception):
+            raise self._entry
+        return self._entry
+
+
+def with_points(monkeypatch: pytest.MonkeyPatch, *points: Point) -> Registry[int]:
+    monkeypatch.setattr(registry, "entry_points", lambda group: points if group == "advsearch.numbers" else ())
+    own: dict[str, int | str] = {"one": 1, "mod": "sys:maxsize"}
+    return Registry("advsearch.numbers", own, "a number", lambda name, entry: isinstance(entry, int))
+
+
+def test_own_entries_come_first_and_win_and_texts_are_imported(monkeypatch: pytest.MonkeyPatch) -> None:
+    numbers = with_points(monkeypatch, Point("one", 100), Point("two", 2))
+    assert list(numbers) == ["one", "mod", "two"] and len(numbers) == 3
+    assert (numbers["one"], numbers["mod"], numbers["two"]) == (1, sys.maxsize, 2)
+    assert "three" not in numbers
+
+
+@pytest.mark.parametrize(
+    ("entry", "complaint"),
+    [("two", "expected a number"), (ImportError("no module x"), r"cannot be imported \(no module x\)")],
+)
+def test_an_entry_that_does_not_fit_is_named_with_its_package(
+    monkeypatch: pytest.MonkeyPatch, entry: Any, complaint: str
+) -> None:
+    numbers = with_points(monkeypatch, Point("two", entry))
+    with pytest.raises(InputError, match=rf"entry point two = other:two of group advsearch\.numbers: {complaint}"):
+        list(numbers)
+
+
+@pytest.mark.parametrize("known", [CONTROLS, POLICIES, OBJECTIVE_KINDS, SOURCES], ids=lambda known: known.group)
+def test_every_registry_is_in_the_page_that_says_how_to_add_to_it(known: Registry[Any]) -> None:
+    assert f"| `{known.group}` |" in (DOCS / "extending.md").read_text("utf-8")
+    assert len(known) > 0 and all(known[name] is not None for name in known)
+
+
+# ---- a package from the pages ---------------------------------------------------------------------------------------
+
+
+def blocks(page: str, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", (DOCS / page).read_text("utf-8"), re.S)
+
+
+def made_from_the_pages(folder: Path) -> Path:
+    """Write the package that docs/extending.md describes."""
+    page = (DOCS / "extending.md").read_text("utf-8")
+    (folder / "my_package").mkdir(parents=True)
+    (folder / "setup.cfg").write_text(blocks("extending.md", "ini")[0])
+    (folder / "pyproject.toml").write_text(
+        '[build-system]\nrequires = ["setuptools"]\nbuild-backend = "setuptools.build_meta"\n'
+    )
+    names = re.findall(r"^`my_package/(\w+)\.py`", page, re.M)
+    sources = dict(zip(names, blocks("extending.md", "python"), strict=True))
+    sources |= {"fade": blocks("controls/writing.md", "python")[0], "__init__": ""}
+    for name, source in sources.items():
+        (folder / "my_package" / f"{name}.py").write_text(source)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which that package is installed."""
+    folder = tmp_path_factory.mktemp("outside")
+    package, target = made_from_the_pages(folder / "package"), folder / "installed"
+    pip = [sys.executable, "-m", "pip", "install", "-qq", "--no-deps", "--no-index", "--no-build-isolation"]
+    subprocess.run([*pip, "--disable-pip-version-check", "--target", str(target), str(package)], check=True)
+    return target
+
+
+def advsearch(installed: Path, *words: str) -> Any:
+    """Run a command beside the installed package and return its JSON answer."""
+    command = [sys.executable, "-m", "advsearch", *words, "--json"]
+    done = subprocess.run(command, stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(installed)})
+    assert done.returncode == 0
+    return json.loads(done.stdout)
+
+
+def test_its_names_are_listed_and_its_parts_work_together(installed: Path, tmp_path: Path) -> None:
+    listed = advsearch(installed, "list")
+    for kind, name in (("controls", "fade"), ("policies", "shrinking"), ("objectives", "brightness")):
+        assert listed[kind][-1] == name
+    example = next(words for words in blocks("extending.md", "sh")[0].splitlines() if words.startswith("advsearch"))
+    small = ["--run", str(tmp_path / "run"), "--no-baseline", "--steps", "4", "--spp", "1", "--verify-spp", "1"]
+    words = [*example.split()[1:], *small, "--denoise", "none", "--label", "bowl", "--quiet"]
+    summary = advsearch(installed, *words)
+    assert (summary["controls"], summary["policy"], summary["objective"]) == (["fade"], "shrinking", "brightness")
+    assert summary["model"] == "tiny" and summary["steps"] == 4
