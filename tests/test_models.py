@@ -608,7 +608,7 @@ def test_damaged_files(tmp_path: Path, exported: Path) -> None:
         archive.writestr("hello.txt", "hello")
     with pytest.raises(FileFormatError, match=r"a zip archive, but neither torch.export nor TorchScript"):
         load_model(tmp_path / "other.zip")
-    with pytest.raises(FileFormatError, match=r"cannot be read"):
+    with pytest.raises(FileFormatError, match=r"expected a model file, got a directory"):
         load_model(tmp_path)
 
 

@@ -11,14 +11,16 @@ import difflib
 import logging
 import os
 import warnings
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import torch
 
 from advsearch.errors import FileFormatError, ModelError
+from advsearch.files import open_regular
+from advsearch.models import exported
+from advsearch.models.archive import LARGEST, Archive, open_archive, refused
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source, source_of
 
@@ -42,52 +44,44 @@ def load_file(path: Path) -> Source:
         FileFormatError: missing, empty, truncated, damaged, a pickle, or of another kind; the message names the file.
         ModelError: a program that does not take one floating-point image.
     """
-    kind = _kind(path)
-    if kind == "torchscript":
-        return _load_torchscript(path)
-    return _load_exported(path)
+    with _opened(path) as file:
+        head = file.read(16)
+        if not head:
+            raise FileFormatError(f"model file {path}: expected a model, got an empty file")
+        if head[:2] != b"PK":
+            raise FileFormatError(f"model file {path}: {_not_an_archive(path, head)}")
+        archive = open_archive(path, file, os.fstat(file.fileno()).st_size)
+        if _kind(archive) == "torchscript":
+            return _load_torchscript(path)
+        return _load_exported(path, archive)
 
 
-def _kind(path: Path) -> str:
-    """Return ``"exported"`` or ``"torchscript"``; raise for everything else."""
+def _opened(path: Path) -> BinaryIO:
     try:
-        with path.open("rb") as file:
-            head = file.read(16)
+        return open_regular(path, "a model file", LARGEST)
     except FileNotFoundError:
         raise FileFormatError(f"model file {path}: no such file.{_near_files(path)}") from None
     except OSError as error:
         raise FileFormatError(f"model file {path}: cannot be read ({error.strerror or error})") from None
-    if not head:
-        raise FileFormatError(f"model file {path}: expected a model, got an empty file")
-    if head[:2] != b"PK":
-        raise FileFormatError(f"model file {path}: {_not_an_archive(path, head)}")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-    except (zipfile.BadZipFile, OSError, ValueError) as error:
-        raise FileFormatError(f"model file {path}: truncated or damaged archive ({first_line(error)})") from None
-    return _kind_of_archive(path, names)
 
 
-def _kind_of_archive(path: Path, names: list[str]) -> str:
-    inner = {name.partition("/")[2] for name in names} | set(names)
-    if any(name.startswith("models/") and name.endswith(".json") for name in inner):
-        refused = [
-            n
-            for n in inner
-            if n.startswith("data/aotinductor/") or Path(n).name.startswith(("opaque_obj", "custom_obj"))
+def _kind(archive: Archive) -> str:
+    """Return ``"exported"`` or ``"torchscript"``; raise for everything else."""
+    path, names = archive.path, archive.members
+    if any(name.startswith("models/") and name.endswith(".json") for name in names):
+        compiled = [
+            name
+            for name in names
+            if name.startswith("data/aotinductor/") or Path(name).name.startswith(("opaque_obj", "custom_obj"))
         ]
-        if refused:
-            raise FileFormatError(
-                f"model file {path}: holds {min(refused)!r}, which is a pickled object or compiled code and is never "
-                "loaded. Export a plain network with torch.export.save"
-            )
+        if compiled:
+            raise refused(path, f"holds {min(compiled)!r}, which is a pickled object or compiled code and never loaded")
         return "exported"
-    if "serialized_exported_program.json" in inner:
+    if "serialized_exported_program.json" in names:
         return "exported"
-    if "constants.pkl" in inner and any(name.startswith("code/") for name in inner):
+    if "constants.pkl" in names and any(name.startswith("code/") for name in names):
         return "torchscript"
-    if "data.pkl" in inner:
+    if "data.pkl" in names:
         raise FileFormatError(
             f"model file {path}: is a pickle (made by torch.save), which is never opened. {EXPORT_HINT}"
         )
@@ -128,9 +122,10 @@ def _load_torchscript(path: Path) -> Source:
 # torch.export
 
 
-def _load_exported(path: Path) -> Source:
-    with _damaged(path, "torch.export"), _no_unpickling(), _quiet_export(), path.open("rb") as file:
-        program = torch.export.load(file)
+def _load_exported(path: Path, archive: Archive) -> Source:
+    checked = exported.rewritten(archive)
+    with _damaged(path, "torch.export"), _no_unpickling(), _quiet_export():
+        program = torch.export.load(checked)
         module = program.module()
     return source_of(module, path.stem, **_signature(program, path.stem))
 

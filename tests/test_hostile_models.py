@@ -1,0 +1,317 @@
+"""Model files that were made to do harm: nothing in them is run, and they are refused in one sentence."""
+
+from __future__ import annotations
+
+import copy
+import json
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from advsearch.errors import FileFormatError
+from advsearch.models import expressions, load_model
+
+Program = dict[str, Any]
+
+TABLES = ("data/weights/model_weights_config.json", "data/constants/model_constants_config.json")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+class Net(nn.Module):
+    """A parameter, a buffer, text as an argument, and arithmetic with the size of the batch."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.linspace(-1, 1, 36).reshape(3, 12))
+        self.register_buffer("shift", torch.ones(12))
+
+    def forward(self, x: Tensor) -> Tensor:
+        cells = nn.functional.gelu(nn.functional.adaptive_avg_pool2d(x, 2), approximate="tanh").flatten(1)
+        return ((cells + self.shift) @ self.weight.T).reshape(x.shape[0], -1)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("models") / "net.pt2"
+    batch = torch.export.Dim("batch", min=1, max=4)
+    program = torch.export.export(Net().eval(), (torch.rand(2, 3, 8, 8),), dynamic_shapes=({0: batch},))
+    torch.export.save(program, path)
+    return path
+
+
+def repacked(source: Path, target: Path, changes: dict[str, bytes | None], method: int = zipfile.ZIP_STORED) -> Path:
+    """Copy an archive with these members added, replaced or (None) left out; names without the root folder."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", method) as new:
+        root = old.namelist()[0].partition("/")[0]
+        kept = {name.partition("/")[2]: old.read(name) for name in old.namelist()}
+        for name, content in {**kept, **changes}.items():
+            if content is not None:
+                new.writestr(f"{root}/{name}", content)
+    return target
+
+
+def member(path: Path, ending: str) -> bytes:
+    with zipfile.ZipFile(path) as archive:
+        return archive.read(next(name for name in archive.namelist() if name.endswith(ending)))
+
+
+def planted(source: Path, target: Path, plant: Callable[[Program], None]) -> Path:
+    """Copy an exported program with its description, and the tables of its tensors, changed by `plant`."""
+    parts = {name: json.loads(member(source, name)) for name in (*TABLES, "models/model.json")}
+    program = parts["models/model.json"] | {name: parts[name] for name in TABLES}
+    plant(program)
+    parts = {name: program.pop(name) for name in TABLES} | {"models/model.json": program}
+    return repacked(source, target, {name: json.dumps(part).encode() for name, part in parts.items()})
+
+
+def _code(trace: Path) -> str:
+    return f"__import__('os').mkdir({str(trace)!r})"
+
+
+def _expression(where: str) -> Callable[[Program, Path], None]:
+    def plant(program: Program, trace: Path) -> None:
+        graph = program["graph_module"]["graph"]
+        bad = {"as_expr": {"expr_str": _code(trace), "hint": {"as_int": 2}}}
+        if where == "size":
+            graph["tensor_values"]["x"]["sizes"][0] = bad
+        elif where == "stride":
+            graph["tensor_values"]["x"]["strides"][0] = bad
+        elif where == "sym_bool":
+            graph["sym_bool_values"]["evil"] = bad
+        else:
+            graph["sym_int_values"] = {name: bad for name in graph["sym_int_values"]}
+
+    return plant
+
+
+def _operator(target: str, **arguments: Any) -> Callable[[Program, Path], None]:
+    """Add the call of an operator with the trace's path as text, and use its answer."""
+
+    def plant(program: Program, trace: Path) -> None:
+        graph = program["graph_module"]["graph"]
+        user = next(node for node in graph["nodes"] if "as_tensor" in node["outputs"][0])
+        node, output = copy.deepcopy(user), user["outputs"][0]["as_tensor"]["name"]
+        graph["tensor_values"]["evil"] = graph["tensor_values"][output]
+        inputs = {"filename": {"as_string": str(trace)}, **arguments}
+        node |= {"target": target, "name": "evil", "outputs": [{"as_tensor": {"name": "evil"}}]}
+        node["inputs"] = [{"arg": arg, "kind": 1, "name": name} for name, arg in inputs.items()]
+        user["inputs"][0]["arg"]["as_tensor"]["name"] = "evil"
+        graph["nodes"].insert(0, node)
+
+    return plant
+
+
+def _renamed(old: str, new: Callable[[Path], str]) -> Callable[[Program, Path], None]:
+    """Give one value of the graph a name that is code."""
+
+    def plant(program: Program, trace: Path) -> None:
+        text = json.dumps(program).replace(json.dumps(old), json.dumps(new(trace)))
+        program.clear()
+        program.update(json.loads(text))
+
+    return plant
+
+
+def _guards(program: Program, trace: Path) -> None:
+    program["guards_code"] = [_code(trace)]
+
+
+def _module_to_import(program: Program, trace: Path) -> None:
+    folder = trace.parent / "planted_module"
+    folder.mkdir()
+    (folder / "__init__.py").write_text(f"import os\nos.mkdir({str(trace)!r})\nx = dict\n")
+    context = {"default_factory_module": "planted_module", "default_factory_name": "x", "dict_context": []}
+    tree = {"type": "collections.defaultdict", "context": context, "children_spec": []}
+    signature = program["graph_module"]["module_call_graph"][0]["signature"]
+    signature["out_spec"] = json.dumps([1, tree])
+
+
+PLANTED: dict[str, Callable[[Program, Path], None]] = {
+    "expression of a size": _expression("size"),
+    "expression of a stride": _expression("stride"),
+    "expression of a truth value": _expression("sym_bool"),
+    "expression of a whole number": _expression("sym_int"),
+    "operator os.mkdir": _operator("torch.os.mkdir"),
+    "operator load_library": _operator("torch.ops.load_library"),
+    "operator from_file": _operator("torch.ops.aten.from_file.default", shared={"as_bool": True}, size={"as_int": 384}),
+    "operator save": _operator("torch.ops.aten.save.default"),
+    "operator of the operator module": _operator("_operator.attrgetter"),
+    "name of an input": _renamed("x", lambda trace: f"x, evil={_code(trace)}"),
+    "name of an input of the module": _renamed("x", lambda trace: f"x): pass\n{_code(trace)}\ndef g(x"),
+    "name of a parameter": _renamed("weight", lambda trace: f'a" + {_code(trace)} + "'),
+    "guards": _guards,
+    "a module to import": _module_to_import,
+}
+
+
+@pytest.mark.parametrize("place", PLANTED)
+def test_no_planted_command_runs(place: str, exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    trace = tmp_path / "executed"
+    path = planted(exported, tmp_path / "planted.pt2", lambda program: PLANTED[place](program, trace))
+    try:
+        load_model(path)
+    except FileFormatError as error:
+        assert len(str(error)) < 800 + len(str(path)) and "\n" not in str(error)
+    else:
+        assert place == "guards"  # which are left away
+    assert not trace.exists()
+
+
+def test_a_pickle_in_place_of_a_weight_is_refused(exported: Path, tmp_path: Path) -> None:
+    def plant(program: Program) -> None:
+        next(iter(program[TABLES[0]]["config"].values()))["use_pickle"] = True
+
+    with pytest.raises(FileFormatError, match="is a pickled object or compiled code, which is never loaded"):
+        load_model(planted(exported, tmp_path / "pickled.pt2", plant))
+
+
+def test_compiled_code_is_refused(exported: Path, tmp_path: Path) -> None:
+    path = repacked(exported, tmp_path / "compiled.pt2", {"data/aotinductor/model/wrapper.so": b"\x7fELF"})
+    with pytest.raises(FileFormatError, match=r"holds 'data/aotinductor/model/wrapper.so', which is .* compiled code"):
+        load_model(path)
+
+
+def test_a_tensor_without_data_takes_no_memory(exported: Path, tmp_path: Path) -> None:
+    def plant(program: Program) -> None:
+        entry = next(iter(program[TABLES[0]]["config"].values()))
+        entry["path_name"] = "nothing"
+        entry["tensor_meta"]["sizes"] = [{"as_int": 10**7}, {"as_int": 100}]
+
+    path = planted(exported, tmp_path / "large.pt2", plant)
+    path = repacked(path, tmp_path / "larger.pt2", {"data/weights/nothing": b""})
+    with pytest.raises(FileFormatError, match="is empty, but should hold a tensor of"):
+        load_model(path)
+
+
+def test_a_counter_of_sizes_ends(exported: Path, tmp_path: Path) -> None:
+    """torch counts up to the number in the name of a size."""
+
+    def plant(program: Program) -> None:
+        program["range_constraints"]["u999999999999"] = {"min_val": 0, "max_val": 9}
+
+    with pytest.raises(FileFormatError, match="expected arithmetic with whole numbers and symbols"):
+        load_model(planted(exported, tmp_path / "counter.pt2", plant))
+
+
+def test_archives_that_swell_are_refused(exported: Path, tmp_path: Path) -> None:
+    zeros = bytes(64 << 20)
+    path = repacked(exported, tmp_path / "bomb.pt2", {"data/weights/zeros": zeros}, zipfile.ZIP_DEFLATED)
+    with pytest.raises(FileFormatError, match=r"unpacks to at most 20 times its size, .*ADVSEARCH_LIMITS"):
+        load_model(path)
+
+
+def test_members_have_plain_names_and_one_each(exported: Path, tmp_path: Path) -> None:
+    path = repacked(exported, tmp_path / "up.pt2", {"../../up": b""})
+    with pytest.raises(FileFormatError, match="has a member of the name"):
+        load_model(path)
+    path = repacked(exported, tmp_path / "double.pt2", {})
+    with zipfile.ZipFile(path, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
+        archive.writestr(archive.namelist()[0], b"")
+    with pytest.raises(FileFormatError, match="has two members of one name"):
+        load_model(path)
+
+
+@pytest.mark.parametrize("depth", [200, 200_000])
+def test_nested_descriptions_are_refused(depth: int, exported: Path, tmp_path: Path) -> None:
+    text = b'{"graph_module": ' + b"[" * depth + b"]" * depth + b"}"
+    path = repacked(exported, tmp_path / "deep.pt2", {"models/model.json": text})
+    with pytest.raises(FileFormatError, match="nested deeper than"):
+        load_model(path)
+
+
+def test_a_compressed_archive_is_loaded(exported: Path, tmp_path: Path) -> None:
+    path = repacked(exported, tmp_path / "packed.pt2", {}, zipfile.ZIP_DEFLATED)
+    images = torch.rand((2, 8, 8, 3), generator=torch.Generator().manual_seed(0))
+    assert torch.equal(load_model(path)(images), load_model(exported)(images))
+
+
+class Strided(nn.Module):
+    """Sizes that depend on the picture's, without gradients for a part."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        with torch.no_grad():
+            small = nn.functional.interpolate(x[:, :, ::2], scale_factor=0.5, mode="bilinear")
+        return {"logits": small.mean((2, 3)) + x.mean((2, 3))}["logits"]
+
+
+def test_sizes_that_depend_on_each_other_are_loaded(tmp_path: Path) -> None:
+    batch, side = torch.export.Dim("batch", min=1, max=8), torch.export.Dim("side", min=4, max=32)
+    sizes = ({0: batch, 2: 2 * side, 3: 2 * side},)
+    program = torch.export.export(Strided().eval(), (torch.rand(2, 3, 16, 16),), dynamic_shapes=sizes)
+    torch.export.save(program, tmp_path / "strided.pt2")
+    model = load_model(tmp_path / "strided.pt2", input_size=20)
+    images = torch.rand((3, 20, 20, 3), generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(model(images), Strided()(images.permute(0, 3, 1, 2)))
+    assert model.batch_limits == (1, 8)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "s0",
+        "2*s77 + 1",
+        "(s0 - 1)//32 + 1",
+        "Symbol('s77', positive=True, integer=True)",
+        "Add(Mul(Integer(2), Symbol('s0', integer=True)), Integer(-1))",
+        "FloorDiv(Add(Symbol('s0', integer=True), Integer(-1)), Integer(32))",
+        "Pow(Symbol('s0', positive=True, integer=True), Integer(2))",
+        "Mul(Rational(1, 2), Symbol('s0'))",
+        "Eq(Symbol('u0', integer=True), Integer(3))",
+        "Max(Integer(1), Min(Symbol('s1'), Integer(64)))",
+        "Mul(Float('0.5', precision=53), ToFloat(Symbol('s0')))",
+        "And(StrictLessThan(Integer(1), Symbol('s0')), true)",
+    ],
+)
+def test_expressions_of_sizes_that_are_read(text: str) -> None:
+    assert expressions.problem(text) == ""
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "__import__('os').system('true')",
+        "s0.__class__",
+        "(lambda: 1)()",
+        "[s0 for s0 in (1,)]",
+        "S('1')",
+        "sympify('1')",
+        "Symbol(__import__('os'))",
+        "Symbol('s0', **{'a': True})",
+        "Symbol('os.system')",
+        "Float('1e999999999')",
+        "Float('1', precision=10**9)",
+        "factorial(10**9)",
+        "9**9**9",
+        "((2**64)**64)**64",
+        "Pow(Pow(Integer(2), Integer(64)), Integer(64))",
+        "LShift(Integer(1), Symbol('s0'))",
+        "1" * 50,
+        "-" * 30_000 + "1",
+        "-" * 15_000 + "1",
+        "(" * 300 + "1" + ")" * 300,
+        "f'{s0}'",
+        "'text'",
+        "s0; s1",
+        "s0 := 1",
+        "",
+        "E",
+        "x" * 5000,
+        "Max(" + ", ".join(f"s{i}" for i in range(100)) + ")",
+    ],
+)
+def test_expressions_that_are_none(text: str) -> None:
+    message = expressions.problem(text)
+    assert message and len(message) < 250
