@@ -112,7 +112,7 @@ def test_its_names_are_listed_and_its_parts_work_together(installed: Path, tmp_p
     listed = advsearch(installed, "list")
     for kind, name in (("controls", "fade"), ("policies", "shrinking"), ("objectives", "brightness")):
         assert listed[kind][-1] == name
-    example = next(words for words in blocks("extending.md", "sh")[0].splitlines() if words.startswith("advsearch"))
+    example = next(words for words in blocks("extending.md", "text")[0].splitlines() if words.startswith("advsearch"))
     small = ["--run", str(tmp_path / "run"), "--no-baseline", "--steps", "4", "--spp", "1", "--verify-spp", "1"]
     words = [*example.split()[1:], *small, "--denoise", "none", "--label", "bowl", "--quiet"]
     summary = advsearch(installed, *words)
