@@ -8,8 +8,15 @@ from typing import Protocol
 class Progress(Protocol):
     """A watcher of a run. Its methods return at once and never raise because of what they are shown."""
 
-    def stage(self, name: str, total: int | None = None) -> None:
-        """End the stage before and begin `name` (``"search"``, say) of `total` steps; None when that isn't known."""
+    def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
+        """End the stage before and begin another.
+
+        Args:
+            name: what is being done, in a user's words: "searching", say.
+            total: steps that it has; None where nothing counts them.
+            hint: what it consists of, and in backticks the setting that shortens it: "40 pictures; lower `steps`".
+            at_most: `total` is an upper bound: the stage may end before.
+        """
 
     def advance(self, n: int = 1, **info: float | str) -> None:
         """Report `n` more steps of the stage done. `info` is shown beside the bar: ``best=0.31``."""
@@ -21,7 +28,7 @@ class Progress(Protocol):
 class NullProgress:
     """The watcher that looks away: what a Python call uses when it is given none."""
 
-    def stage(self, name: str, total: int | None = None) -> None:
+    def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
         """See `Progress.stage`."""
 
     def advance(self, n: int = 1, **info: float | str) -> None:

@@ -6,6 +6,7 @@ import ctypes
 import io
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -832,20 +833,39 @@ class Clock:
 def test_lines_come_at_most_every_five_seconds_and_messages_at_once() -> None:
     stream, clock = io.StringIO(), Clock()
     progress = LineProgress(stream, clock)
-    progress.stage("search", 40)
+    progress.stage("searching", 40, hint="40 pictures; `steps` shortens it", at_most=True)
     for _ in range(12):
         clock.now += 1.0
         progress.advance(best=0.31234)
     progress.message("a warning")
-    progress.stage("verification")
-    clock.now += 5.0
+    progress.stage("a short one", 3)
+    clock.now += 1.0
     progress.advance(3)
+    progress.stage("loading the scene")
+    for _ in range(8):
+        clock.now += 1.0
+        progress.tick()
     assert stream.getvalue().splitlines() == [
-        "advsearch: search: 5 of 40, 35 s left, best 0.312",
-        "advsearch: search: 10 of 40, 30 s left, best 0.312",
+        "advsearch: searching: 40 pictures; --steps shortens it",
+        "advsearch: searching: 7 of at most 40, 7 s, at most 33 s left, best 0.312",
+        "advsearch: searching: 12 of at most 40, 12 s, at most 28 s left, best 0.312",
         "advsearch: a warning",
-        "advsearch: verification: 3",
+        "advsearch: loading the scene",
+        "advsearch: loading the scene: 7 s",
     ]
+
+
+def test_lines_come_where_nothing_is_counted_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = io.StringIO()
+    monkeypatch.setattr("sys.stderr", stream)
+    monkeypatch.setattr("advsearch.cli.progress.PATIENCE", 0.0)
+    with watching() as progress:
+        progress.stage("compiling")
+        for _ in range(100):
+            if stream.getvalue():
+                break
+            time.sleep(0.05)
+    assert stream.getvalue() == "advsearch: compiling\n"
 
 
 def test_bars_show_stages_and_the_best() -> None:
@@ -855,7 +875,7 @@ def test_bars_show_stages_and_the_best() -> None:
         progress = BarProgress(bars)
         progress.advance()
         progress.stage("set-up")
-        progress.stage("search", 40)
+        progress.stage("search", 40, hint="40 [small] pictures")
         progress.advance(2, best=0.5, state="[fine]")
         progress.advance()
         progress.message("a [bold] warning")
@@ -863,8 +883,25 @@ def test_bars_show_stages_and_the_best() -> None:
     assert [(task.description, task.completed, task.finished) for task in bars.tasks] == [
         ("set-up", 1, True), ("search", 3, True), ("verification", 0, False),
     ]  # fmt: skip
-    assert "a [bold] warning" in stream.getvalue()
+    assert "a [bold] warning" in stream.getvalue() and "search: 40 [small] pictures" in stream.getvalue()
     assert bars.tasks[1].fields["info"] == "best 0.5, state [fine]"
+
+
+def test_a_terminal_shows_the_last_stages_with_counts_and_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = io.StringIO()
+    monkeypatch.setattr(stream, "isatty", lambda: True)
+    monkeypatch.setattr("sys.stderr", stream)
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setenv("COLUMNS", "120")
+    with watching() as progress:
+        for number in range(9):
+            progress.stage(f"stage {number}")
+        progress.stage("searching", 40, hint="`steps` shortens it", at_most=True)
+        progress.advance(10, best=0.5)
+    shown = stream.getvalue()
+    assert "stage 8" in shown and "searching: --steps shortens it" in shown
+    assert re.search(r"10 of at most 40, \d s, at most \d+ s left, best 0\.5", shown)
+    assert sum(task.visible for task in progress._bars.tasks) == 5
 
 
 def test_who_watches(monkeypatch: pytest.MonkeyPatch) -> None:

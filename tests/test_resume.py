@@ -92,10 +92,10 @@ class StandInProblem:
             bool(logits.argmax() == 0),
         )
 
-    def describe(self, u: Tensor) -> dict[str, Any]:
+    def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Any]:
         return {f"u.{number}": {"value": float(value), "unit": "1"} for number, value in enumerate(u)}
 
-    def conditions_of(self, seed: int) -> dict[str, Any]:
+    def conditions_of(self, u: Tensor, seed: int) -> dict[str, Any]:
         return {}
 
 

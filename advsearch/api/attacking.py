@@ -37,6 +37,9 @@ from advsearch.scene.renderer import Renderer
 OVER_CONDITIONS = {"momentum": 0.9, "step_size": 0.2}
 """Options of `pgd` where conditions vary."""
 
+LOADING, PREPARING = "loading the scene and the model", "preparing the scene for rendering"
+"""What a person who waits is told before the first picture."""
+
 CLEAN_SPP = 64
 """Samples a pixel of the clean picture that an objective compares features with."""
 
@@ -102,7 +105,7 @@ def attack_from_config(config: AttackConfig, *, progress: Progress | None = None
     if config.run is not None:
         check_free(config.run, overwrite=config.overwrite)
     progress = progress or NullProgress()
-    progress.stage("set-up")
+    progress.stage(LOADING)
     return _carry_out(_job(config), progress)
 
 
@@ -120,7 +123,7 @@ def resume_attack(run: str | Path, *, progress: Progress | None = None) -> Attac
     progress = progress or NullProgress()
     path = find_run(run)
     config = AttackConfig.from_yaml(path / CONFIG)
-    progress.stage("set-up")
+    progress.stage(LOADING)
     return _go_on(_job(config), path, progress)
 
 
@@ -310,7 +313,7 @@ def _goal(model: Model, labels: LabelSet, config: AttackConfig) -> Goal:
 def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -> AttackResult:
     """Do it all, in a run directory of its own unless one is given that was begun already."""
     stages = Stages(progress)
-    stages.begin("setup", "set-up")
+    stages.begin("setup", PREPARING)
     problem = _problem(job)
     said = [*job.scene.description.object.warnings, *job.scene.description.environment.warnings, *job.loaded[1]]
     for text in said:

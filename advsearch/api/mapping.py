@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.api.attacking import problem_from_config
+from advsearch.api.attacking import LOADING, problem_from_config
 from advsearch.api.memory import ANSWER, Memory
 from advsearch.api.problem import Problem
 from advsearch.api.record import Recorder, Stages
 from advsearch.api.stages import Attack
 from advsearch.attacks import make_policy
-from advsearch.attacks.region import Region, grow
+from advsearch.attacks.region import ATTEMPTS, LEVELS, Part, Region, grow
 from advsearch.config import AttackConfig, RegionConfig, SceneConfig
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.progress import NullProgress, Progress
@@ -59,7 +59,7 @@ def region_from_config(config: RegionConfig, *, progress: Progress | None = None
         InputError: the verdict at the centre depends on the noise, the parameters do not fit, and what a scene raises.
     """
     stages = Stages(progress or NullProgress())
-    stages.begin("setup", "set-up")
+    stages.begin("setup", LOADING)
     as_attack = AttackConfig(**{name: getattr(config, name) for name in SceneConfig.model_fields})
     budget = {} if config.around is None else _budget(config.around)
     as_attack = as_attack.model_copy(update={"measure": "no", "verify_spp": config.verify_spp, **budget})
@@ -78,13 +78,30 @@ def region_from_config(config: RegionConfig, *, progress: Progress | None = None
             u[varied.places] = values
             return u
 
-        stages.begin("search", "region", None)
-        found = grow(
-            lambda values, number: attack.one_trial("region", number, at(values)).wrong == verdict,
-            centre[varied.places],
-            seed=seeds.stream(config.seed, "region"),
-            samples=config.samples,
-        )
+        spp = attack.findings.spp
+        hint = f"in rounds, pictures of {spp} samples a pixel; fewer parameters in `vary` or `verify_spp` shorten it"
+        stages.begin("search", "growing the box", LEVELS, hint=hint)
+        checks = 0
+
+        def on_part(part: Part) -> None:
+            nonlocal checks
+            if part == "level":
+                stages.progress.advance(1)
+                return
+            if checks == 0:
+                most = ATTEMPTS * config.samples
+                hint = f"{config.samples} pictures, and as many again where one is an exception; `samples` shortens it"
+                stages.begin("search", "checking the box with fresh samples", most, hint=hint, at_most=True)
+            checks += 1
+
+        def same(values: Tensor, number: int) -> bool:
+            trial = attack.one_trial("region", number, at(values))
+            if checks:
+                stages.progress.advance(1)
+            return trial.wrong == verdict
+
+        seed = seeds.stream(config.seed, "region")
+        found = grow(same, centre[varied.places], seed=seed, samples=config.samples, on_part=on_part)
         box = _box(problem, found, at, varied)
         answer = {
             "schema": 1,
@@ -167,7 +184,11 @@ def _verdict(attack: Attack, centre: Tensor) -> bool:
     Raises:
         InputError: that depends on the noise.
     """
-    wrong = sum(attack.one_trial("centre", number, centre).wrong for number in range(AT_CENTRE))
+    attack.stages.begin("verification", "looking at the centre", AT_CENTRE)
+    wrong = 0
+    for number in range(AT_CENTRE):
+        wrong += attack.one_trial("centre", number, centre).wrong
+        attack.stages.progress.advance(1)
     needed = attack.rule.needed(AT_CENTRE)
     if AT_CENTRE - needed < wrong < needed:
         raise InputError(
@@ -203,12 +224,16 @@ def _number(told: Any, number: str) -> float:
 
 def _map(attack: Attack, side: int, at: Any, varied: Varied, box: Any, run: RunDirectory) -> dict[str, Any]:
     """The margin on a grid over two parameters, as numbers and as a picture."""
-    attack.stages.begin("map", "map", side * side)
+    hint = f"{side * side} pictures of {attack.findings.spp} samples a pixel; `map` or `verify_spp` shorten it"
+    attack.stages.begin("map", "drawing the map", side * side, hint=hint)
     steps = torch.linspace(0.0, 1.0, side) if side > 1 else torch.tensor([0.5])
-    margins = [
-        [attack.one_trial("map", row * side + column, at(torch.stack([x, y]))).margin for column, x in enumerate(steps)]
-        for row, y in enumerate(steps)
-    ]
+
+    def margin(row: int, column: int) -> float:
+        trial = attack.one_trial("map", row * side + column, at(torch.stack([steps[column], steps[row]])))
+        attack.stages.progress.advance(1)
+        return trial.margin
+
+    margins = [[margin(row, column) for column in range(len(steps))] for row in range(len(steps))]
     ends = [attack.problem.describe(at(torch.full((2,), end))) for end in (0.0, 1.0)]
     axes = []
     for one in box:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,14 +13,14 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.api.attacking import problem_from_config
+from advsearch.api.attacking import LOADING, problem_from_config
 from advsearch.api.measuring_report import Section, figures_of, report_of
 from advsearch.api.problem import Problem
 from advsearch.attacks import make_policy
 from advsearch.config import PrecisionConfig
 from advsearch.errors import InputError
 from advsearch.evaluation.gradients import Loss, inside, smooth_loss
-from advsearch.evaluation.planning import measured_plan
+from advsearch.evaluation.planning import measured_plan, plan_gradients
 from advsearch.evaluation.precision.fits import UNKNOWN, Theory
 from advsearch.evaluation.precision.gradient import GradientBench, Part, parts_of, theory_of
 from advsearch.evaluation.precision.image import REFERENCE_SAMPLER, PictureBench, variants
@@ -62,7 +63,7 @@ def precision(config: PrecisionConfig, *, progress: Progress | None = None) -> d
     if config.run is not None and config.out is None:
         check_free(config.run, overwrite=config.overwrite)
     begun = time.perf_counter()
-    progress.stage("set-up")
+    progress.stage(LOADING, hint=f"then {config.seconds:g} seconds of measurements; `seconds` sets them")
     policies = {name: make_policy(name) for name in split_names(config.policies)}
     problem, said = problem_from_config(config.as_attack())
     for text in said:
@@ -119,15 +120,15 @@ class _Job:
             with torch.no_grad():
                 return -float(problem.goal.score(problem.model(picture))[0])
 
-        self.progress.stage("image: set-up")
+        self.progress.stage("the picture: preparing every sampler and path length")
         bench = PictureBench(renderer, problem.whole(problem.domain.start), margin, chosen)
-        self.progress.stage("image: references")
-        bench.refer(budget.share(REFERENCE_SHARE), self.seed, self._tick)
+        share = budget.share(REFERENCE_SHARE)
+        bench.refer(share, self.seed, self._timed("the picture: rendering references", share))
         for family, one in bench.pictures.items():
             self.section.refer("image", family, "", one, bench.part_spp[family], bench.margins[family])
         theories = {one.series: one.theory for one in chosen}
         families = {one.series: one.family for one in chosen}
-        found = self._rounds("image", bench.settings, bench.measure, budget)
+        found = self._rounds("the picture", bench.settings, bench.measure, budget)
         for measure in ("error", "margin_error"):
             self._take(found, measure, bench.floor, lambda series: theories[series])
         self.section.families |= {("image", "", series): family for series, family in families.items()}
@@ -147,8 +148,8 @@ class _Job:
             self._one_gradient(bench, part, budget.share(1.0 / (len(parts) - number)))
 
     def _one_gradient(self, bench: GradientBench, part: Part, budget: Budget) -> None:
-        self.progress.stage(f"gradient of {part.name}: reference")
-        bench.refer(budget.share(REFERENCE_SHARE), self.seed, self._tick)
+        share = budget.share(REFERENCE_SHARE)
+        bench.refer(share, self.seed, self._timed(f"gradient of {part.name}: references", share))
         if bench.reference is None:
             return
         self.section.refer("gradient", bench.by, part.name, bench.reference, bench.part_spp)
@@ -167,14 +168,14 @@ class _Job:
             return
         like = next(setting for setting in bench.settings if setting.line == one.line)
         setting = replace(like, spp=one.spp, cost=like.cost / like.spp * one.spp)
-        self.progress.stage(f"gradient of {part.name}: {one.line[2]} with {one.spp} samples again", CONFIRM_MOST)
+        tick = self._timed(f"gradient of {part.name}: {one.line[2]} with {one.spp} samples again", budget)
         found = in_rounds(
             [setting],
             bench.measure,
             budget,
             rounds=CONFIRM_MOST,
             seed=seeds.stream(self.seed, "confirm"),
-            on_done=lambda _: self._tick(),
+            on_done=lambda _: tick(),
         )
         samples = [Sample(numbers, seconds) for numbers, seconds in found.results.get(setting, [])]
         if len(samples) >= CONFIRM_LEAST:
@@ -185,13 +186,21 @@ class _Job:
         """The best verified objective of each policy."""
         problem, config = self.problem, self.config
         if any(policy.uses_gradient for policy in policies.values()):
-            self.progress.stage("gradient plan")
+            self.progress.stage("measuring which gradients are best here", plan_gradients(problem.plan))
             at, seed = inside(problem.renderer), seeds.stream(config.seed, "measure")
-            problem.plan = measured_plan(problem.renderer, problem.loss, at, seed=seed, spp=problem.spp, counted=True)
+            problem.plan = measured_plan(
+                problem.renderer,
+                problem.loss,
+                at,
+                seed=seed,
+                spp=problem.spp,
+                counted=True,
+                tick=lambda: self.progress.advance(1),
+            )
         bench = ObjectiveBench(problem.evaluator, problem.domain, policies, config.steps, self._verified, budget)
         self.section.start = self._verified(problem.domain.start)
         settings = bench.settings(problem.spp)
-        self.progress.stage("objective", len(settings) * config.repeats)
+        tick = self._timed("searching with each policy", budget)
         found = in_rounds(
             settings,
             bench.measure,
@@ -200,7 +209,7 @@ class _Job:
             seed=self.seed,
             least=1,
             warm_up=0,
-            on_done=lambda setting: self.progress.advance(1, policy=setting.series),
+            on_done=lambda setting: tick(policy=setting.series),
         )
         self.section.left_out += found.left_out
         for setting, taken in found.results.items():
@@ -219,14 +228,14 @@ class _Job:
     # ---- inside -----------------------------------------------------------------------------------------------------
 
     def _rounds(self, name: str, settings: Sequence[Setting], measure: Any, budget: Budget) -> Rounds[dict[str, float]]:
-        self.progress.stage(name, len(settings) * self.config.rounds)
+        tick = self._timed(f"{name}: measuring every setting in rounds", budget)
         found: Rounds[dict[str, float]] = in_rounds(
             settings,
             measure,
             budget,
             rounds=self.config.rounds,
             seed=self.seed,
-            on_done=lambda setting: self.progress.advance(1, now=setting.series, samples=setting.spp),
+            on_done=lambda setting: tick(now=setting.series, samples=setting.spp),
         )
         self.section.left_out += found.left_out
         return found
@@ -247,8 +256,18 @@ class _Job:
         for line, points in lines.items():
             self.section.add(line, points, theory(line[2]))
 
-    def _tick(self) -> None:
-        self.progress.advance(1)
+    def _timed(self, name: str, budget: Budget) -> Callable[..., None]:
+        """Begin a stage that ends with a budget of seconds, and return what tells how many have passed."""
+        total, done = math.ceil(budget.left), 0
+        self.progress.stage(name, total, hint="counted in seconds; `seconds` sets them", at_most=True)
+
+        def tick(**info: float | str) -> None:
+            nonlocal done
+            passed = min(total, total - math.ceil(budget.left))
+            self.progress.advance(passed - done, **info)
+            done = passed
+
+        return tick
 
 
 def _head(config: PrecisionConfig, problem: Problem) -> dict[str, Any]:

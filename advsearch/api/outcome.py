@@ -68,6 +68,7 @@ def summarise(
     u = start if search is None else problem.domain.project(search.best_u)
     spp = max(PICTURE_SPP, findings.sample_count.spp if findings.sample_count else 0)
     noise = seeds.stream(config.seed, "pictures")
+    stages.progress.stage("making the pictures and the report", hint=f"pictures of {spp} samples a pixel")
     with torch.no_grad():
         linear = {
             "clean": problem.renderer.radiance(problem.whole(start), noise, spp),

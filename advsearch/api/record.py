@@ -82,11 +82,11 @@ class Stages:
         self._name = ""
         self._begun = self.started
 
-    def begin(self, name: str, title: str, total: int | None = None) -> None:
-        """End the stage before and begin another; a name that comes twice adds up."""
+    def begin(self, name: str, title: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
+        """End the stage before and begin another; a `name` that comes twice adds up. The rest: `Progress.stage`."""
         self.end()
         self._name, self._begun = name, time.perf_counter()
-        self.progress.stage(title, total)
+        self.progress.stage(title, total, hint=hint, at_most=at_most)
 
     def end(self) -> None:
         """End the stage that runs, if one does."""
@@ -142,7 +142,16 @@ class Recorder:
         )
 
     def trial(
-        self, kind: str, number: int, spp: int, trial: Trial, seed: int, u: Tensor, *, described: bool = False
+        self,
+        kind: str,
+        number: int,
+        spp: int,
+        trial: Trial,
+        seed: int,
+        u: Tensor,
+        *,
+        described: bool = False,
+        drawn: bool = True,
     ) -> None:
         """Keep one trial.
 
@@ -154,11 +163,13 @@ class Recorder:
             seed: of its render.
             u: (d,) of the searched controls.
             described: whether to say u, which the trials of one kind may have in common, beside the conditions.
+            drawn: whether it had conditions of its own, where they vary by chance.
         """
         if self.run is None or self._memory.holds(kind, number):
             return
         labels = self._problem.model.labels
-        told = {**(self._problem.describe(u, seed) if described else {}), **self._problem.conditions_of(u, seed)}
+        told = self._problem.describe(u, seed) if described else {}
+        told = {**told, **(self._problem.conditions_of(u, seed) if drawn else {})}
         self.run.record(trial_row(kind, number, seed, spp, trial, labels, told))
 
 

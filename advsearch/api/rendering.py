@@ -148,7 +148,7 @@ def render(
         raise InputError("around: sets camera.azimuth itself, and `controls` fixes it; leave one of them out")
     size = resolution or (model.input_size[0], model.input_size[1])
     progress = progress or NullProgress()
-    progress.stage("pictures", around or 1)
+    progress.stage("rendering", around or 1)
     formation = None
     views = []
     for description in _turned(scene.description, around):
@@ -181,7 +181,7 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
     for spec in (config.object, config.environment, config.model, config.labels):
         if spec is not None and out.exists() and Path(spec).exists() and out.samefile(spec):
             raise InputError(f"out: would replace {spec}, which is read; choose another name")
-    progress.stage("set-up")
+    progress.stage("loading the scene and the model")
     controls = as_controls(config.controls)
     given = scene_settings(config.set_, config.exposure)
     scene = load_scene(config.object, config.environment, up=config.up, settings=given)

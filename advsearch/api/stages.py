@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.api.bounces import WORTH, bounces_of
+from advsearch.api.bounces import WORTH, bounces_of, most_pictures
 from advsearch.api.memory import PLAN, Frames, Memory
 from advsearch.api.problem import Problem
 from advsearch.api.record import Findings, Recorder, Stages
@@ -34,11 +34,12 @@ from advsearch.attacks import (
 )
 from advsearch.attacks import search as run_search
 from advsearch.attacks import verify as run_verify
-from advsearch.attacks.smallest import confirmed, scaled, smallest
+from advsearch.attacks.sample_count import most_samples
+from advsearch.attacks.smallest import ATTEMPTS, MOST_CHECKS, ROUNDS, confirmed, scaled, smallest
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.config import AttackConfig
 from advsearch.evaluation.gradients import inside
-from advsearch.evaluation.planning import cosines, measured_plan, tuned
+from advsearch.evaluation.planning import cosine_samples, cosines, measured_plan, plan_gradients, tuned
 
 FIRST_LOOK = 4
 """Renders of the clean configuration before the search; wrong in all of them, it goes through the full trials first."""
@@ -72,6 +73,7 @@ class Attack:
     stages: Stages
     findings: Findings = field(default_factory=Findings)
     _clean_spp: int = 0
+    _probed: dict[tuple[str, int], Trial] = field(default_factory=dict)
 
     def carry_out(self) -> Findings:
         """Do everything; what an interrupt leaves undone is missing from the findings."""
@@ -115,7 +117,14 @@ class Attack:
         """Leave bounces of light out of the search's renders, where it is long enough for that to pay."""
         problem, config = self.problem, self.config
         if config.specialise and (config.measure == "full" or config.steps >= WORTH):
-            problem.search_depth = bounces_of(problem, config.seed).depth
+            self.stages.begin(
+                "setup",
+                "finding how many bounces of light the search needs",
+                most_pictures(problem),
+                hint="few samples each; `specialise=false` leaves it out",
+                at_most=True,
+            )
+            problem.search_depth = bounces_of(problem, config.seed, tick=self._advance).depth
 
     def _measure(self) -> None:
         """Replace the first gradient plan by a measured one, as far as the configuration wants that."""
@@ -124,11 +133,34 @@ class Attack:
             return
         renderer, full = problem.renderer, config.measure == "full"
         u, seed = inside(renderer), seeds.stream(config.seed, "measure")
+        gradients = plan_gradients(renderer.plan, every=full)
+        if gradients:
+            self.stages.begin(
+                "setup",
+                "measuring which gradients are best here",
+                gradients,
+                hint=f"{gradients} gradients of {problem.spp} samples a pixel; `measure=no` leaves it out",
+            )
         problem.plan = measured_plan(
-            renderer, problem.loss, u, seed=seed, spp=problem.spp, every=full, counted=not full or config.deterministic
+            renderer,
+            problem.loss,
+            u,
+            seed=seed,
+            spp=problem.spp,
+            every=full,
+            counted=not full or config.deterministic,
+            tick=self._advance,
         )
         if full:
-            plan, spp = tuned(problem.plan, cosines(renderer, problem.loss, u, seed=seed))
+            self.stages.begin(
+                "setup",
+                "choosing step and samples of gradients",
+                cosine_samples(problem.plan),
+                hint="counted in samples a pixel; `measure=quick` leaves it out",
+                at_most=True,
+            )
+            table = cosines(renderer, problem.loss, u, seed=seed, tick=self._advance)
+            plan, spp = tuned(problem.plan, table)
             problem.plan = plan
             problem.spp = problem.spp if config.spp is not None or spp is None else spp
 
@@ -136,11 +168,21 @@ class Attack:
         """Look at the clean configuration; one that is wrong in every look goes through the full trials at once."""
         problem, config, findings = self.problem, self.config, self.findings
         seed, start = seeds.stream(config.seed, "first look"), problem.domain.start
-        findings.first_look = run_trials(problem.trial, start, spp=search_samples(config), seed=seed, trials=FIRST_LOOK)
+        self.stages.begin(
+            "setup", "looking at the clean scene", FIRST_LOOK, hint="the first picture compiles the renderer's code"
+        )
+        findings.first_look = run_trials(
+            problem.trial,
+            start,
+            spp=search_samples(config),
+            seed=seed,
+            trials=FIRST_LOOK,
+            on_trial=lambda *_: self._advance(),
+        )
         if not self.rule.control or any(trial.right for trial in findings.first_look):
             return True
         self.choose_spp({"clean": start})
-        self.stages.begin("verification", "verification", config.trial_count)
+        self._begin_trials("checking the clean scene with fresh renders", config.trial_count)
         self.clean_trials()
         return not already_wrong(count_right(findings.clean, findings.spp))
 
@@ -151,12 +193,14 @@ class Attack:
         config, findings = self.config, self.findings
         frames = Frames(config.steps)
         findings.frames = frames.pictures
-        self.stages.begin("search", "search", planned_renders(config.steps, close=config.close_looks))
+        self._begin_search(
+            "search", f"searching with {self.policy.name}", config.steps, "`steps` or `seconds` shorten it"
+        )
         findings.search = self.one_search("search", self.policy, config.steps, config.seed, frames, config.seconds)
         if not config.baseline or self.policy.name == "random":
             return
         steps = config.steps if config.seconds is None else _spent(findings.search)
-        self.stages.begin("baseline", "random baseline", planned_renders(steps, close=config.close_looks))
+        self._begin_search("baseline", "searching at random, to compare", steps, "`baseline=false` leaves it out")
         seed = seeds.stream(config.seed, "baseline")
         findings.baseline = self.one_search("baseline", make_policy("random"), steps, seed)
 
@@ -176,9 +220,13 @@ class Attack:
             KeyboardInterrupt: the search was interrupted; the result of an interrupted main search is kept before.
         """
 
+        before = 0
+
         def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
+            nonlocal before
             self.recorder.step(kind, record, u, evaluation)
-            self.stages.progress.advance(1, best=record.best)
+            self.stages.progress.advance(record.renders - before, best=record.best)
+            before = record.renders
 
         found = run_search(
             self.memory.evaluator(kind, lambda tell: self.problem.evaluator(kind, tell), frames),
@@ -205,8 +253,8 @@ class Attack:
             raise RuntimeError("nothing was searched, so there is nothing to verify")
         answer = problem.domain.project(found.best_u)
         self.choose_spp({"clean": problem.domain.start, "adversarial": answer})
-        groups = 2 + (baseline is not None)
-        self.stages.begin("verification", "verification", groups * self.config.trial_count)
+        groups = 1 + (baseline is not None) + (not self._clean_tried)
+        self._begin_trials("checking the answer with fresh renders", groups * self.config.trial_count)
         self.clean_trials()
         findings.verification = self.verified("verification", found)
         if baseline is not None:
@@ -232,24 +280,45 @@ class Attack:
     def choose_spp(self, candidates: dict[str, Tensor]) -> None:
         """Raise the samples until no margin drifts, under the conditions that the scene comes with."""
 
-        def margin_of(u: Tensor) -> Callable[[int, int], float]:
-            def margin(spp: int, seed: int) -> float:
-                self.stages.progress.advance(1, samples=spp)
-                return self.problem.trial(u, seed, spp, drawn=False).margin
+        ladder = verification_ladder(self.config)
+        if len(ladder) > 1:
+            self.stages.begin(
+                "verification",
+                "finding how many samples the check needs",
+                most_samples(len(candidates), ladder),
+                hint="more and more samples a pixel until noise no longer moves the answer (counted in samples a "
+                "pixel); `verify_spp=NUMBER` leaves it out",
+                at_most=True,
+            )
+        margins = {name: self._probe(name, u) for name, u in candidates.items()}
+        self.findings.sample_count = choose_spp(margins, seed=self.config.seed, ladder=ladder)
 
-            return margin
+    def _probe(self, name: str, u: Tensor) -> Callable[[int, int], float]:
+        """Margins of one configuration by sample count and seed; what was rendered before, in this life of the run or
+        in an earlier one, is not rendered again."""
+        kind, count = f"sample count {name}", 0
 
-        self.stages.begin("verification", "sample count")
-        margins = {name: margin_of(u) for name, u in candidates.items()}
-        self.findings.sample_count = choose_spp(margins, seed=self.config.seed, ladder=verification_ladder(self.config))
-        self.findings.verification_renders += self.findings.sample_count.renders
+        def margin(spp: int, seed: int) -> float:
+            nonlocal count
+            number, count = count, count + 1
+            trial = self._probed.get((kind, number))
+            if trial is None:
+                trial = self.memory.trial(kind, number, self.problem.goal)
+                trial = trial or self.problem.trial(u, seed, spp, drawn=False)
+                self.recorder.trial(kind, number, spp, trial, seed, u, drawn=False)
+                self.findings.verification_renders += 1
+                self._probed[kind, number] = trial
+            self.stages.progress.advance(spp)
+            return trial.margin
+
+        return margin
 
     def clean_trials(self) -> None:
         """The control group: the clean configuration under the seeds that every other group gets.
 
         A start that looked wrong at first has been through it before the search, at a sample count of its own.
         """
-        if self.findings.clean and self._clean_spp == self.findings.spp:
+        if self._clean_tried:
             return
         kind = "first control" if self.findings.search is None else "control"
         self._clean_spp = self.findings.spp
@@ -262,6 +331,11 @@ class Attack:
             group="clean",
             on_trial=self._teller(kind, self.problem.domain.start),
         )
+
+    @property
+    def _clean_tried(self) -> bool:
+        """Whether the control group has been through its trials at this sample count."""
+        return bool(self.findings.clean) and self._clean_spp == self.findings.spp
 
     def verified(self, kind: str, found: SearchResult) -> Verification:
         """Verify one search's answer against the control group."""
@@ -295,20 +369,43 @@ class Attack:
         trial = self.memory.trial(kind, number, self.problem.goal) or self.problem.trial(u, seed, spp)
         self.recorder.trial(kind, number, spp, trial, seed, u, described=self.problem.domain.dim <= MANY)
         self.findings.verification_renders += 1
-        self.stages.progress.advance(1)
         return trial
 
     def average(self) -> None:
         """Try configurations drawn from the whole space and budget: how often the model is wrong on average."""
         if self.findings.sample_count is None:
             self.choose_spp({"clean": self.problem.domain.start})
-        self.stages.begin("average", "average case", self.config.average)
+        self._begin_trials("trying random configurations", self.config.average, name="average", flags="`average`")
         found: list[Trial] = []
         for number in range(self.config.average):
             generator = torch.Generator().manual_seed(seeds.stream(self.config.seed, "draw", number))
             u = self.problem.domain.sample(generator)[0]
             found.append(self.one_trial("average", number, u))
+            self._advance()
         self.findings.average = tuple(found)
+
+    def _begin_search(self, name: str, title: str, steps: int, shorter: str) -> None:
+        """Begin the stage of a search of at most so many steps, and its ranking."""
+        renders = planned_renders(steps, close=self.config.close_looks)
+        hint = f"{renders} pictures of {self.problem.spp} samples a pixel; {shorter}"
+        self.stages.begin(name, title, renders, hint=hint, at_most=True)
+
+    def _begin_trials(
+        self,
+        title: str,
+        trials: int,
+        *,
+        name: str = "verification",
+        flags: str = "`trials` or `verify_spp`",
+        at_most: bool = False,
+    ) -> None:
+        """Begin a stage of so many trials."""
+        most = "at most " if at_most else ""
+        hint = f"{most}{trials} pictures of {self.findings.spp} samples a pixel; {flags} shorten it"
+        self.stages.begin(name, title, trials, hint=hint, at_most=at_most)
+
+    def _advance(self, steps: int = 1) -> None:
+        self.stages.progress.advance(steps)
 
     def _teller(self, kind: str, u: Tensor) -> Callable[[str, int, Trial], None]:
         def on_trial(group: str, number: int, trial: Trial) -> None:
@@ -347,21 +444,29 @@ def find_smallest(attack: Attack) -> None:
     results: list[SearchResult] = []
 
     def found(inside: Domain, number: int) -> Tensor:
-        attack.stages.begin("search", f"search {number + 1}", planned_renders(config.steps, close=config.close_looks))
+        attack._begin_search(
+            "search", f"search {number + 1} of at most {ROUNDS}", config.steps, "`steps` shortens each search"
+        )
         kind, seed = f"search {number}" if number else "search", seeds.stream(config.seed, "smallest", number)
         results.append(attack.one_search(kind, attack.policy, config.steps, seed, domain=inside))
+        attack._begin_trials("trying smaller changes", MOST_CHECKS * config.trial_count, at_most=True)
         return results[-1].best_u
 
     def passes(u: Tensor, check: int) -> bool:
         failures, allowed = 0, config.trial_count - attack.rule.needed(config.trial_count)
         for number in range(config.trial_count):
             failures += not attack.one_trial(f"check {check}", number, u).wrong
+            attack._advance()
             if failures > allowed:
                 return False
         return True
 
     times = -(-CONFIRMED // config.trial_count)
-    bracket = confirmed(smallest(found, passes, problem.domain), passes, problem.domain, times=times)
+    bracket = smallest(found, passes, problem.domain)
+    if bracket.u is not None:
+        most = ATTEMPTS * times * config.trial_count
+        attack._begin_trials("checking the smallest change", most, at_most=True)
+    bracket = confirmed(bracket, passes, problem.domain, times=times)
     renders, gradients = sum(one.renders for one in results), sum(one.gradients for one in results)
     answer = results[0].best_u if bracket.u is None else bracket.u
     ending = results[0].ending if bracket.u is None else Ending.FOUND

@@ -64,7 +64,8 @@ def _study(config: Any, body: Callable[[Any, _Parts], Summary], progress: Progre
     begun = time.perf_counter()
     opened = RunDirectory.resume(resumed) if resumed is not None else RunDirectory.create_for(config)
     with opened as run:
-        parts = _Parts(run.path / PARTS, progress)
+        each = len(config.controls) if isinstance(config, GapConfig) else max(1, len(config.epsilons))
+        parts = _Parts(run.path / PARTS, progress, len(config.objects) * each)
         answer = {
             "schema": 1,
             "command": config.command,
@@ -96,10 +97,10 @@ class _Parts:
         interrupted: whether one was; nothing more is carried out then.
     """
 
-    def __init__(self, folder: Path, progress: Progress) -> None:
+    def __init__(self, folder: Path, progress: Progress, most: int) -> None:
         self.names: list[str] = []
         self.interrupted = False
-        self._folder, self._progress = folder, progress
+        self._folder, self._progress, self._most = folder, progress, most
 
     def attack(self, config: AttackConfig, name: str) -> Summary | None:
         """Return the summary of one attack, or None if there was an interrupt."""
@@ -107,7 +108,9 @@ class _Parts:
             return None
         path = self._folder / name
         self.names.append(name)
-        self._progress.message(name)
+        budget = f", epsilon {config.epsilon:.3g}" if isinstance(config.epsilon, float) else ""
+        what = f"{config.object}, {' and '.join(config.controls)}{budget}"
+        self._progress.message(f"attack {len(self.names)} of at most {self._most}: {what}")
         if is_run(path) and (path / CONFIG).is_file():
             summary = read_summary(path) if finished(path) else resume_attack(path, progress=self._progress).summary
         else:

@@ -8,6 +8,7 @@ from typing import Any
 
 from torch import nn
 
+from advsearch.api.attacking import LOADING
 from advsearch.api.naming import different, load_models, scene_settings
 from advsearch.api.scene import Controls, Scene, as_controls, load_scene
 from advsearch.api.sweeps.axes import read_axes
@@ -89,7 +90,7 @@ def sweep_from_config(config: SweepConfig, *, progress: Progress | None = None) 
     if config.run is not None:
         check_free(config.run, overwrite=config.overwrite)
     progress = progress or NullProgress()
-    progress.stage("set-up")
+    progress.stage(LOADING)
     return _kept(_job_of(config), progress, None)
 
 
@@ -106,7 +107,7 @@ def resume_sweep(run: str | Path, *, progress: Progress | None = None) -> SweepR
     """
     progress = progress or NullProgress()
     path = find_run(run)
-    progress.stage("set-up")
+    progress.stage(LOADING)
     return _kept(_job_of(SweepConfig.from_yaml(path / CONFIG)), progress, path)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -55,8 +56,22 @@ class Region:
         return float((self.high - self.low).prod())
 
 
+LEVELS, ATTEMPTS = 6, 4
+"""How often the step of the faces is halved, and final checks at most."""
+
+Part = Literal["level", "check"]
+
+
 def grow(
-    same: Same, centre: Tensor, *, seed: int, samples: int = 200, probes: int = 8, levels: int = 6, attempts: int = 4
+    same: Same,
+    centre: Tensor,
+    *,
+    seed: int,
+    samples: int = 200,
+    probes: int = 8,
+    levels: int = LEVELS,
+    attempts: int = ATTEMPTS,
+    on_part: Callable[[Part], None] = lambda part: None,
 ) -> Region:
     """Grow a box around the centre, then check it with samples that nothing was fitted to.
 
@@ -73,6 +88,7 @@ def grow(
         probes: of a slab.
         levels: how often the step of the faces is halved.
         attempts: final checks at most; the last one counts whatever it shows.
+        on_part: told the end of each of the levels, and the beginning of each final check.
 
     Raises:
         InputError: the centre is not in the unit box, or samples is under 1.
@@ -88,7 +104,9 @@ def grow(
         while any([_push(judge, low, high, face, share, probes) for face in range(2 * centre.numel())]):
             pass
         share /= 2.0
+        on_part("level")
     for attempt in range(attempts):
+        on_part("check")
         points = judge.points(low, high, samples)
         wrong = points[[not judge(point) for point in points]]
         if len(wrong) == 0 or attempt == attempts - 1:

@@ -26,6 +26,9 @@ DRIFT = 0.5
 The drift left above the upper rung is smaller than the one that led there, so a margin that passes keeps its sign.
 """
 
+SEEDS = 8
+"""Renders of a configuration at each sample count."""
+
 MarginOf = Callable[[int, int], float]
 """(spp, seed) -> margin in logits of one render."""
 
@@ -73,7 +76,7 @@ def choose_spp(
     *,
     seed: int,
     ladder: Sequence[int] = LADDER,
-    seeds: int = 8,
+    seeds: int = SEEDS,
     drift: float = DRIFT,
 ) -> SampleCount:
     """Climb a ladder of sample counts until no configuration's margin drifts, and return the rung reached.
@@ -115,6 +118,11 @@ def choose_spp(
             return SampleCount(spp, True, tuple(table), len(table) * seeds)
         below = here
     return SampleCount(ladder[-1], False, tuple(table), len(table) * seeds)
+
+
+def most_samples(configurations: int, ladder: Sequence[int] = LADDER, seeds: int = SEEDS) -> int:
+    """Return the samples a pixel that `choose_spp` renders in all, at most: where only the last rung settles it."""
+    return configurations * seeds * sum(ladder) if len(ladder) > 1 else 0
 
 
 def _rung(name: str, spp: int, values: list[float], below: Rung | None, drift: float) -> Rung:

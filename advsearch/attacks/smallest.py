@@ -22,6 +22,18 @@ RATIO = 1.05
 SMALLEST_SCALE = 1e-3
 """No smaller scale than this is tried."""
 
+ROUNDS = 12
+"""Searches at most."""
+
+ATTEMPTS = 6
+"""Steps outwards that the confirmation of the upper end takes at most."""
+
+SHORTENED = 1.0 + (RATIO - 1.0) / 5.0
+"""An answer's length is bisected until the ends are within this: a fifth of the bracket's ratio."""
+
+MOST_CHECKS = 1 + math.ceil(math.log2(math.log(1.0 / SMALLEST_SCALE) / math.log(SHORTENED)))
+"""Configurations that go through the trials after a search, at most: its answer, and those of the bisection."""
+
 Search = Callable[[Domain, int], Tensor]
 """(domain, round) -> the best configuration a search finds there; round numbers its seeds."""
 
@@ -78,7 +90,7 @@ def shrunk(domain: Domain, u: Tensor, scale: float) -> Tensor:
     return domain.project(domain.start + scale * (u - domain.start))
 
 
-def smallest(search: Search, passes: Passes, domain: Domain, *, rounds: int = 12) -> Bracket:
+def smallest(search: Search, passes: Passes, domain: Domain, *, rounds: int = ROUNDS) -> Bracket:
     """Bracket the smallest scale of the domain's budgets at which a configuration passes.
 
     1. A search in the whole budget. If its answer fails the trials, there is nothing to shrink.
@@ -118,7 +130,7 @@ def smallest(search: Search, passes: Passes, domain: Domain, *, rounds: int = 12
     return state
 
 
-def confirmed(bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 2, attempts: int = 6) -> Bracket:
+def confirmed(bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 2, attempts: int = ATTEMPTS) -> Bracket:
     """Return the bracket with its upper end moved out until the configuration there passes several times in a row.
 
     What lies exactly on the edge passes its trials by chance, and the one that was chosen among many passed by luck. So
@@ -145,12 +157,12 @@ def confirmed(bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 
 
 
 def _shorten(state: Bracket, passes: Passes, domain: Domain) -> Bracket:
-    """Bisect the length of the configuration, down to a hundredth of the bracket's ratio."""
+    """Bisect the length of the configuration until the ends are within `SHORTENED`."""
     if state.u is None:
         raise RuntimeError("there is no configuration to shorten")
     longest, high, low = state.u, state.high, max(state.low, SMALLEST_SCALE * state.high)
     best, checks = state.u, state.checks
-    while high > (1.0 + (RATIO - 1.0) / 5.0) * low:
+    while high > SHORTENED * low:
         middle = math.sqrt(high * low)
         shorter = shrunk(scaled(domain, middle), longest, middle / state.high)
         if passes(shorter, checks):

@@ -7,7 +7,7 @@ leaves out nothing, so that no answer rests on it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -72,7 +72,13 @@ class Bounces:
 
 
 def measured_bounces(
-    renderer: Renderer, configurations: Sequence[Tensor], *, seed: int, spp: int, bound: float = BOUND
+    renderer: Renderer,
+    configurations: Sequence[Tensor],
+    *,
+    seed: int,
+    spp: int,
+    bound: float = BOUND,
+    tick: Callable[[], None] = lambda: None,
 ) -> Bounces:
     """Return the shortest paths whose pictures agree with those of the full length to within a bound.
 
@@ -82,6 +88,7 @@ def measured_bounces(
         seed: root of the noise, which is the same for all lengths.
         spp: samples a pixel of each of two halves; few are enough.
         bound: in 8-bit levels, see `Cut.levels`.
+        tick: called after each picture.
 
     Returns:
         The depth, with what was measured: from the full length downwards, to the first that misses the bound.
@@ -89,12 +96,20 @@ def measured_bounces(
     raw = renderer.like(denoiser="none")  # a denoiser would spread a change over its neighbours
     full = raw.scene.max_depth
     noises = [seeds.stream(seed, "half", half) for half in range(2)]
-    wholes = [[_pictures(raw, u, noise, spp, full) for noise in noises] for u in configurations]
+
+    def pictures(u: Tensor, depth: int) -> list[tuple[Tensor, Tensor]]:
+        rendered = []
+        for noise in noises:
+            rendered.append(_pictures(raw, u, noise, spp, depth))
+            tick()
+        return rendered
+
+    wholes = [pictures(u, full) for u in configurations]
     cuts, chosen = [], full
     for depth in range(full - 1, SHORTEST - 1, -1):
         light = levels = 0.0
         for u, whole in zip(configurations, wholes, strict=True):
-            cut = [_pictures(raw, u, noise, spp, depth) for noise in noises]
+            cut = pictures(u, depth)
             light = max(light, _missing(whole, cut))
             levels = max(levels, LEVELS * _bias(whole, cut))
         cuts.append(Cut(depth, light, levels))

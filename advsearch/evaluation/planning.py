@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import statistics
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -106,6 +106,15 @@ def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Gr
     return found
 
 
+REPEATS = 3
+"""Gradients that are taken of everything that is compared."""
+
+
+def plan_gradients(plan: GradientPlan, *, every: bool = False, repeats: int = REPEATS) -> int:
+    """Return how many gradients `measured_plan` takes."""
+    return repeats * sum(len(candidates) for _, candidates in contested(plan, every=every))
+
+
 def measured_plan(
     renderer: Renderer,
     loss: Loss,
@@ -113,9 +122,10 @@ def measured_plan(
     *,
     seed: int,
     spp: int,
-    repeats: int = 3,
+    repeats: int = REPEATS,
     every: bool = False,
     counted: bool = False,
+    tick: Callable[[], None] = lambda: None,
 ) -> GradientPlan:
     """Return the renderer's plan with every contested choice made by measurement at u.
 
@@ -129,10 +139,11 @@ def measured_plan(
         every: see `contested`.
         counted: take the renders that an estimator needs for its time (an adjoint for `ADJOINT_RENDERS`), so that the
             choice is the same on a busy machine.
+        tick: called after each gradient.
     """
     plan = renderer.plan
     for groups, candidates in contested(plan, every=every):
-        scores = _scores(renderer, loss, u, groups, candidates, seed, spp, repeats, counted)
+        scores = _scores(renderer, loss, u, groups, candidates, seed, spp, repeats, counted, tick)
         best = min(scores, key=lambda name: scores[name])
         others = ", ".join(f"{name} {score / scores[best]:.3g}" for name, score in scores.items() if name != best)
         time = "renders" if counted else "time"
@@ -158,6 +169,7 @@ def _scores(
     spp: int,
     repeats: int,
     counted: bool,
+    tick: Callable[[], None],
 ) -> dict[str, float]:
     """Squared error x seconds of each candidate. The reference is the mean of the differences among them, whose own
     noise is taken off the others' errors. Random directions are no reference: where there are no other differences,
@@ -172,6 +184,7 @@ def _scores(
             noise = seeds.stream(seed, "plan", number)
             found.append(estimated(renderer, loss, u, estimator, names, noise, spp))
             times.append(time.perf_counter() - begun)
+            tick()
         cost = 1.0 + only(renderer.plan, names, estimator).renders
         cost += ADJOINT_RENDERS if estimator in BY_ADJOINT else 0.0
         gradients[estimator], seconds[estimator] = torch.stack(found), cost if counted else statistics.median(times)
@@ -190,6 +203,22 @@ def _scores(
     return scores
 
 
+def cosine_samples(
+    plan: GradientPlan,
+    *,
+    factors: Sequence[float] = FACTORS,
+    counts: Sequence[int] = COUNTS,
+    repeats: int = REPEATS,
+) -> int:
+    """Return the samples a pixel that the gradients of `cosines` take in all, at most."""
+    each = repeats * sum(counts) + WITNESSES * (1 + AGAIN) * CONVERGED
+    by_control: dict[str, set[str]] = {}
+    for group in plan.groups:
+        if group.estimator != "none":
+            by_control.setdefault(group.control, set()).add(group.estimator)
+    return each * sum(len(factors) if used & BY_DIFFERENCES else 1 for used in by_control.values())
+
+
 def cosines(
     renderer: Renderer,
     loss: Loss,
@@ -198,11 +227,13 @@ def cosines(
     seed: int,
     factors: Sequence[float] = FACTORS,
     counts: Sequence[int] = COUNTS,
-    repeats: int = 3,
+    repeats: int = REPEATS,
+    tick: Callable[[int], None] = lambda samples: None,
 ) -> list[Cosine]:
     """Measure, control by control, the cosine of working gradients with the converged one at the same step.
 
-    Sample counts are tried in their order until one reaches the goal at a step; then the next step follows.
+    Sample counts are tried in their order until one reaches the goal at a step; then the next step follows. `tick` is
+    called after each gradient with the samples a pixel that it took; `cosine_samples` bounds their sum.
     """
     base = renderer.plan
     found: list[Cosine] = []
@@ -221,7 +252,7 @@ def cosines(
                 if renderer.plan in tried:  # no step can be wider
                     continue
                 tried.append(renderer.plan)
-                mine += _cosines_at(renderer, loss, u, control, factor, seed, counts, repeats)
+                mine += _cosines_at(renderer, loss, u, control, factor, seed, counts, repeats, tick)
             found += mine
     finally:
         renderer.plan = base
@@ -244,9 +275,13 @@ def _cosines_at(
     seed: int,
     counts: Sequence[int],
     repeats: int,
+    tick: Callable[[int], None],
 ) -> list[Cosine]:
     def converged(spp: int) -> tuple[Tensor, float]:
-        found = [renderer.gradient(loss, u, seeds.stream(seed, "converged", k), spp)[1] for k in range(WITNESSES)]
+        found = []
+        for k in range(WITNESSES):
+            found.append(renderer.gradient(loss, u, seeds.stream(seed, "converged", k), spp)[1])
+            tick(spp)
         agreements = torch.tensor([_cosine(*pair) for pair in itertools.combinations(found, 2)])
         return torch.stack(found).mean(dim=0), float(agreements.min())  # NaN if one is
 
@@ -263,6 +298,7 @@ def _cosines_at(
             gradient = renderer.gradient(loss, u, seeds.stream(seed, "working", number), spp)[1]
             times.append(time.perf_counter() - begun)
             values.append(_cosine(gradient, truth))
+            tick(spp)
         mean = statistics.fmean(values)
         found.append(Cosine(control, factor, spp, mean, agreement, statistics.median(times)))
         if mean >= GOAL:

@@ -86,7 +86,7 @@ class Sweep:
 
     def __init__(self, job: Job, run: RunDirectory | None, progress: Progress) -> None:
         self.job, self.run, self.stages = job, run, Stages(progress)
-        self.stages.begin("setup", "set-up")
+        self.stages.begin("setup", "preparing the scenes for rendering")
         self.points, self._shown = check_all(job)
         self.per_scene, self.models = self.points.count, len(job.models)
         self.total = len(job.places) * self.per_scene * self.models
@@ -116,7 +116,9 @@ class Sweep:
             self.stages.progress.message(text)
         try:
             self._open(min(first, self.total - 1) // self.models // self.per_scene)
-            self.stages.begin("sweep", "sweep", self.total)
+            hint = f"{self.total} answers, pictures of {self.samples} samples a pixel; `resolution`, `spp`"
+            hint += " or fewer points shorten it"
+            self.stages.begin("sweep", "rendering and classifying", self.total, hint=hint)
             self.stages.progress.advance(first)
             self._go_through(first, tally)
             worst = self._claimed(tally)
@@ -243,7 +245,6 @@ class Sweep:
 
     def _verified(self, worst: dict[str, Any]) -> dict[str, Any] | None:
         """What fresh renders say of it; keeps a picture."""
-        self.stages.begin("verification", "verification")
         points, picks, model = self._find(worst["configuration"])
         view = self._open(picks.number // self.per_scene)
         u = points.configurations(picks)[0]

@@ -17,12 +17,13 @@ from advsearch.api.sweeps.job import Job
 from advsearch.api.sweeps.summary import verified
 from advsearch.api.sweeps.view import View
 from advsearch.attacks import Trial, choose_spp, run_trials
+from advsearch.attacks.sample_count import most_samples
 from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
 from advsearch.seeds import stream
 
-KIND = "verification"
-"""Rows of the trials."""
+KIND, PROBES = "verification", "sample count worst"
+"""Rows of the trials, and of the renders that chose their sample count."""
 
 
 def check_worst(
@@ -48,12 +49,29 @@ def check_worst(
         return None
     ladder = verification_ladder(config)
 
+    stages.begin(
+        "verification",
+        "finding how many samples the check needs",
+        most_samples(1, ladder),
+        hint="the worst configuration, counted in samples a pixel; `verify_spp=NUMBER` leaves it out",
+        at_most=True,
+    )
+    probe = _after(_stored(run, PROBES), lambda at, seed, spp: view.trial(model, at, seed, spp))
+    known, number = 0 if run is None else run.store.count(PROBES), 0
+
     def margin_of(spp: int, seed: int) -> float:
-        stages.progress.advance(1, samples=spp)
-        return view.trial(model, u, seed, spp).margin
+        nonlocal number
+        trial = probe(u, seed, spp)
+        if run is not None and number >= known:
+            run.record(trial_row(PROBES, number, seed, spp, trial, network.labels))
+        number += 1
+        stages.progress.advance(spp)
+        return trial.margin
 
     count = choose_spp({"worst": margin_of}, seed=config.seed, ladder=ladder)
-    stored = [] if run is None else [trial_of(row) for row in run.store.rows(KIND)]
+    hint = f"{config.trials} pictures of {count.spp} samples a pixel; `trials` or `verify_spp` shorten it"
+    stages.begin("verification", "checking the worst configuration with fresh renders", config.trials, hint=hint)
+    stored = _stored(run, KIND)
 
     def keep(group: str, number: int, trial: Trial) -> None:
         stages.progress.advance(1)
@@ -66,6 +84,10 @@ def check_worst(
     settled = count.converged or len(ladder) == 1
     renders = count.renders + len(trials)
     return verified(trials, network.labels, count.spp, converged=settled, renders=renders)
+
+
+def _stored(run: RunDirectory | None, kind: str) -> list[Trial]:
+    return [] if run is None else [trial_of(row) for row in run.store.rows(kind)]
 
 
 def trial_of(row: store.Row) -> Trial:

@@ -1,0 +1,206 @@
+"""What whoever waits is told: every stage has a name in plain words, and no count goes beyond its total."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from test_resume import StandInProblem, carry_out, configuration, rows
+
+from advsearch.api import sweep_from_config
+from advsearch.api.attacking import attack_from_config
+from advsearch.api.mapping import region_from_config
+from advsearch.api.measuring import precision
+from advsearch.api.memory import Memory
+from advsearch.api.record import Findings, Recorder, Stages
+from advsearch.api.stages import Attack
+from advsearch.attacks import make_policy
+from advsearch.attacks.region import grow
+from advsearch.attacks.sample_count import choose_spp, most_samples
+from advsearch.cli.flags import with_flags
+from advsearch.config import AttackConfig, PrecisionConfig, RegionConfig, SweepConfig
+from advsearch.runs.directory import RunDirectory
+
+JARGON = re.compile(r"set-up|rerank|adjoint|estimator|baseline|sample count|spp|bounces$|verification", re.IGNORECASE)
+"""Words of our own, which nobody who waits should have to know."""
+
+
+@dataclass
+class Stage:
+    """One stage as it was told."""
+
+    name: str
+    total: int | None
+    hint: str
+    at_most: bool
+    done: int = 0
+
+
+@dataclass
+class Recorded:
+    """A watcher that remembers."""
+
+    stages: list[Stage] = field(default_factory=list)
+    messages: list[str] = field(default_factory=list)
+
+    def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
+        self.stages.append(Stage(name, total, hint, at_most))
+
+    def advance(self, n: int = 1, **info: float | str) -> None:
+        self.stages[-1].done += n
+
+    def message(self, text: str) -> None:
+        self.messages.append(text)
+
+    def check(self) -> None:
+        """Every stage has a name in plain words, and an honest end; what counts says of how many."""
+        assert self.stages
+        for one in self.stages:
+            assert one.name and not JARGON.search(one.name), one
+            assert one.total is not None or one.done == 0, f"{one.name} counts {one.done} of nobody knows how many"
+            assert one.total is None or one.done <= one.total, f"{one.name} counts {one.done} of {one.total}"
+
+    def named(self, part: str) -> list[Stage]:
+        return [one for one in self.stages if part in one.name]
+
+
+def attacked(config: AttackConfig, problem: Any = None) -> tuple[Recorded, Findings]:
+    """An attack without the renderer, in memory."""
+    progress, memory = Recorded(), Memory(None)
+    problem = problem or StandInProblem()
+    policy = make_policy(config.policy_name)
+    attack = Attack(problem, config, policy, Recorder(None, problem, memory), memory, Stages(progress))
+    return progress, attack.carry_out()
+
+
+@pytest.mark.parametrize("policy", ["pgd", "auto", "random", "cmaes"])
+def test_an_attack_counts_what_it_says(policy: str) -> None:
+    progress, _ = attacked(configuration(policy).model_copy(update={"verify_spp": None}))
+    progress.check()
+    (checking,) = progress.named("checking the answer")
+    assert checking.done == checking.total == 6 * (2 if policy == "random" else 3)
+    assert "`trials` or `verify_spp` shorten it" in checking.hint and "samples a pixel" in checking.hint
+    (search,) = progress.named(f"searching with {policy}")
+    assert 25 <= search.done <= search.total == 33 and "`steps` or `seconds`" in search.hint
+    assert progress.named("how many samples")[0].at_most
+
+
+@dataclass
+class Easy(StandInProblem):
+    """Wrong wherever it is moved a little."""
+
+    def _logits(self, u: torch.Tensor, seed: int) -> torch.Tensor:
+        value = 50.0 * (u - 0.5).abs().max() - 1.0
+        return torch.stack([-value, value])
+
+
+def test_the_smallest_change_counts_what_it_says() -> None:
+    problem = Easy()
+    blocks = tuple(block for block in problem.domain.blocks if block.epsilon is not None)
+    problem.domain = type(problem.domain)(torch.full((4,), 0.5), blocks)
+    progress, findings = attacked(configuration(smallest=True), problem)
+    assert findings.smallest is not None and findings.smallest.searches > 1
+    progress.check()
+    assert progress.named("search 1 of at most 12")[0].total == 33
+    assert progress.named("trying smaller changes")[0].done > 6
+
+
+def test_samples_of_the_ladder_have_a_bound() -> None:
+    spent = 0
+
+    def never_settles(spp: int, seed: int) -> float:
+        nonlocal spent
+        spent += spp
+        return float(torch.randn((), generator=torch.Generator().manual_seed(seed % 2**63)))
+
+    count = choose_spp({"clean": never_settles, "adversarial": never_settles}, seed=0)
+    assert not count.converged and spent == most_samples(2) == 2 * 8 * 340
+
+
+def test_growing_a_box_tells_its_parts() -> None:
+    told: list[str] = []
+    grow(lambda u, number: bool(u.sum() < 1.2), torch.full((2,), 0.5), seed=0, samples=20, on_part=told.append)
+    assert told[:6] == ["level"] * 6 and set(told[6:]) == {"check"} and len(told) <= 10
+
+
+# ---- with the renderer ----------------------------------------------------------------------------------------------
+
+
+SMALL: dict[str, Any] = {"object": "mug", "resolution": 16, "spp": 1, "threads": 1}
+
+
+@pytest.mark.parametrize(
+    ("make", "do"),
+    [
+        (lambda run: AttackConfig(**SMALL, steps=3, trials=2, average=2, verify_spp=2, run=run), attack_from_config),
+        (lambda run: SweepConfig(**SMALL, grid={"pose.yaw": "0,90"}, trials=2, run=run), sweep_from_config),
+        (
+            lambda run: RegionConfig(
+                **SMALL, controls={"camera": {}}, vary="camera.azimuth", samples=3, verify_spp=1, run=run
+            ),
+            region_from_config,
+        ),
+        (
+            lambda run: PrecisionConfig(
+                **SMALL,
+                controls={"light": {}},
+                quantities="image",
+                seconds=1,
+                rounds=3,
+                samplers="independent",
+                run=run,
+            ),
+            precision,
+        ),
+    ],
+    ids=["attack", "sweep", "region", "precision"],
+)
+def test_every_command_says_what_it_does_and_how_far_it_is(
+    tmp_path: Path, make: Callable[[str], Any], do: Callable[..., Any]
+) -> None:
+    progress = Recorded()
+    do(make(str(tmp_path / "run")), progress=progress)
+    progress.check()
+    hints = [with_flags(one.hint) for one in progress.stages]
+    assert any("--" in one for one in hints) and not any("`" in one for one in hints)
+
+
+# ---- what is stored is not rendered again ---------------------------------------------------------------------------
+
+
+def test_a_resumed_run_takes_its_probes_from_the_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = configuration().model_copy(update={"verify_spp": None})
+    whole = carry_out(tmp_path / "whole", config)
+    rendered: list[tuple[int, bool]] = []
+    once = StandInProblem.trial
+
+    def trial(self: Any, u: torch.Tensor, seed: int, spp: int, *, drawn: bool = True) -> Any:
+        rendered.append((spp, drawn))
+        if len(rendered) == stop:
+            raise KeyboardInterrupt
+        return once(self, u, seed, spp, drawn=drawn)
+
+    monkeypatch.setattr(StandInProblem, "trial", trial)
+    stop = 4 + 20  # the first look, then in the middle of the probes
+    assert carry_out(tmp_path / "run", config).interrupted
+    stop, before = 0, len([one for one in rendered if not one[1]])
+    rendered.clear()
+    resumed = carry_out(tmp_path / "run", config, resume=True)
+    again = len([one for one in rendered if not one[1]])
+    assert resumed.sample_count == whole.sample_count and whole.sample_count is not None
+    assert before - 1 + again == whole.sample_count.renders  # the one that was interrupted is rendered again
+    assert resumed.verification_renders == whole.verification_renders
+    assert rows(tmp_path / "run") == rows(tmp_path / "whole")
+
+
+def test_the_probes_of_a_sweeps_worst_configuration_are_stored(tmp_path: Path) -> None:
+    config = SweepConfig(**SMALL, grid={"pose.yaw": "0,90"}, trials=2, run=str(tmp_path / "run"))
+    found = sweep_from_config(config)
+    with RunDirectory.resume(tmp_path / "run") as run:
+        kept = run.store.counts()
+    assert kept["sample count worst"] + 2 == found.summary["renders"]["verification"]
