@@ -9,7 +9,7 @@ ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.set-up
-SOURCES := advsearch scenes tests benchmarks docs
+SOURCES := advsearch scenes tests benchmarks docs tools
 
 export TORCH_INDEX
 

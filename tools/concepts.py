@@ -1,0 +1,139 @@
+"""Counts what a stranger has to learn: python tools/concepts.py [CHECKOUT]
+
+Lines of the package and its modules; lines with an untyped answer (`dict[str, Any]`, `Mapping[str, Any]`); class names
+and file names that occur several times; imports that go in a circle; modules that take a run's settings (a parameter
+annotated with a `...Config`); and the classes of ours that a new control has to import or subclass, from the worked
+example of docs/controls/writing.md.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+UNTYPED = re.compile(r"(?:dict|Mapping)\[str, Any\]")
+Modules = Mapping[str, Path]
+
+
+def modules_of(root: Path) -> Modules:
+    """Return every module of the package by its dotted name."""
+    found = {}
+    for path in sorted((root / "advsearch").rglob("*.py")):
+        parts = path.relative_to(root).with_suffix("").parts
+        found[".".join(parts).removesuffix(".__init__")] = path
+    return found
+
+
+def imports_of(name: str, path: Path, modules: Modules) -> Iterator[str]:
+    """Yield the modules of the package that one imports when it is imported itself."""
+    for node in at_import(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in modules)
+        elif isinstance(node, ast.ImportFrom) and node.module in modules:
+            inner = [f"{node.module}.{alias.name}" for alias in node.names]
+            yield from (one if one in modules else str(node.module) for one in inner)
+
+
+def at_import(node: ast.AST) -> Iterator[ast.AST]:
+    """Yield what runs when a module is imported: not the bodies of functions, not what is for the type checker only."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            continue
+        if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+            continue
+        yield child
+        yield from at_import(child)
+
+
+def circles(modules: Modules) -> list[list[str]]:
+    """Return the groups of modules that import each other in a circle (Tarjan 1972)."""
+    graph = {name: sorted(set(imports_of(name, path, modules)) - {name}) for name, path in modules.items()}
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[list[str]] = []
+
+    def visit(name: str) -> None:
+        index[name] = low[name] = len(index)
+        stack.append(name)
+        for other in graph[name]:
+            if other not in index:
+                visit(other)
+                low[name] = min(low[name], low[other])
+            elif other in stack:
+                low[name] = min(low[name], index[other])
+        if low[name] == index[name]:
+            place = stack.index(name)
+            group = stack[place:]
+            del stack[place:]
+            if len(group) > 1:
+                found.append(sorted(group))
+
+    sys.setrecursionlimit(10_000)
+    for name in graph:
+        if name not in index:
+            visit(name)
+    return found
+
+
+def takes_settings(tree: ast.Module) -> bool:
+    """Whether a function of a module has a parameter that is a command's configuration."""
+    functions = (node for node in ast.walk(tree) if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)))
+    notes = (
+        arg.annotation
+        for one in functions
+        for arg in (*one.args.posonlyargs, *one.args.args, *one.args.kwonlyargs)
+        if arg.annotation is not None
+    )
+    return any(re.search(r"\b[A-Z]\w*Config\b", ast.unparse(note)) for note in notes)
+
+
+def classes_for_a_control(root: Path) -> list[str]:
+    """Return the classes of ours that the worked example of a control names."""
+    page = (root / "docs" / "controls" / "writing.md").read_text("utf-8")
+    tree = ast.parse(re.findall(r"```python\n(.*?)```", page, re.S)[0])
+    names = [
+        alias.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("advsearch")
+        for alias in node.names
+    ]
+    return [name for name in names if name[0].isupper()]
+
+
+def repeated(names: Iterator[str]) -> list[str]:
+    """Return the names that occur several times, with how often."""
+    return [f"{name} {count}" for name, count in Counter(names).most_common() if count > 1]
+
+
+def main() -> int:
+    """Print the counts."""
+    root = Path(sys.argv[1] if len(sys.argv) > 1 else ".").resolve()
+    modules = modules_of(root)
+    texts = {name: path.read_text("utf-8") for name, path in modules.items()}
+    trees = {name: ast.parse(text) for name, text in texts.items()}
+    lines = sorted(text.count("\n") for text in texts.values())
+    untyped = sum(bool(UNTYPED.search(line)) for text in texts.values() for line in text.splitlines())
+    classes = repeated(
+        node.name for tree in trees.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)
+    )
+    files = repeated(path.name for path in modules.values() if path.name != "__init__.py")
+    settings = [name for name, tree in trees.items() if takes_settings(tree)]
+    control = classes_for_a_control(root)
+    print(f"lines of the package          {sum(lines):6d}   in {len(lines)} modules, median {lines[len(lines) // 2]}")
+    print(f"lines with an untyped answer  {untyped:6d}")
+    print(f"class names that come again   {len(classes):6d}   {', '.join(classes)}")
+    print(f"file names that come again    {len(files):6d}   {', '.join(files)}")
+    print(f"modules that take settings    {len(settings):6d}")
+    print(f"classes to add a control      {len(control):6d}   {', '.join(control)}")
+    found = circles(modules)
+    print(f"circles of imports            {len(found):6d}   {'; '.join(' '.join(group) for group in found)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
