@@ -20,7 +20,7 @@ from advsearch.runs.store import Row, Store
 
 SIZE = 32
 LABELS = ("mug", "vase")
-FAST: dict[str, Any] = {"resolution": (SIZE, SIZE), "steps": 6, "spp": 2, "trials": 4, "verify_spp": 4}
+FAST: dict[str, Any] = {"resolution": (SIZE, SIZE), "steps": 6, "spp": 2, "trials": 6, "verify_spp": 4}
 
 
 class Brightness(nn.Module):
@@ -57,9 +57,9 @@ def test_a_weakness_is_found_verified_and_kept(scene: advsearch.Scene, level: fl
     result = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", **FAST)
     summary = result.summary
     assert result.found and summary["ending"] == "found"
-    assert summary["verified"]["successes"] == summary["verified"]["trials"] == 4
-    assert summary["clean"]["control"]["correct"] == 4 and summary["clean"]["label"] == "mug"
-    assert summary["adversarial"]["label"] == "vase" and summary["verified"]["labels"] == {"vase": 4}
+    assert summary["verified"]["successes"] == summary["verified"]["trials"] == 6
+    assert summary["clean"]["control"]["correct"] == 6 and summary["clean"]["label"] == "mug"
+    assert summary["adversarial"]["label"] == "vase" and summary["verified"]["labels"] == {"vase": 6}
     assert summary["renders"]["search"] == summary["baseline"]["renders"]
     assert json.loads((tmp_path / "run" / "summary.json").read_text("utf-8")) == json.loads(json.dumps(summary))
     for name in ("clean.png", "clean.exr", "adversarial.png", "adversarial.exr", "difference.png", "search.gif"):
@@ -100,7 +100,7 @@ def test_a_start_that_is_already_wrong_is_said_and_not_counted(scene: advsearch.
 def test_what_cannot_be_found_is_not_claimed(scene: advsearch.Scene) -> None:
     summary = advsearch.attack(scene, model(0.98), **FAST).summary
     assert summary["ending"] == "budget spent"
-    assert summary["verified"]["successes"] == 0 and summary["clean"]["control"]["correct"] == 4
+    assert summary["verified"]["successes"] == 0 and summary["clean"]["control"]["correct"] == 6
 
 
 def test_the_same_seed_gives_the_same_numbers_when_deterministic(scene: advsearch.Scene, level: float) -> None:
@@ -215,7 +215,7 @@ def test_conditions_are_other_ones_in_every_trial_and_the_same_for_both_groups(
         clean, adversarial = (
             [row.values["camera.azimuth"]["value"] for row in store.rows(kind)] for kind in ("control", "verification")
         )
-    assert len(set(clean)) == 4
+    assert len(set(clean)) == 6
     assert adversarial in ([], clean)  # nothing, if the clean scene is wrong in half of them
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import math
 from collections.abc import Callable
@@ -28,7 +29,11 @@ from advsearch.attacks import (
     verdict,
     verify,
 )
+from advsearch.attacks.region import Region, grow
+from advsearch.attacks.verification import EASIER, LEAST_RATE, OVER_CONDITIONS, WORST_CASE, Rule
+from advsearch.config import FEWEST_SAMPLES, FEWEST_TRIALS
 from advsearch.errors import InputError
+from advsearch.seeds import stream
 
 DOMAIN = Domain(torch.full((4,), 0.5), (Block(4, "linf", 0.1),))
 WORST = DOMAIN.start + 0.1
@@ -180,7 +185,47 @@ def test_a_bad_ladder_is_refused(ladder: tuple[int, ...]) -> None:
 
 
 def test_nineteen_of_twenty_are_needed() -> None:
-    assert [needed(n) for n in (1, 10, 19, 20, 21, 40, 100, 200)] == [1, 10, 19, 19, 20, 38, 95, 190]
+    assert [needed(n) for n in (10, 19, 20, 21, 40, 100, 200)] == [10, 19, 19, 20, 38, 95, 190]
+
+
+@pytest.mark.parametrize("rule", [WORST_CASE, OVER_CONDITIONS, EASIER])
+def test_the_fewest_trials_are_those_whose_interval_excludes_a_claim_that_mostly_fails(rule: Rule) -> None:
+    assert rule.fewest == FEWEST_TRIALS
+    assert clopper_pearson(rule.fewest - 1, rule.fewest - 1)[0] < LEAST_RATE
+    for trials in range(rule.fewest, 300):
+        assert clopper_pearson(rule.needed(trials), trials)[0] >= LEAST_RATE
+
+
+@pytest.mark.parametrize("trials", range(1, 6))
+def test_too_few_trials_find_nothing_even_if_all_succeed(trials: int) -> None:
+    render = noisy(-3.0, 3.0, 0.1)
+    result = verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=trials)
+    assert (result.adversarial.successes, result.clean.successes) == (trials, trials)
+    assert result.ending is Ending.NOT_VERIFIED
+    assert f"A success in {trials} of {trials} trials, 6 are needed" in result.reason
+    enough = verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=FEWEST_TRIALS)
+    assert enough.ending is Ending.FOUND
+
+
+def test_conditions_under_which_the_clean_scene_is_seldom_right_leave_too_few_trials() -> None:
+    """Right in 5 of 10: those 5 may all succeed, and say nothing yet."""
+
+    def render(u: torch.Tensor, seed: int, spp: int) -> Trial:
+        order = [stream(0, "verification", number) for number in range(10)]
+        hard = order.index(seed) % 2 == 1
+        return Trial(1.0 if hard or not torch.equal(u, DOMAIN.start) else -1.0, 0, 0.5)
+
+    result = verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=10, rule=OVER_CONDITIONS)
+    assert (result.adversarial.successes, result.adversarial.trials) == (5, 5)
+    assert result.ending is Ending.NOT_VERIFIED
+
+
+def test_the_fewest_samples_of_a_region_follow_from_the_confidence_of_its_interval() -> None:
+    low, high = torch.zeros(1), torch.ones(1)
+    attempts = inspect.signature(grow).parameters["attempts"].default
+    for samples in (FEWEST_SAMPLES - 1, FEWEST_SAMPLES):
+        region = Region(low, low, high, samples, samples, attempts, samples, torch.zeros(0, 1))
+        assert (region.interval[0] >= LEAST_RATE) == (samples == FEWEST_SAMPLES)
 
 
 @pytest.mark.parametrize(

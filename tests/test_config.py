@@ -61,7 +61,10 @@ WRONG: dict[str, tuple[Any, str]] = {
     "specialise": ("maybe", "expected true or false, got maybe"),
     "baseline": ("maybe", "expected true or false, got maybe"),
     "verify_spp": (0, "expected a whole number from 1 to 65536, got 0"),
-    "trials": (0, "expected a whole number from 1 to 100000, got 0"),
+    "trials": (
+        5,
+        "expected a whole number from 6 to 100000 (with fewer, nothing can be called found), got 5",
+    ),
     "seed": (-1, "expected a whole number from 0 to 2**63 - 1, got -1"),
     "threads": (0, "expected a whole number from 1 to 1024, got 0"),
     "deterministic": (3, "expected true or false, got 3"),
@@ -189,12 +192,20 @@ def test_every_command_has_the_same_form_in_yaml_and_in_flags(config: Config, tm
         (GapConfig, "average", 0, "expected a whole number from 1 to 1000000, got 0"),
         (RegionConfig, "around", 3.5, "expected the name or the folder of a run, got 3.5"),
         (RegionConfig, "vary", [1], "expected names such as pose.yaw,camera.elevation, got [1]"),
-        (RegionConfig, "samples", 0, "expected a whole number from 1 to 1000000, got 0"),
+        (RegionConfig, "samples", 7, "expected a whole number from 8 to 1000000, got 7"),
+        (
+            GapConfig,
+            "trials",
+            1,
+            "expected a whole number from 6 to 100000 (with fewer, nothing can be called found), got 1",
+        ),
+        (SweepConfig, "trials", 1, "expected 0, or a whole number from 6 to 100000, got 1"),
+        (SweepConfig, "trials", -1, "expected 0, or a whole number from 6 to 100000, got -1"),
         (RegionConfig, "map", 513, "expected a whole number from 0 to 512, got 513"),
         (RegionConfig, "verify_spp", 0, "expected a whole number from 1 to 65536, got 0"),
     ],
 )
-def test_a_wrong_value_of_gap_and_region_names_its_flag(
+def test_a_wrong_value_of_other_commands_names_its_flag(
     config: type[Config], field: str, value: Any, message: str
 ) -> None:
     with pytest.raises(InputError) as error:

@@ -123,7 +123,7 @@ SMALL: dict[str, Any] = {"object": "mug", "resolution": 16, "denoise": "none"}
 def test_a_region_is_told_in_the_units_of_its_parameters(tmp_path: Path) -> None:
     config = RegionConfig(
         **SMALL, controls={"pose": {"yaw": [10, 50], "pitch": 0, "roll": 0, "x": 0, "z": 0}, "camera.elevation": {}},
-        vary="pose.yaw,camera.elevation", samples=6, map=2, verify_spp=2, run=str(tmp_path / "run"),
+        vary="pose.yaw,camera.elevation", samples=8, map=2, verify_spp=2, run=str(tmp_path / "run"),
     )  # fmt: skip
     try:
         summary = mapping.region_from_config(config)
@@ -135,7 +135,7 @@ def test_a_region_is_told_in_the_units_of_its_parameters(tmp_path: Path) -> None
         "high"
     ] <= 50
     assert elevation["unit"] == "degrees" and 0.0 <= summary["volume"] <= 1.0
-    assert summary["same"] <= summary["samples"] == 6 and len(summary["map"]["margins"]) == 2
+    assert summary["same"] <= summary["samples"] == 8 and len(summary["map"]["margins"]) == 2
     assert (tmp_path / "run" / "images" / "map.png").is_file()
     assert "fresh samples of this box" in region_text(summary)
 
@@ -159,15 +159,15 @@ def test_one_texture_for_many_conditions(tmp_path: Path) -> None:
     result = advsearch.attack(
         "mug", label=[name for name in names if name != "lamp"],  # at 16 pixels a mug is none
         controls={"texture": {"resolution": 4}}, over=["camera.azimuth"], resolution=16, denoise="none", steps=3,
-        draws=2, trials=4, verify_spp=2, average=3, baseline=False, run=tmp_path / "run",
+        draws=2, trials=6, verify_spp=2, average=3, baseline=False, run=tmp_path / "run",
     )  # fmt: skip
     summary = result.summary
     assert summary["over"] == ["camera"] and summary["controls"] == ["texture"]
     assert len(summary["configuration"]) and all(name.startswith("texture") for name in summary["configuration"])
-    assert summary["verified"] is None or summary["verified"]["trials"] <= 4
+    assert summary["verified"] is None or summary["verified"]["trials"] <= 6
     with RunDirectory.resume(tmp_path / "run") as run:
         trials = list(run.store.rows("control"))
         searched = list(run.store.rows("search"))
     azimuths = {json.dumps(row.values["camera.azimuth"]) for row in trials}
-    assert len(azimuths) == 4, "every trial has conditions of its own"
+    assert len(azimuths) == 6, "every trial has conditions of its own"
     assert all("camera.azimuth" not in row.values for row in searched)

@@ -542,12 +542,12 @@ SURVIVES: dict[str, Any] = {
     "controls": {"camera": {"azimuth": [0, 90]}},
     "samples": 3,
     "batch": 4,
-    "trials": 5,
+    "trials": 6,
     "environment": "studio,noon",
 }
 
 
-PICTURES, WHOLE = 2 * 6 * 3 * 3, 108 + 16 + 5 + 1
+PICTURES, WHOLE = 2 * 6 * 3 * 3, 108 + 16 + 6 + 1
 """Pictures of that sweep, and all renders: two rungs of eight that choose a sample count, trials, the picture kept."""
 
 
@@ -600,7 +600,7 @@ def test_other_settings_do_not_go_on_and_a_finished_sweep_is_kept(tmp_path: Path
 
 def test_resume_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    config = SweepConfig(object="mug", grid={"pose.yaw": "0:360:40"}, resolution=32, run="mine", trials=3)
+    config = SweepConfig(object="mug", grid={"pose.yaw": "0:360:40"}, resolution=32, run="mine", trials=6)
     FakeRenderer.stops_at = 20
     assert sweep_from_config(config).summary["configurations"] == 16
     FakeRenderer.stops_at = None
@@ -650,7 +650,7 @@ def test_what_is_no_list_of_values_is_refused(given: Any) -> None:
         ("samples", 0, "--samples: expected a whole number from 1 to 1000000000, got 0"),
         ("sampler", "halton", "--sampler: expected sobol or random, got halton"),
         ("batch", 0, "--batch: expected a whole number from 1 to 1024, got 0"),
-        ("trials", -1, "--trials: expected a whole number from 0 to 100000, got -1"),
+        ("trials", -1, "--trials: expected 0, or a whole number from 6 to 100000, got -1"),
         ("verify_spp", 0, "--verify-spp: expected a whole number from 1 to 65536, got 0"),
         ("spp", 1.5, "--spp: expected a whole number from 1 to 65536, got 1.5"),
         ("grid", 3, "--grid: expected PARAMETER=FIRST:LAST:COUNT, or values separated by commas, got 3"),
@@ -696,7 +696,7 @@ def test_the_command_prints_json(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     status, out, _ = command(
-        capsys, "--grid", "camera.elevation=5:50:4", "--trials", "3", "--verify-spp", "4", "--json"
+        capsys, "--grid", "camera.elevation=5:50:4", "--trials", "6", "--verify-spp", "4", "--json"
     )
     summary = json.loads(out)
     assert status == 0 and summary["schema"] == 1 and summary["command"] == "sweep"
@@ -796,7 +796,7 @@ def test_the_table_of_nothing() -> None:
 def test_a_small_sweep_really_rendered_is_repeatable(tmp_path: Path) -> None:
     """Bit for bit, and each picture is that of `render` at the listed values."""
     grid = {"pose.yaw": [0, 180], "camera.elevation": [10, 60]}
-    options: dict[str, Any] = {"spp": 1, "trials": 2, "verify_spp": 2, "resolution": (16, 16), "batch": 2}
+    options: dict[str, Any] = {"spp": 1, "trials": 6, "verify_spp": 2, "resolution": (16, 16), "batch": 2}
     first = advsearch.sweep("mug", model(), grid, run=tmp_path / "a", **options)
     second = advsearch.sweep("mug", model(), grid, run=tmp_path / "b", **options)
     assert rows_of(tmp_path / "a") == rows_of(tmp_path / "b")

@@ -7,6 +7,7 @@ group.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.ending import Ending
-from advsearch.attacks.trials import Trials
+from advsearch.attacks.trials import Trials, clopper_pearson
 from advsearch.errors import InputError
 from advsearch.seeds import stream
 
@@ -25,6 +26,10 @@ PASS_PERCENT = 95
 
 PASS_PERCENT_OVER = 90
 """What a claim over many conditions must hold in, in per cent of those in which the clean configuration is right."""
+
+LEAST_RATE = 0.5
+"""Where the 95 % interval of a claim's rate may begin: what is called found holds more often than not. So 6 trials are
+the fewest that can verify anything (54 to 100 %); 5 of 5 begin at 48 %."""
 
 
 class Trial(NamedTuple):
@@ -71,7 +76,15 @@ class Rule:
     conditional: bool = False
 
     def needed(self, trials: int) -> int:
-        """Return how many of `trials` must succeed."""
+        """Return how many of `trials` must succeed: the percentage, rounded up, and never under `fewest`."""
+        return max(self._share(trials), self.fewest)
+
+    @property
+    def fewest(self) -> int:
+        """Trials under which nothing is verified: even without a failure their interval begins under `LEAST_RATE`."""
+        return next(n for n in itertools.count(1) if clopper_pearson(self._share(n), n)[0] >= LEAST_RATE)
+
+    def _share(self, trials: int) -> int:
         return -(-self.percent * trials // 100)
 
 
@@ -114,7 +127,7 @@ class Verification:
 
 
 def needed(trials: int) -> int:
-    """Return how many of `trials` must succeed: ceil of 95 %, so 19 of 20."""
+    """Return how many of `trials` must succeed: ceil of 95 %, so 19 of 20, and never fewer than 6."""
     return WORST_CASE.needed(trials)
 
 
@@ -134,7 +147,7 @@ def verdict(search: Ending, clean: Trials, adversarial: Trials, rule: Rule = WOR
         return search
     if rule.control and already_wrong(clean):
         return Ending.ALREADY_WRONG
-    enough = adversarial.trials > 0 and adversarial.successes >= rule.needed(adversarial.trials)
+    enough = adversarial.successes >= rule.needed(adversarial.trials)
     control = not rule.control or rule.conditional or clean.successes >= rule.needed(clean.trials)
     if control and enough:
         return Ending.FOUND

@@ -7,9 +7,9 @@ that this package stays light.
 
 from __future__ import annotations
 
-from advsearch.config.attack import TRIALS, TRIALS_OVER, AttackConfig
+from advsearch.config.attack import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.config.precision import QUANTITIES, SAMPLERS, PrecisionConfig
-from advsearch.config.questions import GapConfig, RegionConfig
+from advsearch.config.questions import FEWEST_SAMPLES, GapConfig, RegionConfig
 from advsearch.config.rendering import RenderConfig
 from advsearch.config.scene import AUTO_SHARE, CLOSE_LOOKS, SEARCH_SPP, SceneConfig
 from advsearch.config.sweep import SweepConfig
@@ -17,6 +17,8 @@ from advsearch.config.sweep import SweepConfig
 __all__ = [
     "AUTO_SHARE",
     "CLOSE_LOOKS",
+    "FEWEST_SAMPLES",
+    "FEWEST_TRIALS",
     "QUANTITIES",
     "SAMPLERS",
     "SEARCH_SPP",

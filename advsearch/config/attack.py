@@ -15,6 +15,9 @@ from advsearch.settings import parse_assignment, setting
 TRIALS, TRIALS_OVER = 20, 200
 """Fresh renders that check an answer, and one that holds for many conditions."""
 
+FEWEST_TRIALS = 6
+"""With fewer, nothing can be called found: `attacks.verification.Rule.fewest`, which a test holds this to."""
+
 
 class AttackConfig(SceneConfig):
     """Everything that decides what `attack` does. Frozen; unknown names are refused."""
@@ -124,10 +127,10 @@ class AttackConfig(SceneConfig):
         None,
         "verification",
         "fresh renders that check the answer, and as many of the clean scene",
-        "a whole number from 1 to 100000",
+        f"a whole number from {FEWEST_TRIALS} to 100000 (with fewer, nothing can be called found)",
         otherwise=f"{TRIALS}, or {TRIALS_OVER} with --over",
         unit="renders",
-        ge=1,
+        ge=FEWEST_TRIALS,
         le=100_000,
     )
 

@@ -8,6 +8,10 @@ from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import setting
 
+FEWEST_SAMPLES = 8
+"""With fewer, not even a box without exceptions has one verdict in more than half of it, at the confidence of
+`attacks.region.Region.interval`."""
+
 
 class GapConfig(AttackConfig):
     """Everything that decides what `gap` does: the worst case beside the average, for each object and each control."""
@@ -48,9 +52,9 @@ class RegionConfig(SceneConfig):
         200,
         "region",
         "fresh samples that check the box",
-        "a whole number from 1 to 1000000",
+        f"a whole number from {FEWEST_SAMPLES} to 1000000",
         unit="renders",
-        ge=1,
+        ge=FEWEST_SAMPLES,
         le=1_000_000,
     )
     map: int = setting(

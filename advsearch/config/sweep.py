@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator
 
+from advsearch.config.attack import FEWEST_TRIALS
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import number_or_text, setting, split_names
 
@@ -78,8 +79,8 @@ class SweepConfig(SceneConfig):
     trials: int = setting(
         20,
         "verification",
-        "fresh renders that check the worst configuration",
-        "a whole number from 0 to 100000",
+        "fresh renders that check the worst configuration; 0 for none",
+        f"0, or a whole number from {FEWEST_TRIALS} to 100000",
         unit="renders",
         ge=0,
         le=100_000,
@@ -112,6 +113,13 @@ class SweepConfig(SceneConfig):
     def models(self) -> tuple[str, ...]:
         """The models by name."""
         return split_names(self.model)
+
+    @field_validator("trials")
+    @classmethod
+    def _none_or_enough(cls, value: int) -> int:
+        if 0 < value < FEWEST_TRIALS:
+            raise ValueError("too few to verify anything")
+        return value
 
     @field_validator("grid", mode="before")
     @classmethod
