@@ -150,6 +150,13 @@ class Config(BaseModel):
         places = {name: _absolute(getattr(self, name)) for name in FILES if name in type(self).model_fields}
         return self.model_copy(update={**places, **PLACE})
 
+    def deciding(self) -> dict[str, Any]:
+        """Return the settings that decide a run's numbers, as JSON values: not where it is kept and on how many threads
+        it runs. Files have their names only, since they may have been moved."""
+        given = {name: value for name, value in self.plain().items() if name not in (*PLACE, "threads")}
+        files = {name: _bare(given[name]) for name in FILES if isinstance(given.get(name), str)}
+        return {**given, **files}
+
     def command_line(self) -> str:
         """Return the shell command that repeats this in a place of its own: all settings that are not the default."""
         words = ["advsearch", self.command]
@@ -358,6 +365,11 @@ def split_names(text: str) -> tuple[str, ...]:
     if "," not in text or Path(text).is_file():
         return (text,)
     return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def _bare(value: str) -> str:
+    """Return names with no folders before them."""
+    return ",".join(Path(part).name for part in split_names(value))
 
 
 def _absolute(value: str | None) -> str | None:

@@ -25,10 +25,11 @@ from advsearch.api.stages import Attack
 from advsearch.attacks import Block, Domain, Evaluation, Policy, Proposal, Trial, make_policy
 from advsearch.attacks.goal import Goal
 from advsearch.config import AttackConfig
-from advsearch.errors import InputError
+from advsearch.errors import FileFormatError, InputError
 from advsearch.progress import NullProgress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.replay import Entry, ReplayLog
+from advsearch.runs.store import Row
 from advsearch.seeds import stream
 
 POLICIES = ("pgd", "auto", "random", "cmaes")
@@ -220,6 +221,48 @@ def test_another_configuration_than_was_stored_is_refused(tmp_path: Path) -> Non
         again = Memory(run).evaluator("search", lambda tell: problem.evaluator("search", tell))
         with pytest.raises(InputError, match="cannot go on: evaluation 0 of the search is another one now"):
             again(torch.full((6,), 0.4), index=0, gradient=False)
+
+
+CHANGES: dict[str, Any] = {
+    "seed": 1, "steps": 26, "trials": 40, "spp": 7, "epsilon": 0.05, "exposure": 1.0, "set": {"camera.azimuth": 9.0},
+    "label": "bowl", "model": "torchvision:resnet18", "policy": {"name": "pgd", "momentum": 0.5}, "average": 6,
+    "controls": {"texture": {"resolution": 8}}, "denoise": "none", "deterministic": True, "baseline": False,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_run_goes_on_with_the_settings_that_it_began_with(tmp_path: Path, name: str) -> None:
+    with RunDirectory.create(tmp_path / "run") as run:
+        run.write_config(configuration())
+        run.record(Row(kind="search", step=0))
+    recipe = tmp_path / "run" / "run.yaml"
+    edited = AttackConfig.from_yaml(recipe, {name: CHANGES[name]})
+    with pytest.raises(InputError, match=rf"cannot go on: {name} was .* and is .* now; set it back to what"):
+        RunDirectory.resume(tmp_path / "run", edited)
+    with RunDirectory.resume(tmp_path / "run", AttackConfig.from_yaml(recipe)):  # and nothing is locked any more
+        pass
+
+
+def test_a_run_goes_on_elsewhere_on_other_threads_and_with_files_that_were_moved(tmp_path: Path) -> None:
+    for folder in ("old", "new"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "net.pt2").touch()
+    with RunDirectory.create(tmp_path / "run") as run:
+        run.write_config(configuration(model=str(tmp_path / "old" / "net.pt2")))
+    moved = configuration(model=str(tmp_path / "new" / "net.pt2"), threads=1, run="other", overwrite=True)
+    with RunDirectory.resume(tmp_path / "run", moved):
+        pass
+    with pytest.raises(InputError, match=r"model was 'net\.pt2' and is 'other\.pt2' now"):
+        RunDirectory.resume(tmp_path / "run", configuration(model="other.pt2"))
+
+
+def test_a_run_that_is_older_than_the_note_goes_on_and_a_damaged_note_is_named(tmp_path: Path) -> None:
+    with RunDirectory.create(tmp_path / "run") as run:
+        run.record(Row(kind="search", step=0))
+    with RunDirectory.resume(tmp_path / "run", configuration()) as run:
+        run.store.set_note("settings", "[1,")
+    with pytest.raises(FileFormatError, match="expected the settings the run began with, got a damaged note"):
+        RunDirectory.resume(tmp_path / "run", configuration())
 
 
 def test_a_log_keeps_whole_entries_only(tmp_path: Path) -> None:

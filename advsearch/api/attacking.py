@@ -338,7 +338,7 @@ def _policy(job: _Job, problem: Problem) -> Policy[Any]:
 
 def _go_on(job: _Job, run: str | Path, progress: Progress) -> AttackResult:
     """Carry out what is left of a run."""
-    with RunDirectory.resume(run) as kept:
+    with RunDirectory.resume(run, job.config) as kept:
         return _carry_out(job, progress, kept)
 
 

@@ -66,7 +66,7 @@ def region_from_config(config: RegionConfig, *, progress: Progress | None = None
     problem, _ = problem_from_config(as_attack)
     varied = _varied(problem, config)
     centre = _centre(problem, config)
-    opened = RunDirectory.resume(resumed) if resumed is not None else RunDirectory.create_for(config)
+    opened = RunDirectory.resume(resumed, config) if resumed is not None else RunDirectory.create_for(config)
     with opened as run:
         memory = Memory(run)
         attack = Attack(problem, as_attack, make_policy("random"), Recorder(run, problem, memory), memory, stages)

@@ -62,7 +62,7 @@ def gap_from_config(config: GapConfig, *, progress: Progress | None = None, resu
 
 def _study(config: Any, body: Callable[[Any, _Parts], Summary], progress: Progress, resumed: Path | None) -> Summary:
     begun = time.perf_counter()
-    opened = RunDirectory.resume(resumed) if resumed is not None else RunDirectory.create_for(config)
+    opened = RunDirectory.resume(resumed, config) if resumed is not None else RunDirectory.create_for(config)
     with opened as run:
         each = len(config.controls) if isinstance(config, GapConfig) else max(1, len(config.epsilons))
         parts = _Parts(run.path / PARTS, progress, len(config.objects) * each)

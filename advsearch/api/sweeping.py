@@ -225,7 +225,7 @@ def _stopped(config: SweepConfig) -> Path | None:
 def _kept(job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
     """Sweep in a run directory: a new one, or one that was begun."""
     if resumed is not None:
-        with RunDirectory.resume(resumed) as run:
+        with RunDirectory.resume(resumed, job.config) as run:
             return carry_out(job, run, progress)
     config = job.config
     stem = "-".join(Path(name).stem for name in config.objects)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
 import re
 import shutil
@@ -12,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
 
-from advsearch.errors import InputError, RunExistsError, UnknownNameError
+from advsearch.errors import FileFormatError, InputError, RunExistsError, UnknownNameError
 from advsearch.runs import images, lock, replay, store, summary
 from advsearch.runs.files import PART, replacing, storage_errors, write_text
 
@@ -30,6 +31,9 @@ IMAGES = "images"
 ARTIFACTS = "artifacts"
 PARTS = "parts"
 """Runs that a study consists of."""
+
+BEGUN_WITH = "settings"
+"""The note under which the store keeps what decides the run's numbers, as it was when the run began."""
 
 CONTENTS = (
     CONFIG,
@@ -123,24 +127,54 @@ class RunDirectory:
         return run
 
     @classmethod
-    def resume(cls, run: str | Path) -> RunDirectory:
+    def resume(cls, run: str | Path, config: SceneConfig | None = None) -> RunDirectory:
         """Open and lock the directory of a run that is there, to go on with it.
 
         Args:
             run: its name or path, as for `find_run`.
+            config: what the rest of the run will be carried out with; None if nothing will be.
 
         Raises:
             UnknownNameError: there is no such run.
-            InputError: another process works on it.
+            InputError: another process works on it, or `config` would give other numbers than the run began with.
             FileFormatError: its results cannot be read.
         """
         path = find_run(run)
         held = lock.RunLock(path)
         try:
-            return cls(path, held)
+            opened = cls(path, held)
         except BaseException:
             held.release()
             raise
+        try:
+            if config is not None:
+                opened._check_same(config)
+        except BaseException:
+            opened.close()
+            raise
+        return opened
+
+    def _check_same(self, config: SceneConfig) -> None:
+        """Refuse settings that decide other numbers than those that are stored: the rest would not fit to them."""
+        before, now = self._begun_with(), config.deciding()
+        changed = [
+            f"{name} was {value!r} and is {now.get(name)!r}" for name, value in before.items() if value != now.get(name)
+        ]
+        if changed:
+            raise InputError(
+                f"{self.path}: cannot go on: {', '.join(changed)} now; set it back to what the run began with, or "
+                f"start again with advsearch run {self.path / CONFIG}"
+            )
+
+    def _begun_with(self) -> dict[str, Any]:
+        """What the store notes of the settings; empty of a run that is older than that note."""
+        try:
+            noted = json.loads(self.store.note(BEGUN_WITH) or "{}")
+        except ValueError:
+            noted = None
+        if not isinstance(noted, dict):
+            raise FileFormatError(f"{self.store.path}: expected the settings the run began with, got a damaged note")
+        return noted
 
     @property
     def replay(self) -> replay.ReplayLog:
@@ -154,7 +188,11 @@ class RunDirectory:
         self.replay.remove()
 
     def write_config(self, config: SceneConfig) -> Path:
-        """Write `run.yaml`, from which `advsearch run` repeats the run, and return its path."""
+        """Write `run.yaml`, from which `advsearch run` repeats the run, and return its path.
+
+        What decides the numbers is noted in the store too, so that a file that was edited since is noticed.
+        """
+        self.store.set_note(BEGUN_WITH, json.dumps(config.deciding()))
         return write_text(self.path / CONFIG, config.recipe().to_yaml())
 
     def record(self, *rows: store.Row) -> None:
