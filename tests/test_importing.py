@@ -18,11 +18,13 @@ from PIL import Image
 from trimesh.visual.material import PBRMaterial
 
 from advsearch.errors import FileFormatError, InputError
+from advsearch.scene import library
 from advsearch.scene.assets import Material, Mesh, ObjectAsset
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.images import area_average, display_image
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.texture import sampled
+from advsearch.scene.importing.upright import guess_up
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "objects"
 real_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the shared test data is not at {DATA}")
@@ -154,6 +156,40 @@ def test_up_axis(tmp_path: Path, suffix: str, up: Any, turned: bool) -> None:
     expected -= [middle[0], middle[1], expected[:, 2].min()]
     assert np.unique(got.vertices.round(5), axis=0) == pytest.approx(np.unique(expected.round(5), axis=0), abs=1e-5)
     assert volume(got) > 0.0
+
+
+AS_Y_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+"""From points with y up to points with z up, as rows times this matrix transposed."""
+
+
+@pytest.mark.parametrize("name", library.list_objects())
+def test_every_bundled_object_is_recovered_from_a_file_with_either_axis_up(name: str) -> None:
+    points = library.load_object(name).mesh.vertices.astype(np.float64)
+    for axis, stored in (("z", points), ("y", points @ AS_Y_UP)):
+        moved = 3.0 * stored + [5.0, -2.0, 7.0]  # neither the size nor the origin takes part
+        assert guess_up(moved, "thing.obj").axis == axis
+
+
+@real_data
+@pytest.mark.parametrize("name", ["mug.obj", "teapot.obj", "banana.obj", "bowl.obj", "cow.obj"])
+def test_real_objects_stand_upright(name: str) -> None:
+    axis = "y" if name in ("teapot.obj", "cow.obj") else "z"
+    got, told = (import_object(DATA / name, up=up) for up in (None, axis))  # type: ignore[arg-type]
+    assert got.up is not None and got.up.axis == axis
+    np.testing.assert_array_equal(got.mesh.vertices, told.mesh.vertices)
+    other = "z" if axis == "y" else "y"
+    assert got.notes[0].startswith(f"{name}: {axis} is taken for up, because it then rests on ")
+    assert got.notes[0].endswith(f"if it lies on its side, give `up={other}`")
+    assert told.notes == told.warnings
+
+
+def test_what_does_not_tell_which_way_is_up_stays_as_it_is(tmp_path: Path) -> None:
+    cube = exported(tmp_path, "cube.stl", trimesh.creation.box((1.0, 1.0, 1.0)))
+    (note,) = import_object(cube).notes
+    assert note.startswith("cube.stl: z is taken for up, because its shape does not tell, as it rests as well either")
+    upright = trimesh.Trimesh([[0.0, 0, 0], [1, 0, 0], [0, 0, 1]], [[0, 1, 2]], process=False)  # no area from above
+    assert import_object(exported(tmp_path, "flat.ply", upright)).up is not None
+    assert import_object(exported(tmp_path, "cube.glb", trimesh.creation.box())).notes == ()
 
 
 def test_scene_graph_is_applied_and_parts_are_joined(tmp_path: Path) -> None:

@@ -315,7 +315,7 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
     stages = Stages(progress)
     stages.begin("setup", PREPARING)
     problem = _problem(job)
-    said = [*job.scene.description.object.warnings, *job.scene.description.environment.warnings, *job.loaded[1]]
+    said = [*job.scene.description.object.notes, *job.scene.description.environment.warnings, *job.loaded[1]]
     for text in said:
         progress.message(text)
     policy = _policy(job, problem)

@@ -102,6 +102,7 @@ class Rendering:
             "spp": self.spp,
             "image_formation": self.formation.summary(),
             "gain": self.formation.gain,
+            "up": None if self.scene.object.up is None else asdict(self.scene.object.up),
             "views": [
                 {"azimuth": view.azimuth, "answers": [asdict(answer) for answer in view.answers]} for view in self.views
             ],
@@ -164,8 +165,7 @@ def render(
         views.append(View(azimuth, picture, radiance * formation.gain, model.answers(picture)))
         progress.advance(1)
     assert formation is not None
-    assets = scene.description.object, scene.description.environment
-    warnings = tuple(text for asset in assets for text in asset.warnings)
+    warnings = (*scene.description.object.notes, *scene.description.environment.warnings)
     return Rendering(scene.description, model.name, formation, spp, tuple(views), warnings)
 
 

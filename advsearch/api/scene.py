@@ -86,7 +86,7 @@ def load_scene(
     Args:
         object: a bundled name ("mug"), a path to an .obj, .ply or .glb file, or an asset.
         environment: a bundled name, a path to an .hdr or .exr file, an asset; default "studio".
-        up: the up axis of a mesh file, "y" or "z"; by default the habit of its format.
+        up: the up axis of a mesh file, "y" or "z"; by default what its format or else its shape says.
         settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``.
 
     Raises:

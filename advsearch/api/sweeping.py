@@ -169,7 +169,7 @@ def _job(config: SweepConfig, places: Sequence[Place], models: Sequence[AnyModel
     samples = config.samples or (SAMPLES if drawn and not axes else 1)
     networks, said = _models(models, config)
     for place in places:
-        said += [*place.scene.description.object.warnings, *place.scene.description.environment.warnings]
+        said += [*place.scene.description.object.notes, *place.scene.description.environment.warnings]
     return Job(config, tuple(places), networks, drawn, axes, samples, tuple(dict.fromkeys(said)))
 
 

@@ -81,7 +81,7 @@ class LineProgress:
     def message(self, text: str) -> None:
         """See `Progress.message`."""
         with self._lock:
-            self._print(text)
+            self._print(with_flags(text))
 
     def tick(self) -> None:
         """Print a line if it is time for one."""
@@ -132,7 +132,7 @@ class BarProgress:
 
     def message(self, text: str) -> None:
         """See `Progress.message`."""
-        self._bars.console.print(text, markup=False, highlight=False)
+        self._bars.console.print(with_flags(text), markup=False, highlight=False)
 
     def _end_stage(self) -> None:
         """Fill the bar of a stage whose length was unknown, or that ended early, and stop its clock."""

@@ -33,7 +33,11 @@ class SceneConfig(Config):
     )
     environment: str = setting("studio", "scene", "what lights it", "the name of an environment or a .hdr or .exr file")
     up: Literal["y", "z"] | None = setting(
-        None, "scene", "axis of an imported object that points up", "y or z", otherwise="found from the file"
+        None,
+        "scene",
+        "axis of an imported object that points up",
+        "y or z",
+        otherwise="as the format says, or else the axis along which it stands best",
     )
     set_: dict[str, float | str | tuple[float, ...]] = setting(
         dict,

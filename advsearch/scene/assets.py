@@ -54,6 +54,19 @@ class Material:
     clearcoat: float = 0.0
 
 
+@dataclass(frozen=True)
+class UpAxis:
+    """The axis of a mesh file that is taken for up.
+
+    Attributes:
+        axis: "y" or "z".
+        reason: why, in one sentence with what to do if it is wrong; empty where the user or the format said it.
+    """
+
+    axis: str
+    reason: str = ""
+
+
 @dataclass(frozen=True, eq=False)
 class ObjectAsset:
     """The object a model should recognise.
@@ -66,6 +79,7 @@ class ObjectAsset:
         label: name of the class it belongs to in the reference model, or None when unknown.
         source: where it came from, for messages and logs.
         warnings: what the importer had to repair or leave out, one sentence each.
+        up: the axis of the file that was taken for up; None for what comes from no file.
     """
 
     name: str
@@ -75,6 +89,13 @@ class ObjectAsset:
     label: str | None = None
     source: str = ""
     warnings: tuple[str, ...] = ()
+    up: UpAxis | None = None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know of how it was read: the up axis where that was guessed, and the warnings."""
+        guessed = (self.up.reason,) if self.up is not None and self.up.reason else ()
+        return (*guessed, *self.warnings)
 
 
 @dataclass(frozen=True, eq=False)

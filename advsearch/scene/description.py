@@ -114,7 +114,7 @@ def describe(
         object_spec: a bundled name, a path to a mesh, or an asset.
         environment_spec: a bundled name, a path to an .hdr or .exr file, an asset, or None for the default.
         given: settings to fix, by name.
-        up: "y" or "z", the up axis of a mesh file; None takes the format's habit.
+        up: "y" or "z", the up axis of a mesh file; None takes what its format or else its shape says.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a setting is out of range.

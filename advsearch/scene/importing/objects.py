@@ -9,12 +9,13 @@ from typing import Literal
 import numpy as np
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Material, ObjectAsset, normalised
+from advsearch.scene.assets import Material, ObjectAsset, UpAxis, normalised
 from advsearch.scene.importing.files import read_bytes, safe_name
 from advsearch.scene.importing.geometry import Soup, assemble, join, repaired
-from advsearch.scene.importing.parts import GLTF, read_parts
+from advsearch.scene.importing.parts import GLTF, Part, read_parts
 from advsearch.scene.importing.surfaces import Surface
 from advsearch.scene.importing.texture import textured
+from advsearch.scene.importing.upright import guess_up
 
 SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl")
 """The mesh files that can be imported."""
@@ -24,9 +25,9 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
     """Read an object from a mesh file, repaired, normalised and with a texture.
 
     - All geometry in the file is joined, with the transforms of its scene graph.
-    - Axes: y up for .glb and .gltf, as their specification says, and z up for the formats that leave it open; `up`
-      overrides. y up is turned to z up by 90 degrees about x. Then the object is scaled to a largest extent of 1 and
-      set on z = 0.
+    - Axes: y up for .glb and .gltf, as their specification says; for the formats that leave it open, the axis along
+      which the object stands best (`guess_up`); `up` overrides. y up is turned to z up by 90 degrees about x. Then the
+      object is scaled to a largest extent of 1 and set on z = 0.
     - Faces without area are removed, the winding is made consistent, closed shells that are inside out are turned over.
     - Normals are the file's; where it has none, or they contradict the faces, they are computed: smooth, with creases
       where faces meet at more than 40 degrees.
@@ -43,7 +44,7 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
 
     Args:
         path: a file that ends in one of `SUFFIXES`; files that it refers to are looked up beside it.
-        up: the axis that points up in the file, or None for the format's own.
+        up: the axis that points up in the file; None for what the format or else the shape says.
 
     Raises:
         FileFormatError: the file is missing, of another kind, damaged, or holds no faces; the message names it.
@@ -54,8 +55,8 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
     file = Path(path)
     data = read_bytes(file, "object", SUFFIXES)
     parts, notes = read_parts(file, data)
-    y_up = up == "y" or (up is None and file.suffix.lower() in GLTF)
-    soup, repairs = repaired(join(parts, str(file), y_up=y_up), str(file))
+    soup, axis = _upright(parts, file, up)
+    soup, repairs = repaired(soup, str(file))
     surfaces = [part.surface for part in parts]
     soup, base_color, bakes = textured(soup, surfaces)
     material, blends = _material(soup, surfaces)
@@ -66,7 +67,19 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
         material=material,
         source=str(file),
         warnings=(*notes, *(f"{file.name}: {note}" for note in repairs + bakes + blends)),
+        up=axis,
     )
+
+
+def _upright(parts: list[Part], file: Path, up: str | None) -> tuple[Soup, UpAxis]:
+    """Return the joined parts, z up, and the axis of the file that was taken for up."""
+    if up is None and file.suffix.lower() in GLTF:
+        up = "y"
+    soup = join(parts, str(file), y_up=up == "y")
+    if up is not None:
+        return soup, UpAxis(up)
+    guess = guess_up(soup.points[np.unique(soup.faces)], file.name)
+    return (soup if guess.axis == "z" else join(parts, str(file), y_up=True)), guess
 
 
 def _material(soup: Soup, surfaces: list[Surface]) -> tuple[Material, list[str]]:
