@@ -137,11 +137,11 @@ SMALL: dict[str, Any] = {"object": "mug", "resolution": 16, "spp": 1, "threads":
 @pytest.mark.parametrize(
     ("make", "do"),
     [
-        (lambda run: AttackConfig(**SMALL, steps=3, trials=2, average=2, verify_spp=2, run=run), attack_from_config),
-        (lambda run: SweepConfig(**SMALL, grid={"pose.yaw": "0,90"}, trials=2, run=run), sweep_from_config),
+        (lambda run: AttackConfig(**SMALL, steps=3, trials=6, average=2, verify_spp=2, run=run), attack_from_config),
+        (lambda run: SweepConfig(**SMALL, grid={"pose.yaw": "0,90"}, trials=6, run=run), sweep_from_config),
         (
             lambda run: RegionConfig(
-                **SMALL, controls={"camera": {}}, vary="camera.azimuth", samples=3, verify_spp=1, run=run
+                **SMALL, controls={"camera": {}}, vary="camera.azimuth", samples=8, verify_spp=1, run=run
             ),
             region_from_config,
         ),
@@ -199,8 +199,8 @@ def test_a_resumed_run_takes_its_probes_from_the_store(tmp_path: Path, monkeypat
 
 
 def test_the_probes_of_a_sweeps_worst_configuration_are_stored(tmp_path: Path) -> None:
-    config = SweepConfig(**SMALL, grid={"pose.yaw": "0,90"}, trials=2, run=str(tmp_path / "run"))
+    config = SweepConfig(**SMALL, grid={"pose.yaw": "0,90"}, trials=6, run=str(tmp_path / "run"))
     found = sweep_from_config(config)
     with RunDirectory.resume(tmp_path / "run") as run:
         kept = run.store.counts()
-    assert kept["sample count worst"] + 2 == found.summary["renders"]["verification"]
+    assert kept["sample count worst"] + 6 == found.summary["renders"]["verification"]
