@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import json
+import os
+import warnings
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -315,3 +317,143 @@ def test_expressions_of_sizes_that_are_read(text: str) -> None:
 def test_expressions_that_are_none(text: str) -> None:
     message = expressions.problem(text)
     assert message and len(message) < 250
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# TorchScript
+
+
+def scripted(module: nn.Module, path: Path) -> Path:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.jit.script(module.eval()).save(str(path))
+    return path
+
+
+class Scripted(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.linspace(-1, 1, 36).reshape(3, 12))
+        self.note = "two\nlines"
+        self.path = ""
+
+    def forward(self, x: Tensor) -> Tensor:
+        small = nn.functional.interpolate(x, (2, 2), mode="bilinear")
+        return small.flatten(1) @ self.weight.T
+
+
+class Saves(Scripted):
+    def forward(self, x: Tensor) -> Tensor:
+        torch.save(x, self.path)  # type: ignore[arg-type]
+        return x.mean((2, 3))
+
+
+class MapsAFile(Scripted):
+    def forward(self, x: Tensor) -> Tensor:
+        return x.mean((2, 3)) + torch.from_file(self.path, True, 12)[:3]
+
+
+class SavesWhileLoading(Scripted):
+    @torch.jit.export
+    def __getstate__(self) -> tuple[Tensor, str, bool]:
+        return (self.weight, self.path, self.training)
+
+    @torch.jit.export
+    def __setstate__(self, state: tuple[Tensor, str, bool]) -> None:
+        torch.save(state[0], state[1])  # type: ignore[arg-type]
+        self.weight, self.path, self.note, self.training = state[0], state[1], "", state[2]  # type: ignore
+
+
+class Prints(Scripted):
+    def forward(self, x: Tensor) -> Tensor:
+        print("\x1b[2J")
+        return x.mean((2, 3))
+
+
+@pytest.fixture(scope="module")
+def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return scripted(Scripted(), tmp_path_factory.mktemp("models") / "net.pt")
+
+
+def test_plain_torchscript_answers_as_before(script: Path, tmp_path: Path) -> None:
+    images = torch.rand((2, 8, 8, 3), generator=torch.Generator().manual_seed(0))
+    expected = Scripted()(images.permute(0, 3, 1, 2))
+    torch.testing.assert_close(load_model(script, input_size=8)(images), expected)
+
+
+@pytest.mark.parametrize("kind", [Saves, MapsAFile, SavesWhileLoading, Prints])
+def test_torchscript_touches_nothing(kind: type[Scripted], tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    trace = tmp_path / "executed"
+    module = kind()
+    module.path = str(trace)
+    with pytest.raises(FileFormatError, match=r"'code/__torch__/test_hostile_models.py' uses '\w+', which no plain"):
+        load_model(scripted(module, tmp_path / "net.pt"), input_size=8)
+    assert not trace.exists() and "\x1b" not in capfd.readouterr().out
+
+
+@pytest.mark.parametrize("text", ["getattr(torch, '\\163ave')", "x = '\\033[2J'", "torch.classes.other.X()"])
+def test_torchscript_hides_nothing(text: str, script: Path, tmp_path: Path) -> None:
+    name = "code/__torch__/test_hostile_models.py"
+    code = member(script, name).replace(b"return", f"y = {text}\n    return".encode())
+    with pytest.raises(FileFormatError, match=r"hidden characters|native classes"):
+        load_model(repacked(script, tmp_path / "net.pt", {name: code}), input_size=8)
+
+
+def test_a_tensor_is_as_large_as_torchscript_states(script: Path, tmp_path: Path) -> None:
+    """torch reads past the end of the memory of one that is smaller."""
+    data = member(script, "/data.pkl").replace(b"K\x24tQ", b"J\x00\x00\x00\x40tQ")
+    data = data.replace(b"K\x03K\x0ct", b"J\x00\x00\x00\x04K\x0ct")
+    with pytest.raises(FileFormatError, match="'data/0' has 144 bytes, but should hold 1,073,741,824 numbers"):
+        load_model(repacked(script, tmp_path / "net.pt", {"data.pkl": data}), input_size=8)
+
+
+def test_nested_pickles_of_torchscript_are_refused(script: Path, tmp_path: Path) -> None:
+    """torch follows them until the stack is full, and the process ends."""
+    deep = b"\x80\x02(" + b"]" * 300_000 + b"a" * 299_999 + b"t."
+    with pytest.raises(FileFormatError, match=r"'constants.pkl' is nested deeper than 200"):
+        load_model(repacked(script, tmp_path / "net.pt", {"constants.pkl": deep}), input_size=8)
+
+
+def test_pickles_of_torchscript_make_nothing(script: Path, tmp_path: Path) -> None:
+    trace = tmp_path / "executed"
+    data = b"\x80\x02(cos\nmkdir\nX" + len(str(trace)).to_bytes(4, "little") + str(trace).encode() + b"\x85Rt."
+    with pytest.raises(FileFormatError, match="cannot be read as TorchScript"):
+        load_model(repacked(script, tmp_path / "net.pt", {"constants.pkl": data}), input_size=8)
+    assert not trace.exists()
+
+
+@pytest.mark.parametrize("name", ["data.pkl", "code/__torch__/test_hostile_models.py"])
+def test_damaged_torchscript_is_refused(name: str, script: Path, tmp_path: Path) -> None:
+    content = member(script, f"/{name}")
+    for damaged in (content[: len(content) // 2], bytes(100), b"\xff" * 50):
+        with pytest.raises(FileFormatError):
+            load_model(repacked(script, tmp_path / "net.pt", {name: damaged}), input_size=8)
+
+
+def test_torchscript_that_swells_is_refused(script: Path, tmp_path: Path) -> None:
+    path = repacked(script, tmp_path / "net.pt", {"extra/zeros": bytes(64 << 20)}, zipfile.ZIP_DEFLATED)
+    with pytest.raises(FileFormatError, match="unpacks to at most 20 times its size"):
+        load_model(path, input_size=8)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# what is no ordinary file
+
+
+def test_pipes_and_devices_are_no_models(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.pt2")
+    for path in (tmp_path / "pipe.pt2", Path("/dev/zero")):
+        with pytest.raises(FileFormatError, match=r"expected a model file, got a (pipe|device)"):
+            load_model(path)
+
+
+@pytest.mark.parametrize("length", [0, 1 << 20, 1 << 62])
+def test_safetensors_of_impossible_headers(length: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "hostile_weights.py").write_text("from torch import nn\nbuild = lambda: nn.Linear(2, 2)\n")
+    path = tmp_path / "w.safetensors"
+    path.write_bytes(length.to_bytes(8, "little") + b'{"weight":' * 10_000)
+    with pytest.raises(FileFormatError, match="expected a complete safetensors file"):
+        load_model(f"hostile_weights:build@{path}")
+    with pytest.raises(FileFormatError, match="expected weights, got a device"):
+        load_model("hostile_weights:build@/dev/zero")

@@ -19,7 +19,7 @@ import torch
 
 from advsearch.errors import FileFormatError, ModelError
 from advsearch.files import open_regular
-from advsearch.models import exported
+from advsearch.models import exported, torchscript
 from advsearch.models.archive import LARGEST, Archive, open_archive, refused
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source, source_of
@@ -52,7 +52,7 @@ def load_file(path: Path) -> Source:
             raise FileFormatError(f"model file {path}: {_not_an_archive(path, head)}")
         archive = open_archive(path, file, os.fstat(file.fileno()).st_size)
         if _kind(archive) == "torchscript":
-            return _load_torchscript(path)
+            return _load_torchscript(path, archive)
         return _load_exported(path, archive)
 
 
@@ -111,10 +111,11 @@ def _near_files(path: Path) -> str:
 # TorchScript
 
 
-def _load_torchscript(path: Path) -> Source:
+def _load_torchscript(path: Path, archive: Archive) -> Source:
+    checked = torchscript.rewritten(archive)
     with warnings.catch_warnings(), _damaged(path, "TorchScript"):
         warnings.filterwarnings("ignore", message=r".*torch\.jit\.\w+.* is deprecated", category=DeprecationWarning)
-        module = torch.jit.load(str(path), map_location="cpu")  # type: ignore[no-untyped-call]
+        module = torch.jit.load(checked, map_location="cpu")  # type: ignore[no-untyped-call]
     return source_of(module, path.stem)
 
 

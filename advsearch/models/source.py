@@ -16,6 +16,8 @@ from safetensors.torch import load_file
 from torch import nn
 
 from advsearch.errors import FileFormatError, ModelError
+from advsearch.files import open_regular
+from advsearch.models.archive import LARGEST
 from advsearch.models.model import CPU, ModelWarning
 from advsearch.models.preprocessing import Triple
 from advsearch.models.probe import first_line
@@ -99,10 +101,11 @@ def load_weights(module: nn.Module, path: Path, name: str) -> None:
         FileFormatError: the file is missing or is not safetensors.
         ModelError: keys or shapes do not fit.
     """
-    if not path.is_file():
-        raise FileFormatError(f"weights {path} of model {name}: no such file")
     try:
+        open_regular(path, "weights", LARGEST).close()
         state = load_file(path)
+    except FileNotFoundError:
+        raise FileFormatError(f"weights {path} of model {name}: no such file") from None
     except (SafetensorError, OSError) as error:
         raise FileFormatError(
             f"weights {path} of model {name}: expected a complete safetensors file ({first_line(error)}); "
