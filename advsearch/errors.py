@@ -9,7 +9,11 @@ but an `AdvsearchError` is a bug and keeps its traceback.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
+
+SIMILAR, SIMILAR_WORD = 0.6, 0.75
+"""Least ratio of `difflib` at which a name, or one word of it, is spelled nearly like another."""
 
 
 class AdvsearchError(Exception):
@@ -32,7 +36,7 @@ class UnknownNameError(InputError):
 
     def __init__(self, kind: str, name: str, known: Iterable[str], hint: str = "") -> None:
         names = sorted(known)
-        near = difflib.get_close_matches(name, names, n=3, cutoff=0.5)
+        near = resembling(name, names)[:3]
         guess = f" Did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
         super().__init__(f"unknown {kind} {name!r}.{guess} Known: {', '.join(names)}.{' ' + hint if hint else ''}")
         self.near = tuple(near)
@@ -56,3 +60,49 @@ class StorageError(AdvsearchError):
 
 class EnvironmentSetupError(AdvsearchError):
     """A part of the machine is missing or unusable (no usable LLVM, say). The message holds the command to type."""
+
+
+def resembling(name: str, known: Iterable[str]) -> list[str]:
+    """Return the known names that are like `name`, whatever their case, best first.
+
+    First those with all of its words ("coffee mug" for "mug"; a plural s is no difference), then those with words that
+    begin like them, then those that contain it; of equals, those with fewer other words, and with its last word last.
+    Where there is none, those of nearly the same spelling, as a whole or in one word.
+    """
+    asked, names = _words(name), list(dict.fromkeys(known))
+    ranked = [(rank, one) for one in names if (rank := _rank(asked, _words(one))) is not None]
+    if ranked:
+        return [one for _, one in sorted(ranked, key=lambda pair: pair[0])]
+    matcher = difflib.SequenceMatcher(None, "", name.casefold())
+    near = {one: _similarity(matcher, one) for one in names}
+    return sorted((one for one in names if near[one]), key=lambda one: -near[one])
+
+
+def _words(name: str) -> list[str]:
+    """The words of a name in folded case, without a plural s."""
+    words = [word for word in re.split(r"[\W_]+", name.casefold()) if word]
+    return [re.sub("(?<=ss|sh|ch)es$|(?<=[^s])s$", "", word) if len(word) > 3 else word for word in words]
+
+
+def _rank(asked: Sequence[str], words: Sequence[str]) -> tuple[int, int, bool] | None:
+    """Where a name with these words stands among those that are like what was asked for; None if it isn't."""
+    if not asked or not words:
+        return None
+    place = len(words) - len(asked), words[-1] != asked[-1]
+    if set(asked) <= set(words):
+        return (0, *place)
+    if all(any(word.startswith(part) for word in words) for part in asked):
+        return (1, *place)
+    return (2, *place) if "".join(asked) in "".join(words) else None
+
+
+def _similarity(asked: difflib.SequenceMatcher[str], name: str) -> float:
+    """How near a name's spelling is to what was asked for, as a whole or in one word; 0 where it is not."""
+    return max([_ratio(asked, name.casefold(), SIMILAR), *(_ratio(asked, word, SIMILAR_WORD) for word in _words(name))])
+
+
+def _ratio(asked: difflib.SequenceMatcher[str], name: str, least: float) -> float:
+    asked.set_seq1(name)
+    quick = asked.real_quick_ratio() >= least and asked.quick_ratio() >= least
+    ratio = asked.ratio() if quick else 0.0
+    return ratio if ratio >= least else 0.0

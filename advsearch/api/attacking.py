@@ -12,8 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from advsearch import seeds
+from advsearch.api.answers import right_answers
 from advsearch.api.memory import Memory
-from advsearch.api.naming import load_models, right_answers, scene_settings
+from advsearch.api.naming import load_models, scene_settings
 from advsearch.api.outcome import AttackResult, summarise
 from advsearch.api.problem import Problem
 from advsearch.api.record import Recorder, Stages
@@ -253,7 +254,7 @@ def _policy_options(config: AttackConfig) -> dict[str, Any]:
 def _problem(job: _Job) -> Problem:
     config, (model, _) = job.config, job.loaded
     description = job.scene.description
-    labels = right_answers(model, config.label, config.object, description.object.label)
+    labels = right_answers(model, job.scene, config.object, config)
     resolution = config.resolution or (model.input_size[0], model.input_size[1])
     description = framed(description, resolution)
     space = make_space((*job.controls, *job.over), description)

@@ -9,7 +9,7 @@ from typing import Any
 from advsearch import threads
 from advsearch.config import SceneConfig
 from advsearch.errors import InputError
-from advsearch.models import LabelSet, Model, ModelWarning, load_model
+from advsearch.models import Model, ModelWarning, load_model
 
 
 def scene_settings(fixed: Mapping[str, Any] | None, exposure: float | None) -> dict[str, Any]:
@@ -51,29 +51,3 @@ def different(names: Sequence[str], setting: str) -> Sequence[str]:
             f"{setting}: expected different names, got {','.join(names)!r}; leave {', '.join(twice[:1])} out"
         )
     return names
-
-
-def right_answers(model: Model, asked: str | None, object: str, own: str | None) -> LabelSet:
-    """Return the right answers for an object: what was said, or else its own label.
-
-    Args:
-        model: whose classes.
-        asked: what `--label` said.
-        object: the object's name, for messages.
-        own: its label.
-
-    Raises:
-        InputError: the model has no such class, or the object has no label.
-    """
-    if asked is None and own is None:
-        raise InputError(
-            f"label: expected the right answers for {object}, got none; name classes of model {model.name}"
-        )
-    try:
-        return model.label_set(str(own) if asked is None else asked)
-    except InputError as error:
-        if asked is not None:
-            raise InputError(f"label: {error}") from None
-        raise InputError(
-            f"the label of {object} itself does not fit the model; say which is right with `label` ({error})"
-        ) from None

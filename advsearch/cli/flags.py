@@ -25,6 +25,9 @@ GROUPS = {
     "run": "run",
 }
 
+_NO_SETTINGS = {"case": "--case", "group": "--group"}
+"""Flags of `stability`, which messages name too and which are no setting of a configuration."""
+
 _LISTS = ("controls", "over", "set_", "estimators", "grid")
 
 Given = TypeVar("Given", bound=Config)
@@ -104,15 +107,17 @@ def with_flags(message: str) -> str:
     ``--epsilon: ...; lower --steps or use --denoise none``.
     """
     every = [getattr(configurations, name) for name in configurations.__all__ if name.endswith("Config")]
-    found = {one.name: one for config in every for one in settings(config)}
+    known = [one for config in every for one in settings(config)]
+    flags = {**_NO_SETTINGS, **{one.name: one.flag for one in known}}
+    switches = {one.name for one in known if one.is_switch}
 
-    def named(match: re.Match[str]) -> str:
-        one, value = found[match["name"]], match["value"]
-        return one.flag if value is None or one.is_switch else f"{one.flag} {value}"
+    def written(match: re.Match[str]) -> str:
+        name, value = match["name"], match["value"]
+        return flags[name] if value is None or name in switches else f"{flags[name]} {value}"
 
-    names = f"(?P<name>{'|'.join(found)})"
-    message = re.sub(rf"`{names}(=(?P<value>[^`]*))?`", named, message)
-    return re.sub(rf"(?P<before>^|; ){names}(?=: )", lambda match: match["before"] + found[match["name"]].flag, message)
+    names = f"(?P<name>{'|'.join(flags)})"
+    message = re.sub(rf"`{names}(=(?P<value>[^`]*))?`", written, message)
+    return re.sub(rf"(?P<before>^|; ){names}(?=: )", lambda match: match["before"] + flags[match["name"]], message)
 
 
 def help_text(setting: Setting) -> str:

@@ -36,6 +36,7 @@ COMMANDS = {
     "stability": "advsearch.cli.stability",
     "precision": "advsearch.cli.precision",
     "list": "advsearch.cli.list",
+    "labels": "advsearch.cli.labels",
     "show": "advsearch.cli.show",
     "doctor": "advsearch.cli.doctor_command",
 }

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
-from advsearch.models.labels import LabelSet, find_label_set, read_labels
+from advsearch.models.labels import LabelSet, find_label_set, matching_labels, read_labels
 from advsearch.models.loading import load_model
 from advsearch.models.model import Model, ModelWarning
 from advsearch.models.preprocessing import Preprocessing
 
-__all__ = ["LabelSet", "Model", "ModelWarning", "Preprocessing", "find_label_set", "load_model", "read_labels"]
+__all__ = [
+    "LabelSet",
+    "Model",
+    "ModelWarning",
+    "Preprocessing",
+    "find_label_set",
+    "load_model",
+    "matching_labels",
+    "read_labels",
+]

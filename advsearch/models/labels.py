@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import re
 from collections.abc import Iterator, Sequence
@@ -10,7 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from advsearch.errors import FileFormatError, InputError
+from advsearch.errors import FileFormatError, InputError, resembling
+
+MOST_SUGGESTIONS = 4
+"""Labels that a message suggests for an unknown one."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,19 @@ def find_label_set(text: str | int | Sequence[str | int], labels: Sequence[str],
     return LabelSet(tuple(labels[index] for index in indices), indices)
 
 
+def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
+    """Return index and name of the classes whose names, or synonyms, are like `word`, best first; see `resembling`.
+
+    The name is the part of the label that matched: "frying pan" of "frying pan, frypan, skillet".
+    """
+    table = {name: indices for name, indices in _name_table(labels).items() if "," not in name}
+    parts: dict[int, str] = {}
+    for name in resembling(word, table):
+        for index in table[name]:
+            parts.setdefault(index, name)
+    return list(parts.items())
+
+
 def _find(term: str, table: dict[str, list[int]], labels: Sequence[str], named: bool) -> int:
     """Return the one class index that `term` stands for."""
     explicit = re.fullmatch(r"#\s*(-?\d+)", term)
@@ -88,9 +103,9 @@ def _unknown(term: str, table: dict[str, list[int]], labels: Sequence[str], name
         return (
             f"{message} Its {len(labels)} classes have no names: give a label file (`labels`), or an index such as '#0'"
         )
-    near = difflib.get_close_matches(_key(term), table, n=4, cutoff=0.6)
+    near = matching_labels(term, labels)[:MOST_SUGGESTIONS]
     if near:
-        options = [f"{name!r} (#{table[name][0]})" for name in near]
+        options = [f"{name!r} (#{index})" for index, name in near]
         return f"{message} Did you mean {' or '.join(options)}?"
     shown = ", ".join(labels[:20]) + (", ..." if len(labels) > 20 else "")
     return f"{message} Its {len(labels)} labels: {shown}"

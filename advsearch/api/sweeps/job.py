@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from advsearch.api.naming import right_answers
+from advsearch.api.answers import right_answers
 from advsearch.api.scene import Scene, framed
 from advsearch.api.sweeps.axes import Axis, on_grid
 from advsearch.api.sweeps.points import BINS, Drawn, Points
@@ -88,8 +88,7 @@ class Job:
         Raises:
             InputError: the model has no such class, or the object has no label.
         """
-        own = place.scene.description.object.label
-        return right_answers(model, self.config.label, place.object, own)
+        return right_answers(model, place.scene, place.object, self.config)
 
 
 def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:

@@ -68,7 +68,7 @@ def run_case(case: Case) -> Row:
 def run_cases(cases: Sequence[Case] = CASES, progress: Progress | None = None) -> Iterator[Row]:
     """Run cases one after the other and yield each row as it is done."""
     progress = progress or NullProgress()
-    hint = "--case and --group pick some, --seconds stops before the next one"
+    hint = "`case` and `group` pick some, `seconds` stops before the next one"
     progress.stage("trying extreme scenes, objectives and arithmetic", len(cases), hint=hint)
     for case in cases:
         row = run_case(case)

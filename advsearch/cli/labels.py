@@ -1,0 +1,74 @@
+"""`advsearch labels`: the classes of a model by name, those that are like a word first."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from advsearch.cli import output
+from advsearch.errors import InputError
+
+HELP = "find the names of a model's classes, as --label takes them"
+
+_EXAMPLES = """examples:
+  advsearch labels
+  advsearch labels mug --labels labels.json
+  advsearch labels mug --model model.pt2 --labels labels.json --json
+"""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add the command."""
+    from advsearch.cli.flags import add_settings
+
+    parser = subparsers.add_parser(
+        "labels",
+        help=HELP,
+        description=f"{HELP[0].upper()}{HELP[1:]}. With --labels the model itself is not loaded.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("word", metavar="WORD", nargs="?", help="what the names should be like; all without it")
+    add_settings(parser, groups=(), fields=("model", "labels"))
+    output.add_flags(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print index and name of the classes, best first.
+
+    Raises:
+        InputError: no class is like the word, or the model has no names for its classes.
+    """
+    with output.output_kept_clean():
+        from advsearch.models import matching_labels
+
+        labels = class_names(getattr(args, "model", "reference"), getattr(args, "labels", None))
+        if args.word is None:
+            indices = list(range(len(labels)))
+        else:
+            indices = [index for index, _ in matching_labels(args.word, labels)]
+    if not indices:
+        raise InputError(f"none of the {len(labels)} labels is like {args.word!r}; leave the word out to see all")
+    if args.json:
+        found = [{"index": index, "label": labels[index]} for index in indices]
+        output.print_json({"schema": 1, "command": "labels", "word": args.word, "labels": found})
+    else:
+        print(output.columns([[f"#{index}", labels[index]] for index in indices]))
+    return 0
+
+
+def class_names(model: str, labels: str | None) -> tuple[str, ...]:
+    """Return the names of a model's classes in index order: those of a file, or else the model's own.
+
+    Raises:
+        InputError: the model has none.
+    """
+    from advsearch.models import load_model, read_labels
+
+    if labels is not None:
+        return read_labels(labels)
+    loaded = load_model(model)
+    if not loaded.named:
+        raise InputError(f"model {loaded.name} has {loaded.classes} classes without names; give a file with `labels`")
+    return loaded.labels

@@ -1,0 +1,135 @@
+"""Finding the name of a class: what is like a word, `advsearch labels`, and what an object without a label is told."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import advsearch
+from advsearch import models
+from advsearch.cli.main import main
+from advsearch.errors import InputError, UnknownNameError, resembling
+from advsearch.models import find_label_set, matching_labels
+
+LABELS = ("pug", "coffee mug", "frying pan, frypan", "giant panda", "cup", "mosque", "crane", "crane", "glasses")
+
+
+@pytest.mark.parametrize(
+    ("word", "found"),
+    [
+        ("mug", ["coffee mug"]),
+        ("MUGS", ["coffee mug"]),
+        ("pan", ["frying pan", "giant panda", "frypan"]),
+        ("panda", ["giant panda"]),
+        ("coffee  Mug", ["coffee mug"]),
+        ("mug coffee", ["coffee mug"]),
+        ("glass", ["glasses"]),
+        ("fry", ["frypan", "frying pan"]),
+        ("mosk", ["mosque"]),
+        ("cofee", ["coffee mug"]),
+        ("xyzzy", []),
+        ("???", []),
+    ],
+)
+def test_whole_words_come_first_then_beginnings_then_parts_then_spelling(word: str, found: list[str]) -> None:
+    names = ["pug", "frypan", "coffee mug", "giant panda", "frying pan", "mosque", "glasses"]
+    assert resembling(word, names) == found
+
+
+@pytest.mark.parametrize(("name", "near"), [("step", "steps"), ("azimuth", "camera.azimuth"), ("smug", "mug")])
+def test_every_unknown_name_is_helped_in_the_same_way(name: str, near: str) -> None:
+    error = UnknownNameError("name", name, ["step_size", "steps", "camera.azimuth", "mug"])
+    assert error.near[0] == near and f"Did you mean {near!r}" in str(error)
+
+
+def test_a_name_of_any_length_is_compared_at_once() -> None:
+    assert resembling("x" * 100_000, ["coffee mug"] * 10 + [f"label {number}" for number in range(1000)]) == []
+
+
+def test_labels_match_by_their_synonyms() -> None:
+    assert matching_labels("pan", LABELS) == [(2, "frying pan"), (3, "giant panda")]
+    assert matching_labels("crane", LABELS) == [(6, "crane"), (7, "crane")]
+    with pytest.raises(InputError, match=r"no label 'mug'\. Did you mean 'coffee mug' \(#1\)\?$"):
+        find_label_set("mug", LABELS)
+    with pytest.raises(InputError, match=r"no label 'pan'\. Did you mean 'frying pan' \(#2\) or 'giant panda'"):
+        find_label_set("pan", LABELS)
+
+
+def test_labels_are_listed_from_the_file_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "labels.json"
+    file.write_text(json.dumps(LABELS), encoding="utf-8")
+    monkeypatch.setattr(models, "load_model", None)
+    assert main(["labels", "mug", "--model", "large.pt2", "--labels", str(file), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["labels"] == [{"index": 1, "label": "coffee mug"}]
+    assert main(["labels", "pan", "--labels", str(file)]) == 0
+    assert capsys.readouterr().out == "  #2   frying pan, frypan\n  #3   giant panda\n"
+    assert main(["labels", "--labels", str(file), "--json"]) == 0
+    assert [one["label"] for one in json.loads(capsys.readouterr().out)["labels"]] == list(LABELS)
+    assert main(["labels", "xyzzy", "--labels", str(file)]) == 2
+    assert "none of the 9 labels is like 'xyzzy'; leave the word out" in capsys.readouterr().err
+
+
+def test_labels_of_the_bundled_model(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["labels", "pan"]) == 0
+    assert capsys.readouterr().out.split()[1:] == ["frying", "pan"]
+
+
+def test_the_classes_of_a_real_network_are_found(real_data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = real_data / "models"
+    given = ["--model", str(folder / "mobilenet_v2_imagenet.pt2"), "--labels", str(folder / "imagenet_labels.json")]
+    assert main(["labels", "mug", *given, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["labels"][0] == {"index": 504, "label": "coffee mug"}
+    assert main(["labels", "pan", *given]) == 0
+    assert capsys.readouterr().out.startswith("  #567   frying pan")
+
+
+class Always(nn.Module):
+    """Answers nearly the same to everything."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        mean = images.mean(dim=(1, 2, 3))[:, None]
+        return torch.tensor([0.0, 2.0, 1.0, -0.1, -0.2, -1.0, -2.0]) + 1e-3 * mean * torch.arange(7)
+
+
+TRIANGLE = "v -1 0 0\nv 1 0 0\nv 0 0 1\nv 0 1 0\nf 1 2 3\nf 1 2 4\nf 2 3 4\nf 1 3 4\n"
+
+
+@pytest.mark.parametrize("question", ["attack", "sweep"])
+def test_an_object_without_a_label_is_shown_to_the_model(question: str, tmp_path: Path) -> None:
+    mesh = tmp_path / "thing.obj"
+    mesh.write_text(TRIANGLE, encoding="utf-8")
+    model = advsearch.load_model(Always(), labels=["a", "coffee mug", "pan, pot", "c", "d", "e", "f"], input_size=16)
+    message = (
+        r"^label: expected the right answers for .*thing\.obj, got none; model Always calls a clean picture of it "
+        r"'coffee mug' 55\.\d %, 'pan, pot' 20\.\d %, 'a' 7\.\d %, 'c' 6\.\d %, 'd' 6\.\d %; name what is right, such "
+        r'as `label="coffee mug"`$'
+    )
+    with pytest.raises(InputError, match=message):
+        getattr(advsearch, question)(mesh, model, controls="pose", resolution=16)
+    with pytest.raises(InputError, match=r"the label of mug itself does not fit .* 'coffee mug' .* calls a clean"):
+        getattr(advsearch, question)("mug", model, controls="pose", resolution=16)
+
+
+def test_a_class_without_a_name_of_its_own_is_suggested_by_its_number(tmp_path: Path) -> None:
+    mesh = tmp_path / "thing.obj"
+    mesh.write_text(TRIANGLE, encoding="utf-8")
+    model = advsearch.load_model(Always(), labels=["a", "crane", "crane", "c", "d", "e", "f"], input_size=16)
+    with pytest.raises(InputError, match=r'such as `label="#1"`$'):
+        advsearch.attack(mesh, model, controls="pose", resolution=16)
+
+
+def test_the_command_line_says_which_flag_to_add(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("thing.obj").write_text(TRIANGLE, encoding="utf-8")
+    assert main(["attack", "--object", "thing.obj", "--control", "pose", "--resolution", "16", "--quiet"]) == 2
+    err = capsys.readouterr().err
+    assert "--label: expected the right answers for thing.obj" in err and ' such as --label "' in err
+    assert not Path("runs").exists()
