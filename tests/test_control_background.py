@@ -68,11 +68,11 @@ def test_it_asks_for_a_backdrop_and_takes_the_ground_away_unless_told_to_keep_it
 def test_the_environment_may_be_a_choice(scene: SceneDescription) -> None:
     bound = BackgroundControl(what=["colour", "environment"]).bind(scene)
     assert [group.name for group in bound.groups] == ["what", "hue", "saturation", "value"]
-    assert COLOR in bound.inputs(bound.start), "it starts as a colour"
+    assert bound.inputs(bound.start) == {}, "it starts as the scene is"
+    assert bound.describe(bound.start)["background.what"]["value"] == "environment"
     there = bound.start.clone()
-    there[0] = 0.75
-    assert bound.inputs(there) == {}
-    assert bound.describe(there)["background.what"]["value"] == "environment"
+    there[0] = 0.25
+    assert COLOR in bound.inputs(there)
 
 
 def test_only_what_is_given_a_range_is_searched(scene: SceneDescription) -> None:

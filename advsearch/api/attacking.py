@@ -27,6 +27,7 @@ from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
 from advsearch.config import AttackConfig
 from advsearch.controls import CONTROLS, make_space
 from advsearch.controls.base import Control
+from advsearch.controls.clean import sentences
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import LabelSet, Model
 from advsearch.models.features import features_of
@@ -90,7 +91,7 @@ def attack(
         "over": {one.name: one.settings() for one in conditions},
         "objective": objective if isinstance(objective, str) else getattr(objective, "__name__", "custom"),
         "policy": policy if isinstance(policy, str) else policy.name,
-        "set": {name: value for name, value in scene.description.values.items() if value is not None},
+        "set": _set_by(scene, options),
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
     check_objective(objective, targeted=config.target is not None, minimise=config.minimise)
@@ -136,7 +137,8 @@ def problem_from_config(config: AttackConfig, *, denoise: str | None = None) -> 
         denoise: another denoiser than the configuration's.
     """
     job = _job(config if denoise is None else config.model_copy(update={"denoise": denoise}))
-    return _problem(job), job.loaded[1]
+    problem = _problem(job)
+    return problem, [*job.loaded[1], *sentences(problem.space.moved)]
 
 
 def _scene(scene: Scene | str | Path, options: Mapping[str, Any]) -> Scene:
@@ -150,6 +152,15 @@ def _scene(scene: Scene | str | Path, options: Mapping[str, Any]) -> Scene:
         return scene
     settings = scene_settings(told["set"], told["exposure"])
     return load_scene(scene, told["environment"], up=told["up"], settings=settings)
+
+
+def _set_by(scene: Scene, options: Mapping[str, Any]) -> dict[str, float]:
+    """The parameters of the scene that were fixed, but for the exposure where an option says it."""
+    values, given = scene.description.values, scene.description.given
+    fixed = {name: value for name, value in values.items() if name in given and value is not None}
+    if options.get("exposure"):
+        fixed.pop("camera.exposure", None)
+    return fixed
 
 
 def _budgeted(controls: Controls, instances: tuple[Control, ...], config: AttackConfig) -> tuple[Control, ...]:
@@ -316,7 +327,8 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
     stages = Stages(progress)
     stages.begin("setup", PREPARING)
     problem = _problem(job)
-    said = [*job.scene.description.object.notes, *job.scene.description.environment.warnings, *job.loaded[1]]
+    own = job.scene.description
+    said = [*own.object.notes, *own.environment.warnings, *job.loaded[1], *sentences(problem.space.moved)]
     for text in said:
         progress.message(text)
     policy = _policy(job, problem)

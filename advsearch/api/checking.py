@@ -28,6 +28,7 @@ from advsearch.evaluation.gradients import (
 )
 from advsearch.evaluation.planning import CONVERGED, COUNTS, cosines, measured_plan, tuned
 from advsearch.progress import NullProgress, Progress
+from advsearch.scene.description import DEFAULT_ENVIRONMENT
 from advsearch.scene.plan import STEP_RANGE, GroupPlan
 
 SCENES = (("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"))
@@ -86,6 +87,8 @@ def _configurations(config: AttackConfig, everything: bool) -> Iterator[AttackCo
         for control in CONTROLS:
             if control == "contents" and object == "bottle":
                 continue  # a bottle is closed
+            if control == "sky" and environment != DEFAULT_ENVIRONMENT:
+                continue  # a sky takes the place of the environment
             update: dict[str, Any] = {
                 "object": object,
                 "environment": environment,

@@ -63,7 +63,9 @@ def region_from_config(config: RegionConfig, *, progress: Progress | None = None
     as_attack = AttackConfig(**{name: getattr(config, name) for name in SceneConfig.model_fields})
     budget = {} if config.around is None else _budget(config.around)
     as_attack = as_attack.model_copy(update={"measure": "no", "verify_spp": config.verify_spp, **budget})
-    problem, _ = problem_from_config(as_attack)
+    problem, said = problem_from_config(as_attack)
+    for text in said:
+        stages.progress.message(text)
     varied = _varied(problem, config)
     centre = _centre(problem, config)
     opened = RunDirectory.resume(resumed, config) if resumed is not None else RunDirectory.create_for(config)
@@ -108,7 +110,7 @@ def region_from_config(config: RegionConfig, *, progress: Progress | None = None
             "command": "region",
             "run": str(run.path),
             "object": config.object,
-            "environment": config.environment,
+            "environment": problem.space.environment or config.environment,
             "model": problem.model.name,
             "controls": [bound.name for bound in problem.space.controls],
             "ending": "done",
@@ -121,6 +123,8 @@ def region_from_config(config: RegionConfig, *, progress: Progress | None = None
             "volume": found.volume,
             "spp": attack.findings.spp,
             "image_formation": problem.renderer.formation.summary(),
+            "clean": {"moved": [one.to_dict() for one in problem.space.moved]},
+            "warnings": said,
         }
         if config.map:
             answer["map"] = _map(attack, config.map, at, varied, box, run)

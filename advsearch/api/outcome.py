@@ -116,7 +116,7 @@ def _answers(
     summary: dict[str, Any] = {
         "object": config.object,
         "model": problem.model.name,
-        "environment": config.environment,
+        "environment": problem.space.environment or config.environment,
         "controls": [bound.name for bound in controls],
         "policy": config.policy_name,
         "objective": config.objective,
@@ -136,6 +136,7 @@ def _answers(
         "clean": {
             **_named(clean_trial, labels),
             "correct": clean_trial.predicted in problem.labels.indices,
+            "moved": [one.to_dict() for one in problem.space.moved],
             "control": control.to_control_dict() if control else None,
         },
         "adversarial": _named(found, labels) if findings.search else None,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from advsearch.api.scene import Controls, Scene, as_controls, framed, load_scene
 from advsearch.config import RenderConfig
 from advsearch.config.rendering import PICTURE_SPP, PICTURES
 from advsearch.controls import Control, compose
+from advsearch.controls.clean import sentences
 from advsearch.errors import InputError
 from advsearch.models import Model, load_model
 from advsearch.models.model import Answer
@@ -165,8 +166,10 @@ def render(
         views.append(View(azimuth, picture, radiance * formation.gain, model.answers(picture)))
         progress.advance(1)
     assert formation is not None
-    warnings = (*scene.description.object.notes, *scene.description.environment.warnings)
-    return Rendering(scene.description, model.name, formation, spp, tuple(views), warnings)
+    own = scene.description
+    warnings = (*own.object.notes, *own.environment.warnings, *sentences(space.moved))
+    shown = replace(own, environment_spec=space.environment or own.environment_spec)
+    return Rendering(shown, model.name, formation, spp, tuple(views), warnings)
 
 
 def render_from_config(config: RenderConfig, *, progress: Progress | None = None) -> dict[str, Any]:

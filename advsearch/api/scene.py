@@ -71,7 +71,8 @@ class Scene:
             InputError: a name is unknown or a value out of range.
         """
         settings.resolve(given)
-        return Scene(replace(self.description, values={**self.description.values, **given}))
+        own = self.description
+        return Scene(replace(own, values={**own.values, **given}, given=own.given | set(given)))
 
 
 def load_scene(

@@ -76,6 +76,7 @@ def _study(config: Any, body: Callable[[Any, _Parts], Summary], progress: Progre
             "model": config.model,
             "policy": config.policy_name,
             **body(config, parts),
+            "warnings": parts.warnings,
             "parts": parts.names,
             "ending": "interrupted" if parts.interrupted else "done",
             "seconds": {"total": time.perf_counter() - begun},
@@ -94,11 +95,13 @@ class _Parts:
 
     Attributes:
         names: of the parts so far.
+        warnings: what they said, each sentence once.
         interrupted: whether one was; nothing more is carried out then.
     """
 
     def __init__(self, folder: Path, progress: Progress, most: int) -> None:
         self.names: list[str] = []
+        self.warnings: list[str] = []
         self.interrupted = False
         self._folder, self._progress, self._most = folder, progress, most
 
@@ -116,6 +119,7 @@ class _Parts:
         else:
             own = config.model_copy(update={"run": str(path), "overwrite": True})
             summary = attack_from_config(own, progress=self._progress).summary
+        self.warnings += [text for text in summary.get("warnings") or () if text not in self.warnings]
         self.interrupted = summary["ending"] == "interrupted"
         return None if self.interrupted else summary
 

@@ -12,7 +12,7 @@ from advsearch.api.attacking import LOADING
 from advsearch.api.naming import different, load_models, scene_settings
 from advsearch.api.scene import Controls, Scene, as_controls, load_scene
 from advsearch.api.sweeps.axes import read_axes
-from advsearch.api.sweeps.job import Job, Place
+from advsearch.api.sweeps.job import Job, Place, check_scenes
 from advsearch.api.sweeps.loop import SweepResult, carry_out
 from advsearch.config import SweepConfig
 from advsearch.errors import InputError
@@ -20,7 +20,6 @@ from advsearch.models import Model
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import CONFIG, RunDirectory, check_free, default_name, find_run, is_run, run_path
 from advsearch.runs.listing import finished
-from advsearch.scene.settings import SETTINGS
 from advsearch.settings import split_names
 
 SAMPLES = 100
@@ -136,7 +135,7 @@ def _place(scene: Scene) -> Place:
 def _described(places: Sequence[Place]) -> dict[str, Any]:
     """Settings that say what loaded scenes are."""
     first = places[0].scene.description
-    given = {name: value for name, value in first.values.items() if value not in (None, SETTINGS[name].default)}
+    given = {name: value for name, value in first.values.items() if name in first.given and value is not None}
     return {
         "object": ",".join(dict.fromkeys(place.object for place in places)),
         "environment": ",".join(dict.fromkeys(place.environment for place in places)),
@@ -147,9 +146,6 @@ def _described(places: Sequence[Place]) -> dict[str, Any]:
 
 def _job_of(config: SweepConfig) -> Job:
     """Find and load everything that a configuration names."""
-    fixed = sorted(set(config.grid) & set(config.set_))
-    if fixed:
-        raise InputError(f"`grid` {fixed[0]}: `set` fixes it already; leave it out of one of the two")
     return _job(config, _places(config), config.models, config.controls)
 
 
@@ -168,6 +164,7 @@ def _job(config: SweepConfig, places: Sequence[Place], models: Sequence[AnyModel
         )
     samples = config.samples or (SAMPLES if drawn and not axes else 1)
     networks, said = _models(models, config)
+    check_scenes(places, drawn, axes)
     for place in places:
         said += [*place.scene.description.object.notes, *place.scene.description.environment.warnings]
     return Job(config, tuple(places), networks, drawn, axes, samples, tuple(dict.fromkeys(said)))

@@ -9,11 +9,12 @@ from collections.abc import Mapping, Sequence
 from importlib import import_module
 
 from advsearch.controls.base import BoundControl, Budget, Choice, Control, Group, Parameter
+from advsearch.controls.clean import Moved, check_prepared
 from advsearch.controls.numbers import NumberControl
 from advsearch.controls.space import Space
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.registry import Registry
-from advsearch.scene.description import SceneDescription
+from advsearch.scene.description import ENVIRONMENT, SceneDescription
 
 OWN = {
     "pose": "PoseControl",
@@ -134,7 +135,8 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
     """Let controls prepare a scene, bind them to it and compose them; none, or only fixed ones, will do.
 
     Raises:
-        InputError: two controls of one name, or one that the scene cannot take.
+        InputError: two controls of one name, one that the scene cannot take, or one that leaves out what the scene was
+            asked to have.
     """
     names = [control.name for control in controls]
     if len(set(names)) != len(names):
@@ -142,9 +144,17 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
             f"controls: every instance needs a name of its own, got {', '.join(names)}; write KIND:NAME, such as "
             f"light:key,light:fill"
         )
+    described, moved = scene, list[Moved]()
     for control in controls:
-        scene = control.prepare(scene)
-    return Space(tuple(control.bind(scene) for control in controls), scene)
+        prepared = control.prepare(scene)
+        moved += check_prepared(control.name, scene, prepared)
+        scene = prepared
+    bound = tuple(control.bind(scene) for control in controls)
+    moved += [one for control in bound for one in control.moved]
+    lit_by = [str(one.used) for one in moved if one.parameter == ENVIRONMENT]
+    lit_by += [scene.environment_spec] if scene.environment_spec != described.environment_spec else []
+    ordered = tuple(sorted(moved, key=lambda one: names.index(one.control)))
+    return Space(bound, scene, ordered, lit_by[0] if lit_by else None)
 
 
 def _suggestion(control: Control) -> str:

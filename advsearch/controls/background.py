@@ -19,7 +19,7 @@ from torch import Tensor
 
 from advsearch.controls.base import Choice, Parameter, Value
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Fixed
+from advsearch.controls.values import Choices, Fixed, Number
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import srgb_to_linear
@@ -35,6 +35,7 @@ class BackgroundControl(NumberControl):
     """A plain colour behind the object."""
 
     kind: ClassVar[str] = "background"
+    amount: ClassVar[str | None] = "what"
     summary: ClassVar[str] = "A plain colour behind the object; the environment keeps lighting it."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
@@ -93,6 +94,14 @@ class BackgroundControl(NumberControl):
     def check_choices(self) -> None:
         if self.chosen["ground"] not in GROUNDS:
             raise InputError(f"{self.name}.ground: expected one of {', '.join(GROUNDS)}, got {self.chosen['ground']!r}")
+
+    def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
+        spec = self.specs.get("what")
+        as_ever = parameter.name == "what" and isinstance(spec, Choices) and "environment" in spec.values
+        return "environment" if as_ever else super().default(scene, parameter)
+
+    def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
+        return "environment" if parameter.name == "what" else super().unchanged(scene, parameter)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         scene = dataclasses.replace(scene, backdrop=True)

@@ -20,6 +20,7 @@ from typing import ClassVar, TypedDict
 import torch
 from torch import Tensor
 
+from advsearch.controls.clean import Moved
 from advsearch.scene.description import SceneDescription
 
 NOTHING: Mapping[str, Tensor] = MappingProxyType({})
@@ -100,6 +101,7 @@ class Group:
         periodic: 0 and 1 are the same value.
         options: number of options of a discrete choice; 0 for a continuous parameter.
         moves_silhouettes: see `Parameter`.
+        setting: name of the scene's setting that says the same; may be empty.
     """
 
     name: str
@@ -109,6 +111,7 @@ class Group:
     periodic: bool = False
     options: int = 0
     moves_silhouettes: bool = False
+    setting: str = ""
 
 
 class Value(TypedDict):
@@ -125,6 +128,7 @@ class BoundControl(ABC):
         name: the instance's name.
         start: (d,) float32 in [0, 1], the value that leaves the scene as it is.
         groups: the coordinates of the slice in order; their sizes add up to d.
+        moved: values of the clean scene that the start has not, because the control leaves them out.
         refines: the scene inputs that this control takes from the ones before it, and may change (a patch on a
             texture).
     """
@@ -132,6 +136,7 @@ class BoundControl(ABC):
     name: str
     start: Tensor
     groups: tuple[Group, ...]
+    moved: tuple[Moved, ...] = ()
     refines: frozenset[str] = frozenset()
 
     @property
@@ -184,6 +189,11 @@ class Control(ABC):
     parameters: ClassVar[tuple[Parameter, ...]]
     choices: ClassVar[tuple[Choice, ...]]
     name: str
+
+    @classmethod
+    def setting(cls, parameter: Parameter) -> str:
+        """Return the name of the scene's setting that says the same as a parameter, whether or not there is one."""
+        return f"{cls.kind}.{parameter.name}"
 
     def settings(self) -> dict[str, object]:
         """Return what `make_control` needs to make an equal instance, as JSON values."""

@@ -85,9 +85,11 @@ class CameraControl(NumberControl):
             return fitted_distance(scene)
         if parameter.name == "focal_length":
             return SENSOR_WIDTH / 2.0 / math.tan(math.radians(scene.number("camera.fov")) / 2.0)
-        if parameter.name == "exposure":
-            return 0.0
         return super().default(scene, parameter)
+
+    @classmethod
+    def setting(cls, parameter: Parameter) -> str:
+        return "camera.fov" if parameter.name == "focal_length" else super().setting(parameter)
 
     def search_range(self, scene: SceneDescription, parameter: Parameter) -> tuple[float, float] | None:
         if parameter.name == "distance" and parameter.search is not None:
@@ -99,7 +101,7 @@ class CameraControl(NumberControl):
         fov = values["fov"]
         if "focal_length" in self.specs:
             fov = torch.rad2deg(2.0 * torch.atan(SENSOR_WIDTH / 2.0 / values["focal_length"]))
-        distance = values["distance"] if self._distance_is_free() else self._following(scene, fov)
+        distance = values["distance"] if self._distance_is_free(scene) else self._following(scene, fov)
         inputs = {"camera.to_world": self._orbit(scene, values, distance), "camera.fov": fov.reshape(1)}
         if scene.thin_lens and ("aperture" in self.specs or "focus" in self.specs):
             inputs["camera.aperture"] = values["aperture"].clamp_min(1e-5).reshape(1)
@@ -108,11 +110,11 @@ class CameraControl(NumberControl):
         if "shift_x" in self.specs or "shift_y" in self.specs:
             inputs["camera.shift"] = torch.stack([values["shift_x"], values["shift_y"]])
         if "exposure" in self.specs:
-            inputs["camera.exposure"] = values["exposure"]
+            inputs["camera.exposure"] = values["exposure"] - scene.number("camera.exposure")
         return inputs
 
-    def _distance_is_free(self) -> bool:
-        return "distance" in self.specs or not self.asked
+    def _distance_is_free(self, scene: SceneDescription) -> bool:
+        return "distance" in self.specs or not self.asked or "camera.distance" in scene.given
 
     def _following(self, scene: SceneDescription, fov: Tensor) -> Tensor:
         """The distance that keeps the object's size in the picture."""

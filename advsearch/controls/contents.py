@@ -61,6 +61,7 @@ class ContentsControl(NumberControl):
     """
 
     kind: ClassVar[str] = "contents"
+    amount: ClassVar[str | None] = "level"
     summary: ClassVar[str] = "What a vessel is filled with, and how high: water, coffee and milk."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(

@@ -67,6 +67,7 @@ class CorruptionControl(NumberControl):
     """One of the common image corruptions, by name and severity."""
 
     kind: ClassVar[str] = "corruption"
+    amount: ClassVar[str | None] = "severity"
     summary: ClassVar[str] = "A common image corruption (noise, blur, weather, digital) by name and severity."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(

@@ -14,23 +14,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 from typing import ClassVar
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Parameter
 from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.values import Choices, Fixed, Number
 from advsearch.errors import InputError
 from advsearch.scene import library
-from advsearch.scene.description import SceneDescription, metered_gain
+from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription, metered_gain
 
 LIT = ("adjoint", "differences")
 """Valid estimators for what only changes light."""
-OWN_MAP = "own"
-"""The option of `which` that keeps the scene's environment."""
 COEFFICIENTS = 27
 """Degrees 0 to 2 of three colour channels."""
 
@@ -92,6 +91,35 @@ class EnvironmentControl(NumberControl):
         if isinstance(given, bool) or not isinstance(given, (int, float)) or not 0.0 < float(given) <= 100.0:
             raise InputError(f"{self.name}.epsilon: expected a number over 0 and at most 100, got {given!r}")
 
+    def prepare(self, scene: SceneDescription) -> SceneDescription:
+        """An environment that is fixed is the scene's."""
+        spec = self.specs.get("which")
+        if not isinstance(spec, Fixed) or spec.value in (OWN_MAP, scene.bundled_environment):
+            return scene
+        name = str(spec.value)
+        return replace(scene, environment=library.load_environment(name), environment_spec=name)
+
+    def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
+        """Of `which`, the scene's own environment, by its name where only that is allowed."""
+        if parameter.name != "which":
+            return super().default(scene, parameter)
+        by_name = OWN_MAP not in self._allowed() and scene.bundled_environment in self._allowed()
+        return str(scene.bundled_environment) if by_name else OWN_MAP
+
+    @classmethod
+    def setting(cls, parameter: Parameter) -> str:
+        return ENVIRONMENT if parameter.name == "which" else super().setting(parameter)
+
+    def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
+        if parameter.name == "which" and OWN_MAP not in self._allowed():
+            return scene.environment_spec
+        return super().unchanged(scene, parameter)
+
+    def _allowed(self) -> tuple[Number, ...]:
+        """The environments that can be chosen."""
+        spec = self.specs.get("which")
+        return spec.values if isinstance(spec, Choices) else (spec.value,) if isinstance(spec, Fixed) else (OWN_MAP,)
+
     def budget(self, scene: SceneDescription, parameter: Parameter) -> Budget:
         if parameter.name != "harmonics":
             return WHOLE_RANGE
@@ -111,10 +139,9 @@ class EnvironmentControl(NumberControl):
 
     def _map(self, scene: SceneDescription, which: int) -> Tensor:
         name = self.parameters[0].options[which]
-        if name == OWN_MAP:
+        if name in (OWN_MAP, scene.bundled_environment):
             return _tensor_of(scene)
-        height, width = scene.environment.radiance.shape[:2]
-        return _bundled(name, height, width) / metered_gain(scene.environment)
+        return _bundled(name) / metered_gain(scene.environment)
 
 
 @lru_cache(maxsize=4)
@@ -123,13 +150,10 @@ def _tensor_of(scene: SceneDescription) -> Tensor:
 
 
 @lru_cache(maxsize=16)
-def _bundled(name: str, height: int, width: int) -> Tensor:
-    """A bundled map at another size, times its own metered gain, so that pictures keep their exposure."""
+def _bundled(name: str) -> Tensor:
+    """A bundled map in its own size, times its own metered gain, so that pictures keep their exposure."""
     asset = library.load_environment(name)
-    channels_first = torch.from_numpy(asset.radiance.copy()).permute(2, 0, 1)[None]
-    if channels_first.shape[-2:] != (height, width):
-        channels_first = F.interpolate(channels_first, (height, width), mode="bilinear", antialias=True)
-    return channels_first[0].permute(1, 2, 0).contiguous() * metered_gain(asset)
+    return torch.from_numpy(asset.radiance.copy()) * metered_gain(asset)
 
 
 def turn(radiance: Tensor, degrees: Tensor) -> Tensor:

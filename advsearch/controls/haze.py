@@ -41,6 +41,7 @@ class HazeControl(NumberControl):
     """A uniform haze around camera and object."""
 
     kind: ClassVar[str] = "haze"
+    amount: ClassVar[str | None] = "density"
     summary: ClassVar[str] = "A uniform haze around camera and object: how dense it is, and its colour."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
@@ -62,6 +63,9 @@ class HazeControl(NumberControl):
     def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
         if parameter.name == "density" and self.asked and not self.searches_density:
             return THIN_HAZE
+        return parameter.default
+
+    def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
         return parameter.default
 
     @property

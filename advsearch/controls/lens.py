@@ -52,6 +52,7 @@ class LensControl(NumberControl):
     """Translucent dots on the camera's lens."""
 
     kind: ClassVar[str] = "lens"
+    amount: ClassVar[str | None] = "opacity"
     summary: ClassVar[str] = "Translucent, blurred dots on the camera's lens: their places, sizes, colours, opacities."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         _per_dot("x", "picture widths", 0.5, "Centre of each dot, from the left edge."),

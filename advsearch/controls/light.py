@@ -66,6 +66,7 @@ class LightControl(NumberControl):
     """One lamp beside the environment."""
 
     kind: ClassVar[str] = "light"
+    amount: ClassVar[str | None] = "power"
     summary: ClassVar[str] = "A lamp: where it stands, its colour, its power, and the size of an area light."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         _place("x", -2.0, 2.0, 1.5, "Where the lamp's middle is, along x."),
@@ -115,6 +116,9 @@ class LightControl(NumberControl):
     def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
         if parameter.name == "power" and self.asked and isinstance(self.specs.get("power", Fixed(0.0)), Fixed):
             return LIT_POWER
+        return parameter.default
+
+    def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
         return parameter.default
 
     def search_range(self, scene: SceneDescription, parameter: Parameter) -> tuple[float, float] | None:

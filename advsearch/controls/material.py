@@ -76,6 +76,10 @@ class MaterialControl(NumberControl):
             return float(getattr(self._own(scene, self._fixed()), parameter.name))
         return parameter.default
 
+    def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
+        given = self.setting(parameter) in scene.given
+        return scene.number(self.setting(parameter)) if given else self.default(scene, parameter)
+
     def refines(self, scene: SceneDescription) -> frozenset[str]:
         return frozenset({BASE_COLOR}) if self._colours() else frozenset()
 

@@ -14,7 +14,7 @@ Subclass `NumberControl`, declare the parameters, and say in `scene_inputs` what
 from __future__ import annotations
 
 from abc import ABC
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -33,10 +33,21 @@ from advsearch.controls.base import (
     Value,
     scalar,
 )
-from advsearch.controls.values import Choices, Fixed, Number, Range, Spec, option_index, read, to_unit, to_value
+from advsearch.controls.clean import Moved, apart, check_start, nearest, same
+from advsearch.controls.values import (
+    Choices,
+    Fixed,
+    Number,
+    Range,
+    Spec,
+    in_words,
+    option_index,
+    read,
+    to_unit,
+    to_value,
+)
 from advsearch.errors import UnknownNameError
-from advsearch.scene.description import SceneDescription
-from advsearch.scene.settings import SETTINGS
+from advsearch.scene.description import ENVIRONMENT, SceneDescription
 
 Values = Mapping[str, Tensor]
 """A configuration: parameter name to a float32 tensor of the parameter's shape; of a discrete choice, its number."""
@@ -57,6 +68,9 @@ class NumberControl(Control, ABC):
     """
 
     choices: ClassVar[tuple[Choice, ...]] = ()
+    amount: ClassVar[str | None] = None
+    """The parameter whose value in the scene as it was described means that the rest of the control does not show: the
+    power of a lamp, say. None where the scene has all parameters of itself."""
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         self.name = name or self.kind
@@ -88,12 +102,12 @@ class NumberControl(Control, ABC):
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
         """Return a parameter's value in the unchanged scene: the setting of that name, or else its own default."""
-        setting = f"{self.kind}.{parameter.name}"
-        if setting in SETTINGS:
-            value = scene.values.get(setting)
-            if value is not None:
-                return value
-        return parameter.default
+        value = scene.values.get(self.setting(parameter))
+        return parameter.default if value is None else value
+
+    def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
+        """Return a parameter's value in the scene as it was described: the default, unless that changes the scene."""
+        return self.default(scene, parameter)
 
     def size(self, parameter: Parameter) -> int:
         """Return how many numbers a parameter has: by default the product of its shape."""
@@ -141,14 +155,33 @@ class NumberControl(Control, ABC):
     # ---- what it makes of it ----------------------------------------------------------------------------------------
 
     def bind(self, scene: SceneDescription) -> BoundNumbers:
-        slots: list[_Slot] = []
+        slots: list[Slot] = []
         begin = 0
         for parameter in self.parameters:
             value = self.default(scene, parameter)
-            slot = _Slot(parameter, self._spec(scene, parameter, value), self.size(parameter), begin, value)
+            slot = Slot(parameter, self._spec(scene, parameter, value), self.size(parameter), begin, value)
             slots.append(slot)
             begin += slot.width
         return BoundNumbers(self, scene, tuple(slots))
+
+    def moved(self, scene: SceneDescription, slots: Sequence[Slot]) -> Iterator[Moved]:
+        """Yield the values of the clean scene that the start has not.
+
+        Raises:
+            InputError: one of them was asked for.
+        """
+        for slot in slots:
+            parameter = slot.parameter
+            if self.amount not in (None, parameter.name):
+                continue
+            wanted, used = self.unchanged(scene, parameter), slot.start_value()
+            if same(used, wanted, turns=slot.turns):
+                continue
+            setting = self.setting(parameter)
+            check_start(self.name, parameter.name, in_words(slot.spec), setting, scene, wanted)
+            if not isinstance(self.specs.get(parameter.name), Fixed):
+                address = setting if setting == ENVIRONMENT else f"{self.name}.{parameter.name}"
+                yield Moved(self.name, address, "name" if parameter.options else parameter.unit, wanted, used)
 
     def _spec(self, scene: SceneDescription, parameter: Parameter, value: Number) -> Spec:
         if parameter.name in self.specs:
@@ -160,7 +193,7 @@ class NumberControl(Control, ABC):
 
 
 @dataclass(frozen=True)
-class _Slot:
+class Slot:
     """One parameter in a bound control: what it is set to and where its coordinates begin."""
 
     parameter: Parameter
@@ -175,22 +208,35 @@ class _Slot:
         return 0 if isinstance(self.spec, Fixed) else 1 if isinstance(self.spec, Choices) else self.size
 
     @property
+    def turns(self) -> bool:
+        """Whether a whole turn changes nothing."""
+        return self.parameter.periodic and self.parameter.unit == "degrees"
+
+    @property
     def periodic(self) -> bool:
+        """Whether the range is a whole turn."""
         spec, parameter = self.spec, self.parameter
         return parameter.periodic and isinstance(spec, Range) and abs(spec.high - spec.low - 360.0) < 1e-9
 
+    def start_value(self) -> Number:
+        """The default, or the nearest value that is allowed; of names, the first one that is allowed."""
+        spec, default = self.spec, self.default
+        if isinstance(spec, Fixed):
+            return spec.value
+        if isinstance(spec, Range):
+            return nearest(float(default), spec.low, spec.high, turns=self.turns)
+        if default in spec.values or any(isinstance(value, str) for value in (default, *spec.values)):
+            return default if default in spec.values else spec.values[0]
+        return min(spec.values, key=lambda value: apart(float(value), float(default), turns=self.turns))
+
     def start(self) -> list[float]:
-        """Coordinates of the default; the nearest end of the range where the default lies outside."""
-        spec = self.spec
+        """Coordinates of that value."""
+        spec, value = self.spec, self.start_value()
         if isinstance(spec, Fixed):
             return []
         if isinstance(spec, Choices):
-            index = spec.values.index(self.default) if self.default in spec.values else 0
-            return [(index + 0.5) / len(spec.values)]
-        value = float(self.default)
-        if self.periodic:
-            value = spec.low + (value - spec.low) % 360.0
-        return [to_unit(spec, self.parameter.log, value)] * self.size
+            return [(spec.values.index(value) + 0.5) / len(spec.values)]
+        return [to_unit(spec, self.parameter.log, float(value))] * self.size
 
     def value(self, u: Tensor) -> Tensor:
         """The value at a configuration: a float32 tensor of the parameter's shape, or the number of an option."""
@@ -208,16 +254,17 @@ class _Slot:
 class BoundNumbers(BoundControl):
     """A `NumberControl` in a scene."""
 
-    def __init__(self, control: NumberControl, scene: SceneDescription, slots: tuple[_Slot, ...]) -> None:
+    def __init__(self, control: NumberControl, scene: SceneDescription, slots: tuple[Slot, ...]) -> None:
         self.control = control
         self.scene = scene
         self.name = control.name
         self.refines = control.refines(scene)
         self._slots = slots
+        self.moved = tuple(control.moved(scene, slots))
         self.start = torch.tensor([share for slot in slots for share in slot.start()], dtype=torch.float32)
         self.groups = tuple(self._group(slot) for slot in slots if slot.width)
 
-    def _group(self, slot: _Slot) -> Group:
+    def _group(self, slot: Slot) -> Group:
         parameter, spec = slot.parameter, slot.spec
         options = len(spec.values) if isinstance(spec, Choices) else 0
         estimators = () if options else self.control.estimators(self.scene, parameter)
@@ -229,6 +276,7 @@ class BoundNumbers(BoundControl):
             periodic=slot.periodic,
             options=options,
             moves_silhouettes=parameter.moves_silhouettes,
+            setting=self.control.setting(parameter),
         )
 
     def values(self, u: Tensor) -> dict[str, Tensor]:

@@ -73,6 +73,7 @@ class OcclusionControl(NumberControl):
     """A second object between the camera and the object."""
 
     kind: ClassVar[str] = "occlusion"
+    amount: ClassVar[str | None] = "coverage"
     summary: ClassVar[str] = "A second object between the camera and the object, hiding a wanted share of it."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(

@@ -29,9 +29,10 @@ from advsearch.controls.base import (
     Value,
     scalar,
 )
+from advsearch.controls.clean import Moved
 from advsearch.controls.numbers import BoundNumbers, NumberControl
 from advsearch.controls.texture import resampled
-from advsearch.controls.values import Choices, Fixed, Number, Range, read
+from advsearch.controls.values import Choices, Fixed, Number, Range, in_words, read
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
@@ -196,10 +197,18 @@ class PatchControl(Control):
         side = int(self.resolution)
         sticker = Sticker(scene, {one: float(value) for one, value in resting.items()}, side)
         if isinstance(spec, Fixed):
-            return BoundPatch(self.name, sticker, Range(0.0, 1.0), self._fixed_pixels(float(spec.value)), None, placed)
-        start = ((sticker.underneath() - spec.low) / (spec.high - spec.low)).clamp(0.0, 1.0)
+            pixels = self._fixed_pixels(float(spec.value))
+            bound = BoundPatch(self.name, sticker, Range(0.0, 1.0), pixels, None, placed)
+            bound.moved = placed.moved if isinstance(placed, BoundNumbers) else ()
+            return bound
+        wanted = (sticker.underneath() - spec.low) / (spec.high - spec.low)
+        start = wanted.clamp(0.0, 1.0)
         group = Group("pixels", start.numel(), ("adjoint",), self._budget(start.numel(), spec))
-        return BoundPatch(self.name, sticker, spec, start, group, placed)
+        bound = BoundPatch(self.name, sticker, spec, start, group, placed)
+        if not torch.allclose(start, wanted, atol=1e-5):
+            nearest = f"the nearest {in_words(spec)}"
+            bound.moved = (Moved(self.name, f"{self.name}.pixels", "sRGB", "the texture underneath", nearest),)
+        return bound
 
     def _fixed_pixels(self, grey: float) -> Tensor:
         """The patch (n, n, 3) sRGB that is not searched: the picture, or else one grey."""

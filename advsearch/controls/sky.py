@@ -87,7 +87,8 @@ class SkyControl(NumberControl):
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         radiance = self.radiance(scene, self.start_values(scene)).numpy().astype(np.float32)
-        return replace(scene, environment=EnvironmentAsset("sky", radiance, source="Hosek and Wilkie's sky"))
+        sky = EnvironmentAsset("sky", radiance, source="Hosek and Wilkie's sky")
+        return replace(scene, environment=sky).with_values(environment__rotation=0.0, environment__exposure=0.0)
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {"environment.data": self.radiance(scene, values)}

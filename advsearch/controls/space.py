@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import NOTHING, BoundControl, Group, Value
+from advsearch.controls.clean import Moved
 from advsearch.errors import InputError
-from advsearch.scene.description import SceneDescription
+from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
 from advsearch.scene.plan import WITH_BOUNDARY, GroupPlan
 
 
@@ -22,12 +23,17 @@ class Space:
         controls: at least none; an empty space renders the scene as it is.
         scene: the scene with everything in it that the controls need; None leaves it to the caller.
 
+        moved: values of the clean scene that the start has not, because a control leaves them out.
+        environment: what lights the clean scene in the place of its own environment; None if nothing does.
+
     Raises:
         InputError: two instances have one name.
     """
 
     controls: tuple[BoundControl, ...]
     scene: SceneDescription | None = None
+    moved: tuple[Moved, ...] = ()
+    environment: str | None = None
 
     def __post_init__(self) -> None:
         names = [control.name for control in self.controls]
@@ -108,6 +114,18 @@ class Space:
             if controls is None or control in controls:
                 found.update(control.describe(*arguments))
         return found
+
+    def lit_by(self, values: Mapping[str, Value]) -> str | None:
+        """Return what lights a configuration in the place of the scene's environment; None if nothing does.
+
+        Args:
+            values: the configuration as it is described.
+        """
+        for control, group in self.groups:
+            if group.setting == ENVIRONMENT:
+                chosen = str(values[f"{control.name}.{group.name}"]["value"])
+                return None if chosen == OWN_MAP else chosen
+        return self.environment
 
     def artifacts(self, u: Tensor) -> dict[str, Tensor]:
         """Return the pictures worth keeping of a configuration, by file stem."""

@@ -103,6 +103,15 @@ def _value(where: str, parameter: Parameter, given: object) -> Number:
     return number
 
 
+def in_words(spec: Spec) -> str:
+    """Say what a parameter is set to: ``10``, ``from 5 to 30``, ``one of noon, kitchen``."""
+    if isinstance(spec, Range):
+        return f"from {spec.low:g} to {spec.high:g}"
+    values = (spec.value,) if isinstance(spec, Fixed) else spec.values
+    written = ", ".join(value if isinstance(value, str) else f"{value:g}" for value in values)
+    return written if isinstance(spec, Fixed) else f"one of {written}"
+
+
 def to_value(spec: Range, log: bool, u: Tensor) -> Tensor:
     """Map coordinates in [0, 1] to values of a range; differentiable."""
     if log:

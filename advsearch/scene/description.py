@@ -23,8 +23,12 @@ from advsearch.scene.parts import Part
 Doubles = npt.NDArray[np.float64]
 
 DEFAULT_ENVIRONMENT = "studio"
+ENVIRONMENT = "environment"
+"""What stands for the environment among the settings that were asked for."""
 FRAME_FILL = 0.86
 """Share of the picture's half-width that the object's outline may reach when the distance is worked out."""
+OWN_MAP = "own"
+"""What the scene's own environment is called where another may be chosen."""
 METERED_WHITE = 0.9
 """Linear display value that a diffuse white surface (albedo 0.8) gets in the direction of the strongest light."""
 
@@ -40,6 +44,7 @@ class SceneDescription:
         object_spec: how the object was asked for: a bundled name, a path, or an asset's own name.
         environment_spec: how the environment was asked for, likewise.
         up: the up axis that was given for a mesh file, or None.
+        given: what was asked for: names of settings, and "environment" where it is not the default one.
         parts: what controls have put into the scene beside the object, the environment and the ground.
         thin_lens: the camera has an aperture and a focus distance.
         backdrop: the environment may be hidden behind a plain colour (`backdrop.color`).
@@ -52,6 +57,7 @@ class SceneDescription:
     object_spec: str = ""
     environment_spec: str = ""
     up: str | None = None
+    given: frozenset[str] = frozenset()
     parts: tuple[Part, ...] = ()
     thin_lens: bool = False
     backdrop: bool = False
@@ -70,6 +76,11 @@ class SceneDescription:
     def with_values(self, **given: float | None) -> SceneDescription:
         """Return the scene with some settings replaced; dots in their names are written as two underscores."""
         return replace(self, values={**self.values, **{name.replace("__", "."): v for name, v in given.items()}})
+
+    @property
+    def bundled_environment(self) -> str | None:
+        """Name of the environment if it is a bundled one."""
+        return self.environment.name if self.environment.source == library.BUNDLED_ENVIRONMENT else None
 
     @property
     def base_vertices(self) -> Doubles:
@@ -121,9 +132,11 @@ def describe(
     """
     values = settings.resolve(given or {})
     lit_by = environment_spec or DEFAULT_ENVIRONMENT
-    return SceneDescription(
+    scene = SceneDescription(
         _object(object_spec, up), _environment(lit_by), values, _spec(object_spec), _spec(lit_by), up
     )
+    asked = () if scene.bundled_environment == DEFAULT_ENVIRONMENT else (ENVIRONMENT,)
+    return replace(scene, given=frozenset((*(given or {}), *asked)))
 
 
 def _spec(spec: str | Path | ObjectAsset | EnvironmentAsset) -> str:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from importlib.abc import Traversable
 
 Floats = npt.NDArray[np.float32]
+BUNDLED_ENVIRONMENT = "bundled environment"
+"""Source of an environment that is bundled."""
 _MAP_HINT = "A path to an .hdr or .exr file works too."
 _OBJECT_HINT = "A path to an .obj, .ply or .glb file works too."
 
@@ -82,7 +84,7 @@ def load_environment(name: str) -> EnvironmentAsset:
         radiance = _exr((_data() / "environments" / f"{name}.exr").read_bytes())
     except (OSError, ValueError, KeyError, RuntimeError) as error:
         raise FileFormatError(f"bundled environment {name!r} cannot be read ({error}); reinstall advsearch") from error
-    return EnvironmentAsset(name, radiance, source="bundled environment")
+    return EnvironmentAsset(name, radiance, source=BUNDLED_ENVIRONMENT)
 
 
 def _mesh(content: bytes) -> Mesh:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -10,11 +11,12 @@ from advsearch.api.scene import Scene, framed
 from advsearch.api.sweeps.axes import Axis, on_grid
 from advsearch.api.sweeps.points import BINS, Drawn, Points
 from advsearch.config import SweepConfig
-from advsearch.controls import Control, Space, make_space
+from advsearch.controls import CONTROLS, Control, Space, make_space
 from advsearch.controls.base import Value
 from advsearch.errors import InputError
 from advsearch.evaluation.domains import domain_of
 from advsearch.models import LabelSet, Model
+from advsearch.scene.description import ENVIRONMENT
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,32 @@ class Job:
         return right_answers(model, place.scene, place.object, self.config)
 
 
+def check_scenes(places: Sequence[Place], controls: Sequence[Control], axes: Sequence[Axis]) -> None:
+    """Refuse to vary what the scenes were asked to have.
+
+    Raises:
+        InputError: a parameter is fixed and in the grid, or several environments meet a control that chooses one.
+    """
+    given = {name for place in places for name in place.scene.description.given}
+    for axis in axes:
+        setting = CONTROLS[axis.control].setting(axis.parameter)
+        if setting in given and setting != ENVIRONMENT:
+            raise InputError(f"`grid` {axis.name}: `set` fixes it already; leave it out of one of the two")
+    environments = list(dict.fromkeys(place.environment for place in places))
+    choosing = [f"`grid` {axis.name}" for axis in axes if CONTROLS[axis.control].setting(axis.parameter) == ENVIRONMENT]
+    choosing += [
+        f"`controls` {control.name}"
+        for control in controls
+        for parameter in control.parameters
+        if control.setting(parameter) == ENVIRONMENT and parameter.name in control.settings()
+    ]
+    if len(environments) > 1 and choosing:
+        raise InputError(
+            f"`environment={','.join(environments)}` and {choosing[0]} both choose what lights the scene; name all of "
+            "them in one of the two, and leave the other out"
+        )
+
+
 def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
     """Bind every scene once, so that what is wrong is said before anything is rendered.
 
@@ -103,7 +131,9 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
     """
     found = []
     for place in job.places:
-        found += [(place, job.points(job.space(place, size))) for size in dict.fromkeys(job.sizes)]
+        spaces = [job.space(place, size) for size in dict.fromkeys(job.sizes)]
+        _check_draws(place, spaces[0])
+        found += [(place, job.points(space)) for space in spaces]
         for model in job.models:
             job.label_set(place, model)
     first = found[0][1]
@@ -118,6 +148,16 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
         same = all(one.parts == versions[0].parts for one in versions)
         drawn.append(versions[0] if same else replace(versions[0], unit="of its range", parts=_shares()))
     return first, tuple(drawn)
+
+
+def _check_draws(place: Place, space: Space) -> None:
+    """Refuse to draw what the scene was asked to have."""
+    for control, group in space.groups:
+        if group.setting in place.scene.description.given - {ENVIRONMENT}:
+            raise InputError(
+                f"`controls` {control.name}: draws {group.name} by chance, and `set` {group.setting} fixes it; "
+                "leave it out of one of the two"
+            )
 
 
 def _shares() -> tuple[list[float], ...]:

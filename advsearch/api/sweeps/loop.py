@@ -175,6 +175,8 @@ class Sweep:
     ) -> store.Row:
         network = self.job.models[model]
         place = self.job.places[number // self.per_scene]
+        lit_by = self.points.lit_by(values)
+        lit: dict[str, Value] = {} if lit_by is None else {"environment": {"value": lit_by, "unit": ""}}
         known = not math.isnan(trial.margin)
         return store.Row(
             kind=KIND,
@@ -186,7 +188,7 @@ class Sweep:
             label=network.labels[trial.predicted],
             label_index=trial.predicted,
             probability=trial.probability,
-            values={**place.values, "model": {"value": network.name, "unit": ""}, **values},
+            values={**place.values, **lit, "model": {"value": network.name, "unit": ""}, **values},
             seconds=seconds,
             renders=int(self.job.sizes[model] not in self.job.sizes[:model]),
         )

@@ -190,6 +190,10 @@ class Points:
         norm = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-30)
         return np.asarray(self._start[part] + direction * (length / norm))
 
+    def lit_by(self, values: Mapping[str, Value]) -> str | None:
+        """Return what lights a picture in the place of the scene's environment, by what is stored of it."""
+        return self._space.lit_by(values)
+
     def values(self, u: Tensor, picks: Picks) -> list[dict[str, Value]]:
         """Return what is stored of the pictures: parameter to value and unit, as `Space.describe` says it.
 
