@@ -309,7 +309,9 @@ def test_what_cannot_be_is_refused(scene: SceneDescription, given: dict[str, obj
 def test_names_and_files_that_do_not_exist_are_explained(scene: SceneDescription, tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match=r"unknown setting of control patch 'sizee'. Did you mean 'size'"):
         PatchControl(sizee=1)
-    with pytest.raises(FileFormatError, match=r"patch.picture: expected a picture file such as PNG, got .*none.png"):
+    with pytest.raises(
+        FileFormatError, match=r"patch.picture: .*none.png: expected a picture file such as PNG, got No such file"
+    ):
         bound(scene, picture=str(tmp_path / "none.png"), azimuth=[0, 360])
 
 

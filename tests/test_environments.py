@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -242,6 +243,37 @@ def cut_exr(keep: float) -> Callable[[Path], Path]:
     return write
 
 
+def hostile_exr(window: tuple[int, int, int, int] = (0, 0, 15, 7)) -> Callable[[Path], Path]:
+    """Return a function that writes a small OpenEXR file with any data window in its header."""
+
+    def write(folder: Path) -> Path:
+        data = write_exr(folder / "bad.exr", {"RGB": light()}).read_bytes()
+        start = data.index(b"dataWindow\0box2i\0") + 21
+        return raw("bad.exr", data[:start] + struct.pack("<4i", *window) + data[start + 16 :])(folder)
+
+    return write
+
+
+def deep_exr(folder: Path) -> Path:
+    """Write an OpenEXR file with two values a pixel."""
+    plane = np.empty((8, 16), object)
+    for place in np.ndindex(8, 16):
+        plane[place] = np.array([0.5, 0.25], np.float32)
+    header = {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.deepscanline}
+    OpenEXR.File(header, dict.fromkeys("RGB", plane)).write(str(folder / "bad.exr"))
+    return folder / "bad.exr"
+
+
+def link(name: str, target: str) -> Callable[[Path], Path]:
+    """Return a function that makes a symbolic link."""
+
+    def write(folder: Path) -> Path:
+        (folder / name).symlink_to(target)
+        return folder / name
+
+    return write
+
+
 PLANE = light()[:, :, 0].copy()
 LINE = HEADER + b"-Y 8 +X 16\n"
 NOISE = np.random.default_rng(0).bytes(2000)
@@ -276,6 +308,9 @@ BAD = {
         bad_exr({"R": PLANE.astype(np.uint32), "G": PLANE, "B": PLANE}),
         r"channels of equal size in half or float, got R uint32 \(8, 16\), G float32 \(8, 16\), .*; save it again",
     ),
+    "huge exr": (hostile_exr((0, 0, 19_999, 9_999)), r"at most 134,217,728 pixels times channels, got 600,000,000; if"),
+    "deep exr": (deep_exr, r"expected one value a pixel, got a deep OpenEXR picture; flatten it"),
+    "device": (link("bad.exr", "/dev/zero"), r"expected .*environment.*, got a device; name an ordinary file"),
     "cut hdr header": (bad_hdr(b"#?RADIANCE\nFORMAT=32-"), r"expected a Radiance \.hdr picture, got half a header"),
     "xyz": (bad_hdr(b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 8 +X 16\n"), r"got 32-bit_rle_xyze; convert it to RGB"),
     "rotated": (
@@ -283,7 +318,10 @@ BAD = {
         r"a size like '-Y 512 \+X 1024', got '\+X 16 -Y 8'; save the picture",
     ),
     "no size": (bad_hdr(HEADER + b"-Y 0 +X 16\n"), r"a size like '-Y 512 \+X 1024', got '-Y 0 \+X 16'"),
-    "huge": (bad_hdr(HEADER + b"-Y 99999 +X 99999\n"), r"at most 268435456 pixels, got 99999 x 99999; scale it down"),
+    "huge": (
+        bad_hdr(HEADER + b"-Y 99999 +X 99999\n"),
+        r"at most 67,108,864 pixels, got 99999 x 99999; if you trust it, ADVSEARCH_LIMITS=10",
+    ),
     "no pixels": (bad_hdr(LINE), r"expected 8 scanlines of 16 pixels, got 0 whole ones and the start of another"),
     "cut runs": (bad_hdr(LINE + run_lengths(rgbe(8, 16))[:-1]), r"expected 8 scanlines of 16 pixels, got 7 whole ones"),
     "cut pixels": (

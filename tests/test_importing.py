@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import struct
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from fuzz.pictures import plain_png
 from PIL import Image
 from trimesh.visual.material import PBRMaterial
 
@@ -771,11 +773,17 @@ def png() -> bytes:
     return buffer.getvalue()
 
 
-def glb_of(header: dict[str, Any]) -> bytes:
-    """Return a .glb file with a JSON chunk only."""
+def glb_of(header: dict[str, Any], rest: bytes = b"") -> bytes:
+    """Return a .glb file with a JSON chunk, and whatever comes after it."""
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 4)
-    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text), len(text), 0x4E4F534A) + text
+    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
+
+
+def glb_parts(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """Return the header of a .glb file, and what comes after it."""
+    length = struct.unpack_from("<I", data, 12)[0]
+    return json.loads(data[20 : 20 + length]), data[20 + length :]
 
 
 NOISE = np.random.default_rng(0).bytes(3000)
@@ -841,7 +849,10 @@ BAD = {
         raw("t.glb", glb_of(INTEGER_UVS)),
         r"expected floats, got TEXCOORD_0 values that are not 32-bit floats",
     ),
-    "old gltf": (raw("t.gltf", b'{"asset": {"version": "1.0"}}'), r"is not readable GLTF \(only GLTF 2 is supported"),
+    "old gltf": (
+        raw("t.gltf", b'{"asset": {"version": "1.0"}}'),
+        r"expected glTF of version 2, got version '1\.0'; export",
+    ),
 }
 
 
@@ -872,6 +883,212 @@ def test_damage_anywhere_is_the_inputs_fault(tmp_path: Path, suffix: str, capfd:
             refused += 1  # anything else fails the test
     assert refused > 0
     assert capfd.readouterr() == ("", "")
+
+
+# --- hostile input ----------------------------------------
+
+
+@pytest.mark.parametrize(("target", "got"), [("/dev/zero", "a device"), (None, "a pipe"), (".", "a directory")])
+def test_only_ordinary_files_are_read(tmp_path: Path, target: str | None, got: str) -> None:
+    path = tmp_path / "thing.obj"
+    if target is None:
+        os.mkfifo(path)
+    else:
+        path.symlink_to(target)
+    with pytest.raises(FileFormatError, match=rf"thing\.obj: expected .*object.*, got {got}"):
+        import_object(path)
+
+
+REFERENCES = {
+    "above": ("../secret.png", "is outside its folder and is not read"),
+    "absolute": ("{outside}/secret.png", "is outside its folder and is not read"),
+    "through a link": ("link.png", "is outside its folder and is not read"),
+    "through a linked folder": ("folder/secret.png", "is outside its folder and is not read"),
+    "a device": ("/dev/zero", "is outside its folder and is not read"),
+    "a pipe": ("pipe.png", "is not read (expected an ordinary file, got a pipe; write what it yields to a file and"),
+    "a directory": ("inside", "is not read (expected an ordinary file, got a directory; name a file inside it)"),
+    "a long name": ("n" * 5000 + ".png", "is missing"),
+    "an escape sequence": ("\x1b[31m.png", "is missing"),
+}
+
+
+@pytest.mark.parametrize("case", REFERENCES)
+def test_references_are_read_from_the_own_folder_only(tmp_path: Path, case: str) -> None:
+    home = tmp_path / "home"
+    (home / "inside").mkdir(parents=True)
+    picture(tmp_path, "secret.png")
+    (home / "link.png").symlink_to("../secret.png")
+    (home / "folder").symlink_to("..")
+    os.mkfifo(home / "pipe.png")
+    name, why = REFERENCES[case]
+    written(home, "thing.mtl", f"newmtl paint\nKd 0.2 0.3 0.7\nmap_Kd {name.format(outside=tmp_path)}\n")
+    asset = import_object(written(home, "thing.obj", "mtllib thing.mtl\nusemtl paint\n" + QUAD))
+    (warning,) = asset.warnings
+    assert warning.startswith("thing.obj: thing.mtl names the texture ") and why in warning
+    assert warning.endswith("; its base colour (0.20, 0.30, 0.70) is used instead")
+    assert len(warning) < 400 and warning.isprintable()
+    assert asset.base_color[0, 0] == pytest.approx([0.2, 0.3, 0.7])
+
+
+def test_a_reference_below_the_folder_is_read(tmp_path: Path) -> None:
+    (tmp_path / "maps").mkdir()
+    pixels = picture(tmp_path / "maps")
+    (tmp_path / "link.png").symlink_to("maps/wood.png")
+    for name in ("maps/wood.png", "link.png"):
+        written(tmp_path, "thing.mtl", f"newmtl paint\nmap_Kd {name}\n")
+        asset = import_object(written(tmp_path, "thing.obj", "mtllib thing.mtl\nusemtl paint\n" + QUAD))
+        assert asset.warnings == () and np.array_equal(asset.base_color, pixels)
+
+
+def test_material_files_and_buffers_elsewhere_are_not_read(tmp_path: Path) -> None:
+    home = tmp_path / "home"
+    home.mkdir()
+    written(tmp_path, "secret.mtl", MTL)
+    asset = import_object(written(home, "thing.obj", "mtllib ../secret.mtl\nusemtl paint\n" + QUAD))
+    assert asset.warnings == (
+        "thing.obj names the material file '../secret.mtl', which is outside its folder and is not read; neutral grey"
+        " is used instead",
+    )
+    path = split_gltf(home)
+    (buffer, *_) = home.glob("*.bin")
+    buffer.rename(tmp_path / "secret.bin")
+    path.write_text(path.read_text().replace(buffer.name, "../secret.bin"))
+    message = (
+        r"split\.gltf: needs '\.\./secret\.bin', which is outside its folder and is not read; put that file beside it"
+    )
+    with pytest.raises(FileFormatError, match=message):
+        import_object(path)
+
+
+def test_pictures_that_run_programs_or_take_gigabytes_are_not_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started = []
+    monkeypatch.setattr(subprocess, "Popen", lambda *arguments, **_: started.append(arguments))
+    written(tmp_path, "thing.mtl", "newmtl paint\nKd 0.2 0.3 0.7\nmap_Kd wood.png\n")
+    path = written(tmp_path, "thing.obj", "mtllib thing.mtl\nusemtl paint\n" + QUAD)
+    eps = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 90 90\n%%EndComments\nshowpage\n%%EOF\n"
+    contents = {
+        "expected a picture such as PNG or JPEG, got EPS; convert it": eps,
+        "expected a picture of at most 67,108,864 pixels, got 20000 x 20000; if you trust it, ADVSEARCH_LIMITS=10 in": (
+            plain_png(20_000, 20_000, 1, 0)
+        ),
+    }
+    for reason, content in contents.items():
+        written(tmp_path, "wood.png", content)
+        (warning,) = import_object(path).warnings
+        assert warning.startswith(f"thing.obj: thing.mtl names the texture 'wood.png', which is not read ({reason}")
+    assert started == []
+
+
+def test_textures_have_a_limit_in_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    picture(tmp_path)
+    monkeypatch.setattr("advsearch.scene.importing.surfaces.LARGEST_SUM", 512)  # two of the three
+    materials = "".join(f"newmtl m{k}\nKd 0.2 0.3 0.7\nmap_Kd wood.png\n" for k in range(3))
+    written(tmp_path, "thing.mtl", materials)
+    faces = "".join(f"usemtl m{k}\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n" for k in range(3))
+    warnings = import_object(written(tmp_path, "thing.obj", "mtllib thing.mtl\n" + QUAD_V + QUAD_UV + faces)).warnings
+    assert sum("pictures of at most 512 pixels, got 768 in all; if you trust it" in line for line in warnings) == 1
+
+
+def test_large_pictures_are_averaged_in_bands_to_the_same_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = Image.fromarray(np.random.default_rng(0).integers(0, 256, (1100, 1300, 3), np.uint8))
+    whole = display_image(image, 100)
+    monkeypatch.setattr("advsearch.scene.importing.images._BAND", 50_000)
+    assert np.array_equal(display_image(image, 100), whole)
+
+
+@pytest.mark.parametrize(
+    ("face", "message"),
+    [
+        ("f " + "1 2 3 " * 300_000, r"at most 10,000 corners in the face on line 5, got 900,000; if you trust it, ADV"),
+        ("f 1 2 3 4\n" * 30, r"expected a mesh of at most 20 triangles, got 60; if you trust it, ADVSEARCH_LIMITS=10"),
+    ],
+)
+def test_faces_have_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, face: str, message: str) -> None:
+    if "20 triangles" in message:
+        monkeypatch.setattr("advsearch.scene.importing.checks.LARGEST_FACES", 20)
+    with pytest.raises(FileFormatError, match=message):
+        import_object(written(tmp_path, "thing.obj", QUAD_V + face))
+
+
+@pytest.mark.parametrize("index", ["8", "-1", "-2147483648"])
+def test_faces_of_vertices_that_are_not_there(tmp_path: Path, index: str) -> None:
+    box = trimesh.creation.box()
+    box.visual.vertex_colors = np.arange(32, dtype=np.uint8).reshape(8, 4) * 8
+    text = exported(tmp_path, "box.ply", box, encoding="ascii").read_text()
+    lines = text.rstrip().split("\n")
+    lines[-1] = f"3 0 1 {index}"
+    with pytest.raises(FileFormatError, match="a face that refers to a vertex that is not there; export or download"):
+        import_object(written(tmp_path, "thing.ply", "\n".join(lines) + "\n"))
+
+
+def test_a_heap_of_faces_is_laid_out_in_a_grid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("advsearch.scene.importing.unwrap._MOST_PATCHES", 8)
+    corners = np.random.default_rng(0).random((33, 3, 3))
+    heap = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(99).reshape(-1, 3), process=False)
+    monkeypatch.setattr("advsearch.scene.importing.unwrap._MANY", 8)
+    asset = import_object(exported(tmp_path, "heap.stl", heap))
+    check_sound(asset)
+    assert overlap(asset.mesh) == 0 and len(asset.mesh.faces) == 33
+
+
+def test_old_gltf_materials_keep_their_diffuse_color(tmp_path: Path) -> None:
+    data = glb(tmp_path, PBRMaterial(baseColorFactor=[1.0, 0.0, 0.0, 1.0])).read_bytes()
+    header, rest = glb_parts(data)
+    old = {"diffuseFactor": [0.0, 1.0, 0.0, 1.0], "glossinessFactor": 0.25, "specularFactor": [1, 1, 1]}
+    header["materials"][0] = {"extensions": {"KHR_materials_pbrSpecularGlossiness": old}}
+    asset = import_object(written(tmp_path, "old.glb", glb_of(header, rest)))
+    assert asset.base_color[0, 0] == pytest.approx([0, 1, 0]) and asset.material == Material(0.75, 0.0)
+
+
+GLTF_CHANGES: dict[str, tuple[list[Any], Any, str]] = {
+    "null meshes": (["meshes"], None, r"glTF whose meshes is a valid list, got 'null'"),
+    "integer as list": (["scene"], [0], r"glTF whose scene is a valid integer, got '\[0\]'"),
+    "text as integer": (["accessors", 0, "count"], "8", r"glTF whose accessors\[0\]\.count is a valid integer"),
+    "negative index": (
+        ["meshes", 0, "primitives", 0, "indices"],
+        -1,
+        r"indices is greater than or equal to 0, got '-1'",
+    ),
+    "index past the end": (["meshes", 0, "primitives", 0, "indices"], 99, r"glTF with 100 accessors, as it refers to"),
+    "huge count": (["accessors", 0, "count"], 10**9, r"geometry and pictures of at most 268,435,456 bytes, got"),
+    "sparse": (["accessors", 0, "sparse"], {"count": 1}, r"has sparse accessors, which are not supported"),
+    "nan": (["nodes", 0, "matrix"], [float("nan")] * 16, r"matrix\[0\] is a finite number, got 'NaN'"),
+    "cycle": (["nodes"], [{"children": [1], "mesh": 0}, {"children": [0]}], r"nodes that form trees, got a cycle"),
+    "two parents": (["nodes"], [{"children": [2]}, {"children": [2]}, {"mesh": 0}], r"one parent each, got two for"),
+    "deep": (
+        ["nodes"],
+        [{"children": [k + 1]} for k in range(999)] + [{"mesh": 0}],
+        r"of at most 500 levels, got more",
+    ),
+    "many pieces": (["nodes"], [{"mesh": 0}] * 20_001, r"at most 20,000 nodes and pieces, got 20,001"),
+}
+
+
+@pytest.mark.parametrize("case", GLTF_CHANGES)
+def test_gltf_that_is_not_gltf(tmp_path: Path, case: str) -> None:
+    (*path, key), value, message = GLTF_CHANGES[case]
+    header, rest = glb_parts(exported(tmp_path, "box.glb", trimesh.creation.box()).read_bytes())
+    place: Any = header
+    for step in path:
+        place = place[step]
+    place[key] = value
+    with pytest.raises(FileFormatError, match=message) as caught:
+        import_object(written(tmp_path, "thing.glb", glb_of(header, rest)))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "got"),
+    [
+        ("[" * 100_000, "lists or objects nested deeper than 100"),
+        ('{"asset": {"version": "2.0"}, "scene": ' + "9" * 6000 + "}", "a whole number of 6000 digits"),
+    ],
+)
+def test_gltf_json_has_limits(tmp_path: Path, text: str, got: str) -> None:
+    with pytest.raises(FileFormatError, match=f"expected glTF with a JSON header, got {got}"):
+        import_object(written(tmp_path, "thing.gltf", text))
 
 
 def test_near_matches_of_a_missing_file(tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
-from PIL import Image
 from torch import Tensor
 
 from advsearch.controls.base import (
@@ -36,7 +35,7 @@ from advsearch.controls.values import Choices, Fixed, Number, Range, in_words, r
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.images import display_image
+from advsearch.scene.importing.images import read_picture
 from advsearch.scene.sticker import Sticker, towards_camera
 
 BASE_COLOR = "object.base_color"
@@ -217,12 +216,9 @@ class PatchControl(Control):
             return torch.full((side, side, 3), grey)
         path = Path(self.picture)
         try:
-            with Image.open(path) as image:
-                pixels = torch.from_numpy(display_image(image))
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-            raise FileFormatError(
-                f"{self.name}.picture: expected a picture file such as PNG, got {path} ({error}); check the path"
-            ) from error
+            pixels = torch.from_numpy(read_picture(path))
+        except FileFormatError as error:
+            raise FileFormatError(f"{self.name}.picture: {error}") from error
         return resampled(pixels, side)
 
     def _budget(self, count: int, spec: Range) -> Budget:

@@ -7,18 +7,20 @@ is not UTF-8. The few lines that each format needs are here, where a message can
 
 from __future__ import annotations
 
-import json
 import re
 import struct
 from pathlib import Path
-from typing import Any
 
-from advsearch.errors import FileFormatError
+from advsearch import files
 from advsearch.scene.importing.files import damaged, looks_like, text_of
 
+LARGEST_FACES = 2_000_000
+"""Triangles that a mesh may have, before `advsearch.files.scaled`."""
+
+MOST_CORNERS = 10_000
+"""Corners that one face may have."""
+
 _OBJ = "a Wavefront OBJ file (text with 'v' and 'f' lines)"
-_UNREADABLE = re.compile(r"compression|quantization|basisu")
-_FLOAT = 5126  # glTF's code of a 32-bit float
 
 
 def checked(path: Path, data: bytes) -> bytes:
@@ -38,9 +40,17 @@ def checked(path: Path, data: bytes) -> bytes:
         _check_ply(path, data)
     elif suffix == ".stl":
         _check_stl(path, data)
-    else:
-        _check_gltf(path, gltf_header(path, data))
     return data
+
+
+def check_faces(path: Path, count: int) -> None:
+    """Refuse a mesh with too many triangles.
+
+    Raises:
+        FileFormatError: there are more than `LARGEST_FACES`, before `advsearch.files.scaled`.
+    """
+    if count > files.scaled(LARGEST_FACES):
+        raise files.too_large(path, f"a mesh of at most {files.scaled(LARGEST_FACES):,} triangles", f"{count:,}")
 
 
 # --- Wavefront OBJ ----------------------------------------
@@ -52,7 +62,7 @@ def _checked_obj(path: Path, data: bytes) -> str:
         raise damaged(path, _OBJ, looks_like(data))
     counts = {"v": 0, "vt": 0, "vn": 0}
     largest = {"v": (0, 0), "vt": (0, 0), "vn": (0, 0)}
-    lines = []
+    lines, triangles = [], 0
     for number, line in enumerate(re.sub(r"\\\r?\n", " ", text_of(data)).splitlines(), start=1):
         key, _, rest = line.replace("\t", " ").strip().partition(" ")
         if key in counts:
@@ -60,10 +70,13 @@ def _checked_obj(path: Path, data: bytes) -> str:
             if rest.count(" ") < 2 and len(rest.split()) < (1 if key == "vt" else 3):
                 raise damaged(path, f"3 numbers after {key!r} on line {number}", f"{rest!r} (is the file cut short?)")
         elif key == "f":
-            rest = " ".join(_corners(path, number, rest.split("#", 1)[0].split(), counts, largest))
+            tokens = rest.split("#", 1)[0].split()
+            triangles += len(tokens) - 2
+            rest = " ".join(_corners(path, number, tokens, counts, largest))
         lines.append(f"{key} {rest.strip()}")
     if not counts["v"]:
         raise damaged(path, _OBJ, looks_like(data))
+    check_faces(path, triangles)
     for kind, (index, number) in largest.items():
         if index > counts[kind]:
             got = f"{counts[kind]}, and a face on line {number} that refers to number {index} (is the file cut short?)"
@@ -77,6 +90,9 @@ def _corners(
     """Return the corners of the face on line `number` with absolute indices; note the largest index of each kind."""
     if len(tokens) < 3:
         raise damaged(path, f"3 or more corners on line {number}", f"'f {' '.join(tokens)}' (is the file cut short?)")
+    if len(tokens) > files.scaled(MOST_CORNERS):
+        expected = f"at most {files.scaled(MOST_CORNERS):,} corners in the face on line {number}"
+        raise files.too_large(path, expected, f"{len(tokens):,}")
     result = []
     for token in tokens:
         parts = token.split("/")
@@ -125,48 +141,3 @@ def _check_stl(path: Path, data: bytes) -> None:
     kind = looks_like(data)
     got = f"{len(data)} bytes, which is neither ASCII nor that long" if "another" in kind else kind
     raise damaged(path, f"an STL file (in binary, {promised} bytes for its number of facets)", got)
-
-
-# --- glTF ----------------------------------------
-
-
-def gltf_header(path: Path, data: bytes) -> dict[str, Any]:
-    """Return the JSON part of a .gltf or .glb file.
-
-    Raises:
-        FileFormatError: the file is not glTF, or shorter than it says.
-    """
-    text = data
-    if path.suffix.lower() == ".glb":
-        if not data.startswith(b"glTF") or len(data) < 20:
-            got = "the first few bytes of one" if data.startswith(b"glTF") else looks_like(data)
-            raise damaged(path, "a binary glTF file", got)
-        length, chunk = struct.unpack_from("<8xII", data)
-        if length > len(data):
-            raise damaged(path, f"{length} bytes, as its header says", f"{len(data)}; the file is cut short")
-        text = data[20 : 20 + chunk]
-    try:
-        header = json.loads(text_of(text))
-    except ValueError:
-        kind = looks_like(data)
-        raise damaged(path, "glTF with a JSON header", kind if "another" not in kind else "something else") from None
-    if not isinstance(header, dict) or "asset" not in header:
-        raise damaged(path, "glTF with an 'asset' entry", "other JSON")
-    return header
-
-
-def _check_gltf(path: Path, header: dict[str, Any]) -> None:
-    """Refuse what would be read wrongly: compressed meshes, and integers where floats are meant."""
-    needed = sorted(name for name in header.get("extensionsRequired", ()) if _UNREADABLE.search(str(name)))
-    if needed:
-        raise FileFormatError(
-            f"{path}: needs {', '.join(needed)}, which is not supported; export it without that option"
-        )
-    accessors = header.get("accessors", [])
-    for mesh in header.get("meshes", []):
-        for primitive in mesh.get("primitives", []):
-            for name, index in primitive.get("attributes", {}).items():
-                whole = name in ("POSITION", "NORMAL", "TEXCOORD_0") and index < len(accessors)
-                if whole and accessors[index].get("componentType") != _FLOAT:
-                    got = f"{name} values that are not 32-bit floats"
-                    raise FileFormatError(f"{path}: expected floats, got {got}; export it without quantization")

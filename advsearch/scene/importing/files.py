@@ -6,7 +6,13 @@ import difflib
 from collections.abc import Sequence
 from pathlib import Path
 
+from advsearch import files
 from advsearch.errors import FileFormatError
+
+LARGEST_FILE = 1 << 29
+"""Bytes that a mesh, a texture or an environment may have, before `advsearch.files.scaled`."""
+
+_LONGEST_NAME = 100
 
 _KINDS = (
     (b"\x89PNG", "a PNG picture"),
@@ -37,7 +43,8 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
         suffixes: the supported endings, lower case with dot.
 
     Raises:
-        FileFormatError: an unsupported ending, or a file that is missing, a directory, unreadable or empty.
+        FileFormatError: an unsupported ending, or a file that is missing, not an ordinary file, unreadable, empty or
+            larger than `LARGEST_FILE`.
     """
     try:
         if path.is_dir():
@@ -47,7 +54,7 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
             raise FileFormatError(
                 f"{path}: expected an {what} file ending in {', '.join(suffixes)}, {got}; convert it to one of these"
             )
-        data = path.read_bytes()
+        data = files.read_bytes(path, f"an {what} file", LARGEST_FILE)
     except FileNotFoundError as error:
         raise FileFormatError(f"{path}: no such {what} file.{_near(path, suffixes)} Check the path") from error
     except (OSError, ValueError) as error:
@@ -77,6 +84,13 @@ def text_of(data: bytes) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         return data.decode("latin-1")
+
+
+def shown(name: str) -> str:
+    """Return a name out of a file as a message shows it: quoted, control characters spelled out, cut to a length."""
+    if len(name) <= _LONGEST_NAME:
+        return repr(name)
+    return f"{name[: _LONGEST_NAME // 2]!r}... ({len(name):,} characters)"
 
 
 def safe_name(path: Path) -> str:

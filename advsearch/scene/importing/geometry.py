@@ -88,15 +88,10 @@ def join(parts: Sequence[Part], source: str, *, y_up: bool) -> Soup:
         y_up: whether the file's y axis points up; it is turned about x by 90 degrees, which keeps handedness.
 
     Raises:
-        InputError: vertices that are NaN or infinite, faces that refer to none, or no extent.
+        InputError: vertices that are NaN or infinite, or no extent.
     """
     vertices = np.concatenate([part.vertices for part in parts])
     starts = np.cumsum([0] + [len(part.vertices) for part in parts])
-    for part in parts:
-        if part.faces.min() < 0 or part.faces.max() >= len(part.vertices):
-            raise InputError(
-                f"{source}: a face refers to a vertex that is not there; the file is damaged, export it again"
-            )
     bad = ~np.isfinite(vertices).all(axis=1)
     if bad.any():
         first = int(bad.argmax())

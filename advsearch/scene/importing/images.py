@@ -2,49 +2,138 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
 from scipy import sparse
 
+from advsearch import files
+from advsearch.errors import FileFormatError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
+from advsearch.scene.importing.files import LARGEST_FILE
 
 Floats = npt.NDArray[np.float32]
 
 TEXTURE_LIMIT = 1024
 """Longest side of an imported texture, in texels; larger ones are averaged down."""
 
+FORMATS = ("BMP", "DDS", "GIF", "JPEG", "JPEG2000", "PNG", "PPM", "SGI", "TGA", "TIFF", "WEBP")
+"""Formats of pictures, as Pillow names them. Pillow knows more; for some (EPS) it runs other programs."""
 
-def display_image(image: Image.Image, limit: int | None = TEXTURE_LIMIT) -> Floats:
+LARGEST_PIXELS = 1 << 26
+"""Pixels that a picture may have (8192 x 8192), before `advsearch.files.scaled`; decoded they take 4 bytes each."""
+
+_BAND = 1 << 22  # pixels of a large picture that are averaged at a time
+
+
+@contextlib.contextmanager
+def without_pillows_limit() -> Iterator[None]:
+    """Let Pillow open, but not decode, pictures of any size: what is decoded is up to `check_pixels`."""
+    kept, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    try:
+        yield
+    finally:
+        Image.MAX_IMAGE_PIXELS = kept
+
+
+def check_pixels(path: Path | str, width: int, height: int, limit: int = LARGEST_PIXELS) -> None:
+    """Refuse a picture with too many pixels before it is decoded.
+
+    Raises:
+        FileFormatError: it has more than `limit`, before `advsearch.files.scaled`.
+    """
+    if width * height > files.scaled(limit):
+        expected = f"a picture of at most {files.scaled(limit):,} pixels"
+        raise files.too_large(path, expected, f"{width} x {height}")
+
+
+def read_picture(path: Path, limit: int | None = TEXTURE_LIMIT) -> Floats:
+    """Read a picture file; arguments and result as for `display_image`.
+
+    Raises:
+        FileFormatError: it is missing, no ordinary file, no picture, too large or damaged.
+    """
+    try:
+        data = files.read_bytes(path, "a picture file such as PNG", LARGEST_FILE)
+        with warnings.catch_warnings(), without_pillows_limit():
+            warnings.simplefilter("ignore")  # of odd metadata
+            with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+                return display_image(image, limit, path)
+    except (OSError, ValueError, SyntaxError, EOFError) as error:
+        reason = getattr(error, "strerror", None) or "one that cannot be read"
+        raise FileFormatError(f"{path}: expected a picture file such as PNG, got {reason}; check the path") from error
+
+
+def display_image(image: Image.Image, limit: int | None = TEXTURE_LIMIT, path: Path | str = "picture") -> Floats:
     """Decode a picture; alpha is dropped.
 
     Args:
         image: an opened picture of any mode.
         limit: longest side of the result; larger pictures are averaged down in linear light. None: no limit.
+        path: where it is from, for messages.
 
     Returns:
         (H, W, 3) float32 display-referred values in [0, 1], row 0 on top.
 
     Raises:
-        OSError, ValueError, SyntaxError, Image.DecompressionBombError: the file's pixels are truncated or damaged.
+        FileFormatError: too many pixels, or a format that is not one of `FORMATS`.
+        OSError, ValueError, SyntaxError: the file's pixels are truncated or damaged.
     """
+    width, height = image.size
+    check_pixels(path, width, height)
+    if image.format not in (None, "MPO", *FORMATS):  # an MPO is a JPEG with a second picture
+        raise FileFormatError(f"{path}: expected a picture such as PNG or JPEG, got {image.format}; convert it")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of large pictures and odd metadata
         image.load()
-        if image.mode == "F" or image.mode.startswith("I"):  # grey in floats or 16 bits
-            grey = np.nan_to_num(np.asarray(image, np.float32)) / np.float32(1.0 if image.mode == "F" else 65535.0)
-            steps = np.round(np.clip(grey, 0.0, 1.0) * 255.0).astype(np.uint8)[:, :, None].repeat(3, axis=2)
-        else:
-            steps = np.asarray(image.convert("RGBA" if "transparency" in image.info else "RGB"))[:, :, :3]
-    height, width = steps.shape[:2]
-    scale = 1.0 if limit is None else limit / max(height, width)
-    display: Floats = np.arange(256, dtype=np.float32) / np.float32(255.0)
-    if scale >= 1.0:
-        return np.asarray(display[steps])
-    target = max(1, round(height * scale)), max(1, round(width * scale))
-    return linear_to_srgb(area_average(srgb_to_linear(display)[steps], *target))
+        scale = 1.0 if limit is None else limit / max(height, width)
+        display: Floats = np.arange(256, dtype=np.float32) / np.float32(255.0)
+        if scale >= 1.0:
+            return np.asarray(display[_steps(image)])
+        target = max(1, round(height * scale)), max(1, round(width * scale))
+        linear = srgb_to_linear(display)
+        return linear_to_srgb(
+            banded_average(
+                lambda top, end: np.take(linear, _steps(image.crop((0, top, width, end)))), (height, width), target
+            )
+        )
+
+
+def _steps(image: Image.Image) -> npt.NDArray[np.uint8]:
+    """Return the (H, W, 3) colours of a decoded picture in 8 bits."""
+    if image.mode == "F" or image.mode.startswith("I"):  # grey in floats or 16 bits
+        grey = np.nan_to_num(np.asarray(image, np.float32)) / np.float32(1.0 if image.mode == "F" else 65535.0)
+        steps: npt.NDArray[np.uint8] = np.round(np.clip(grey, 0.0, 1.0) * 255.0).astype(np.uint8)
+        return steps[:, :, None].repeat(3, axis=2)
+    steps = np.asarray(image.convert("RGBA" if "transparency" in image.info else "RGB"))
+    return steps[:, :, :3]
+
+
+def banded_average(band: Callable[[int, int], Floats], size: tuple[int, int], target: tuple[int, int]) -> Floats:
+    """Average an image down that is too large to hold in floats; the same as `area_average` of the whole.
+
+    Args:
+        band: returns rows from the first to before the second of its arguments, (n, W, C) float32.
+        size: rows and columns of the image.
+        target: rows and columns of the result, at most those.
+
+    Returns:
+        (H, W, C) float32.
+    """
+    down, across = _overlaps(size[0], target[0]), _overlaps(size[1], target[1])
+    count = max(1, _BAND * target[0] // (size[0] * size[1]))
+    pieces = []
+    for start in range(0, target[0], count):
+        rows = down[start : start + count]
+        top, end = int(rows.indices.min()), int(rows.indices.max()) + 1
+        pieces.append(_averaged(band(top, end), rows[:, top:end], across))
+    return np.concatenate(pieces)
 
 
 def area_average(image: Floats, height: int, width: int) -> Floats:
@@ -58,10 +147,15 @@ def area_average(image: Floats, height: int, width: int) -> Floats:
     Returns:
         (height, width, C) float32 with the same mean as `image`.
     """
+    return _averaged(image, _overlaps(image.shape[0], height), _overlaps(image.shape[1], width))
+
+
+def _averaged(image: Floats, down: sparse.csr_array, across: sparse.csr_array) -> Floats:
+    """Average rows, then columns, by matrices as `_overlaps` makes them."""
     rows, columns, channels = image.shape
-    down = _overlaps(rows, height) @ image.reshape(rows, columns * channels)
-    across = _overlaps(columns, width)
-    sideways = down.reshape(height, columns, channels).transpose(1, 0, 2).reshape(columns, height * channels)
+    height, width = down.shape[0], across.shape[0]
+    low = down @ image.reshape(rows, columns * channels)
+    sideways = low.reshape(height, columns, channels).transpose(1, 0, 2).reshape(columns, height * channels)
     result = (across @ sideways).reshape(width, height, channels).transpose(1, 0, 2)
     return np.ascontiguousarray(result, dtype=np.float32)
 

@@ -19,13 +19,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import trimesh
-from trimesh.resolvers import FilePathResolver
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.importing.checks import checked, gltf_header
-from advsearch.scene.importing.files import damaged, text_of
-from advsearch.scene.importing.surfaces import UNNAMED, Named, Surface, SurfaceReader, plain_name
+from advsearch.scene.importing import gltf
+from advsearch.scene.importing.checks import check_faces, checked
+from advsearch.scene.importing.files import damaged, shown, text_of
+from advsearch.scene.importing.images import without_pillows_limit
+from advsearch.scene.importing.references import Named, References
+from advsearch.scene.importing.surfaces import UNNAMED, Surface, SurfaceReader
 
 Array = npt.NDArray[np.float64]
 
@@ -55,49 +57,6 @@ class Part:
     surface: Surface
 
 
-class _Resolver:
-    """Finds the files that a mesh file names, and remembers what it found in material files and what is missing.
-
-    Attributes:
-        missing: names that were asked for and are not there.
-        materials: names of the materials in the .mtl files read.
-        named: for each material that names a texture: the file that names it, and the texture's name.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._files = FilePathResolver(str(path), allow_anywhere=True)
-        self.missing: list[str] = []
-        self.materials: set[str] = set()
-        self.named: Named = {}
-
-    def get(self, name: str) -> bytes:
-        """Return the content of a named file; after the name as it stands, its usual distortions are tried."""
-        plain = plain_name(name)
-        options_dropped = plain.split()[-1] if plain.split() else plain  # map_Kd -s 1 1 1 wood.png
-        for candidate in (name, plain, options_dropped):
-            try:
-                data = bytes(self._files.get(candidate))
-            except (OSError, ValueError):
-                continue
-            return self._noted(candidate, data) if candidate.lower().endswith(".mtl") else data
-        self.missing.append(plain)
-        raise FileNotFoundError(name)
-
-    __getitem__ = get
-
-    def _noted(self, name: str, data: bytes) -> bytes:
-        """Note the materials of a material file and the textures they name; return it as UTF-8."""
-        current = None
-        for line in text_of(data).splitlines():
-            key, _, rest = line.strip().partition(" ")
-            if key.lower() == "newmtl":
-                current = " ".join(rest.split())
-                self.materials.add(current)
-            elif key.lower() == "map_kd" and current is not None and rest.strip():
-                self.named[current] = (Path(name).name, rest.strip())
-        return text_of(data).encode()
-
-
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
     """Keep trimesh's log messages, some with tracebacks, and numpy's warnings about damaged files to ourselves."""
@@ -105,7 +64,7 @@ def _silent() -> Iterator[None]:
     propagate, logger.propagate = logger.propagate, False
     logger.addHandler(handler)  # without any, Python would print them
     try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
+        with warnings.catch_warnings(), np.errstate(all="ignore"), without_pillows_limit():
             warnings.simplefilter("ignore")
             yield
     finally:
@@ -127,18 +86,25 @@ def read_parts(path: Path, data: bytes) -> tuple[list[Part], list[str]]:
     Raises:
         FileFormatError: the file is damaged, not a mesh, refers to missing geometry, or has no faces.
     """
-    resolver = _Resolver(path)
-    found = _parse(path, checked(path, data), resolver)
+    references = References(path)
+    header = gltf.read_header(path, data) if path.suffix.lower() in GLTF else None
+    readable = checked(path, data) if header is None else gltf.rewritten(path, data, header)
+    found = _parse(path, readable, references)
     meshes = [(mesh, matrix) for mesh, matrix in found if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
     if any(np.shape(mesh.vertices)[1:] != (3,) for mesh, _ in meshes):
         raise damaged(path, "vertices with 3 coordinates", "another number")
+    if any(mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices) for mesh, _ in meshes):
+        raise damaged(path, "faces of its own vertices", "a face that refers to a vertex that is not there")
+    check_faces(path, sum(len(mesh.faces) for mesh, _ in meshes))
     if not meshes:
         got = "points or lines only" if found else "none"
         raise FileFormatError(f"{path}: expected a mesh with faces, got {got}; export triangles")
-    notes = _file_notes(path, data, resolver)
+    notes = _file_notes(path, data, header, references)
     if len(meshes) < len(found):
         notes.append(f"{path.name}: {len(found) - len(meshes)} parts without faces (points, lines) are left out")
-    reader = SurfaceReader(path.name, _named_textures(path, data, resolver), set(resolver.missing))
+    named = _named_textures(path, data, header, references)
+    materials = len(references.materials) if header is None else len(header.materials)
+    reader = SurfaceReader(path.name, named, references.refused, materials)
     parts = []
     for mesh, matrix in meshes:
         part = _part(mesh, reader.surface(mesh.visual), linear=path.suffix.lower() in GLTF)
@@ -148,25 +114,29 @@ def read_parts(path: Path, data: bytes) -> tuple[list[Part], list[str]]:
     return parts, notes + reader.notes
 
 
-def _parse(path: Path, data: bytes, resolver: _Resolver) -> list[tuple[Any, Array]]:
+def _parse(path: Path, data: bytes, references: References) -> list[tuple[Any, Array]]:
     """Run trimesh's parser; return what it found with the transforms (4, 4), always in the same order."""
     kind = path.suffix.lower().lstrip(".")
     options: dict[str, Any] = {"process": False}
     if kind == "ply":  # with fix_texture, vertices are shuffled and their normals are not
         options["fix_texture"] = _has_face_uvs(path, data)
     try:
-        scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=resolver, **options)
+        scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=references, **options)
         found = []
         for node in scene.graph.nodes_geometry:
             matrix, name = scene.graph.get(node)
             found.append((str(name), np.asarray(matrix, dtype=np.float64)))
         found.sort(key=lambda item: (item[0], item[1].tobytes()))  # the names of nodes can be random
         return [(scene.geometry[name], matrix) for name, matrix in found]
+    except MemoryError:
+        raise
     except Exception as error:
-        if resolver.missing:
-            message = f"{path}: needs {resolver.missing[0]!r}, which is missing; put that file beside it"
+        if references.refused:
+            name, reason = next(iter(references.refused.items()))
+            message = f"{path}: needs {shown(name)}, which {reason}; put that file beside it"
         else:
-            reason = " ".join(str(error).split())[:120] or type(error).__name__
+            words = "".join(c if c.isprintable() else " " for c in str(error)).split()
+            reason = " ".join(words)[:120] or type(error).__name__
             message = f"{path}: is not readable {kind.upper()} ({reason}); it is damaged or cut short, export it again"
         raise FileFormatError(message) from error
 
@@ -176,49 +146,37 @@ def _has_face_uvs(path: Path, data: bytes) -> bool:
     return path.suffix.lower() == ".ply" and b"texcoord" in data.split(b"end_header")[0]
 
 
-def _file_notes(path: Path, data: bytes, resolver: _Resolver) -> list[str]:
+def _file_notes(path: Path, data: bytes, header: gltf.Header | None, references: References) -> list[str]:
     """Return the warnings about material files, and about features of the file that are not carried over."""
     notes = []
-    for name in resolver.missing:
+    for name, reason in references.refused.items():
         if name.lower().endswith(".mtl"):
             notes.append(
-                f"{path.name} names the material file {name!r}, which is missing; neutral grey is used instead"
+                f"{path.name} names the material file {shown(name)}, which {reason}; neutral grey is used instead"
             )
-    if path.suffix.lower() == ".obj" and resolver.materials:
+    if path.suffix.lower() == ".obj" and references.materials:
         used = set(re.findall(r"^\s*usemtl\s+(.*?)\s*$", text_of(data), re.MULTILINE))
-        for name in sorted(used - resolver.materials):
+        for name in sorted(used - references.materials):
             notes.append(
-                f"{path.name} uses the material {name!r}, which its .mtl file lacks; neutral grey is used instead"
+                f"{path.name} uses the material {shown(name)}, which its .mtl file lacks; neutral grey is used instead"
             )
-    if path.suffix.lower() in GLTF:
-        if "KHR_texture_transform" in gltf_header(path, data).get("extensionsUsed", ()):
-            notes.append(f"{path.name} moves its textures with KHR_texture_transform, which is not applied")
+    if header is not None and "KHR_texture_transform" in header.extensionsUsed:
+        notes.append(f"{path.name} moves its textures with KHR_texture_transform, which is not applied")
     return notes
 
 
-def _named_textures(path: Path, data: bytes, resolver: _Resolver) -> Named:
+def _named_textures(path: Path, data: bytes, header: gltf.Header | None, references: References) -> Named:
     """Return, for each material that names a base colour texture, the file that names it and the texture's name."""
     if path.suffix.lower() == ".ply":
         found = re.search(r"^comment TextureFile\s+(.*?)\s*$", text_of(data.split(b"end_header")[0]), re.MULTILINE)
         return {UNNAMED: (path.name, found[1])} if found else {}
-    if path.suffix.lower() not in GLTF:
-        return resolver.named
-    header = gltf_header(path, data)
+    if header is None:
+        return references.named
     images: dict[str | None, str | None] = {}
-    for material in header.get("materials", []):
-        name, texture = material.get("name"), _gltf_texture(header, material)
-        images[name] = texture if name not in images or images[name] else None
+    for material in header.materials:
+        texture = gltf.base_color_image(header, material)
+        images[material.name] = texture if material.name not in images or images[material.name] else None
     return {name: (path.name, image) for name, image in images.items() if image}
-
-
-def _gltf_texture(header: dict[str, Any], material: dict[str, Any]) -> str | None:
-    """Return a name for the base colour image of a glTF material, or None when it has none."""
-    try:
-        texture = header["textures"][material["pbrMetallicRoughness"]["baseColorTexture"]["index"]]
-        uri = str(header["images"][texture["source"]].get("uri", "data:"))
-    except (KeyError, IndexError, TypeError):
-        return None
-    return "(embedded)" if uri.startswith("data:") else uri
 
 
 def _part(mesh: Any, surface: Surface, *, linear: bool) -> Part:

@@ -14,29 +14,26 @@ import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.importing.files import damaged, looks_like
+from advsearch.scene.importing.images import check_pixels
 
 Floats = npt.NDArray[np.float32]
 Bytes = npt.NDArray[np.uint8]
 
-LARGEST_PIXELS = 1 << 28
-"""More are refused before memory is asked for them; a damaged header can promise anything."""
-
 _RESOLUTION = re.compile(rb"([-+])Y (\d{1,6}) ([-+])X (\d{1,6})\n")
 
 
-def read_radiance(path: Path, data: bytes) -> Floats:
-    """Decode a Radiance RGBE picture.
+def read_radiance(path: Path, data: bytes) -> Bytes:
+    """Unpack a Radiance RGBE picture; `linear` makes floats of it, which take three times the memory.
 
     Args:
         path: the file, for messages.
         data: its content.
 
     Returns:
-        (H, W, 3) float32 linear values, at least 0; row 0 is the top, column 0 the left. A value is
-        mantissa x 2^(exponent - 136); the EXPOSURE line is not applied. Both are as in Mitsuba.
+        (H, W, 4) uint8: three mantissas and an exponent; row 0 is the top, column 0 the left.
 
     Raises:
-        FileFormatError: not a Radiance picture, one in XYZ colours, an unusual orientation, or cut short.
+        FileFormatError: not a Radiance picture, one in XYZ colours, an unusual orientation, too large, or cut short.
     """
     head, found, rest = data.partition(b"\n\n")
     if not data.startswith(b"#?") or not found:
@@ -54,12 +51,16 @@ def read_radiance(path: Path, data: bytes) -> Floats:
             f"{path}: expected a size like '-Y 512 +X 1024', got {line!r}; save the picture unrotated"
         )
     height, width = int(size[2]), int(size[4])
-    if height * width > LARGEST_PIXELS:
-        raise FileFormatError(
-            f"{path}: expected at most {LARGEST_PIXELS} pixels, got {width} x {height}; scale it down"
-        )
+    check_pixels(path, width, height)
     pixels = _scanlines(path, rest[size.end() :], height, width)
-    pixels = pixels[:: 1 if size[1] == b"-" else -1, :: 1 if size[3] == b"+" else -1]
+    return pixels[:: 1 if size[1] == b"-" else -1, :: 1 if size[3] == b"+" else -1]
+
+
+def linear(pixels: Bytes) -> Floats:
+    """Return the linear values (H, W, 3) float32, at least 0, of pixels (H, W, 4).
+
+    A value is mantissa x 2^(exponent - 136); the EXPOSURE line is not applied. Both are as in Mitsuba.
+    """
     scale = np.ldexp(np.float32(1.0), pixels[:, :, 3].astype(np.int32) - 136)
     scale = np.where(pixels[:, :, 3] == 0, np.float32(0.0), scale)
     return np.ascontiguousarray(pixels[:, :, :3].astype(np.float32) * scale[:, :, None], dtype=np.float32)

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
+from advsearch import files
+from advsearch.errors import FileFormatError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.images import TEXTURE_LIMIT, display_image
+from advsearch.scene.importing.files import shown
+from advsearch.scene.importing.images import LARGEST_PIXELS, TEXTURE_LIMIT, check_pixels, display_image
+from advsearch.scene.importing.references import Named, plain_name
 
 Floats = npt.NDArray[np.float32]
 
-Named = dict[str | None, tuple[str, str]]
+LARGEST_SUM = 2 * LARGEST_PIXELS
+"""Pixels that the textures of a file may have in all, before `advsearch.files.scaled`."""
+
+MOST_TEXTURES = 16
+"""Materials whose textures are kept at `TEXTURE_LIMIT`; more are baked into one map, for which less will do."""
 
 NEUTRAL = 0.5
 """Display-referred grey of an object without material."""
@@ -47,11 +55,6 @@ class Surface:
         return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
 
 
-def plain_name(name: str) -> str:
-    """Return a file name as it is written on this system: no quotes, no percent signs, forward slashes."""
-    return unquote(name.strip().strip('"')).replace("\\", "/")
-
-
 @dataclass
 class SurfaceReader:
     """Turns the materials of one file, as trimesh parsed them, into surfaces; each material once.
@@ -59,15 +62,19 @@ class SurfaceReader:
     Attributes:
         source: the file's name, for warnings.
         named: for each material that names a texture: the file that names it, and the texture's name.
-        missing: names of files, as `plain_name` gives them, that were looked for and are not there.
+        refused: for names of files, as `plain_name` gives them, why they were not read.
+        materials: how many the file has.
         notes: the warnings so far.
     """
 
     source: str
     named: Named
-    missing: set[str]
+    refused: Mapping[str, str]
+    materials: int
     notes: list[str] = field(default_factory=list)
     _known: dict[int, Surface] = field(default_factory=dict)
+    _pictures: dict[int, Floats | str] = field(default_factory=dict)
+    _pixels: int = 0
 
     def surface(self, visual: Any) -> Surface:
         """Return the surface of a parsed mesh's visual; an empty one where the file gives no material."""
@@ -97,8 +104,8 @@ class SurfaceReader:
         if texture is not None and (factor != 1.0).any():
             texture = linear_to_srgb(srgb_to_linear(texture) * factor)
         roughness, metallic = material.roughnessFactor, material.metallicFactor
-        packed = self._decoded(material.metallicRoughnessTexture, None)
-        if packed is not None:
+        packed = self._decoded(material.metallicRoughnessTexture)
+        if isinstance(packed, np.ndarray):
             self._note(f"{self.source}: textures of roughness and metallic are replaced by their means")
             green, blue = packed[:, :, 1].mean(), packed[:, :, 2].mean()
             roughness = float(green) * (1.0 if roughness is None else roughness)
@@ -108,29 +115,57 @@ class SurfaceReader:
     def _texture(self, material: Any, image: Image.Image | None, color: Floats | None) -> Floats | None:
         """Return the base colour texture; where the material names one that cannot be had, warn."""
         texture = self._decoded(image)
-        if texture is not None:
+        if isinstance(texture, np.ndarray):
             return texture
         if material.name in self.named:
             file, name = self.named[material.name]
-            why = "is missing" if plain_name(name) in self.missing else "cannot be read as a picture"
+            why = self.refused.get(plain_name(name)) or texture or "cannot be read as a picture"
             kept = _unless_white(color, material, self.named)
             instead = "neutral grey" if kept is None else f"its base colour ({', '.join(f'{c:.2f}' for c in kept)})"
             where = "" if file == self.source else f"{self.source}: "
-            self._note(f"{where}{file} names the texture {name!r}, which {why}; {instead} is used instead")
+            self._note(f"{where}{file} names the texture {shown(name)}, which {why}; {instead} is used instead")
         return None
 
-    def _decoded(self, image: Image.Image | None, limit: int | None = TEXTURE_LIMIT) -> Floats | None:
-        """Return a picture's values, or None where there is none; a picture without format is trimesh's invention."""
+    def _decoded(self, image: Image.Image | None) -> Floats | str | None:
+        """Return a picture's values, why there are none, or None; a picture without format is trimesh's invention."""
         if image is None or image.format is None:
             return None
+        if id(image) not in self._pictures:
+            self._pictures[id(image)] = self._pixels_of(image)
+        return self._pictures[id(image)]
+
+    def _pixels_of(self, image: Image.Image) -> Floats | str:
+        """Decode a picture, or say why not."""
+        width, height = image.size
         try:
-            return display_image(image, limit)
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-            return None
+            check_pixels("", width, height)
+            self._check_sum(self._pixels + width * height)
+            texture = display_image(image, _side(self.materials), "")
+        except FileFormatError as error:
+            return f"is not read ({str(error).removeprefix(': ')})"
+        except (OSError, ValueError, SyntaxError, EOFError):
+            return "cannot be read as a picture"
+        self._pixels += width * height
+        return texture
+
+    @staticmethod
+    def _check_sum(pixels: int) -> None:
+        """Refuse a picture that is too much with those before it."""
+        most = files.scaled(LARGEST_SUM)
+        if pixels > most:
+            raise files.too_large("", f"pictures of at most {most:,} pixels", f"{pixels:,} in all")
 
     def _note(self, message: str) -> None:
         if message not in self.notes:
             self.notes.append(message)
+
+
+def _side(materials: int) -> int:
+    """Return the longest side of the textures of so many materials; all together they take a bounded memory."""
+    side = TEXTURE_LIMIT
+    while side > 64 and materials * side * side > MOST_TEXTURES * TEXTURE_LIMIT * TEXTURE_LIMIT:
+        side //= 2
+    return side
 
 
 def _color(given: Any) -> Floats | None:

@@ -18,12 +18,18 @@ _SCALE = 100.0  # xatlas takes faces under about 1e-7 square units for empty
 _FLUSH = 1.0 - 1.5e-4  # xatlas takes neighbours whose normals have a product over 1 - 1e-4 for one plane
 _PLANE = np.cos(np.radians(10.0))  # how far the normals of what it takes for a plane may stray before it matters
 _MANY = 20_000  # faces that xatlas gets at a time, about; its time grows faster than their number
+_MOST_PATCHES = 10_000  # more are no surface but a heap of faces, and xatlas would take minutes over them
 _SMOOTHING = 10  # rounds of averaging normals, so that noise does not fray the borders of patches
 
 
 def unwrapped(soup: Soup) -> Soup:
-    """Return the soup with UVs from xatlas: charts that do not overlap, inside the unit square; deterministic."""
+    """Return the soup with UVs from xatlas: charts that do not overlap, inside the unit square; deterministic.
+
+    The faces of a mesh in very many pieces become triangles of one size, side by side in a grid.
+    """
     patch = _patches(soup)
+    if int(patch.max()) >= _MOST_PATCHES:
+        return replace(soup, uvs=_side_by_side(len(soup.faces)))
     groups = np.split(np.argsort(patch, kind="stable"), np.cumsum(np.bincount(patch))[:-1])
     for size in (ATLAS_SIZE, 0):  # 0: one atlas, however large
         atlas = xatlas.Atlas()
@@ -40,6 +46,17 @@ def unwrapped(soup: Soup) -> Soup:
         _, corners, uvs = atlas[number]
         result[group] = np.asarray(uvs, dtype=np.float64)[np.asarray(corners)]
     return replace(soup, uvs=np.clip(result, 0.0, 1.0))
+
+
+def _side_by_side(count: int) -> Array:
+    """Return UVs (F, 3, 2) of so many faces, two to each cell of a grid."""
+    columns = int(np.ceil(np.sqrt(np.ceil(count / 2))))
+    cell = np.arange(count) // 2
+    corner = np.stack([cell % columns, cell // columns], axis=1)[:, None, :]
+    half = np.array([[0.05, 0.05], [0.85, 0.05], [0.05, 0.85]])
+    inside = np.where((np.arange(count) % 2 == 0)[:, None, None], half, 1.0 - half)
+    uvs: Array = (corner + inside) / columns
+    return uvs
 
 
 def _patches(soup: Soup) -> Ints:

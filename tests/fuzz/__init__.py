@@ -1,0 +1,1 @@
+"""A seeded fuzz of the files that users name: each is read or refused, quickly, in little memory, and quietly."""
