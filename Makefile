@@ -14,7 +14,7 @@ SOURCES := advsearch scenes tests benchmarks docs tools
 export TORCH_INDEX
 
 .DEFAULT_GOAL := help
-.PHONY: help setup attack test test-slow check lint format typecheck docs bench study reference wheel check-wheel clean
+.PHONY: help setup attack test test-slow fuzz check lint format typecheck docs bench study reference wheel check-wheel clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -33,6 +33,9 @@ test: $(STAMP) ## run the tests; ARGS="-k name" picks some
 
 test-slow: $(STAMP) ## run the tests that take minutes
 	@$(BIN)/python -m pytest -m slow $(ARGS)
+
+fuzz: $(STAMP) ## load 400 hostile files, each in bounds of time and memory; ARGS="--seed 1" makes others
+	@PYTHONPATH=tests $(BIN)/python -m fuzz $(ARGS)
 
 check: lint typecheck test ## everything that has to pass before a commit
 

@@ -1,0 +1,16 @@
+"""All cases of the fuzz: number k of a seed is always the same files."""
+
+from __future__ import annotations
+
+import random
+
+from fuzz import gltf, meshes, pictures
+from fuzz.case import Case, Maker
+
+MAKERS: tuple[Maker, ...] = (*meshes.MAKERS, *gltf.MAKERS, *pictures.MAKERS)
+"""They take turns, so that any few dozen cases in a row have some of everything."""
+
+
+def make(seed: int, number: int) -> Case:
+    """Return a case."""
+    return MAKERS[number % len(MAKERS)](random.Random(f"{seed}/{number}"))

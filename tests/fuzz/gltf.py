@@ -1,0 +1,203 @@
+"""glTF in JSON and binary: other types, hostile counts, planted references, odd trees of nodes."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from functools import cache
+from typing import Any
+
+import numpy as np
+import trimesh
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from fuzz.case import OUTSIDE, Case, Maker, Random
+from fuzz.mutations import INTEGERS, as_json, confused, damaged
+from fuzz.pictures import picture, sample
+
+
+@cache
+def box_glb() -> bytes:
+    """Return a textured box in a tree of two nodes."""
+    box = trimesh.creation.box()
+    pixels = np.arange(192, dtype=np.uint8).reshape(8, 8, 3)
+    material = PBRMaterial(
+        baseColorTexture=Image.fromarray(pixels), baseColorFactor=[0.5, 0.6, 0.7, 1.0], roughnessFactor=0.4
+    )
+    box.visual = TextureVisuals(uv=box.vertices[:, :2] + 0.5, material=material)
+    scene = trimesh.Scene(box)
+    scene.add_geometry(trimesh.creation.icosphere(subdivisions=1), transform=trimesh.transformations.scale_matrix(0.5))
+    return scene.export(file_type="glb")
+
+
+def parts(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """Return the header and the binary chunk of a GLB."""
+    length = struct.unpack_from("<I", data, 12)[0]
+    return json.loads(data[20 : 20 + length]), data[28 + length :]
+
+
+def glb(header: Any, binary: bytes) -> bytes:
+    """Return a GLB."""
+    text = as_json(header)
+    text += b" " * (-len(text) % 4)
+    binary += bytes(-len(binary) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def case(random: Random, what: str, header: Any, binary: bytes, extra: dict[str, bytes] | None = None) -> Case:
+    """Return a header and its binary data as .glb, .gltf with a file beside it, or .gltf with all inside."""
+    form = random.choice(("glb", "gltf", "inside"))
+    if form == "glb" or not isinstance(header, dict):
+        return Case(f"gltf: glb {what}", "object", "thing.glb", {"thing.glb": glb(header, binary), **(extra or {})})
+    header = json.loads(as_json(header))
+    uri = "thing.bin" if form == "gltf" else "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
+    try:
+        header["buffers"][0].setdefault("uri", uri)
+    except (KeyError, IndexError, TypeError, AttributeError):
+        pass
+    files = {"thing.gltf": as_json(header), "thing.bin": binary, **(extra or {})}
+    return Case(f"gltf: {form} {what}", "object", "thing.gltf", files)
+
+
+def bytes_damaged(random: Random) -> Case:
+    """A GLB with damaged bytes."""
+    what, data = damaged(random, box_glb())
+    return Case(f"gltf: glb {what}", "object", "thing.glb", {"thing.glb": data})
+
+
+def types_confused(random: Random) -> Case:
+    """A header with other types in it."""
+    header, binary = parts(box_glb())
+    return case(random, "types", confused(random, header), binary)
+
+
+def text(random: Random) -> Case:
+    """JSON that is hostile as text."""
+    kinds = {
+        "nested lists": lambda: b"[" * 100_000 + b"]" * 100_000,
+        "nested nodes": lambda: b'{"asset": {"version": "2.0"}, "extras": ' + b'{"a":' * 90_000 + b"1" + b"}" * 90_001,
+        "an integer of 6,000 digits": lambda: b'{"asset": {"version": "2.0"}, "scene": ' + b"9" * 6_000 + b"}",
+        "two million empty lists": lambda: b'{"asset": {"version": "2.0"}, "nodes": [' + b"[]," * 2_000_000 + b"[]]}",
+        "a name of 5,000 characters": lambda: b'{"asset": {"version": "' + b"2" * 5_000 + b'"}}',
+        "a list": lambda: b"[1, 2]",
+        "a number": lambda: b"1",
+        "a string": lambda: b'"asset"',
+        "an asset of null": lambda: b'{"asset": null}',
+        "no text": lambda: b"\xff\xfe\x00\x00",
+        "a lone surrogate": lambda: b'{"asset": {"version": "2.0"}, "scenes": [{"name": "\\ud800"}]}',
+    }
+    what = random.choice(sorted(kinds))
+    return Case(f"gltf: {what}", "object", "thing.gltf", {"thing.gltf": kinds[what]()})
+
+
+def counts(random: Random) -> Case:
+    """Accessors and views with hostile numbers."""
+    header, binary = parts(box_glb())
+    what = random.choice(("count", "no view", "stride", "sparse", "views", "length", "offset", "type"))
+    accessor = random.choice(header["accessors"])
+    view = header["bufferViews"][accessor["bufferView"]]
+    if what == "count":
+        accessor["count"] = random.choice((*INTEGERS, -1, 10**12))
+    elif what == "no view":
+        del accessor["bufferView"]
+        accessor["count"] = random.choice((10**7, 10**9, 10**12, 3))
+    elif what == "stride":
+        view["byteStride"] = random.choice((0, 1, 2, 4, 252, -4, 2**31))
+        accessor["count"] = random.choice((3, 100, 10**6))
+    elif what == "sparse":
+        accessor["sparse"] = {"count": random.choice((1, 10**9)), "indices": {"bufferView": 0, "componentType": 5123}}
+    elif what == "views":
+        header["bufferViews"] += [{"buffer": 0, "byteLength": len(binary)}] * 20_000
+        binary += bytes(1_000_000)
+        for extra in header["bufferViews"][-20_000:]:
+            extra["byteLength"] = len(binary)
+    elif what == "length":
+        view["byteLength"] = random.choice((*INTEGERS, -1))
+    elif what == "offset":
+        random.choice((view, accessor))["byteOffset"] = random.choice((*INTEGERS, -1, -4))
+    else:
+        accessor["type"] = random.choice(("SCALAR", "VEC2", "VEC4", "MAT4", "VEC9"))
+        accessor["componentType"] = random.choice((5120, 5121, 5122, 5123, 5125, 5126, 5130, 9999))
+    return case(random, what, header, binary)
+
+
+def trees(random: Random) -> Case:
+    """Odd trees of nodes."""
+    header, binary = parts(box_glb())
+    what = random.choice(("cycle", "itself", "deep", "doubling", "instances", "primitives", "matrix", "scene", "names"))
+    nodes = header["nodes"]
+    roots = header["scenes"][0]["nodes"]
+    meshes = len(header["meshes"])
+    first = len(nodes)
+    if what == "cycle":
+        nodes += [{"children": [first + 1]}, {"children": [first], "mesh": 0}]
+        roots.append(first)
+    elif what == "itself":
+        nodes.append({"children": [first], "mesh": 0})
+        roots.append(first)
+    elif what == "deep":
+        depth = random.choice((200, 5_000, 50_000))
+        nodes += [{"children": [first + k + 1]} for k in range(depth)] + [{"mesh": 0}]
+        roots.append(first)
+    elif what == "doubling":
+        nodes += [{"children": [first + k + 1] * 2} for k in range(40)] + [{"mesh": 0}]
+        roots.append(first)
+    elif what == "instances":
+        nodes += [{"mesh": k % meshes, "translation": [k, 0, 0]} for k in range(random.choice((100, 30_000)))]
+        roots += range(first, len(nodes))
+    elif what == "primitives":
+        header["meshes"][0]["primitives"] *= random.choice((100, 20_000))
+    elif what == "matrix":
+        values = random.choice(([0] * 16, [1e308] * 16, [1] * 15, ["a"] * 16, [float("nan")] * 16, [1e-300] * 16, 1))
+        nodes[-1]["matrix"] = values
+    elif what == "scene":
+        header["scene"] = random.choice((-1, 7, "0", [0], None, 10**30))
+    else:
+        for thing in (*nodes, *header["meshes"], *header["materials"]):
+            thing["name"] = random.choice(("world", "x" * 5_000, "\x1b[31m", "", "../..", "\u202e"))
+    return case(random, what, header, binary)
+
+
+def images(random: Random) -> Case:
+    """Images that are hostile, or somewhere else."""
+    header, binary = parts(box_glb())
+    target = random.choice(
+        (
+            "../outside/secret.png",
+            OUTSIDE.decode() + "/secret.png",
+            "%2e%2e%2foutside%2fsecret.png",
+            "link.png",
+            "/dev/zero",
+            "data:image/png;base64," + base64.b64encode(picture(random)[1]).decode()[:2_000_000],
+            "data:image/png;base64,****",
+            "data:image/png," + "x" * 5_000,
+            "wood.png",
+            "wood.png",
+            "x" * 5_000,
+            "http://127.0.0.1:9/wood.png",
+        )
+    )
+    what, data = picture(random)
+    if random.random() < 0.3:
+        header["buffers"].append({"uri": target.replace(".png", ".bin"), "byteLength": 64})
+        header["bufferViews"].append({"buffer": len(header["buffers"]) - 1, "byteLength": 64})
+        what = "buffer elsewhere"
+    else:
+        header["images"] = [{"uri": target}] * random.choice((1, 1, 300))
+        header["textures"] = [{"source": k} for k in range(len(header["images"]))]
+        what = f"image {target[:30]!r} {what}" if target == "wood.png" else f"image {target[:30]!r}"
+    found = case(random, what, header, binary, {"wood.png": data if data else sample("PNG")})
+    return Case(
+        found.what,
+        found.loader,
+        found.main,
+        found.files,
+        {"link.png": "../outside/secret.png", "link.bin": "../outside/secret.bin"},
+    )
+
+
+MAKERS: tuple[Maker, ...] = (bytes_damaged, types_confused, counts, trees, images, types_confused, text)

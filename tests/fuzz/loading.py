@@ -1,0 +1,70 @@
+"""The loaders under test: what a command does with a file before it renders or asks a model anything."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+
+def load_object(path: Path) -> None:
+    """Read an object and put it into Mitsuba."""
+    import advsearch
+
+    advsearch.load_scene(path).renderer("texture", resolution=16)
+
+
+def load_environment(path: Path) -> None:
+    """Read an environment and put it into Mitsuba."""
+    import advsearch
+
+    advsearch.load_scene("book", path).renderer("texture", resolution=16)
+
+
+def load_picture(path: Path) -> None:
+    """Read a picture for the `patch` control."""
+    import advsearch
+
+    advsearch.load_scene("book").renderer({"patch": {"picture": str(path), "size": [0.1, 0.2]}}, resolution=16)
+
+
+def misbehave(path: Path) -> None:
+    """Do what no loader may, as the file says; the test of the fuzz itself."""
+    import subprocess
+    import time
+
+    deeds: dict[str, Callable[[], object]] = {
+        "nothing": lambda: None,
+        "raise": lambda: int("x"),
+        "print": lambda: print("a warning"),
+        "run": lambda: subprocess.run(["true"], check=True),
+        "read outside": lambda: (path.parents[1] / "outside" / "secret.txt").read_bytes(),
+        "write outside": lambda: (path.parent / "planted").write_bytes(b"x"),
+        "take memory": lambda: bytearray(1200 << 20),
+        "crash": lambda: os.abort(),
+        "spin": lambda: [None for _ in iter(time.process_time, 0.0)],
+    }
+    deeds[path.read_text()]()
+
+
+LOADERS: dict[str, Callable[[Path], object]] = {
+    "object": load_object,
+    "environment": load_environment,
+    "picture": load_picture,
+    "misbehave": misbehave,
+}
+"""Each gets the path of a case's main file, and returns or raises an `AdvsearchError`."""
+
+
+def warm_up(loaders: Iterable[str]) -> None:
+    """Import what the loaders need, so that the libraries are not counted as the first case's memory and time."""
+    import advsearch
+
+    if {"object", "environment", "picture"} & set(loaders):
+        advsearch.load_scene("book").renderer("texture", resolution=16)
+        from PIL import Image
+
+        import advsearch.scene.environments
+        import advsearch.scene.importing.objects
+
+        Image.init()

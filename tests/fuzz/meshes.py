@@ -1,0 +1,228 @@
+"""Wavefront OBJ with its materials, PLY and STL."""
+
+from __future__ import annotations
+
+import struct
+from functools import cache
+
+import numpy as np
+import trimesh
+
+from fuzz.case import OUTSIDE, Case, Maker, Random
+from fuzz.mutations import NUMBERS, damaged
+from fuzz.pictures import sample
+
+MTL = b"newmtl paint\nKd .2 .4 .6\nNs 20\nillum 2\nmap_Kd wood.png\nnewmtl plain\nKd 1 0 0\n"
+
+
+@cache
+def box_obj() -> bytes:
+    """Return a box with normals, texture coordinates and two materials."""
+    box = trimesh.creation.box()
+    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices]
+    lines += [f"vt {x + 0.5} {y + 0.5}" for x, y, _ in box.vertices]
+    lines += [f"vn {x} {y} {z}" for x, y, z in box.vertex_normals]
+    faces = ["f " + " ".join(f"{k + 1}/{k + 1}/{k + 1}" for k in face) for face in box.faces]
+    return "\n".join(["mtllib thing.mtl", *lines, "usemtl paint", *faces[:6], "usemtl plain", *faces[6:], ""]).encode()
+
+
+@cache
+def box_file(kind: str, encoding: str = "") -> bytes:
+    """Return a box as trimesh writes it, with colours of its vertices where the format has them."""
+    box = trimesh.creation.box()
+    if kind == "ply":
+        box.visual.vertex_colors = np.arange(32, dtype=np.uint8).reshape(8, 4) * 8
+        return box.export(file_type=kind, encoding=encoding)
+    return (
+        box.export(file_type=f"{kind}_ascii" if encoding == "ascii" else kind).encode()
+        if encoding == "ascii"
+        else (box.export(file_type=kind))
+    )
+
+
+# --- Wavefront OBJ ----------------------------------------
+
+
+def obj(random: Random) -> Case:
+    """A damaged OBJ or material file."""
+    files = {"thing.obj": box_obj(), "thing.mtl": MTL, "wood.png": sample("PNG")}
+    name = random.choice(("thing.obj", "thing.obj", "thing.mtl"))
+    what, files[name] = damaged(random, files[name])
+    return Case(f"obj: {name[-3:]} {what}", "object", "thing.obj", files)
+
+
+def hostile_obj(random: Random) -> Case:
+    """An OBJ that is large in one way."""
+    vertices = b"".join(b"v %d %d %d\n" % (k % 7, k * k % 11, k) for k in range(50))
+    number = random.choice(NUMBERS)
+    kinds = {
+        "a face of a million corners": lambda: vertices + b"f " + b"1 2 3 4 5 " * 200_000 + b"\n",
+        "faces of 1,000 corners": lambda: vertices + (b"f " + b"1 2 3 4 5 " * 200 + b"\n") * 500,
+        "a line of 5 MB": lambda: vertices + b"f 1 2 3\n# " + b"x" * 5_000_000 + b"\n",
+        "a vertex of a million numbers": lambda: vertices + b"v " + b"1 " * 1_000_000 + b"\nf 1 2 3\n",
+        "5,000 materials": lambda: (
+            vertices + b"".join(b"usemtl m%d\nf 1 2 %d\n" % (k, k % 40 + 3) for k in range(5000))
+        ),
+        "5,000 objects": lambda: vertices + b"".join(b"o m%d\nf 1 2 %d\n" % (k, k % 40 + 3) for k in range(5000)),
+        "a name of 5,000 characters": lambda: (
+            b"mtllib "
+            + b"n" * 5_000
+            + b".mtl\no "
+            + b"o" * 5_000
+            + b"\nusemtl "
+            + b"u" * 5_000
+            + b"\n"
+            + vertices
+            + b"f 1 2 3\n"
+        ),
+        "random triangles": lambda: _random_triangles(random),
+        "an odd coordinate": lambda: vertices + b"v " + number + b" 0 0\nf 1 2 3\nf 1 2 51\n",
+        "an odd index": lambda: vertices + b"f 1 2 3\nf 1 2 " + number + b"\n",
+        "an odd texture coordinate": lambda: (
+            b"mtllib thing.mtl\nusemtl paint\n"
+            + vertices
+            + b"vt 0 0\nvt 1 0\nvt 1 "
+            + number
+            + b"\nf 1/1 2/2 4/3\nf 1/1 3/2 4/3\n"
+        ),
+        "continued lines": lambda: vertices + b"f 1 \\\n" * 100_000 + b"2 3\n",
+        "escapes in names": lambda: b"mtllib \x1b]0;owned\x07.mtl\n" + vertices + b"usemtl \x1b[31mred\nf 1 2 3\n",
+        "every face the same": lambda: vertices + b"f 1 2 3\n" * 50_000,
+        "a fan around one point": lambda: (
+            vertices + b"".join(b"f 1 %d %d\n" % (k % 40 + 2, k % 37 + 5) for k in range(9000))
+        ),
+    }
+    what = random.choice(sorted(kinds))
+    files = {"thing.obj": kinds[what](), "thing.mtl": MTL, "wood.png": sample("PNG")}
+    return Case(f"obj: {what}", "object", "thing.obj", files)
+
+
+def _random_triangles(random: Random) -> bytes:
+    numbers = [f"{random.uniform(-1, 1):.3f}" for _ in range(9 * 1500)]
+    vertices = "".join(f"v {' '.join(numbers[k : k + 3])}\n" for k in range(0, len(numbers), 3))
+    return (vertices + "".join(f"f {k} {k + 1} {k + 2}\n" for k in range(1, 4500, 3))).encode()
+
+
+def references(random: Random) -> Case:
+    """An OBJ, material file, PLY or glTF that names what it must not."""
+    name = random.choice(
+        (
+            b"../outside/secret.png",
+            b"../../outside/secret.png",
+            OUTSIDE + b"/secret.png",
+            b"link.png",
+            b"folder/secret.png",
+            b"pipe.png",
+            b"/dev/zero",
+            b"/proc/self/mem",
+            b"http://127.0.0.1:9/a.png",
+            b"file:///dev/zero",
+            b"\\\\server\\share\\a.png",
+            b"~/secret.png",
+            b"%2e%2e/outside/secret.png",
+            b"thing.obj",
+            b".",
+            b"",
+            b"x" * 5000 + b".png",
+            b"a\x00b.png",
+            b"\x1b[31m.png",
+        )
+    )
+    material = random.random() < 0.4
+    mtl = name.replace(b".png", b".mtl") if material else b"thing.mtl"
+    files = {
+        "thing.obj": b"mtllib " + mtl + box_obj()[len(b"mtllib thing.mtl") :],
+        "thing.mtl": MTL.replace(b"wood.png", name),
+    }
+    main = "thing.obj"
+    if not material and random.random() < 0.2:
+        files["thing.ply"] = box_file("ply", "ascii").replace(
+            b"format ascii 1.0\n", b"format ascii 1.0\ncomment TextureFile " + name + b"\n"
+        )
+        main = "thing.ply"
+    links = {"link.png": "../outside/secret.png", "link.mtl": "../outside/secret.mtl", "folder": "../outside"}
+    return Case(f"reference: {name[:40]!r}", "object", main, files, links, ("pipe.png", "pipe.mtl"))
+
+
+def special(random: Random) -> Case:
+    """A main file that is no ordinary file."""
+    name = random.choice(("thing.obj", "thing.ply", "thing.stl", "thing.glb", "room.hdr", "room.exr", "print.png"))
+    loader = {"room": "environment", "print": "picture"}.get(name.split(".")[0], "object")
+    target = random.choice(("/dev/zero", "/dev/null", "/dev/stdin", "/proc/kmsg", ".", "none", name))
+    if random.random() < 0.4:
+        return Case(f"special: a pipe as {name}", loader, name, {}, pipes=(name,))
+    return Case(f"special: a link to {target} as {name}", loader, name, {}, {name: target})
+
+
+# --- PLY and STL ----------------------------------------
+
+
+def ply(random: Random) -> Case:
+    """A damaged PLY."""
+    encoding = random.choice(("ascii", "binary"))
+    what, data = damaged(random, box_file("ply", encoding))
+    return Case(f"ply: {encoding} {what}", "object", "thing.ply", {"thing.ply": data})
+
+
+def hostile_ply(random: Random) -> Case:
+    """A PLY whose header promises much or oddly."""
+    kind = random.choice(("ascii", "binary_little_endian", "binary_big_endian"))
+    count = random.choice((3, 3, 0, -1, 10**9, 2**63, 10**30))
+    corners = random.choice((3, 3, 4, 250, 100_000))
+    size = random.choice(("uchar", "int", "float", "char", "double"))
+    extra = random.choice(
+        (
+            "",
+            "property float nx\n" * 50,
+            "property list uchar float s\n",
+            "property unknown q\n",
+            "property float x\n",
+            "comment TextureFile wood.png\n",
+            "element edge 1000000000\nproperty int vertex1\nproperty int vertex2\n",
+            "element none 1000000000\n",
+        )
+    )
+    header = f"ply\nformat {kind} 1.0\nelement vertex {count}\nproperty float x\nproperty float y\nproperty float z\n"
+    header += (
+        f"{extra}element face {random.choice((1, 1, count))}\nproperty list {size} int vertex_indices\nend_header\n"
+    )
+    if kind == "ascii":
+        body = "0 0 0\n1 0 0\n0 1 0\n" + f"{corners} " + "0 1 2 " * (corners // 3 + 1) + "\n"
+        return Case(f"ply: {kind} header", "object", "thing.ply", {"thing.ply": (header + body).encode()})
+    order = "<" if "little" in kind else ">"
+    data = header.encode() + struct.pack(f"{order}9f", 0, 0, 0, 1, 0, 0, 0, 1, 0)
+    data += struct.pack(
+        {"uchar": "B", "char": "B", "int": order + "i", "float": order + "f", "double": order + "d"}[size],
+        corners & 0xFF if "char" in size else corners,
+    )
+    data += struct.pack(f"{order}3i", 0, 1, 2) * max(1, (corners & 0xFF if "char" in size else corners) // 3)
+    return Case(f"ply: {kind} header", "object", "thing.ply", {"thing.ply": data})
+
+
+def stl(random: Random) -> Case:
+    """A damaged STL."""
+    encoding = random.choice(("ascii", "binary"))
+    what, data = damaged(random, box_file("stl", encoding))
+    return Case(f"stl: {encoding} {what}", "object", "thing.stl", {"thing.stl": data})
+
+
+def hostile_stl(random: Random) -> Case:
+    """An STL with odd counts or values."""
+    count = random.choice((0, 1, 12, 0xFFFFFFFF, 20_000))
+    values = {
+        "noise": lambda: random.randbytes(50),
+        "zeros": lambda: bytes(50),
+        "nan": lambda: struct.pack("<12fH", *[float("nan")] * 12, 0),
+        "small": lambda: struct.pack("<12fH", *[random.uniform(-1e-38, 1e-38) for _ in range(12)], 0),
+        "large": lambda: struct.pack("<12fH", *[random.uniform(-3e38, 3e38) for _ in range(12)], 0),
+        "random": lambda: struct.pack("<12fH", *[random.uniform(-1, 1) for _ in range(12)], 0),
+        "flat": lambda: struct.pack("<12fH", 0, 0, 1, *[c for _ in range(3) for c in (random.random(), 0, 0)], 0),
+    }
+    what = random.choice(sorted(values))
+    written = min(count, random.choice((1, 500, 1500)))
+    told = random.choice((count, written, written))
+    data = bytes(80) + struct.pack("<I", told) + b"".join(values[what]() for _ in range(written))
+    return Case(f"stl: {what}, {written} facets of {told}", "object", "thing.stl", {"thing.stl": data})
+
+
+MAKERS: tuple[Maker, ...] = (obj, hostile_obj, references, ply, hostile_ply, stl, hostile_stl, special)

@@ -1,0 +1,47 @@
+"""The quick part of the fuzz of hostile files (`make fuzz` runs all), and that the fuzz sees what it looks for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from fuzz import cases, run
+from fuzz.case import Case
+
+SEED, NUMBERS = 7, 24
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for the files of all cases."""
+    return tmp_path_factory.mktemp("fuzz")
+
+
+def test_hostile_files_are_loaded_or_refused(folder: Path) -> None:
+    outcomes = list(run.run([(number, cases.make(SEED, number)) for number in range(NUMBERS)], folder))
+    assert [outcome for outcome in outcomes if outcome.faults] == []
+    assert {outcome.ending for outcome in outcomes} == {"loaded", "refused"}
+
+
+def test_a_case_is_the_same_files_each_time() -> None:
+    for number in range(NUMBERS):
+        assert cases.make(SEED, number) == cases.make(SEED, number)
+
+
+def test_the_fuzz_sees_what_must_not_be(tmp_path: Path) -> None:
+    expected = {
+        "nothing": "",
+        "raise": "an error that is not for users",
+        "print": "prints 'a warning",
+        "run": "subprocess.Popen",
+        "read outside": "reads ",
+        "write outside": "a file outside the run folder changed",
+        "take memory": "takes more than 1 GiB",
+        "crash": "the process died with status",
+        "spin": "takes more than 10 CPU seconds",
+    }
+    made = [(k, Case(deed, "misbehave", "deed", {"deed": deed.encode()})) for k, deed in enumerate(expected)]
+    for outcome in run.run(made, tmp_path):
+        faults = "; ".join(outcome.faults)
+        assert expected[outcome.what] in faults, outcome
+        assert faults or outcome.what == "nothing"
