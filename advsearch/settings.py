@@ -8,7 +8,8 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -102,10 +103,13 @@ class Config(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False)
 
     def __init__(self, **data: Any) -> None:
+        deep = {name: value for name, value in data.items() if not is_shallow(value)}
+        if deep:
+            raise _settings_error(type(self), [{"loc": (name,), "input": deep[name], "type": ""} for name in deep])
         try:
             super().__init__(**data)
         except ValidationError as error:
-            raise _settings_error(type(self), error) from None
+            raise _settings_error(type(self), error.errors(include_url=False)) from None
 
     @field_validator("*", mode="before")
     @classmethod
@@ -113,6 +117,14 @@ class Config(BaseModel):
         """Refuse true for a number: YAML's `epsilon: yes` is a slip, not 1."""
         if isinstance(value, bool) and cls.model_fields[info.field_name].annotation is not bool:
             raise ValueError("a truth value is not accepted here")
+        return value
+
+    @field_validator("*")
+    @classmethod
+    def _finite(cls, value: Any) -> Any:
+        """Refuse NaN and infinity however deep they are, and whole numbers that no machine has."""
+        if not all_finite(value):
+            raise ValueError("not finite")
         return value
 
     @classmethod
@@ -301,12 +313,12 @@ def parse_assignment(text: str, where: str) -> tuple[str, Any]:
         return name.strip(), value.strip()
 
 
-def _settings_error(config: type[Config], error: ValidationError) -> AdvsearchError:
-    """Return pydantic's findings as one error of ours: one problem a setting."""
+def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchError:
+    """Return pydantic's findings (`ValidationError.errors`) as one error of ours: one problem a setting."""
     declared = settings(config)
     known = {one.name: one for one in declared} | {one.field: one for one in declared}
     problems: dict[str, str] = {}
-    for found in error.errors(include_url=False):
+    for found in errors:
         name = str(found["loc"][0])
         if name not in known:
             return UnknownNameError("setting", name, {one.name for one in declared})
@@ -327,16 +339,34 @@ def number_or_text(value: Any) -> Any:
 
 
 def _shown(value: Any) -> str:
-    """Return `value` for an error message: plain and not too long."""
-    text = value if isinstance(value, str) and value.strip() else repr(value)
+    """Return `value` for an error message: plain, printable and not too long."""
+    try:
+        text = value if isinstance(value, str) and value.strip() and value.isprintable() else repr(value)
+    except (RecursionError, ValueError):  # nested too deep, or a whole number of thousands of digits
+        text = f"a {type(value).__name__} that is too long to show"
     return text if len(text) <= 80 else text[:77] + "..."
 
 
+DEEPEST = 16
+"""Lists and mappings inside one another that a setting may have."""
+
+LARGEST_WHOLE = 2**63 - 1
+
+
+def is_shallow(value: Any, levels: int = DEEPEST) -> bool:
+    """Return whether lists and mappings are nested at most so deep in `value`."""
+    inner = value.values() if isinstance(value, Mapping) else value if isinstance(value, (list, tuple)) else ()
+    return levels >= 0 and all(is_shallow(one, levels - 1) for one in inner)
+
+
 def all_finite(value: Any) -> bool:
+    """Return whether all numbers in `value`, which `is_shallow`, are finite; whole ones at most 2**63 - 1."""
     if isinstance(value, Mapping):
         return all(all_finite(inner) for inner in value.values())
     if isinstance(value, (list, tuple)):
         return all(all_finite(inner) for inner in value)
+    if isinstance(value, int):
+        return abs(value) <= LARGEST_WHOLE
     return not isinstance(value, float) or math.isfinite(value)
 
 
@@ -362,9 +392,27 @@ def _put(data: dict[str, Any], name: str, value: Any) -> None:
 
 def split_names(text: str) -> tuple[str, ...]:
     """Return the parts of ``mug,bowl``; a file whose name has a comma is one part."""
-    if "," not in text or Path(text).is_file():
+    if "," not in text or _is_file(text):
         return (text,)
     return tuple(part.strip() for part in text.split(",") if part.strip())
+
+
+def check_once(names: Iterable[str], setting: str) -> None:
+    """Check that nothing is given twice.
+
+    Raises:
+        InputError: a name comes twice; the message names the setting.
+    """
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise InputError(f"{setting}: {twice[0]} is given twice; leave one of them out")
+
+
+def _is_file(name: str) -> bool:
+    try:
+        return Path(name).is_file()
+    except OSError:  # longer than a file's name may be
+        return False
 
 
 def _bare(value: str) -> str:
@@ -378,7 +426,7 @@ def _absolute(value: str | None) -> str | None:
 
 
 def _absolute_file(name: str) -> str:
-    is_path = ("/" in name or Path(name).suffix != "") and Path(name).is_file()
+    is_path = ("/" in name or Path(name).suffix != "") and _is_file(name)
     return str(Path(name).resolve()) if is_path else name
 
 

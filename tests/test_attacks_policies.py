@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import pickle
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 import torch
+from hostile import SHORT, shown
 from torch import Tensor
 
 from advsearch.attacks import (
@@ -590,6 +591,35 @@ def test_stored_evaluations_replay_a_search(policy: Policy[Any]) -> None:
 @pytest.mark.parametrize("name", sorted(POLICIES))
 def test_a_registered_policy_knows_its_name(name: str) -> None:
     assert make_policy(name).name == name
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_no_value_of_any_option_ends_in_a_traceback(name: str) -> None:
+    for option in fields(POLICIES[name]):  # type: ignore[arg-type]
+        for value in SHORT:
+            try:
+                policy = make_policy(name, **{option.name: value})
+            except InputError:
+                continue
+            kept = getattr(policy, option.name)
+            assert not isinstance(kept, (int, float)) or abs(kept) <= 1_000_000, (option.name, shown(value))
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        ("nan", "a number up to 1000000, got 'nan'"),
+        (True, "a number up to 1000000, got True"),
+        ([0.9], "a number up to"),
+    ],
+)
+def test_an_option_has_the_type_of_its_field(value: Any, expected: str) -> None:
+    with pytest.raises(InputError, match=f"^momentum of policy pgd: expected {expected}"):
+        make_policy("pgd", momentum=value)
+    with pytest.raises(InputError, match=r"^times of policy restarts: expected a whole number up to 1000000, got 2\.5"):
+        make_policy("restarts", policy="pgd", times=2.5)
+    with pytest.raises(InputError, match=r"^random_start of policy pgd: expected true or false, got 'yes'"):
+        make_policy("pgd", random_start="yes")
 
 
 def test_unknown_policies_and_options_name_their_neighbours() -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import pytest
+from hostile import HOSTILE, shown
 from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
@@ -19,7 +20,7 @@ from advsearch.cli import flags
 from advsearch.cli.sweep import axes_as_text
 from advsearch.config import AttackConfig, GapConfig, PrecisionConfig, RegionConfig, RenderConfig, SweepConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
-from advsearch.settings import Config, flag, parse_assignment, read_yaml, settings
+from advsearch.settings import Config, all_finite, flag, parse_assignment, read_yaml, settings
 
 WRONG: dict[str, tuple[Any, str]] = {
     "object": ("", "expected the name of an object or a .obj, .ply, .glb, .gltf or .stl file, got ''"),
@@ -39,8 +40,8 @@ WRONG: dict[str, tuple[Any, str]] = {
         {"texture": 3},
         "expected names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}, got texture=3",
     ),
-    "epsilon": ("nan", "expected a number greater than 0, got nan"),
-    "seconds": (0, "expected a number greater than 0, got 0"),
+    "epsilon": ("nan", "expected a number greater than 0 and at most 1e+06, got nan"),
+    "seconds": (0, "expected a number greater than 0 and at most 1e9, got 0"),
     "target": ([3], "expected names of classes or their numbers, separated by commas, got [3]"),
     "minimise": ("maybe", "expected true or false, got maybe"),
     "smallest": (2, "expected true or false, got 2"),
@@ -53,7 +54,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "measure": ("some", "expected no, quick or full, got some"),
     "policy": (None, "expected the name of a policy, or NAME={OPTION: VALUE}, got None"),
     "steps": (2.5, "expected a whole number from 1 to 1000000, got 2.5"),
-    "step_size": (0.0, "expected a number greater than 0, got 0.0"),
+    "step_size": (0.0, "expected a number greater than 0 and at most 2, got 0.0"),
     "objective": ({}, "expected the name of an objective, got {}"),
     "spp": ("many", "expected a whole number from 1 to 65536, or auto, got many"),
     "denoise": (False, "expected oidn or none, got False"),
@@ -117,7 +118,7 @@ def test_every_wrong_value_names_its_flag_and_what_was_expected(setting: Any) ->
     "value", [0, -1, -0.5, "nan", math.nan, math.inf, "inf", "-inf", True, "much", "0.1,0", "texture=0"]
 )
 def test_epsilon_is_a_number_greater_than_zero(value: Any) -> None:
-    with pytest.raises(InputError, match=r"^epsilon: expected a number greater than 0, got "):
+    with pytest.raises(InputError, match=r"^epsilon: expected a number greater than 0 and at most 1e\+06, got "):
         AttackConfig(object="mug", epsilon=value)
 
 
@@ -126,7 +127,7 @@ def test_all_problems_are_told_at_once() -> None:
         AttackConfig(epsilon=-1, steps=0)  # type: ignore[call-arg]
     assert flags.with_flags(str(error.value)) == (
         "--object: expected the name of an object or a .obj, .ply, .glb, .gltf or .stl file, got nothing; "
-        "--epsilon: expected a number greater than 0, got -1; "
+        "--epsilon: expected a number greater than 0 and at most 1e+06, got -1; "
         "--steps: expected a whole number from 1 to 1000000, got 0"
     )
 
@@ -213,6 +214,57 @@ def test_a_wrong_value_of_other_commands_names_its_flag(
     assert flags.with_flags(str(error.value)) == f"{flag(field)}: {message}"
 
 
+@pytest.mark.parametrize("config", [*CONFIGS, RenderConfig], ids=lambda config: config.command)
+def test_no_value_of_any_setting_ends_in_a_traceback(config: type[Config]) -> None:
+    """Refused in one line that names the setting, or accepted and then the same in every form."""
+    needed = {one.field: "a.png" for one in settings(config) if one.required}
+    for setting in settings(config):
+        for value in HOSTILE:
+            try:
+                made = config(**{**needed, setting.field: value})
+            except InputError as error:
+                assert len(str(error)) < 500 and str(error).isprintable(), (setting.name, shown(value))
+                continue
+            given = getattr(made, setting.field)
+            assert all_finite(given if isinstance(given, (list, tuple, dict)) else [given]), (
+                setting.name,
+                shown(value),
+            )
+            assert made.to_yaml() and made.command_line() and made.deciding(), (setting.name, shown(value))
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("--epsilon ''", "--epsilon: expected a number greater than 0 and at most 1e+06, got ''"),
+        ("--epsilon 1e308", "--epsilon: expected a number greater than 0 and at most 1e+06, got 1e308"),
+        ("--epsilon 0.1,0.10", "--epsilon: 0.1 is given twice; leave one of them out"),
+        ("--epsilon texture=0.1,texture=0.2", "--epsilon: texture is given twice; leave one of them out"),
+        (
+            "--epsilon 'texture={a: 1}'",
+            "--epsilon: expected a number greater than 0 and at most 1e+06, got texture={a: 1}",
+        ),
+        ("--seconds 1e308", "--seconds: expected a number greater than 0 and at most 1e9, got 1e308"),
+        ("--step-size 1e308", "--step-size: expected a number greater than 0 and at most 2, got 1e308"),
+        ("--control pose --control pose", "--control: pose is given twice; leave one of them out"),
+        ("--control texture,texture", "--control: texture is given twice; leave one of them out"),
+        ("--over camera --over 'camera={fov: 30}'", "--over: camera is given twice; leave one of them out"),
+        (
+            "--set camera.azimuth=1 --set camera.azimuth=2",
+            "--set: camera.azimuth is given twice; leave one of them out",
+        ),
+        ("--estimator adjoint --estimator differences", "--estimator: * is given twice; leave one of them out"),
+        ("--policy 'pgd={momentum: .nan}'", "--policy: expected the name of a policy, or NAME={OPTION: VALUE}, got {"),
+        ("--over 'camera={azimuth: [0, .inf]}'", "--over: expected names of controls, or NAME={PARAMETER: VALUE or "),
+        ("--object ,", "--object: expected the name of an object or a .obj, .ply, .glb, .gltf or .stl file, got ,"),
+    ],
+)
+def test_slips_on_the_command_line_are_refused_in_one_sentence(line: str, message: str) -> None:
+    with pytest.raises(InputError) as error:
+        of_command_line(f"advsearch attack {'' if '--object' in line else '--object mug'} {line}")
+    assert flags.with_flags(str(error.value)).startswith(message)
+
+
 def test_yaml_round_trip_of_everything(tmp_path: Path) -> None:
     config = AttackConfig(**GIVEN)
     assert all(getattr(config, setting.field) == GIVEN[setting.name] for setting in settings(AttackConfig))
@@ -231,7 +283,7 @@ def test_the_command_line_says_the_same() -> None:
 
 @examples(max_examples=60, deadline=None)
 @given(
-    epsilon=st.none() | st.floats(1e-30, 1e30), exposure=st.floats(-10, 10), seed=st.integers(0, 2**63 - 1),
+    epsilon=st.none() | st.floats(1e-20, 1e6), exposure=st.floats(-10, 10), seed=st.integers(0, 2**63 - 1),
     name=st.text(st.characters(codec="utf-8", exclude_categories=("Cc", "Cs")), min_size=1).filter(str.strip),
     value=st.floats(allow_nan=False, allow_infinity=False),
 )  # fmt: skip
@@ -255,7 +307,10 @@ def test_any_values_go_round(
         ("1: 2\n", r"study\.yaml: expected settings and values such as 'object: mug', got dict"),
         ("a: [1,\n", r"study\.yaml: expected YAML, got .*line 2"),
         ("schema: 7\nobject: mug\n", r"study\.yaml: expected schema 1, got 7; it is of another advsearch"),
-        ("object: mug\nepsilon: yes\n", r"study\.yaml: epsilon: expected a number greater than 0, got True"),
+        (
+            "object: mug\nepsilon: yes\n",
+            r"study\.yaml: epsilon: expected a number greater than 0 and at most 1e\+06, got True",
+        ),
         ("object: mug\nset:\n  a: .inf\n", r"study\.yaml: set: expected PARAMETER=VALUE .*, got a=inf"),
         ("object: mug\nsteps:\n", r"study\.yaml: steps: expected a whole number from 1 to 1000000, got None"),
         ("objekt: mug\n", r"unknown setting 'objekt'\. Did you mean 'object'"),

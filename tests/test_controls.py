@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from hostile import SHORT, shown
 
 from advsearch.api import load_scene
 from advsearch.controls import CONTROLS, BoundControl, TextureControl, make_control, make_space
@@ -136,7 +137,7 @@ def test_names_and_settings_that_do_not_exist_are_explained() -> None:
 
 @pytest.mark.parametrize("epsilon", [0.0, -0.1, math.nan, math.inf])
 def test_a_radius_that_is_no_radius_is_refused(epsilon: float) -> None:
-    with pytest.raises(InputError, match="epsilon: expected a finite number greater than 0"):
+    with pytest.raises(InputError, match=r"epsilon: expected a number over 0 and up to 1e\+06"):
         TextureControl(epsilon=epsilon)
 
 
@@ -191,3 +192,46 @@ def test_the_worked_example_is_a_control_that_renders() -> None:
     spread = [float((one.amax(dim=-1) - one.amin(dim=-1)).mean()) for one in (plain, faded)]
     assert spread[1] < 0.8 * spread[0]
     assert [one.estimator for one in render.plan.groups] == ["adjoint"]
+
+
+@pytest.mark.parametrize("kind", CONTROLS)
+def test_no_value_of_any_control_ends_in_a_traceback(kind: str) -> None:
+    """Neither a parameter, a choice, a name nor a kind; what is bound to a scene later is not looked at here."""
+    control = CONTROLS[kind]
+    for name in [one.name for one in (*control.parameters, *control.choices)] + ["name", "kind"]:
+        for value in SHORT:
+            try:
+                made = make_control(kind, {name: value})
+            except InputError:
+                continue
+            assert made.kind == kind, (name, shown(value))
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "message"),
+    [
+        (
+            "pose",
+            {"yaw": {"choices": [1, 1]}},
+            "pose.yaw: expected different choices, got 1 twice; leave one of them out",
+        ),
+        ("pose", {"yaw": [3, 2, 3.0]}, "pose.yaw: expected different choices, got 3 twice"),
+        ("environment", {"which": ["noon", "noon"]}, "environment.which: expected different choices, got noon twice"),
+        ("environment", {"which": []}, "environment.which: expected a value, [low, high] or a list of values, got []"),
+        (
+            "pose",
+            {"yaw": 10**400},
+            "pose.yaw: expected a number from -3600 to 3600 (degrees), got a whole number of 1329",
+        ),
+        ("texture", {"epsilon": 1e308}, "epsilon: expected a number over 0 and up to 1e+06, got 1e+308"),
+        (
+            "patch",
+            {"epsilon": 1e308, "norm": "linf"},
+            "patch.epsilon: expected a number over 0 and up to 1e+06, got 1e",
+        ),
+    ],
+)
+def test_doubled_empty_and_endless_values_are_refused(kind: str, given: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError) as error:
+        make_control(kind, given)
+    assert str(error.value).startswith(message)

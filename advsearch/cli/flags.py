@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from advsearch import config as configurations
 from advsearch.config import AttackConfig
-from advsearch.settings import Config, Setting, parse_assignment, settings
+from advsearch.settings import Config, Setting, check_once, parse_assignment, settings
 
 GROUPS = {
     "scene": "scene",
@@ -92,10 +92,10 @@ def config_from(args: argparse.Namespace, config: type[Given], **otherwise: Any)
             data[name] = _controls(data[name], flag)
     for name, flag in (("set_", "--set"), ("grid", "--grid")):
         if name in data:
-            data[name] = dict(parse_assignment(text, flag) for text in data[name])
+            data[name] = _assignments(data[name], flag)
     if "estimators" in data:
         pairs = [text if "=" in text else f"*={text}" for text in data["estimators"]]
-        data["estimators"] = dict(parse_assignment(text, "--estimator") for text in pairs)
+        data["estimators"] = _assignments(pairs, "--estimator")
     return config(**{**otherwise, **data})
 
 
@@ -134,20 +134,24 @@ def help_text(setting: Setting) -> str:
     return text.replace("%", "%%")
 
 
+def _assignments(given: Sequence[str], flag: str) -> dict[str, Any]:
+    """Return name to value from ``NAME=VALUE``, each name once."""
+    pairs = [parse_assignment(text, flag) for text in given]
+    check_once((name for name, _ in pairs), flag)
+    return dict(pairs)
+
+
 def _controls(given: Sequence[str], flag: str) -> dict[str, Any]:
     """Return control to settings from ``texture,pose``, ``texture={resolution: 64}`` and ``pose,texture={...}``."""
-    found: dict[str, Any] = {}
+    found: list[tuple[str, Any]] = []
     for text in given:
         names, equals, settings_text = text.partition("=")
         plain = [name.strip() for name in names.split(",") if name.strip()]
-        if equals:
-            last = plain.pop() if plain else ""
-            found.update({name: {} for name in plain})
-            name, parameters = parse_assignment(f"{last}={settings_text}", flag)
-            found[name] = parameters
-        else:
-            found.update({name: {} for name in plain})
-    return found
+        last = [plain.pop() if plain else ""] if equals else []
+        found += [(name, {}) for name in plain]
+        found += [parse_assignment(f"{name}={settings_text}", flag) for name in last]
+    check_once((name for name, _ in found), flag)
+    return dict(found)
 
 
 def _metavar(setting: Setting) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
@@ -10,13 +9,16 @@ from pydantic import field_validator, model_validator
 
 from advsearch.config.scene import SceneConfig
 from advsearch.errors import InputError
-from advsearch.settings import parse_assignment, setting
+from advsearch.settings import check_once, parse_assignment, setting
 
 TRIALS, TRIALS_OVER = 20, 200
 """Fresh renders that check an answer, and one that holds for many conditions."""
 
 FEWEST_TRIALS = 6
 """With fewer, nothing can be called found: `attacks.verification.Rule.fewest`, which a test holds this to."""
+
+LARGEST_EPSILON = 1e6
+"""No control has a distance of that size; far above it, its square is none in float32."""
 
 
 class AttackConfig(SceneConfig):
@@ -35,7 +37,7 @@ class AttackConfig(SceneConfig):
         "search",
         "how far a control may go from where it starts, in its own unit (or CONTROL=NUMBER,...; or NUMBER,NUMBER,... "
         "for a curve)",
-        "a number greater than 0",
+        f"a number greater than 0 and at most {LARGEST_EPSILON:g}",
         otherwise="the control's own",
     )
     norm: Literal["linf", "l2"] = setting("linf", "search", "how that distance is measured", "linf or l2")
@@ -67,18 +69,20 @@ class AttackConfig(SceneConfig):
         None,
         "search",
         "time after which the search stops; the random one beside it gets as many renders",
-        "a number greater than 0",
+        "a number greater than 0 and at most 1e9",
         otherwise="no limit",
         unit="seconds",
         gt=0.0,
+        le=1e9,
     )
     step_size: float | None = setting(
         None,
         "search",
         "first step of the policy as a share of epsilon",
-        "a number greater than 0",
+        "a number greater than 0 and at most 2",
         otherwise="the policy's own",
         gt=0.0,
+        le=2.0,
     )
     objective: str = setting("margin", "search", "what is maximised", "the name of an objective")
     target: str | None = setting(
@@ -137,17 +141,26 @@ class AttackConfig(SceneConfig):
     @field_validator("epsilon", mode="before")
     @classmethod
     def _epsilon_from_text(cls, value: Any) -> Any:
-        """Accept ``0.05``, ``0.01,0.02`` and ``texture=0.05,geometry=0.01``; a number greater than 0 each."""
+        """Accept ``0.05``, ``0.01,0.02`` and ``texture=0.05,geometry=0.01``; numbers in range, and none twice."""
         if isinstance(value, str):
-            parts = [part.strip() for part in value.split(",") if part.strip()]
-            if any("=" in part for part in parts):
-                value = dict(parse_assignment(part, "epsilon") for part in parts)
+            parts = [part.strip() for part in value.split(",")]
+            if "=" in value:
+                pairs = [parse_assignment(part, "epsilon") for part in parts]
+                check_once((name for name, _ in pairs), "epsilon")
+                value = dict(pairs)
             else:
-                value = parts[0] if len(parts) == 1 else tuple(parts)
-        if isinstance(value, list) and len(value) == 1:
+                value = tuple(parts)
+        if isinstance(value, (list, tuple)) and len(value) == 1:
             value = value[0]
-        several = value.values() if isinstance(value, Mapping) else value if isinstance(value, (list, tuple)) else ()
-        _positive(value) if not isinstance(value, (Mapping, list, tuple, type(None))) else [*map(_positive, several)]
+        if isinstance(value, Mapping):
+            numbers = [_positive(one) for one in value.values()]
+        elif isinstance(value, (list, tuple)):
+            numbers = [_positive(one) for one in value]
+            check_once((f"{one:g}" for one in numbers), "epsilon")
+        else:
+            numbers = [1.0 if value is None else _positive(value)]
+        if not numbers:
+            raise ValueError("nothing is named")
         return value
 
     @model_validator(mode="before")
@@ -219,6 +232,12 @@ class AttackConfig(SceneConfig):
         return None if isinstance(self.epsilon, tuple) else self.epsilon
 
 
-def _positive(value: Any) -> None:
-    if isinstance(value, bool) or not 0.0 < float(value) < math.inf:
-        raise ValueError("expected a number greater than 0")
+def _positive(value: Any) -> float:
+    """A number of an epsilon."""
+    try:
+        number = float("nan") if isinstance(value, bool) else float(value)
+    except (TypeError, OverflowError):
+        raise ValueError("not a number") from None
+    if not 1e-30 < number <= LARGEST_EPSILON:  # what is smaller has no square in float32
+        raise ValueError("out of range")
+    return number

@@ -6,9 +6,9 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator
 
-from advsearch.config.attack import AttackConfig
+from advsearch.config.attack import LARGEST_EPSILON, AttackConfig
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import PLACE, setting, split_names
+from advsearch.settings import PLACE, check_once, setting, split_names
 
 QUANTITIES = ("image", "gradient", "objective")
 SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
@@ -27,10 +27,21 @@ class PrecisionConfig(SceneConfig):
         "image, gradient, objective",
     )
     seconds: float = setting(
-        120.0, "search", "time that all measurements may take", "a number greater than 0", unit="seconds", gt=0.0
+        120.0,
+        "search",
+        "time that all measurements may take",
+        "a number greater than 0 and at most 1e9",
+        unit="seconds",
+        gt=0.0,
+        le=1e9,
     )
     error: float = setting(
-        0.05, "search", "relative error that the recommended settings should have", "a number greater than 0", gt=0.0
+        0.05,
+        "search",
+        "relative error that the recommended settings should have",
+        "a number greater than 0 and at most 1",
+        gt=0.0,
+        le=1.0,
     )
     rounds: int = setting(
         8, "search", "measurements of every setting, at most", "a whole number from 3 to 1000", ge=3, le=1000
@@ -59,9 +70,10 @@ class PrecisionConfig(SceneConfig):
         None,
         "search",
         "how far a control may go from where it starts, in its own unit",
-        "a number greater than 0",
+        f"a number greater than 0 and at most {LARGEST_EPSILON:g}",
         otherwise="the control's own",
         gt=0.0,
+        le=LARGEST_EPSILON,
     )
     policies: str = setting(
         "auto,random", "search", "policies that are compared, separated by commas", "names of policies"
@@ -87,18 +99,21 @@ class PrecisionConfig(SceneConfig):
         """Accept a list of names for names separated by commas."""
         return ",".join(str(part) for part in value) if isinstance(value, (list, tuple)) else value
 
-    @field_validator("quantities", "samplers")
+    @field_validator("quantities", "samplers", "depths", "policies")
     @classmethod
-    def _known_names(cls, value: str, info: Any) -> str:
-        known = {"quantities": QUANTITIES, "samplers": SAMPLERS}[info.field_name]
-        if not split_names(value) or not set(split_names(value)) <= set(known):
-            raise ValueError("unknown names")
+    def _several(cls, value: str, info: Any) -> str:
+        """Refuse lists with nothing in them, with something twice, and with names that are not known."""
+        names = split_names(value)
+        known = {"quantities": QUANTITIES, "samplers": SAMPLERS}.get(info.field_name, names)
+        if not "".join(names).strip() or not set(names) <= set(known):
+            raise ValueError("nothing, or unknown names")
+        check_once(names, info.field_name)
         return value
 
     @field_validator("depths")
     @classmethod
     def _depths_in_range(cls, value: str) -> str:
-        if not all(2 <= int(part) <= 64 for part in split_names(value)):
+        if not all(part.isdecimal() and 2 <= int(part[:9]) <= 64 for part in split_names(value)):
             raise ValueError("out of range")
         return value
 

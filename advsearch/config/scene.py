@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from pydantic import field_validator
 
-from advsearch.settings import Config, all_finite, number_or_text, setting, split_names
+from advsearch.settings import Config, check_once, number_or_text, setting, split_names
 
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
@@ -164,7 +164,7 @@ class SceneConfig(Config):
         text = str(value) if isinstance(value, (Path, int)) and not isinstance(value, bool) else value
         if isinstance(text, (list, tuple)) and all(isinstance(part, str) for part in text):
             text = ",".join(text)
-        if isinstance(text, str) and (not text.strip() or "\0" in text):
+        if isinstance(text, str) and (not text.strip(" ,\t\n") or "\0" in text):
             raise ValueError("an empty name")
         return text
 
@@ -180,7 +180,8 @@ class SceneConfig(Config):
     def _controls_from_names(cls, value: Any) -> Any:
         """Accept ``"texture"`` and ``["texture", "pose"]`` for controls with nothing set, and an empty YAML value."""
         names = [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
-        if isinstance(names, (list, tuple)):
+        if isinstance(names, (list, tuple)) and all(isinstance(name, str) for name in names):
+            check_once(names, "controls")
             return {name: {} for name in names}
         if isinstance(names, Mapping):
             return {name: {} if given is None else given for name, given in names.items()}
@@ -213,10 +214,3 @@ class SceneConfig(Config):
     def _numbers_from_text(cls, value: Any) -> Any:
         """Read ``1e-3`` as a number: YAML takes it for text."""
         return {name: number_or_text(given) for name, given in value.items()} if isinstance(value, Mapping) else value
-
-    @field_validator("set_", "controls")
-    @classmethod
-    def _finite_inside(cls, value: Any) -> Any:
-        if not all_finite(value):
-            raise ValueError("not finite")
-        return value

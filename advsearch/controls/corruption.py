@@ -31,7 +31,7 @@ from advsearch.controls.corruption_noise import gaussian_noise, impulse_noise, s
 from advsearch.controls.corruption_tools import LEVELS
 from advsearch.controls.corruption_weather import fog, frost, snow
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Choices, Fixed
+from advsearch.controls.values import Choices, Fixed, is_whole
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
 
@@ -106,8 +106,7 @@ class CorruptionControl(NumberControl):
 
     def check_choices(self) -> None:
         given = self.chosen["seed"]
-        number = isinstance(given, (int, float)) and not isinstance(given, bool)
-        if not number or not float(given).is_integer() or not 0 <= given < 2**32:  # type: ignore[arg-type,operator]
+        if not is_whole(given, 0, 2**32 - 1):
             raise InputError(f"{self.name}.seed: expected a whole number from 0 to {2**32 - 1}, got {given!r}")
 
     def estimators(self, scene: SceneDescription, parameter: Parameter) -> tuple[str, ...]:

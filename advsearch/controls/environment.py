@@ -23,7 +23,7 @@ from torch import Tensor
 
 from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Parameter
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Choices, Fixed, Number
+from advsearch.controls.values import Choices, Fixed, Number, is_number
 from advsearch.errors import InputError
 from advsearch.scene import library
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription, metered_gain
@@ -88,7 +88,7 @@ class EnvironmentControl(NumberControl):
 
     def check_choices(self) -> None:
         given = self.chosen["epsilon"]
-        if isinstance(given, bool) or not isinstance(given, (int, float)) or not 0.0 < float(given) <= 100.0:
+        if not is_number(given) or not 0.0 < given <= 100.0:
             raise InputError(f"{self.name}.epsilon: expected a number over 0 and at most 100, got {given!r}")
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:

@@ -10,7 +10,6 @@ from. No vertex moves by more than epsilon, no face turns over and no wall meets
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import NOTHING, BoundControl, Choice, Control, Group, Parameter, Value
+from advsearch.controls.values import is_number, is_whole
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assembly import MovingMesh
 from advsearch.scene.assets import Mesh
@@ -94,12 +94,12 @@ class GeometryControl(Control):
     )
 
     def __post_init__(self) -> None:
-        if not _is_number(self.epsilon) or not 0.0 < self.epsilon <= LARGEST_EPSILON:
+        if not is_number(self.epsilon) or not 0.0 < self.epsilon <= LARGEST_EPSILON:
             raise InputError(
                 f"{self.name}.epsilon: expected a length over 0 and up to {LARGEST_EPSILON:g} object sizes, "
                 f"got {self.epsilon!r}"
             )
-        if not _is_number(self.modes) or self.modes != int(self.modes) or not 1 <= self.modes <= LARGEST_MODES:
+        if not is_whole(self.modes, 1, LARGEST_MODES):
             raise InputError(
                 f"{self.name}.modes: expected a whole number from 1 to {LARGEST_MODES}, got {self.modes!r}"
             )
@@ -224,7 +224,3 @@ def obj_bytes(vertices: Tensor, normals: Tensor, mesh: Mesh) -> bytes:
     lines += [f"vn {x:.5f} {y:.5f} {z:.5f}" for x, y, z in normals.tolist()]
     lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in (mesh.faces.astype(np.int64) + 1).tolist()]
     return ("\n".join(lines) + "\n").encode("ascii")
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)

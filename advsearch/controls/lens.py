@@ -21,6 +21,7 @@ from torch import Tensor
 
 from advsearch.controls.base import Choice, Parameter
 from advsearch.controls.numbers import BoundNumbers, NumberControl, Values
+from advsearch.controls.values import is_whole
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
@@ -85,8 +86,7 @@ class LensControl(NumberControl):
 
     def check_choices(self) -> None:
         given = self.chosen["dots"]
-        number = isinstance(given, (int, float)) and not isinstance(given, bool)
-        if not number or not float(given).is_integer() or not 1 <= given <= MOST_DOTS:  # type: ignore[arg-type,operator]
+        if not is_whole(given, 1, MOST_DOTS):
             raise InputError(f"{self.name}.dots: expected a whole number from 1 to {MOST_DOTS}, got {given!r}")
 
     @property

@@ -31,7 +31,17 @@ from advsearch.controls.base import (
 from advsearch.controls.clean import Moved
 from advsearch.controls.numbers import BoundNumbers, NumberControl
 from advsearch.controls.texture import resampled
-from advsearch.controls.values import Choices, Fixed, Number, Range, in_words, read
+from advsearch.controls.values import (
+    LARGEST_EPSILON,
+    Choices,
+    Fixed,
+    Number,
+    Range,
+    in_words,
+    is_number,
+    is_whole,
+    read,
+)
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
@@ -155,14 +165,16 @@ class PatchControl(Control):
 
     def _check_choices(self) -> None:
         side, epsilon = self.resolution, self.epsilon
-        if not _is_number(side) or not (2 <= side <= 512 and side == int(side)):
+        if not is_whole(side, 2, 512):
             raise InputError(f"{self.name}.resolution: expected a whole number from 2 to 512, got {side!r}")
         if self.norm not in NORMS:
             raise InputError(f"{self.name}.norm: expected one of {', '.join(NORMS)}, got {self.norm!r}")
         if epsilon is None:
             return
-        if not _is_number(epsilon) or not 0.0 < epsilon < math.inf:
-            raise InputError(f"{self.name}.epsilon: expected a finite number greater than 0, got {epsilon!r}")
+        if not is_number(epsilon) or not 0.0 < epsilon <= LARGEST_EPSILON:
+            raise InputError(
+                f"{self.name}.epsilon: expected a number over 0 and up to {LARGEST_EPSILON:g}, got {epsilon!r}"
+            )
         if self.norm == "box":
             raise InputError(
                 f"{self.name}.epsilon: expected none with norm box, got {epsilon:g}; set norm to linf or l2"
@@ -319,7 +331,3 @@ def enlarged(pixels: Tensor, least: int) -> Tensor:
     linear = srgb_to_linear(pixels).permute(2, 0, 1)[None]
     larger = F.interpolate(linear, scale_factor=factor, mode="bilinear", align_corners=False)
     return linear_to_srgb(larger[0].permute(1, 2, 0))
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)

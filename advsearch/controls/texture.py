@@ -32,6 +32,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advsearch.controls.base import NOTHING, BoundControl, Budget, Choice, Control, Group, Parameter, Value
+from advsearch.controls.values import LARGEST_EPSILON, is_number, is_whole
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.description import SceneDescription
@@ -134,13 +135,13 @@ class TextureControl(Control):
     def __post_init__(self) -> None:
         if self.norm not in NORMS:
             raise InputError(f"norm: expected one of {', '.join(NORMS)}, got {self.norm!r}")
-        if self.epsilon is not None and not (_is_number(self.epsilon) and self.epsilon > 0.0):
-            raise InputError(f"epsilon: expected a finite number greater than 0, got {self.epsilon}")
-        if self.resolution is not None and not _is_count(self.resolution, 2, 4096):
+        if self.epsilon is not None and not (is_number(self.epsilon) and 0.0 < self.epsilon <= LARGEST_EPSILON):
+            raise InputError(f"epsilon: expected a number over 0 and up to {LARGEST_EPSILON:g}, got {self.epsilon!r}")
+        if self.resolution is not None and not is_whole(self.resolution, 2, 4096):
             raise InputError(f"texture_resolution: expected 2 to 4096 texels, got {self.resolution}")
         object.__setattr__(self, "form", self._form())
         for choice, largest in (("colors", LARGEST_PALETTE), ("waves", LARGEST_WAVES)):
-            if not _is_count(getattr(self, choice), 1, largest):
+            if not is_whole(getattr(self, choice), 1, largest):
                 raise InputError(
                     f"{self.name}.{choice}: expected a whole number from 1 to {largest}, got {getattr(self, choice)!r}"
                 )
@@ -361,11 +362,3 @@ def _spread(centres: Tensor) -> float:
         return 1.0
     apart = torch.cdist(centres, centres) + torch.diag(torch.full((len(centres),), 10.0))
     return max(0.5 * float(apart.min(dim=1).values.mean()), 1e-3)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _is_count(value: object, low: int, high: int) -> bool:
-    return _is_number(value) and float(value) == int(value) and low <= value <= high  # type: ignore[arg-type, call-overload, operator]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeGuard
 
 import torch
 from torch import Tensor
@@ -19,6 +20,12 @@ from advsearch.controls.base import Parameter
 from advsearch.errors import InputError, UnknownNameError
 
 Number = float | str
+
+LARGEST = 1e30
+"""No quantity of a scene is larger; the square of one that is has no float32."""
+
+LARGEST_EPSILON = 1e6
+"""No distance from where a control starts is larger, in whichever norm."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +67,14 @@ def read(where: str, parameter: Parameter, given: object) -> Spec:
     if isinstance(given, Mapping):
         if set(given) != {"choices"} or not _is_list(given["choices"]) or not given["choices"]:
             raise InputError(f"{where}: expected {{choices: [value, ...]}}, got {dict(given)!r}")
-        return Choices(tuple(_value(where, parameter, one) for one in given["choices"]))
+        return _choices(where, [_value(where, parameter, one) for one in given["choices"]])
     if not _is_list(given):
         return Fixed(_value(where, parameter, given))
     values = [_value(where, parameter, one) for one in given]  # type: ignore[attr-defined]
-    if parameter.options or len(values) > 2:
-        return Choices(tuple(values))
+    if values and (parameter.options or len(values) > 2):
+        return _choices(where, values)
     if len(values) != 2:
-        raise InputError(f"{where}: expected a number, [low, high] or a list of values, got {given!r}")
+        raise InputError(f"{where}: expected a value, [low, high] or a list of values, got {given!r}")
     low, high = (float(value) for value in values)
     if low == high:
         raise InputError(f"{where}: the range [{low:g}, {high:g}] has no size; write {low:g} to fix the value")
@@ -76,6 +83,20 @@ def read(where: str, parameter: Parameter, given: object) -> Spec:
     if parameter.log and low <= 0.0:
         raise InputError(f"{where}: expected a range over 0 (it is searched on a logarithmic scale), got {low:g}")
     return Range(low, high)
+
+
+def _choices(where: str, values: Sequence[Number]) -> Choices:
+    """The values, of which none may come twice: it would be drawn twice as often."""
+    twice = [value for number, value in enumerate(values) if value in values[:number]]
+    if twice:
+        raise InputError(f"{where}: expected different choices, got {_shown(twice[0])} twice; leave one of them out")
+    return Choices(tuple(values))
+
+
+def _shown(value: Number) -> str:
+    if isinstance(value, int) and not is_number(value):
+        return f"a whole number of {value.bit_length()} bits"
+    return value if isinstance(value, str) else f"{value:g}"
 
 
 def _is_list(given: object) -> bool:
@@ -94,13 +115,22 @@ def _value(where: str, parameter: Parameter, given: object) -> Number:
         return given
     if isinstance(given, bool) or not isinstance(given, (int, float)):
         raise InputError(f"{where}: expected a number in {parameter.unit}, got {given!r}")
-    number = float(given)
-    if not math.isfinite(number) or not parameter.low <= number <= parameter.high:
+    if not (is_number(given) and parameter.low <= given <= parameter.high):
         raise InputError(
             f"{where}: expected a number from {parameter.low:g} to {parameter.high:g} ({parameter.unit}), "
-            f"got {number:g}"
+            f"got {_shown(given)}"
         )
-    return number
+    return float(given)
+
+
+def is_number(given: object) -> TypeGuard[float]:
+    """Return whether it is a number that float32 has: not a truth value, not NaN, and at most `LARGEST`."""
+    return isinstance(given, (int, float)) and not isinstance(given, bool) and abs(given) <= LARGEST
+
+
+def is_whole(given: object, low: int, high: int) -> TypeGuard[float]:
+    """Return whether it is a whole number from `low` to `high`."""
+    return is_number(given) and low <= given <= high and given == int(given)
 
 
 def in_words(spec: Spec) -> str:

@@ -68,18 +68,35 @@ def make_policy(name: str, **options: Any) -> Policy[Any]:
     if name not in POLICIES:
         raise UnknownNameError("policy", name, POLICIES)
     policy = POLICIES[name]
-    known = [field.name for field in fields(policy)]  # type: ignore[arg-type]
-    for option in options:
+    known = {field.name: str(getattr(field.type, "__name__", field.type)) for field in fields(policy)}  # type: ignore[arg-type]
+    for option, value in options.items():
         if option not in known:
             raise UnknownNameError(f"option of policy {name!r}:", option, known)
+        _check_type(f"{option} of policy {name}", known[option], value)
     if options.get("policy") is not None:
         options["policy"] = _nested(options["policy"], f"policy of {name}")
     if "policies" in options:
         given = options["policies"]
-        if isinstance(given, (str, Mapping)):
+        if not isinstance(given, (list, tuple)):
             given = [given]
         options["policies"] = tuple(_nested(one, f"policies of {name}") for one in given)
     return policy(**options)
+
+
+MOST = 1_000_000
+"""Of whatever a policy counts: no budget has more renders."""
+
+
+def _check_type(where: str, kind: str, value: Any) -> None:
+    """Refuse a value of another type than an option's field has; its range is the policy's own business."""
+    number = isinstance(value, (int, float)) and not isinstance(value, bool) and not abs(value) > MOST
+    wrong = {
+        "float": None if number else f"a number up to {MOST}",
+        "int": None if number and value % 1 == 0 else f"a whole number up to {MOST}",
+        "bool": None if isinstance(value, bool) else "true or false",
+    }.get(kind)
+    if wrong:
+        raise InputError(f"{where}: expected {wrong}, got {value!r:.80}")
 
 
 def _nested(spec: Spec, where: str) -> Policy[Any]:
