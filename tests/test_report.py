@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import io
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -10,13 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from advsearch.config import AttackConfig
 from advsearch.errors import FileFormatError
 from advsearch.report import wording
-from advsearch.report.charts import Curve, interval_bar, nice_ticks, objective_chart
+from advsearch.report.charts import NARROW, Curve, interval_bar, nice_ticks, objective_chart
 from advsearch.report.markup import Html, element, join
 from advsearch.report.page import LARGE_PICTURE, SMALLER_SIDE, write_report
+from advsearch.report.studies import gap_figure
+from advsearch.report.style import CSS
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.images import read_png
 from advsearch.runs.store import Row
@@ -182,8 +186,30 @@ def test_the_page_is_accessible(tmp_path: Path) -> None:
     assert all(image.get("alt") for image in page.all("img"))
     assert all(head.get("scope") in ("row", "col") for head in page.all("th") if head.get("class") != "hide-small")
     charts = [svg for svg in page.all("svg") if svg.get("aria-hidden") != "true"]
-    assert [svg["role"] for svg in charts] == ["img"]
-    assert "pgd: from -2 to 1.9" in str(charts[0]["aria-label"])
+    assert [svg["class"] for svg in charts] == ["chart wide", "chart narrow"]  # the style sheet shows one of them
+    for svg in charts:
+        assert svg["role"] == "img" and "pgd: from -2 to 1.9" in str(svg["aria-label"])
+
+
+def test_a_phone_gets_a_chart_that_fits_with_letters_that_can_be_read(tmp_path: Path) -> None:
+    text = write_report(make_run(tmp_path / "run")).read_text(encoding="utf-8")
+    narrow = next(svg for svg in Page(text).all("svg") if svg["class"] == "chart narrow")
+    width = float(str(narrow["viewbox"]).split()[2])
+    assert (
+        width <= 390 - 2 * 20
+    )  # what the page leaves of a phone: letters of 13 are drawn as such, and nothing scrolls
+    assert "min-width" not in re.findall(r"svg\.chart \{[^}]*\}", CSS)[0]
+    phone = CSS.index("@media (max-width: 34rem)")
+    assert CSS.index("svg.narrow { display: none; }") < phone < CSS.index("svg.narrow { display: block; }")
+
+
+def test_numbers_have_the_digits_that_mean_something(tmp_path: Path) -> None:
+    formation = {**SUMMARY["image_formation"], "gain": 0.41234567890123456, "exposure": 1 / 3}
+    verified = {**SUMMARY["verified"], "margin": 1.2345678901234567}
+    page = page_of(
+        make_run(tmp_path / "run", changed(image_formation=formation, epsilon=1 / 3, verified=verified), rows=False)
+    )
+    assert "gain 0.4123" in page.text and not re.findall(r"\d\.\d{7,}", page.text)
 
 
 def test_names_cannot_become_markup(tmp_path: Path) -> None:
@@ -260,7 +286,10 @@ def test_ticks_are_round(low: float, high: float, expected: list[float]) -> None
     "values", [[1.0], [2.0, 2.0, 2.0], [None, 1.0, None], [1e-12, 2e-12], [-1e9, 1e9], [float(i) for i in range(5000)]]
 )
 def test_a_chart_of_any_values_is_drawn_inside_its_frame(values: list[float | None]) -> None:
-    page = Page(objective_chart([Curve("a", "search", values), Curve("b", "baseline", values)], "margin", "wrong"))
+    curves = [Curve("a", "search", values), Curve("random", "baseline", values)]
+    for figure in Page(objective_chart(curves, "margin", "wrong", NARROW)).all("polyline"):
+        assert all(0 <= float(pair.split(",")[0]) <= NARROW.width for pair in str(figure["points"]).split())
+    page = Page(objective_chart(curves, "margin", "wrong"))
     (first, second) = page.all("polyline")
     points = [tuple(map(float, pair.split(","))) for pair in str(first["points"]).split()]
     assert first["points"] == second["points"] and len(points) == min(len(values), 400)
@@ -274,6 +303,20 @@ def test_an_interval_is_drawn_only_where_there_is_one() -> None:
     assert interval_bar({}) == ""
     bar = Page(interval_bar({"rate": 1.0, "interval": [0.5, 1.0]})).all("rect")
     assert (bar[1]["x"], bar[1]["width"]) == ("50.0", "48.0")
+
+
+def test_the_worst_case_of_a_gap_does_not_hide_an_average_that_is_equal_to_it() -> None:
+    row = {
+        "object": "mug",
+        "control": "pose",
+        "average": {"accuracy": 1.0, "interval": [1.0, 1.0]},
+        "worst": {"rate": 0},
+    }
+    figure = gap_figure({"table": [{**row, "ending": "budget spent"}], "model": "m"})["png"]
+    pixels = np.asarray(Image.open(io.BytesIO(figure)).convert("RGB")).astype(int)
+    pixels = pixels[: int(0.55 * len(pixels))]  # without the axis and the legend
+    for colour in ((0x1D, 0x5F, 0xD0), (0xB3, 0x26, 0x1E)):
+        assert (abs(pixels - colour).max(axis=-1) < 30).sum() > 20
 
 
 # ---- words ----

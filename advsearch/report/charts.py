@@ -9,8 +9,33 @@ from dataclasses import dataclass
 
 from advsearch.report.markup import Html, element, join
 
-WIDTH, HEIGHT = 720, 300
-_LEFT, _RIGHT, _TOP, _BOTTOM = 56, 120, 16, 44
+HEIGHT = 300
+_LEFT, _BOTTOM = 56, 44
+
+
+@dataclass(frozen=True)
+class Paper:
+    """What a chart is drawn on.
+
+    Attributes:
+        css: class of the style sheet.
+        width: in units of the drawing, of which a letter is about 7 wide.
+        right, top: margins. The curves' names stand beside their ends, or in a line above where `right` has no room.
+    """
+
+    css: str
+    width: int
+    right: int
+    top: int
+
+    @property
+    def names_above(self) -> bool:
+        """Whether the curves' names stand in a line above them."""
+        return self.right < 100
+
+
+WIDE, NARROW = Paper("wide", 720, 120, 16), Paper("narrow", 350, 12, 36)
+"""For a screen, and for a phone, on which letters of the wide one would be too small to read."""
 
 MOST_POINTS = 400
 """Points of a curve that are drawn; of more, evenly spread ones."""
@@ -31,13 +56,14 @@ class Curve:
     values: Sequence[float | None]
 
 
-def objective_chart(curves: Sequence[Curve], objective: str, zero_means: str = "") -> Html:
+def objective_chart(curves: Sequence[Curve], objective: str, zero_means: str = "", paper: Paper = WIDE) -> Html:
     """Return the best objective so far (lines) and each single one (dots) over the number of evaluations.
 
     Args:
         curves: at least one with a finite value.
         objective: label of the vertical axis.
         zero_means: what stands at the zero line; no line when it is empty.
+        paper: how wide it is.
     """
     finite = [value for curve in curves for value in curve.values if value is not None]
     low, high = min(finite), max(finite)
@@ -45,10 +71,9 @@ def objective_chart(curves: Sequence[Curve], objective: str, zero_means: str = "
         low, high = min(low, 0.0), max(high, 0.0)
     margin = 0.06 * ((high - low) or 1.0)
     ticks = nice_ticks(low - margin, high + margin)
-    frame = _Frame(max(len(curve.values) for curve in curves), low - margin, high + margin)
-    ends = _apart([frame.y(_best(curve.values)[-1]) for curve in curves])
+    frame = _Frame(max(len(curve.values) for curve in curves), low - margin, high + margin, paper)
     drawn = [_axes(frame, ticks, objective), _zero(frame, zero_means)]
-    drawn += [_line(frame, curve, end) for curve, end in zip(curves, ends, strict=True)]
+    drawn += [_line(frame, curve, *at) for curve, at in zip(curves, _label_places(frame, curves), strict=True)]
     said = "; ".join(
         f"{curve.name}: from {_first(curve.values):.3g} to {_best(curve.values)[-1]:.3g}" for curve in curves
     )
@@ -56,8 +81,8 @@ def objective_chart(curves: Sequence[Curve], objective: str, zero_means: str = "
         "svg",
         element("title", f"{objective} over evaluations. {said}"),
         *drawn,
-        viewBox=f"0 0 {WIDTH} {HEIGHT}",
-        class_="chart",
+        viewBox=f"0 0 {paper.width} {HEIGHT}",
+        class_=f"chart {paper.css}",
         role="img",
         aria_label=f"{objective} over evaluations. {said}",
     )
@@ -96,16 +121,21 @@ class _Frame:
     count: int
     low: float
     high: float
+    paper: Paper
+
+    @property
+    def right(self) -> int:
+        return self.paper.width - self.paper.right
 
     def x(self, number: float) -> float:
-        return _LEFT + (WIDTH - _LEFT - _RIGHT) * (number - 1) / max(self.count - 1, 1)
+        return _LEFT + (self.right - _LEFT) * (number - 1) / max(self.count - 1, 1)
 
     def y(self, value: float) -> float:
-        return HEIGHT - _BOTTOM - (HEIGHT - _TOP - _BOTTOM) * (value - self.low) / (self.high - self.low)
+        return HEIGHT - _BOTTOM - (HEIGHT - self.paper.top - _BOTTOM) * (value - self.low) / (self.high - self.low)
 
 
 def _axes(frame: _Frame, ticks: Sequence[float], objective: str) -> Html:
-    right, bottom = WIDTH - _RIGHT, HEIGHT - _BOTTOM
+    right, bottom, top = frame.right, HEIGHT - _BOTTOM, frame.paper.top
     parts = [
         join(
             element("line", x1=_LEFT, x2=right, y1=f"{frame.y(tick):.1f}", y2=f"{frame.y(tick):.1f}", class_="grid"),
@@ -118,8 +148,8 @@ def _axes(frame: _Frame, ticks: Sequence[float], objective: str) -> Html:
         if number == 1 or frame.x(number) - frame.x(1) > 24:
             parts.append(element("text", str(number), x=f"{frame.x(number):.1f}", y=bottom + 18, text_anchor="middle"))
     parts.append(element("text", "evaluations", x=(_LEFT + right) / 2, y=HEIGHT - 6, text_anchor="middle"))
-    turn = f"rotate(-90 14 {(_TOP + bottom) / 2})"
-    parts.append(element("text", objective, x=14, y=(_TOP + bottom) / 2, text_anchor="middle", transform=turn))
+    turn = f"rotate(-90 14 {(top + bottom) / 2})"
+    parts.append(element("text", objective, x=14, y=(top + bottom) / 2, text_anchor="middle", transform=turn))
     return join(*parts)
 
 
@@ -128,12 +158,12 @@ def _zero(frame: _Frame, meaning: str) -> Html:
         return Html("")
     y = frame.y(0.0)
     return join(
-        element("line", x1=_LEFT, x2=WIDTH - _RIGHT, y1=f"{y:.1f}", y2=f"{y:.1f}", class_="zero"),
-        element("text", meaning, x=WIDTH - _RIGHT - 4, y=f"{y - 5:.1f}", text_anchor="end", class_="note"),
+        element("line", x1=_LEFT, x2=frame.right, y1=f"{y:.1f}", y2=f"{y:.1f}", class_="zero"),
+        element("text", meaning, x=frame.right - 4, y=f"{y - 5:.1f}", text_anchor="end", class_="note"),
     )
 
 
-def _line(frame: _Frame, curve: Curve, label_y: float) -> Html:
+def _line(frame: _Frame, curve: Curve, label_x: float, label_y: float) -> Html:
     shown = _spread(len(curve.values))
     best = _best(curve.values)
     points = " ".join(f"{frame.x(i + 1):.1f},{frame.y(best[i]):.1f}" for i in shown)
@@ -146,7 +176,7 @@ def _line(frame: _Frame, curve: Curve, label_y: float) -> Html:
         "g",
         *dots,
         element("polyline", points=points),
-        element("text", curve.name, x=f"{frame.x(len(curve.values)) + 8:.1f}", y=f"{label_y + 4:.1f}"),
+        element("text", curve.name, x=f"{label_x:.1f}", y=f"{label_y + 4:.1f}"),
         class_=curve.css,
     )
 
@@ -168,6 +198,15 @@ def _spread(count: int) -> list[int]:
     if count <= MOST_POINTS:
         return list(range(count))
     return sorted({round(i * (count - 1) / (MOST_POINTS - 1)) for i in range(MOST_POINTS)})
+
+
+def _label_places(frame: _Frame, curves: Sequence[Curve]) -> list[tuple[float, float]]:
+    """Return where the curves' names stand: beside their ends, or one after the other above them."""
+    if frame.paper.names_above:
+        widths = [0.0, *(8.0 * len(curve.name) + 16.0 for curve in curves[:-1])]
+        return [(_LEFT + start, 14.0) for start in itertools.accumulate(widths)]
+    ends = _apart([frame.y(_best(curve.values)[-1]) for curve in curves])
+    return [(frame.x(len(curve.values)) + 8.0, end) for curve, end in zip(curves, ends, strict=True)]
 
 
 def _apart(places: Sequence[float], least: float = 16.0) -> list[float]:

@@ -12,7 +12,7 @@ from typing import Any
 
 from advsearch import __version__
 from advsearch.report import wording
-from advsearch.report.charts import Curve, interval_bar, objective_chart
+from advsearch.report.charts import NARROW, WIDE, Curve, interval_bar, objective_chart
 from advsearch.report.markup import Html, element, join
 from advsearch.report.style import CSS
 from advsearch.runs import directory, images, store
@@ -184,11 +184,12 @@ def _curve(data: RunData) -> Html:
         return Html("")
     objective = str(data.summary.get("objective", "objective"))
     above = "right" if wording.minimises(data.summary) else wording.success(data.summary)
-    chart = objective_chart(curves, objective, f"above: {above}" if objective == "margin" else "")
+    zero = f"above: {above}" if objective == "margin" else ""
+    charts = [objective_chart(curves, objective, zero, paper) for paper in (WIDE, NARROW)]
     note = "Lines: the best so far. Dots: each evaluation. These are the search's claims; the table above is verified."
     return join(
         element("h2", "The search"),
-        element("div", chart, class_="scroll", tabindex="0", role="region", aria_label="Chart of the search"),
+        element("div", *charts),
         element("p", note, class_="soft"),
     )
 

@@ -44,8 +44,14 @@ def gap_figure(answer: Mapping[str, Any]) -> Figures:
             mean, worst = row["average"]["accuracy"], _worst(row)
             axes.plot(row["average"]["interval"], [place, place], color=BLUE, alpha=0.35, linewidth=5)
             axes.plot([worst, mean], [place, place], color=GREY, linewidth=1)
-            axes.plot(mean, place, "o", color=BLUE, label="average, with 95 % interval" if place == 0 else None)
-            axes.plot(worst, place, "D", color=RED, label="worst found, verified" if place == 0 else None)
+            first = place == 0
+            axes.plot(
+                mean, place, "o", color=BLUE, ms=4, zorder=4, label="average, with 95 % interval" if first else None
+            )
+            worst_label = (
+                "worst found, verified" if first else None
+            )  # an outline: where the two are equal, both are seen
+            axes.plot(worst, place, "D", color=RED, mfc="none", mew=1.5, ms=9, zorder=3, label=worst_label)
         axes.set_yticks(range(len(rows)), [f"{row['object']}, {row['control']}" for row in reversed(rows)])
         axes.set(xlabel="accuracy", xlim=(-0.03, 1.03))
         axes.set_title(f"Average and worst case: {answer['model']}")

@@ -42,7 +42,7 @@ td.number { white-space: nowrap; }
 svg { display: block; }
 svg.interval { width: 100%; min-width: 7rem; max-width: 16rem; height: 12px; }
 svg .track { fill: var(--track); } svg .range { fill: var(--soft); opacity: 0.55; } svg .mark { fill: var(--ink); }
-svg.chart { width: 100%; height: auto; min-width: 34rem; }
+svg.chart { width: 100%; height: auto; } svg.narrow { display: none; }
 svg.chart text { font-size: 13px; fill: var(--soft); }
 svg.chart .grid { stroke: var(--line); } svg.chart .zero { stroke: var(--soft); stroke-dasharray: 5 4; }
 svg.chart polyline { fill: none; stroke-width: 2; stroke-linejoin: round; }
@@ -58,7 +58,8 @@ pre { background: var(--card); border: 1px solid var(--line); border-radius: 4px
   font: 0.86rem/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu Sans Mono", monospace; margin: 0.5rem 0; }
 pre.wrap { white-space: pre-wrap; overflow-wrap: anywhere; }
 footer { margin-top: 3rem; padding-top: 1rem; padding-bottom: 2.5rem; font-size: 0.88rem; color: var(--soft); }
-@media (max-width: 34rem) { .facts th { width: 7.5rem; } .hide-small { display: none; }
-  th, td { padding-right: 0.6rem; } }
+@media (max-width: 34rem) { .facts th { width: 7.5rem; } .hide-small, svg.wide { display: none; }
+  svg.narrow { display: block; } .scroll th, .scroll td { padding-right: 0.5rem; font-size: 0.88rem; }
+  .scroll thead th { white-space: normal; } }
 @media print { body { background: none; } h2 { break-after: avoid; } figure, table { break-inside: avoid; } }
 """

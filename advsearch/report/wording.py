@@ -219,7 +219,12 @@ def formation_text(summary: Summary) -> str:
     if formation.get("exposure") is not None:
         said.append(f"exposure {formation['exposure']:g} stops")
     known = ("resolution", "filter", "denoiser", "exposure")
-    return ", ".join(said + [f"{name} {value}" for name, value in formation.items() if name not in known])
+    return ", ".join(said + [f"{name} {_short(value)}" for name, value in formation.items() if name not in known])
+
+
+def _short(value: Any) -> str:
+    """A value as text; a number with the digits that mean something to a reader."""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _how_it_errs(summary: Summary, verified: Mapping[str, Any], thing: str) -> str:
