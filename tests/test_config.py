@@ -393,12 +393,6 @@ def test_epsilon_is_one_number_one_for_each_control_or_a_curve(given: Any, expec
     assert of_command_line(config.command_line()) == config
 
 
-def test_a_budget_for_one_control_leaves_the_others_their_own() -> None:
-    config = AttackConfig(object="mug", epsilon="texture=0.05")
-    assert (config.epsilon_of("texture"), config.epsilon_of("pose")) == (0.05, None)
-    assert AttackConfig(object="mug", epsilon=0.1).epsilon_of("pose") == 0.1
-
-
 @pytest.mark.parametrize("given", ["pgd={momentum: 0.9, steps: 80}", {"name": "pgd", "momentum": 0.9, "steps": 80}])
 def test_a_policy_has_options_and_its_steps_are_the_runs(given: Any) -> None:
     config = AttackConfig(object="mug", policy=given)

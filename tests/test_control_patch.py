@@ -293,7 +293,10 @@ def test_settings_make_the_same_control_again(scene: SceneDescription) -> None:
     [
         ({"resolution": 1}, r"patch.resolution: expected a whole number from 2 to 512, got 1"),
         ({"norm": "l1"}, r"patch.norm: expected one of box, linf, l2, got 'l1'"),
-        ({"epsilon": 0.1}, r"patch.epsilon: expected none with norm box, got 0.1; set norm to linf or l2"),
+        (
+            {"norm": "box", "epsilon": 0.1},
+            r"patch.epsilon: expected none with norm box, got 0.1; set norm to linf or l2",
+        ),
         ({"epsilon": -1.0, "norm": "l2"}, r"patch.epsilon: expected a number over 0 and up to 1e\+06, got -1.0"),
         ({"size": 2.0}, r"patch.size: expected a number from 0.05 to 0.6 \(object sizes\), got 2"),
         ({"pixels": [0.1, 0.2, 0.3]}, r"patch.pixels: expected \[low, high\] or one number, got a list of 3"),

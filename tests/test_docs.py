@@ -22,6 +22,7 @@ from PIL import Image
 import advsearch
 import advsearch.config
 from advsearch.api import attacking, mapping, outcome, stages, studies
+from advsearch.api.naming import check_run_settings, controls_of
 from advsearch.api.scene import as_controls
 from advsearch.api.sweeps.axes import read_axes
 from advsearch.attacks import (
@@ -360,7 +361,8 @@ CONFIGS: dict[str, type[SceneConfig]] = {"attack": AttackConfig, **script("make_
 
 def check_names(config: SceneConfig) -> None:
     """Look up every name in a configuration, as its command would; nothing is loaded."""
-    as_controls(config.controls)
+    check_run_settings(config)
+    controls_of(config.controls, config)
     resolve(config.set_)  # type: ignore[arg-type]
     lights = config.environments if isinstance(config, SweepConfig) else (config.environment,)
     for name in config.objects:
@@ -371,7 +373,6 @@ def check_names(config: SceneConfig) -> None:
         assert name in library.list_environments() or Path(name).suffix in environments.SUFFIXES
     if isinstance(config, AttackConfig):
         as_controls(config.over)
-        attacking._check_budgets(config)
         make_policy(config.policy_name, **config.policy_options)
         check_objective(config.objective, targeted=config.target is not None, minimise=config.minimise)
         known = script("make_figures").stored_record()["labels"]

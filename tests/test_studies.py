@@ -75,6 +75,11 @@ def test_a_curve_counts_robust_objects_at_each_epsilon(asked: list[AttackConfig]
     assert "2/4" in answer(summary) and "already wrong" in answer(summary)
 
 
+def test_a_label_for_several_objects_says_whose_own_it_is_not(asked: list[AttackConfig]) -> None:
+    summary = studies.curve_from_config(AttackConfig(object="mug,bowl", label="mug", run="curve"))
+    assert any("also for bowl (its own is 'bowl')" in text for text in summary["warnings"])
+
+
 def test_several_objects_and_one_budget_make_one_row_each(asked: list[AttackConfig]) -> None:
     summary = studies.curve_from_config(AttackConfig(object="mug,pan", run="study"))
     assert [row["ending"] for row in summary["table"]] == ["found", "budget spent"]

@@ -364,6 +364,27 @@ def test_the_fast_way_says_what_the_control_says(scene: advsearch.Scene, control
         assert said == space.describe(one)
 
 
+@pytest.mark.parametrize(
+    ("objects", "label", "said"),
+    [
+        (
+            ["mug", "vase"],
+            "mug",
+            "the right answer for every object, also for vase (its own is 'vase'); without a label",
+        ),
+        (["mug", "vase"], None, None),
+        (["vase"], "mug", None),
+        (["mug", "bowl"], "mug", None),  # the model does not know a bowl
+    ],
+)
+def test_a_label_for_several_objects_says_whose_own_it_is_not(
+    objects: list[str], label: str | None, said: str | None
+) -> None:
+    grid = {"pose.yaw": [0, 90]}
+    found = advsearch.sweep(objects, model(), grid, trials=0, resolution=SIZE, label=label).summary["warnings"]
+    assert found == [] if said is None else len(found) == 1 and said in found[0]
+
+
 def test_what_a_row_says_of_an_occluder_is_true_of_its_own_camera() -> None:
     grid = {"camera.distance": [2, 4], "occlusion.coverage": [0.3]}
     found = advsearch.sweep("mug", model(), grid, trials=0, resolution=SIZE)

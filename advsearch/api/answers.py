@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 from advsearch.api.rendering import render
 from advsearch.api.scene import Scene
 from advsearch.config import SceneConfig
@@ -40,6 +42,37 @@ def right_answers(model: Model, scene: Scene, name: str, config: SceneConfig) ->
         except InputError as error:
             problem = f"label: the label of {name} itself does not fit the model ({error})"
     raise InputError(f"{problem}; {_advice(model, scene, config)}")
+
+
+def one_label_for_several(models: Sequence[Model], label: str | None, objects: Mapping[str, str | None]) -> list[str]:
+    """Return a sentence if a label that was given for several objects is not what some of them are called.
+
+    Args:
+        models: whose classes.
+        label: what was given for all objects; None where each has its own.
+        objects: by name, the label that each has of its own, or None.
+    """
+    if label is None or len(objects) < 2:
+        return []
+    others = [f"{name} (its own is {own!r})" for name, own in objects.items() if own and _differs(models, label, own)]
+    if not others:
+        return []
+    return [
+        f"The label {label!r} is taken as the right answer for every object, also for {', '.join(others)}; without a "
+        "label, each object has its own."
+    ]
+
+
+def _differs(models: Sequence[Model], label: str, own: str) -> bool:
+    """Whether a model has classes for both labels, and none in common."""
+    for model in models:
+        try:
+            known = set(model.label_set(own).indices)
+        except InputError:
+            continue
+        if not known & set(model.label_set(label).indices):
+            return True
+    return False
 
 
 def _advice(model: Model, scene: Scene, config: SceneConfig) -> str:

@@ -14,21 +14,21 @@ from torch import Tensor, nn
 from advsearch import seeds
 from advsearch.api.answers import right_answers
 from advsearch.api.memory import Memory
-from advsearch.api.naming import load_models, scene_settings
+from advsearch.api.naming import RUN_SETTINGS, check_run_settings, controls_of, load_models, scene_settings
 from advsearch.api.outcome import AttackResult, summarise
 from advsearch.api.problem import Problem
 from advsearch.api.record import Recorder, Stages
 from advsearch.api.samples import search_samples
-from advsearch.api.scene import Controls, Scene, as_controls, framed, load_scene, make_renderer
+from advsearch.api.scene import Controls, Scene, framed, load_scene, make_renderer, settings_of
 from advsearch.api.stages import Attack
 from advsearch.attacks import Objective, Policy, get_objective, make_policy
 from advsearch.attacks.goal import Goal
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
 from advsearch.config import AttackConfig
-from advsearch.controls import CONTROLS, make_space
+from advsearch.controls import make_space
 from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
-from advsearch.errors import InputError, UnknownNameError
+from advsearch.errors import InputError
 from advsearch.models import LabelSet, Model
 from advsearch.models.features import features_of
 from advsearch.progress import NullProgress, Progress
@@ -81,22 +81,21 @@ def attack(
         InputError: anything that the caller can put right; nothing is written then.
     """
     scene = _scene(scene, options)
-    instances, conditions = as_controls(controls), as_controls(over)
     described = {
         "object": scene.description.object_spec or scene.description.object.name,
         "environment": scene.description.environment_spec or scene.description.environment.name,
         "up": scene.description.up,
         "model": model if isinstance(model, str) else getattr(model, "name", None) or type(model).__name__,
-        "controls": {one.name: one.settings() for one in instances},
-        "over": {one.name: one.settings() for one in conditions},
+        "controls": settings_of(controls),
+        "over": settings_of(over),
         "objective": objective if isinstance(objective, str) else getattr(objective, "__name__", "custom"),
         "policy": policy if isinstance(policy, str) else policy.name,
         "set": _set_by(scene, options),
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
     check_objective(objective, targeted=config.target is not None, minimise=config.minimise)
-    instances = _budgeted(controls, instances, config)
-    job = _Job(config, scene, _model(model, config), instances, conditions, objective, policy, run is not None)
+    searched, drawn = _controls(config, controls, over)
+    job = _Job(config, scene, _model(model, config), searched, drawn, objective, policy, run is not None)
     if resume and run is not None and is_run(run_path(run)):
         return _go_on(job, run, progress or NullProgress())
     return _carry_out(job, progress or NullProgress())
@@ -163,17 +162,6 @@ def _set_by(scene: Scene, options: Mapping[str, Any]) -> dict[str, float]:
     return fixed
 
 
-def _budgeted(controls: Controls, instances: tuple[Control, ...], config: AttackConfig) -> tuple[Control, ...]:
-    """Controls that were given by name, with the run's `epsilon`, `norm` and `texture_resolution`."""
-    if not isinstance(controls, (str, Mapping)) and all(isinstance(one, Control) for one in controls):
-        if config.epsilon is not None:
-            raise InputError("epsilon: the controls are instances already; give each its own, as in TextureControl")
-        return instances
-    _check_budgets(config)
-    named = controls if isinstance(controls, Mapping) else {one.name: one.settings() for one in instances}
-    return as_controls({name: _control_settings(name, config, given or {}) for name, given in named.items()})
-
-
 # ---- from names to things -------------------------------------------------------------------------------------------
 
 
@@ -193,69 +181,28 @@ class _Job:
 
 def _job(config: AttackConfig) -> _Job:
     """Find and load everything that a configuration names."""
-    _check_budgets(config)
-    controls = as_controls({kind: _control_settings(kind, config, given) for kind, given in config.controls.items()})
-    over = as_controls(config.over)
+    searched, drawn = _controls(config, config.controls, config.over)
     check_objective(config.objective, targeted=config.target is not None, minimise=config.minimise)
     objective, policy = config.objective, make_policy(config.policy_name, **_policy_options(config))
     given = scene_settings(config.set_, config.exposure)
     scene = load_scene(config.object, config.environment, up=config.up, settings=given)
     model = _model(config.model, config)
-    return _Job(config, scene, model, controls, over, objective, policy, True)
+    return _Job(config, scene, model, searched, drawn, objective, policy, True)
+
+
+def _controls(
+    config: AttackConfig, searched: Controls, drawn: Controls
+) -> tuple[tuple[Control, ...], tuple[Control, ...]]:
+    """The controls that are searched and those that vary by chance, with the run's settings; only a search has a
+    budget."""
+    check_run_settings(config)
+    return controls_of(searched, config), controls_of(drawn, config, [one for one in RUN_SETTINGS if one != "epsilon"])
 
 
 def _model(model: Model | nn.Module | str | Path, config: AttackConfig) -> tuple[Model, list[str]]:
     """Load the model; its warnings become sentences of the run."""
     (loaded,), said = load_models([model], config)
     return loaded, said
-
-
-def instance_name(asked: str) -> str:
-    """The name of an instance as it is asked for: `key` of `light:key`, `camera` of `camera.azimuth`."""
-    kind, _, own = asked.partition(":")
-    return (own or kind).partition(".")[0]
-
-
-def _check_budgets(config: AttackConfig) -> None:
-    """Refuse a budget for a control that is not searched, or that has none."""
-    if config.epsilon is None:
-        return
-    if not isinstance(config.epsilon, dict):
-        without = [name for name, given in config.controls.items() if not _has_epsilon(name, given)]
-        if without and (config.epsilons or len(without) == len(config.controls)):
-            raise _no_epsilon(without[0])
-        return
-    known = {instance_name(asked): asked for asked in config.controls}
-    for name in config.epsilon:
-        if name not in known:
-            raise UnknownNameError("control in `epsilon`", name, known)
-        if not _has_epsilon(known[name], config.controls[known[name]]):
-            raise _no_epsilon(name)
-
-
-def _has_epsilon(asked: str, given: Mapping[str, Any]) -> bool:
-    kind = str(given.get("kind") or asked.partition(":")[0].partition(".")[0])
-    return kind not in CONTROLS or "epsilon" in {choice.name for choice in CONTROLS[kind].choices}
-
-
-def _no_epsilon(name: str) -> InputError:
-    return InputError(
-        f"`epsilon` {name}: the control has ranges and no epsilon; give its ranges, as in "
-        f"`controls` '{name}={{PARAMETER: [LOW, HIGH]}}'"
-    )
-
-
-def _control_settings(asked: str, config: AttackConfig, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of one control: its own over the run's `epsilon`, `norm` and `texture_resolution`."""
-    kind = str(given.get("kind") or asked.partition(":")[0].partition(".")[0])
-    if kind not in CONTROLS:
-        return dict(given)
-    known = {choice.name for choice in CONTROLS[kind].choices}
-    epsilon = config.epsilon_of(instance_name(asked))
-    shared = {"epsilon": epsilon, "norm": config.norm, "resolution": config.texture_resolution}
-    if kind != "texture":
-        shared = {"epsilon": epsilon}
-    return {**{name: value for name, value in shared.items() if name in known}, **given}
 
 
 def _policy_options(config: AttackConfig) -> dict[str, Any]:

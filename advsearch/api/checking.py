@@ -8,6 +8,7 @@ from typing import Any
 
 from advsearch import seeds
 from advsearch.api.attacking import problem_from_config
+from advsearch.api.naming import run_settings_for
 from advsearch.api.problem import Problem
 from advsearch.config import AttackConfig
 from advsearch.controls import CONTROLS
@@ -94,6 +95,7 @@ def _configurations(config: AttackConfig, everything: bool) -> Iterator[AttackCo
                 "environment": environment,
                 "controls": {control: {}},
                 "label": None,
+                **run_settings_for(config, control, {}),
             }
             yield config.model_copy(update=update)
 

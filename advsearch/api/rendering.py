@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from advsearch import seeds
-from advsearch.api.naming import load_models, scene_settings
+from advsearch.api.naming import check_run_settings, controls_of, load_models, scene_settings
 from advsearch.api.scene import Controls, Scene, as_controls, framed, load_scene, make_renderer
 from advsearch.config import RenderConfig
 from advsearch.config.rendering import PICTURE_SPP, PICTURES
@@ -185,7 +185,8 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
         if spec is not None and out.exists() and Path(spec).exists() and out.samefile(spec):
             raise InputError(f"out: would replace {spec}, which is read; choose another name")
     progress.stage("loading the scene and the model")
-    controls = as_controls(config.controls)
+    check_run_settings(config)
+    controls = controls_of(config.controls, config)
     given = scene_settings(config.set_, config.exposure)
     scene = load_scene(config.object, config.environment, up=config.up, settings=given)
     (model,), said = load_models([config.model], config)

@@ -127,6 +127,25 @@ def make_renderer(
     return Renderer(scene, space, formation, seed, motion=motion, estimators=estimators)
 
 
+def settings_of(controls: Controls) -> dict[str, dict[str, object]]:
+    """Return settings by name, as a file holds them, for controls in whatever form they were given.
+
+    Of a control that was given by its name it is what was said about it; of an instance, all of it.
+
+    Raises:
+        InputError: not controls at all, or two of one name.
+    """
+    if isinstance(controls, Mapping):
+        return {name: dict(given or {}) for name, given in controls.items()}
+    several = [part.strip() for part in controls.split(",")] if isinstance(controls, str) else list(controls)
+    as_controls(several)
+    return {
+        one.name if isinstance(one, Control) else one: one.settings() if isinstance(one, Control) else {}
+        for one in several
+        if one
+    }
+
+
 def as_controls(controls: Controls) -> tuple[Control, ...]:
     """Return control instances for whatever form they were given in.
 

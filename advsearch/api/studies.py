@@ -11,8 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from advsearch.api.attacking import attack_from_config, instance_name, resume_attack
-from advsearch.api.naming import different
+from advsearch.api.answers import one_label_for_several
+from advsearch.api.attacking import attack_from_config, resume_attack
+from advsearch.api.naming import check_run_settings, different, load_models, run_settings_for
 from advsearch.attacks import clopper_pearson, needed
 from advsearch.config import AttackConfig, GapConfig
 from advsearch.errors import InputError
@@ -22,6 +23,7 @@ from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, default_name, 
 from advsearch.runs.files import write_bytes
 from advsearch.runs.listing import finished
 from advsearch.runs.summary import read_summary
+from advsearch.scene.library import list_objects, load_object
 
 Summary = dict[str, Any]
 
@@ -64,6 +66,9 @@ def _study(config: Any, body: Callable[[Any, _Parts], Summary], progress: Progre
     begun = time.perf_counter()
     opened = RunDirectory.resume(resumed, config) if resumed is not None else RunDirectory.create_for(config)
     with opened as run:
+        said = _label_for_all(config)
+        for text in said:
+            progress.message(text)
         each = len(config.controls) if isinstance(config, GapConfig) else max(1, len(config.epsilons))
         parts = _Parts(run.path / PARTS, progress, len(config.objects) * each)
         answer = {
@@ -76,7 +81,7 @@ def _study(config: Any, body: Callable[[Any, _Parts], Summary], progress: Progre
             "model": config.model,
             "policy": config.policy_name,
             **body(config, parts),
-            "warnings": parts.warnings,
+            "warnings": [*said, *parts.warnings],
             "parts": parts.names,
             "ending": "interrupted" if parts.interrupted else "done",
             "seconds": {"total": time.perf_counter() - begun},
@@ -88,6 +93,16 @@ def _study(config: Any, body: Callable[[Any, _Parts], Summary], progress: Progre
             write_bytes(run.path / "images" / f"{config.command}.{suffix}", data)
         run.write_summary(answer)
         return answer
+
+
+def _label_for_all(config: AttackConfig) -> list[str]:
+    """What there is to say where several bundled objects have one label."""
+    if config.label is None or len(config.objects) < 2:
+        return []
+    bundled = list_objects()
+    own = {name: load_object(name).label if name in bundled else None for name in config.objects}
+    models, _ = load_models([config.model], config)
+    return one_label_for_several(models, config.label, own)
 
 
 class _Parts:
@@ -208,13 +223,12 @@ def _accuracy(rows: Sequence[Summary], epsilon: float | None) -> Summary:
 def _gap(config: GapConfig, parts: _Parts) -> Summary:
     if config.epsilons or config.smallest:
         raise InputError("advsearch gap: compares over one space; give one `epsilon`, and leave `smallest` out")
+    check_run_settings(config)
     rows = []
     for place, name in enumerate(different(config.objects, "object")):
         for number, (control, settings) in enumerate(config.controls.items()):
-            epsilon = config.epsilon
-            if isinstance(epsilon, dict):
-                epsilon = {own: value for own, value in epsilon.items() if own == instance_name(control)} or None
-            one = _as_attack(config, object=name, controls={control: settings}, epsilon=epsilon)
+            shared = run_settings_for(config, control, settings)
+            one = _as_attack(config, object=name, controls={control: settings}, **shared)
             summary = parts.attack(one, f"{place:02d}-{number:02d}-" + default_name(name, [control]))
             if summary is not None:
                 rows.append(_compared(name, control, summary))

@@ -8,9 +8,10 @@ from typing import Any
 
 from torch import nn
 
+from advsearch.api.answers import one_label_for_several
 from advsearch.api.attacking import LOADING
-from advsearch.api.naming import different, load_models, scene_settings
-from advsearch.api.scene import Controls, Scene, as_controls, load_scene
+from advsearch.api.naming import check_run_settings, controls_of, different, load_models, scene_settings
+from advsearch.api.scene import Controls, Scene, load_scene, settings_of
 from advsearch.api.sweeps.axes import read_axes
 from advsearch.api.sweeps.job import Job, Place, check_scenes
 from advsearch.api.sweeps.loop import SweepResult, carry_out
@@ -65,7 +66,7 @@ def sweep(
         raise InputError("scene: expected scenes from load_scene or names of objects, got some of each")
     described: dict[str, Any] = {
         "model": ",".join(_model_name(one) for one in networks),
-        "controls": {one.name: one.settings() for one in as_controls(controls)},
+        "controls": settings_of(controls),
         "grid": dict(grid or {}),
         "samples": samples,
     }
@@ -150,7 +151,8 @@ def _job_of(config: SweepConfig) -> Job:
 
 
 def _job(config: SweepConfig, places: Sequence[Place], models: Sequence[AnyModel], controls: Controls) -> Job:
-    drawn = as_controls(_with_texture_size(controls, config))
+    check_run_settings(config)
+    drawn = controls_of(controls, config)
     axes = read_axes(config.grid, drawn)
     if config.samples is not None and not drawn:
         raise InputError(
@@ -163,21 +165,13 @@ def _job(config: SweepConfig, places: Sequence[Place], models: Sequence[AnyModel
             "`controls=pose` `samples=100`"
         )
     samples = config.samples or (SAMPLES if drawn and not axes else 1)
-    networks, said = _models(models, config)
     check_scenes(places, drawn, axes)
+    networks, said = _models(models, config)
+    own = {place.object: place.scene.description.object.label for place in places}
+    said += one_label_for_several(networks, config.label, own)
     for place in places:
         said += [*place.scene.description.object.notes, *place.scene.description.environment.warnings]
     return Job(config, tuple(places), networks, drawn, axes, samples, tuple(dict.fromkeys(said)))
-
-
-def _with_texture_size(controls: Controls, config: SweepConfig) -> Controls:
-    """Give `--texture-resolution` to a texture that says nothing about it."""
-    if config.texture_resolution is None or not isinstance(controls, Mapping):
-        return controls
-    return {
-        name: {"resolution": config.texture_resolution, **given} if name == "texture" else given
-        for name, given in controls.items()
-    }
 
 
 def _places(config: SweepConfig) -> tuple[Place, ...]:

@@ -40,7 +40,9 @@ class AttackConfig(SceneConfig):
         f"a number greater than 0 and at most {LARGEST_EPSILON:g}",
         otherwise="the control's own",
     )
-    norm: Literal["linf", "l2"] = setting("linf", "search", "how that distance is measured", "linf or l2")
+    norm: Literal["linf", "l2"] | None = setting(
+        None, "search", "how that distance is measured", "linf or l2", otherwise="the control's own"
+    )
     estimators: dict[str, str] = setting(
         dict,
         "search",
@@ -224,12 +226,6 @@ class AttackConfig(SceneConfig):
     def trial_count(self) -> int:
         """Trials of each group in the verification."""
         return self.trials if self.trials is not None else TRIALS_OVER if self.over else TRIALS
-
-    def epsilon_of(self, control: str) -> float | None:
-        """The budget asked for one control by the name of its instance; None leaves it its own."""
-        if isinstance(self.epsilon, dict):
-            return self.epsilon.get(control)
-        return None if isinstance(self.epsilon, tuple) else self.epsilon
 
 
 def _positive(value: Any) -> float:

@@ -72,6 +72,12 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
     return control(**given)
 
 
+def names_of(asked: str, given: Mapping[str, object]) -> tuple[str, str]:
+    """Return the kind and the name of the instance that `make_control` makes of a name and settings."""
+    kind, name, _ = _read_name(asked, dict(given))
+    return kind, name
+
+
 def _read_name(asked: str, given: dict[str, object]) -> tuple[str, str, str | None]:
     """Return kind, instance name and single parameter; takes "kind" out of the settings."""
     kind, colon, name = asked.partition(":")
@@ -186,4 +192,5 @@ __all__ = [
     "gathered",
     "make_control",
     "make_space",
+    "names_of",
 ]

@@ -66,11 +66,20 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Choice:
-    """One setting of a control that is chosen, not searched (a norm, a resolution)."""
+    """One setting of a control that is chosen, not searched (a norm, a resolution).
+
+    Attributes:
+        name: short name.
+        default: what it is when nothing is said.
+        description: one sentence.
+        run_setting: the setting of a whole run that says it for all controls ("epsilon"), unless the control itself
+            says something else; empty if there is none.
+    """
 
     name: str
     default: float | str | None
     description: str
+    run_setting: str = ""
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ class EnvironmentControl(NumberControl):
         ),
     )
     choices: ClassVar[tuple[Choice, ...]] = (
-        Choice("epsilon", 0.5, "Radius of the ball of `harmonics`: L2 norm of all coefficients."),
+        Choice("epsilon", 0.5, "Radius of the ball of `harmonics`: L2 norm of all coefficients.", "epsilon"),
     )
 
     def check_choices(self) -> None:

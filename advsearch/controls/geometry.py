@@ -88,7 +88,7 @@ class GeometryControl(Control):
         ),
     )
     choices: ClassVar[tuple[Choice, ...]] = (
-        Choice("epsilon", DEFAULT_EPSILON, "Largest displacement of a vertex, in object sizes."),
+        Choice("epsilon", DEFAULT_EPSILON, "Largest displacement of a vertex, in object sizes.", "epsilon"),
         Choice("modes", DEFAULT_MODES, "Number of smooth modes (form modes)."),
         Choice("form", "modes", "What is searched: modes (a few smooth fields) or large-steps (every vertex)."),
     )

@@ -63,7 +63,7 @@ class PatchControl(Control):
         name: the instance's name.
         pixels: [low, high] narrows the colours that are searched; a number makes the patch a plain grey.
         resolution: side of the patch in pixels, 2 to 512.
-        norm: "box", "linf" or "l2".
+        norm: "box", "linf" or "l2"; None takes box, or linf where there is an epsilon.
         epsilon: radius of the ball that the pixels stay in, for linf and l2; None takes the norm's default.
         picture: path of a picture to stick on as it is.
         **numbers: azimuth, height, size and rotation: a number, a range or a list; fixed where not given.
@@ -133,8 +133,14 @@ class PatchControl(Control):
     )
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice("resolution", 32, "Side of the patch in pixels."),
-        Choice("norm", "box", "How far pixels may go: box (anywhere), linf or l2 (a ball around what is underneath)."),
-        Choice("epsilon", None, "Radius of that ball, display-referred; by default 0.1 a pixel value."),
+        Choice(
+            "norm",
+            "box",
+            "How far pixels may go: box (anywhere), linf (the default with an epsilon) or l2 (a ball around what is "
+            "underneath).",
+            "norm",
+        ),
+        Choice("epsilon", None, "Radius of that ball, display-referred; by default 0.1 a pixel value.", "epsilon"),
         Choice("picture", None, "A picture file to stick on as it is; the pixels are not searched then."),
     )
 
@@ -144,13 +150,14 @@ class PatchControl(Control):
         *,
         pixels: object = None,
         resolution: int = 32,
-        norm: str = "box",
+        norm: str | None = None,
         epsilon: float | None = None,
         picture: str | None = None,
         **numbers: object,
     ) -> None:
         self.name = name or self.kind
-        self.resolution, self.norm, self.epsilon, self.picture = resolution, norm, epsilon, picture
+        self.resolution, self.epsilon, self.picture = resolution, epsilon, picture
+        self.norm = norm or ("box" if epsilon is None else "linf")
         self._check_choices()
         self._placement = _Placement(self.name, **numbers)
         self._pixels_given = pixels

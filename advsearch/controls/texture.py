@@ -123,9 +123,18 @@ class TextureControl(Control):
         ),
     )
     choices: ClassVar[tuple[Choice, ...]] = (
-        Choice("epsilon", DEFAULT_EPSILON, "Radius of the ball around the original texture, display-referred."),
-        Choice("norm", "linf", "Norm of the ball: linf (per texel value) or l2 (Euclidean, over all texel values)."),
-        Choice("resolution", None, "Side of the searched texture in texels; by default the object's own, 256 to 512."),
+        Choice(
+            "epsilon", DEFAULT_EPSILON, "Radius of the ball around the original texture, display-referred.", "epsilon"
+        ),
+        Choice(
+            "norm", "linf", "Norm of the ball: linf (per texel value) or l2 (Euclidean, over all texel values).", "norm"
+        ),
+        Choice(
+            "resolution",
+            None,
+            "Side of the searched texture in texels; by default the object's own, 256 to 512.",
+            "texture_resolution",
+        ),
         Choice("form", "texels", "What is searched: texels, palette (a few colours) or waves (smooth patterns)."),
         Choice("colors", 6, "Number of colours of the palette."),
         Choice("waves", 8, "Number of waves along each side of the texture."),

@@ -1,0 +1,160 @@
+"""A setting of the whole run reaches every control that declares it, by whatever name and in whatever command."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+import advsearch
+from advsearch.api import attacking, rendering
+from advsearch.api.naming import RUN_SETTINGS, check_run_settings, controls_of
+from advsearch.api.studies import gap_from_config
+from advsearch.api.sweeping import _job_of
+from advsearch.cli.flags import with_flags
+from advsearch.config import AttackConfig, GapConfig, RenderConfig, SweepConfig
+from advsearch.controls import CONTROLS
+from advsearch.controls.patch import PatchControl
+from advsearch.controls.pose import PoseControl
+from advsearch.controls.texture import TextureControl
+from advsearch.errors import InputError, UnknownNameError
+
+ALL: dict[str, Any] = {"epsilon": 0.07, "norm": "l2", "texture_resolution": 16}
+
+
+def settings(controls: Any, **options: Any) -> dict[str, dict[str, object]]:
+    """Settings of the controls of an attack, by the name of the instance."""
+    config = AttackConfig(object="mug", controls=controls, **options)
+    return {one.name: one.settings() for one in controls_of(config.controls, config)}
+
+
+def test_controls_declare_settings_that_a_run_has() -> None:
+    declared = {choice.run_setting for kind in CONTROLS for choice in CONTROLS[kind].choices} - {""}
+    assert declared == set(RUN_SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("asked", "name"),
+    [
+        ("texture", "texture"),
+        ("texture:label", "label"),
+        ("texture.palette", "texture"),
+        ("texture.texels:label", "label"),
+    ],
+)
+def test_a_control_takes_the_settings_of_the_run_whatever_its_name(asked: str, name: str) -> None:
+    found = settings({asked: {}}, **ALL)[name]
+    assert (found["epsilon"], found["norm"], found["resolution"]) == (0.07, "l2", 16)
+
+
+def test_a_control_of_a_file_takes_them_by_its_kind() -> None:
+    found = settings({"label": {"kind": "texture"}, "mine": {"kind": "patch"}}, **ALL)
+    assert (found["label"]["epsilon"], found["label"]["norm"], found["label"]["resolution"]) == (0.07, "l2", 16)
+    assert found["mine"] == {"kind": "patch", "epsilon": 0.07, "norm": "l2"}
+
+
+def test_what_a_control_says_itself_goes_over_the_run() -> None:
+    found = settings({"texture": {"epsilon": 0.5}, "patch": {"norm": "linf", "resolution": 8}}, **ALL)
+    assert (found["texture"]["epsilon"], found["texture"]["norm"]) == (0.5, "l2")
+    assert found["patch"] == {"epsilon": 0.07, "norm": "linf", "resolution": 8}
+
+
+def test_an_epsilon_for_one_control_leaves_the_others_their_own() -> None:
+    found = settings("texture,geometry,texture:label", epsilon="geometry=0.02,label=0.3")
+    assert (found["texture"]["epsilon"], found["geometry"]["epsilon"], found["label"]["epsilon"]) == (None, 0.02, 0.3)
+
+
+@pytest.mark.parametrize(("norm", "expected"), [(None, "linf"), ("linf", "linf"), ("l2", "l2")])
+def test_a_patch_takes_an_epsilon_in_the_norm_of_the_run(norm: str | None, expected: str) -> None:
+    found = settings("patch", epsilon=0.1, norm=norm)["patch"]
+    assert (found["epsilon"], found["norm"]) == (0.1, expected)
+    assert PatchControl().norm == "box", "without an epsilon its pixels may go anywhere"
+
+
+# ---- every command --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "controls", [["texture"], "texture", ("texture",), {"texture": {}}, {"texture:texture": {}}, ["texture", "pose"]]
+)
+def test_python_gives_controls_the_settings_of_the_run(controls: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(attacking, "_carry_out", lambda job, progress: job)
+    job: Any = advsearch.attack("mug", controls=controls, **ALL)
+    again = controls_of(job.config.controls, job.config)
+    for texture in (job.controls[0], again[0]):
+        assert (texture.epsilon, texture.norm, texture.resolution) == (0.07, "l2", 16)
+
+
+def test_what_varies_by_chance_takes_all_but_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(attacking, "_carry_out", lambda job, progress: job)
+    job: Any = advsearch.attack("mug", controls=["geometry"], over=["texture:label"], **ALL)
+    assert job.controls[0].epsilon == 0.07
+    assert (job.over[0].epsilon, job.over[0].norm, job.over[0].resolution) == (None, "l2", 16)
+
+
+@pytest.mark.parametrize("asked", ["texture", "texture:label", {"label": {"kind": "texture"}}])
+def test_a_sweep_and_a_render_give_every_texture_its_resolution(asked: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = _job_of(SweepConfig(object="mug", controls=asked, texture_resolution=16))
+    assert [one.resolution for one in job.controls if isinstance(one, TextureControl)] == [16]
+
+    def rendered(scene: Any, model: Any, *, controls: Any, **more: Any) -> None:
+        raise InterruptedError(controls[0].resolution)
+
+    monkeypatch.setattr(rendering, "render", rendered)
+    config = RenderConfig(object="mug", controls=asked, texture_resolution=16, out="a.png")
+    with pytest.raises(InterruptedError, match="16"):
+        rendering.render_from_config(config)
+
+
+def test_a_gap_gives_each_control_what_it_takes(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    seen = []
+
+    monkeypatch.setattr("advsearch.api.studies._Parts.attack", lambda self, config, name: _seen(config, seen))
+    config = GapConfig(object="mug", controls="texture,pose,geometry", run=str(tmp_path / "gap"), **ALL)
+    gap_from_config(config)
+    assert seen == [(0.07, "l2", 16), (None, None, None), (0.07, None, None)]
+
+
+def _seen(config: AttackConfig, seen: list[Any]) -> None:
+    check_run_settings(config)
+    seen.append((config.epsilon, config.norm, config.texture_resolution))
+
+
+# ---- what nobody takes ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("controls", "options", "message"),
+    [
+        ("pose", {"epsilon": 0.1}, "--epsilon pose: the control has ranges and no epsilon; give its ranges, as in"),
+        (
+            "pose,lens",
+            {"norm": "l2"},
+            "--norm: pose has none, and no other control is there that has one; leave it out",
+        ),
+        ("patch", {"texture_resolution": 8}, "--texture-resolution: patch has none"),
+        ("texture,pose", {"epsilon": "pose=1"}, "--epsilon pose: the control has ranges and no epsilon"),
+        ("texture,pose", {"epsilon": (0.1, 0.2)}, "--epsilon pose: the control has ranges and no epsilon"),
+    ],
+)
+def test_a_setting_that_no_control_takes_is_refused(controls: str, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError) as error:
+        check_run_settings(AttackConfig(object="mug", controls=controls, **options))
+    assert with_flags(str(error.value)).startswith(message)
+
+
+def test_an_epsilon_for_a_control_that_is_not_there_is_refused() -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown control in --epsilon 'texure'\. Did you mean 'texture'"):
+        try:
+            check_run_settings(AttackConfig(object="mug", epsilon="texure=1"))
+        except UnknownNameError as error:
+            error.args = (with_flags(str(error)),)
+            raise
+
+
+@pytest.mark.parametrize("setting", RUN_SETTINGS)
+def test_an_instance_says_its_own(setting: str) -> None:
+    config = AttackConfig(object="mug", **{setting: ALL[setting]})
+    with pytest.raises(InputError, match=rf"{setting}: control texture is an instance already; give it its own"):
+        controls_of([PoseControl(), TextureControl()], config)
+    assert controls_of([PoseControl()], config)[0].name == "pose"
