@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-import re
 import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,6 +17,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
+from advsearch.files import read_text
+from advsearch.yaml_text import LARGEST, parse_yaml
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -31,31 +32,11 @@ HEADER = "# A run of advsearch. To repeat it: advsearch run FILE\n"
 PLACE: dict[str, Any] = {"run": None, "overwrite": False}
 """The settings that say where a run is kept, not what it does, as a repetition has them."""
 
+MOST_BASES = 4
+"""Most files that a `base` names, and most that are one another's base."""
+
 FILES = ("object", "environment", "model", "labels")
 """The settings that may name files."""
-
-
-class _Loader(yaml.SafeLoader):  # type: ignore[misc, unused-ignore]
-    """YAML as its safe loader reads it, but without numbers to the base of 60: 0:360:24 is text."""
-
-
-_Loader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in found if tag not in ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")]
-    for first, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:int",
-    re.compile(r"^(?:[-+]?0b[0-1_]+|[-+]?0[0-7_]*|[-+]?[1-9][0-9_]*|[-+]?0x[0-9a-fA-F_]+)$"),
-    list("-+0123456789"),
-)
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(
-        r"^(?:[-+]?[0-9][0-9_]*\.[0-9_]*(?:[eE][-+][0-9]+)?|\.[0-9][0-9_]*(?:[eE][-+][0-9]+)?"
-        r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$"
-    ),
-    list("-+0123456789."),
-)
 
 
 class SettingsError(InputError):
@@ -254,18 +235,17 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
         FileFormatError: the file is missing, empty, not text, not YAML or not a mapping with names as keys.
     """
     try:
-        data = yaml.load(Path(path).read_text(encoding="utf-8"), _Loader)
+        data = parse_yaml(read_text(Path(path), "a YAML file", LARGEST))
     except OSError as error:
         raise FileFormatError(f"{path}: expected a YAML file, got {error.strerror}; check the path") from None
-    except UnicodeDecodeError:
-        raise FileFormatError(f"{path}: expected a YAML file in UTF-8, got bytes that are not text") from None
-    except yaml.YAMLError as error:
-        raise FileFormatError(f"{path}: expected YAML, got {' '.join(str(error).split())}; correct the file") from None
+    except ValueError as error:
+        raise FileFormatError(f"{path}: expected YAML, got {error}; correct the file") from None
     if not isinstance(data, dict) or not all(isinstance(name, str) for name in data):
         got = "an empty file" if data is None else type(data).__name__
         raise FileFormatError(f"{path}: expected settings and values such as 'object: mug', got {got}")
     if data.get("schema", SCHEMA) != SCHEMA:
-        raise FileFormatError(f"{path}: expected schema {SCHEMA}, got {data['schema']!r}; it is of another advsearch")
+        got = _shown(data["schema"])
+        raise FileFormatError(f"{path}: expected schema {SCHEMA}, got {got}; it is of another advsearch")
     return _with_base(data, Path(path), above)
 
 
@@ -284,8 +264,10 @@ def _with_base(data: dict[str, Any], path: Path, above: tuple[Path, ...]) -> dic
     bases = data.pop("base", None) or []
     bases = [bases] if isinstance(bases, str) else bases
     if not isinstance(bases, list) or not all(isinstance(one, str) for one in bases):
-        raise FileFormatError(f"{path}: base: expected a file or a list of files, got {bases!r}")
+        raise FileFormatError(f"{path}: base: expected a file or a list of files, got {_shown(bases)}")
     here = path.resolve()
+    if len(above) >= MOST_BASES or len(bases) > MOST_BASES:
+        raise FileFormatError(f"{path}: base: expected at most {MOST_BASES} files, one over the other, got more")
     if bases and here in above:
         raise FileFormatError(f"{path}: base: the file is a base of itself; take it out of one of them")
     result: dict[str, Any] = {}
@@ -308,8 +290,8 @@ def parse_assignment(text: str, where: str) -> tuple[str, Any]:
     if not (separator and name.strip()):
         raise InputError(f"{where}: expected NAME=VALUE such as camera.azimuth=130, got {text!r}")
     try:
-        return name.strip(), yaml.load(value, _Loader) if value.strip() else ""
-    except yaml.YAMLError:
+        return name.strip(), parse_yaml(value) if value.strip() else ""
+    except ValueError:
         return name.strip(), value.strip()
 
 

@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCES = {"advsearch": ROOT / "advsearch", "advsearch.bundled": ROOT / "scenes"}
 
 RENDERER = {"mitsuba", "drjit", "mitsuba_oidn"}
-COMMON = {"errors", "files", "registry", "seeds", "threads", "progress"}
+COMMON = {"errors", "files", "registry", "seeds", "threads", "progress", "yaml_text"}
 """Small modules that anyone may import and that import nobody but each other."""
 
 
@@ -44,6 +44,7 @@ class Rule:
 HEAVY = frozenset(RENDERER | {"torch"})
 RULES = {
     **{name: Rule(set(), {"numpy"}, HEAVY) for name in COMMON},
+    "yaml_text": Rule(set(), {"yaml"}),
     "settings": Rule(set(), {"pydantic", "yaml", "typing_extensions"}),  # the last for the type checker only
     "config": Rule({"settings"}, {"pydantic", "yaml"}),
     "scene": Rule(set()),

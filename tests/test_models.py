@@ -455,7 +455,7 @@ def test_label_files(tmp_path: Path, name: str, text: str) -> None:
         ("a.json", b'["mug", 3]', "for class 1, got 3"),
         ("a.json", b"[]", "got an empty list"),
         ("a.txt", b"mug\n\nbowl\n", "for class 1, got ''"),
-        ("a.txt", b"\xff\xfe\x00", "expected UTF-8 text or JSON"),
+        ("a.txt", b"\xff\xfe\x00", "expected a label file in UTF-8"),
         ("a.txt", b"mug\nbowl\n", "2 labels, but model Tiny has 3 classes"),
     ],
 )

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import io
+import os
 import sys
 from pathlib import Path
 from typing import Any
 
 from advsearch.cli import output
+from advsearch.cli.screen import output_errors
 from advsearch.errors import InputError
 
 HELP = "write a run's evaluated configurations as a table: CSV, JSON or Parquet"
@@ -49,14 +52,17 @@ def run(args: argparse.Namespace) -> int:
     format = args.format or otherwise
     if args.json and out is None and format != "json":
         raise InputError(f"--json: prints JSON, but --format asks for {format}; leave one of them out")
-    if out is not None and out.is_dir():
+    if out is not None and os.path.isdir(out):
         raise InputError(f"--out: expected the name of a file, got the folder {out}")
     folder = find_run(args.run)
     if (folder / PARTS).is_dir():
         parts = ", ".join(str(one) for one in sorted((folder / PARTS).iterdir()))
         raise InputError(f"{folder}: is a study, whose rows are those of its parts; export one of {parts}")
-    with Store(folder / NAME, read_only=True) as store:
-        count = export(store, format, out, sys.stdout.buffer, args.kind)
+    on_screen = io.BytesIO() if out is None and sys.stdout.isatty() else None
+    with Store(folder / NAME, read_only=True) as store, output_errors():
+        count = export(store, format, out, on_screen or sys.stdout.buffer, args.kind)
+    if on_screen is not None:
+        print(on_screen.getvalue().decode("utf-8", "replace"), end="")
     if out is not None and args.json:
         output.print_json({"schema": 1, "command": "export", "rows": count, "format": format, "out": str(out)})
     elif out is not None:

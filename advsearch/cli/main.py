@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import os
 import re
+import signal
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from types import ModuleType
+from types import FrameType, ModuleType
 from typing import NoReturn
 
 from advsearch import __version__
+from advsearch.cli.screen import end_output, open_descriptors, screens, shortened
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 
 COMMANDS = {
@@ -62,7 +63,45 @@ class Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. An exception that is a bug of ours passes through."""
-    given = list(sys.argv[1:] if argv is None else argv)
+    interrupts = Interrupts()
+    if argv is None:  # this process is ours
+        open_descriptors()
+        signal.signal(signal.SIGINT, interrupts)
+    with screens():
+        status = _status(list(sys.argv[1:] if argv is None else argv), interrupts)
+        if argv is None:  # what is left is the end of the process, which no further Ctrl-C hastens
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+        end_output()
+    return status
+
+
+class Interrupts:
+    """A handler of Ctrl-C as Python's own, which counts."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Take a signal."""
+        self.count += 1
+        raise KeyboardInterrupt
+
+
+def _status(given: list[str], interrupts: Interrupts) -> int:
+    """Run one command, print what went wrong, and return the exit status."""
+    try:
+        return _run_and_tell(given)
+    except BaseException as error:
+        # Modules that are being imported, and native code, make other errors of an interrupt.
+        if not interrupts.count and not isinstance(error, KeyboardInterrupt):
+            raise
+        with suppress(KeyboardInterrupt):  # one more
+            print("advsearch: interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _run_and_tell(given: list[str]) -> int:
+    """Run one command and return the exit status; what the input is to blame for is printed."""
     try:
         status = _run(given)
         sys.stdout.flush()
@@ -70,13 +109,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except AdvsearchError as error:
         from advsearch.cli.flags import with_flags
 
-        print(f"advsearch: error: {with_flags(str(error))}", file=sys.stderr)
+        print(f"advsearch: error: {shortened(with_flags(str(error)))}", file=sys.stderr)
         return BAD_INPUT
-    except KeyboardInterrupt:
-        print("advsearch: interrupted", file=sys.stderr)
-        return INTERRUPTED
     except BrokenPipeError:
-        _close_output()
         return OK
 
 
@@ -132,12 +167,6 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
 
 def _module(path: str) -> ModuleType:
     return importlib.import_module(path)
-
-
-def _close_output() -> None:
-    """Point standard output at nothing, so that the interpreter's own flush at exit doesn't complain."""
-    with suppress(OSError, ValueError, AttributeError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 if __name__ == "__main__":

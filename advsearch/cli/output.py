@@ -23,7 +23,13 @@ def print_json(value: Any) -> None:
     """Print `value` as JSON on standard output; NaN and infinity become null."""
     from advsearch.runs.summary import plain
 
-    print(json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False))
+    text = json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False)
+    print("".join(sign if sign.isprintable() or sign == "\n" else _json_escape(sign) for sign in text))
+
+
+def _json_escape(sign: str) -> str:
+    """What a terminal would not show, as JSON escapes it."""
+    return "\\u007f" if sign == "\x7f" else json.dumps(sign)[1:-1]
 
 
 def finish(summary: Mapping[str, Any], answer: Callable[[Any], str], *, as_json: bool) -> int:

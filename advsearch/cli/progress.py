@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, TextIO
 
 from advsearch.cli.flags import with_flags
 from advsearch.cli.output import output_kept_clean
+from advsearch.cli.screen import printable, raw
 from advsearch.progress import NullProgress, Progress
 
 if TYPE_CHECKING:
@@ -118,21 +119,23 @@ class BarProgress:
         self._end_stage()
         if hint and hint not in self._hinted:
             self._hinted.add(hint)
-            self._bars.console.print(f"{name}: {with_flags(hint)}", style="dim", markup=False, highlight=False)
+            self._bars.console.print(
+                printable(f"{name}: {with_flags(hint)}"), style="dim", markup=False, highlight=False
+            )
         self._shown = ""
-        self._task = self._bars.add_task(name, total=total, info="", at_most=at_most)
+        self._task = self._bars.add_task(printable(name), total=total, info="", at_most=at_most)
         for task in self._bars.tasks[:-MOST_BARS]:
             self._bars.update(task.id, visible=False)
 
     def advance(self, n: int = 1, **info: float | str) -> None:
         """See `Progress.advance`."""
         if self._task is not None:
-            self._shown = _info(info) if info else self._shown
+            self._shown = printable(_info(info)) if info else self._shown
             self._bars.update(self._task, advance=n, info=self._shown)
 
     def message(self, text: str) -> None:
         """See `Progress.message`."""
-        self._bars.console.print(with_flags(text), markup=False, highlight=False)
+        self._bars.console.print(printable(with_flags(text)), markup=False, highlight=False)
 
     def _end_stage(self) -> None:
         """Fill the bar of a stage whose length was unknown, or that ended early, and stop its clock."""
@@ -198,7 +201,7 @@ def _bars() -> Iterator[Bars]:
             return Text(", ".join(part for part in (count, times, task.fields["info"]) if part))
 
     columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=20), Counted())
-    with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
+    with Bars(*columns, console=Console(file=raw(sys.stderr)), transient=True) as bars:
         yield bars
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     from advsearch.runs.listing import listed
 
     folder = HOME if args.folder is None else Path(args.folder)
-    if args.folder is not None and not folder.is_dir():
+    if args.folder is not None and not os.path.isdir(folder):
         raise InputError(f"{folder}: expected a folder with runs in it, got no such folder")
     found = listed(folder)
     if args.json:

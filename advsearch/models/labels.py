@@ -10,6 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.errors import FileFormatError, InputError, resembling
+from advsearch.files import parse_json, read_text
+
+LARGEST = 16 << 20
+"""Most bytes of a label file."""
+
+LONGEST = 1000
+"""Most characters of a label name; those of ImageNet have up to 130."""
 
 MOST_SUGGESTIONS = 4
 """Labels that a message suggests for an unknown one."""
@@ -172,9 +179,7 @@ def fitting_labels(classes: int, labels: tuple[str, ...] | None, source: str, mo
 
 def _read_file(path: Path) -> tuple[str, ...]:
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise FileFormatError(f"label file {path}: expected UTF-8 text or JSON, got other bytes") from None
+        text = read_text(path, "a label file", LARGEST)
     except OSError as error:
         raise FileFormatError(f"label file {path}: cannot be read ({error.strerror or error})") from None
     if not text.strip():
@@ -191,9 +196,11 @@ def _read_file(path: Path) -> tuple[str, ...]:
 
 def _from_json(path: Path, text: str) -> list[Any]:
     try:
-        data = json.loads(text)
+        data = parse_json(text)
     except json.JSONDecodeError as error:
         raise FileFormatError(f"label file {path}: not valid JSON (line {error.lineno}: {error.msg})") from None
+    except ValueError as error:
+        raise FileFormatError(f"label file {path}: expected label names, got {error}") from None
     if isinstance(data, list):
         return data
     if not isinstance(data, dict):
@@ -212,5 +219,7 @@ def _problem(names: Sequence[Any]) -> str:
         return "expected label names, got an empty list"
     for index, name in enumerate(names):
         if not isinstance(name, str) or not name.strip():
-            return f"expected a name (non-empty text) for class {index}, got {name!r}"
+            return f"expected a name (non-empty text) for class {index}, got {repr(name)[:60]}"
+        if len(name) > LONGEST:
+            return f"expected a name of at most {LONGEST} characters for class {index}, got {len(name):,}"
     return ""

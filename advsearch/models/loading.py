@@ -125,7 +125,7 @@ def _find(spec: object) -> Source | Model:
         raise InputError(f"model {text!r}: write {text.replace('.py:', ':')!r}, without the '.py'")
     if re.fullmatch(r"[^\W\d][\w.]*:[^\W\d][\w.]*(@.+)?", text):
         return imported.load_callable(text)
-    if Path(text).suffix.lower() in files.SUFFIXES or "/" in text or os.sep in text or Path(text).exists():
+    if Path(text).suffix.lower() in files.SUFFIXES or "/" in text or os.sep in text or os.path.exists(text):
         return files.load_file(Path(text))
     raise UnknownNameError("model", text, ["reference", "torchvision:NAME"], FORMS)
 

@@ -14,8 +14,10 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import FileFormatError, InputError, RunExistsError, UnknownNameError
+from advsearch.files import open_regular
 from advsearch.runs import images, lock, replay, store, summary
 from advsearch.runs.files import PART, replacing, storage_errors, write_text
+from advsearch.yaml_text import LARGEST
 
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
@@ -294,7 +296,7 @@ def find_run(run: str | Path) -> Path:
         UnknownNameError: there is none; the message lists the runs here.
     """
     for path in (Path(run).expanduser(), run_path(run)):
-        folder = path.parent if path.name in CONTENTS and path.is_file() else path
+        folder = path.parent if path.name in CONTENTS and os.path.isfile(path) else path
         if is_run(folder):
             return folder
     known = (path.name for path in HOME.glob("*") if is_run(path))
@@ -308,9 +310,9 @@ def is_run(path: Path) -> bool:
     from advsearch.settings import HEADER
 
     try:
-        with (path / CONFIG).open("rb") as file:
+        with open_regular(path / CONFIG, "a run.yaml", LARGEST) as file:
             return file.read(len(HEADER)) == HEADER.encode()
-    except OSError:
+    except (OSError, FileFormatError):
         return False
 
 
@@ -321,7 +323,9 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
         RunExistsError: there is something, and `overwrite` is not given or does not apply.
     """
     path = run_path(run)
-    if path.exists() and not path.is_dir():
+    if "\0" in str(path):
+        raise InputError(f"expected a name or a folder for the run, got {str(path)!r} with a zero byte in it")
+    if os.path.exists(path) and not path.is_dir():
         raise RunExistsError(f"{path}: expected a folder for the run, got a file; choose another name with `run`")
     with storage_errors(path):
         bare = not path.exists() or all(_is_leftover(found) for found in path.iterdir())

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sqlite3
 import time
 from collections.abc import Iterable, Iterator, Mapping
@@ -19,10 +20,14 @@ from types import TracebackType
 from typing import Any, final
 
 from advsearch.errors import FileFormatError
+from advsearch.files import open_regular
 from advsearch.runs.files import storage_errors
 from advsearch.runs.summary import plain
 
 NAME = "results.sqlite"
+
+LARGEST = 64 << 30
+"""Most bytes of it."""
 
 APPLICATION_ID = 0x41445653
 """In the header of every results.sqlite that is ours: "ADVS"."""
@@ -199,9 +204,9 @@ class Store:
 def is_ours(path: Path) -> bool:
     """Return whether the file at `path` starts like a results.sqlite of advsearch."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path, "a results.sqlite", LARGEST) as file:
             header = file.read(72)
-    except OSError:
+    except (OSError, FileFormatError):
         return False
     return header[:15] == b"SQLite format 3" and header[68:72] == APPLICATION_ID.to_bytes(4, "big")
 
@@ -226,7 +231,7 @@ def _make(db: sqlite3.Connection) -> None:
 
 def _connect_to_read(path: Path) -> sqlite3.Connection:
     """Open the file for reading; where the log's index can't be made (a read-only disk), as one that never changes."""
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise FileFormatError(f"{path}: expected the results of a run, got no such file; check the name of the run")
     address = path.resolve().as_uri()
     db = sqlite3.connect(f"{address}?mode=ro", uri=True)

@@ -11,11 +11,15 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.errors import FileFormatError
+from advsearch.files import parse_json, read_text
 from advsearch.runs.files import write_text
 
 NAME = "summary.json"
 
 SCHEMA = 1
+
+LARGEST = 64 << 20
+"""Most bytes of a summary."""
 
 _ORDER = (
     "schema",
@@ -89,7 +93,7 @@ def read_summary(folder: Path) -> dict[str, Any]:
     """
     path = folder / NAME
     try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
+        summary = parse_json(read_text(path, "the summary of a run", LARGEST))
     except FileNotFoundError:
         raise FileFormatError(f"{path}: expected the summary of a run, got no such file; did the run end?") from None
     except (OSError, ValueError) as error:

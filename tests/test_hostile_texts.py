@@ -1,0 +1,227 @@
+"""YAML, label files, names and the terminal: limits, types, and characters that steer a terminal."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from advsearch.cli.main import main
+from advsearch.cli.screen import printable, shortened
+from advsearch.errors import FileFormatError
+from advsearch.models import read_labels
+from advsearch.settings import parse_assignment, read_yaml
+from advsearch.yaml_text import parse_yaml
+
+ESCAPES = "\x1b]0;title\x07\x9b31m\x7f\u202e\r"
+
+
+def aliases(levels: int, merge: bool) -> str:
+    """Text that is small in the file and has 9 to the power of `levels` values in memory."""
+    lines = ["a: &a {k: 1}" if merge else "a: &a [x, x]"]
+    for level in range(levels):
+        name, inner = chr(98 + level), ", ".join([f"*{chr(97 + level)}"] * 9)
+        lines.append(f"{name}: &{name}\n  <<: [{inner}]" if merge else f"{name}: &{name} [{inner}]")
+    return "\n".join(lines)
+
+
+YAML = {
+    "many digits": "seed: " + "1" * 6000,
+    "many hexadecimal digits": "seed: 0x" + "f" * 6000,
+    "a binary number without digits": "seed: 0b_",
+    "a hexadecimal number without digits": "seed: 0x_",
+    "an empty number": "seed: !!int ''",
+    "a date that does not exist": "seed: 2026-02-30",
+    "a date by tag": "seed: !!timestamp 2026-99-99",
+    "a number by tag": "seed: !!int abc",
+    "a truth value by tag": "seed: !!bool maybe",
+    "a Python object": "seed: !!python/object/apply:os.mkdir [executed]",
+    "nested lists": "seed: " + "[" * 100_000,
+    "closed nested lists": "seed: " + "[" * 200 + "]" * 200,
+    "aliases": aliases(12, merge=False),
+    "merged aliases": aliases(12, merge=True),
+    "an alias of itself": "seed: &a [*a]",
+    "a long list": "seed: [" + "x," * 200_000 + "x]",
+    "a long text": "seed: " + "x" * 600_000,
+    "a zero byte": "seed: \0",
+    "an unhashable key": "{[a]: 1}",
+    "a list as key": "controls: {? [a] : 1}",
+    "a number as key": "set: {1: 2}",
+    "a long name": "x" * 5000 + ": 1",
+    "a long value": "policy: " + "x" * 5000,
+    "a long object": "object: " + "x" * 5000,
+    "a long base": "base: " + "x" * 5000,
+    "a base with a zero byte": 'base: "a\\0b"',
+    "many bases": "base: [" + "x.yaml," * 1000 + "]",
+    "a base that is a device": "base: /dev/zero",
+    "a base that is a folder": "base: .",
+    "a name that steers the terminal": '"\\e[2J": 1',
+    "an object that steers the terminal": 'object: "\\e]0;title\\a"',
+    "a command of another type": "command: [1]",
+    "a schema of another type": "schema: {a: 1}",
+}
+
+
+@pytest.mark.parametrize("case", YAML)
+def test_yaml_files_are_refused_in_one_short_sentence(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("run.yaml").write_text(YAML[case])
+    began = time.process_time()
+    assert main(["run", "run.yaml", "--run", "out", "--quiet"]) == 2
+    assert time.process_time() - began < 10
+    captured = capsys.readouterr()
+    assert captured.err.startswith("advsearch: error: ") and captured.err.count("\n") == 1
+    assert len(captured.err) < 900 and captured.err.strip().isprintable() and captured.out == ""
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.yaml"]
+
+
+def test_a_base_in_a_pipe_is_refused(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.yaml")
+    (tmp_path / "run.yaml").write_text("base: pipe.yaml\n")
+    with pytest.raises(FileFormatError, match=r"pipe.yaml: expected a YAML file, got a pipe"):
+        read_yaml(tmp_path / "run.yaml")
+
+
+def test_numbers_and_dates_of_yaml() -> None:
+    text = "[-5, +0b101, -0x1F, 017, 1_000, 2026-11-22, 0:360:24, 0b_, '5', 09]"
+    assert parse_yaml(text) == [-5, 5, -31, 15, 1000, "2026-11-22", "0:360:24", "0b_", "5", "09"]
+    assert parse_yaml("- &x {a: 1}\n- <<: *x\n  b: 2") == [{"a": 1}, {"a": 1, "b": 2}]
+
+
+def test_what_is_no_yaml_on_the_command_line_is_text() -> None:
+    for value in ("!!int ''", "1" * 6000, "[" * 5000):
+        assert parse_assignment(f"run={value}", "--set") == ("run", value)
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        (b"[" * 100_000, "nested deeper than 100"),
+        (b"[" + b"1" * 6000 + b"]", "a whole number of 6000 digits"),
+        (json.dumps(["x" * 5000]).encode(), "at most 1000 characters for class 0, got 5,000"),
+        (b'["' + b"x" * (17 << 20) + b'"]', r"at most 16,777,216 bytes, got .*ADVSEARCH_LIMITS"),
+        (b"[[1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20]]", "for class 0, got"),
+    ],
+)
+def test_label_files_have_limits(content: bytes, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "labels.json"
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match=message) as caught:
+        read_labels(path)
+    assert len(str(caught.value)) < 300 + len(str(path))
+
+
+def test_label_files_are_ordinary_files(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.json")
+    for path in (tmp_path / "pipe.json", Path("/dev/zero"), tmp_path):
+        with pytest.raises(FileFormatError, match="expected a label file, got a "):
+            read_labels(path)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# the terminal
+
+
+def test_what_steers_a_terminal_becomes_readable() -> None:
+    assert printable(f"a{ESCAPES}b") == r"a\x1b]0;title\x07\x9b31m\x7f\u202e\x0db"
+    assert printable("mug \u2014 coffee\u00a0cup\n\t\u00e9") == "mug \u2014 coffee\u00a0cup\n\t\u00e9"
+    assert printable("\u00e9\udc80", "ascii") == r"\xe9\udc80"
+
+
+def test_long_words_of_a_message_are_shortened() -> None:
+    assert shortened("unknown object " + "x" * 5000) == f"unknown object {'x' * 100}...{'x' * 40} (5,000 characters)"
+    assert shortened("a short message") == "a short message"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["attack", "--object", f"mug{ESCAPES}", "--control", "pose"],
+        ["attack", "--object", "mug", "--control", f"pose{ESCAPES}"],
+        ["attack", "--object", "mug", "--control", "pose", "--label", f"mug{ESCAPES}", "--model", "reference"],
+        ["attack", "--object", "mug", "--control", "pose", f"--x{ESCAPES}"],
+        ["show", f"mug{ESCAPES}"],
+        ["attack", "--object", "x" * 5000, "--control", "pose"],
+        ["attack", "--object", "mug", "--environment", "x" * 5000, "--control", "pose"],
+        ["attack", "--object", "mug", "--model", "x" * 5000, "--control", "pose"],
+        ["attack", "--object", "mug", "--model", f"{'x' * 5000}.pt2", "--control", "pose"],
+        ["attack", "--object", "mug", "--labels", "x" * 5000, "--control", "pose"],
+        ["attack", "--object", "mug", "--control", "pose", "--run", "x" * 5000],
+        ["attack", "--object", "mug", "--control", "pose", "--seed", "1" * 6000],
+        ["attack", "--object", "mug", "--control", "pose", "--steps", "0b_"],
+        ["run", "x" * 5000],
+        ["show", "x" * 5000],
+        ["resume", "x" * 5000],
+        ["export", "x" * 5000],
+        ["runs", "x" * 5000],
+        ["region", "--around", "x" * 5000],
+        ["x" * 5000],
+        ["attack", "--object", "a\0b", "--control", "pose"],
+        ["show", "a\0b"],
+        ["run", "a\0b"],
+        ["attack", "--object", "mug", "--labels", "a\0b", "--control", "pose"],
+        ["attack", "--object", "mug", "--model", "a\0b.pt2", "--control", "pose"],
+        ["attack", "--object", "mug", "--control", "pose", "--run", "a\0b"],
+    ],
+)
+def test_names_are_shown_short_and_without_escapes(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and error.strip().isprintable() and len(error) < 1500
+
+
+def test_json_for_a_terminal_is_json_still(capsys: pytest.CaptureFixture[str]) -> None:
+    from advsearch.cli import output
+    from advsearch.cli.screen import screens
+
+    with screens():
+        output.print_json({"name": ESCAPES, "\u00e9": "\U000e0001"})
+    text = capsys.readouterr().out
+    assert json.loads(text) == {"name": ESCAPES, "\u00e9": "\U000e0001"} and text.replace("\n", "").isprintable()
+
+
+def shell(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run `advsearch ...` in bash."""
+    line = command.replace("advsearch", f"{sys.executable} -m advsearch")
+    return subprocess.run(["bash", "-c", line], cwd=folder, capture_output=True, text=True, timeout=60)
+
+
+@pytest.mark.parametrize(
+    "command, status, message",
+    [
+        ("advsearch runs > /dev/full", 2, "cannot write to standard output: No space left on device\n"),
+        ("advsearch runs --json > /dev/full", 2, "cannot write to standard output: No space left on device\n"),
+        ("advsearch --help | head -1", 0, ""),
+        ("advsearch runs >&-", 0, ""),
+        ("advsearch nope >&- 2>&-", 2, ""),
+        ("advsearch nope 2> /dev/full", 2, ""),
+    ],
+)
+def test_an_output_that_cannot_be_written_is_no_bug(command: str, status: int, message: str, tmp_path: Path) -> None:
+    result = shell(command, tmp_path)
+    assert result.returncode == status and result.stderr.endswith(message)
+    assert "Traceback" not in result.stderr and "Exception ignored" not in result.stderr
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.05])
+def test_two_quick_interrupts_leave_no_traceback(delay: float, tmp_path: Path) -> None:
+    """While PyTorch is being imported, which makes other errors of an interrupt."""
+    words = [sys.executable, "-m", "advsearch", "attack", "--object", "mug", "--control", "pose", "--resolution", "16"]
+    process = subprocess.Popen(words, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    time.sleep(1.5)
+    for _ in range(2):
+        process.send_signal(2)
+        time.sleep(delay)
+    error = process.communicate(timeout=60)[1]
+    assert process.returncode in (130, -2)  # the second: before our own code began
+    assert "Traceback" not in error and "Exception ignored" not in error
