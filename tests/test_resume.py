@@ -331,3 +331,13 @@ def test_the_random_searchs_answer_is_taken_where_it_is_the_worse_one(policy: Po
     random = findings.baseline.best_u
     assert torch.equal(findings.search.best_u, random) == beaten
     assert torch.equal(findings.verification.u, problem.domain.project(random)) == beaten
+
+
+def test_a_kill_while_the_results_were_made_leaves_a_folder_that_a_run_can_take(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for name in ("results.sqlite", "results.sqlite-journal", ".lock"):
+        (folder / name).touch()
+    with RunDirectory.create(folder) as run:
+        run.write_config(configuration())
+    assert (folder / "run.yaml").is_file()

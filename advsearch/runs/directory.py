@@ -364,12 +364,16 @@ def _clear(path: Path) -> None:
 
 
 def _is_leftover(path: Path) -> bool:
-    return path.name == lock.NAME or path.name.startswith(PART)
+    """Whether it is what a kill leaves before there is a run: the lock, a part of a file, results without a byte."""
+    if path.name == store.NAME:
+        return path.is_file() and path.stat().st_size == 0
+    return path.name in (lock.NAME, f"{store.NAME}-journal") or path.name.startswith(PART)
 
 
 def _remove_if_bare(path: Path) -> None:
     """Remove the directory if it holds nothing but the lock."""
     with suppress(OSError):
         if all(_is_leftover(found) for found in path.iterdir()):
-            (path / lock.NAME).unlink(missing_ok=True)
+            for found in list(path.iterdir()):
+                found.unlink()
             path.rmdir()
