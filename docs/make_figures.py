@@ -23,7 +23,15 @@ from typing import Any
 
 from advsearch.cli.flags import GROUPS, help_text
 from advsearch.cli.main import COMMANDS
-from advsearch.config import AttackConfig, GapConfig, PrecisionConfig, RegionConfig, RenderConfig, SweepConfig
+from advsearch.config import (
+    AttackConfig,
+    CheckConfig,
+    GapConfig,
+    PrecisionConfig,
+    RegionConfig,
+    RenderConfig,
+    SweepConfig,
+)
 from advsearch.controls import OWN
 from advsearch.scene.settings import SETTINGS
 from advsearch.settings import Config, Setting, settings
@@ -104,7 +112,7 @@ CONFIGS: dict[str, type[Config]] = {
     "gap": GapConfig,
     "region": RegionConfig,
     "plan": AttackConfig,
-    "check": AttackConfig,
+    "check": CheckConfig,
     "precision": PrecisionConfig,
 }
 """The commands whose flags are settings, some of them the same as those of `attack`."""

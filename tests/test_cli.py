@@ -325,7 +325,7 @@ def test_run_reads_a_file_and_puts_changes_over_it(asked: list[AttackConfig], tm
         (
             "object: mug\ncommand: atack\n",
             [],
-            "unknown command 'atack'. Did you mean 'attack'? Known: attack, gap, precision, region, sweep. It stands ",
+            "unknown command 'atack'. Did you mean 'attack'? Known: attack, check, gap, precision, region, sweep. It ",
         ),
         ("object: mug\n", ["steps"], "change 'steps': expected NAME=VALUE such as camera.azimuth=130, got 'steps'"),
         ("object: mug\n", ["step=3"], "unknown setting 'step'. Did you mean 'steps'"),
@@ -427,7 +427,9 @@ def test_an_interrupted_study_says_how_to_go_on(
     answer = {**summary, "ending": "interrupted"}
     api(**{name: lambda config, progress, resumed: answer for name in ("gap_from_config", "curve_from_config")})
     assert main([command, "--object", "mug,bowl"]) == 130
-    assert capsys.readouterr().out.endswith("\n\nInterrupted: advsearch resume goes on.\n")
+    assert capsys.readouterr().out.endswith(
+        f"\n\nInterrupted.\n\nGo on with: advsearch resume {Path(answer['run']).name}\n"
+    )
 
 
 def test_region_builds_its_configuration_and_prints_the_box(
@@ -591,6 +593,31 @@ def test_runs_are_listed(runs: Path, capsys: pytest.CaptureFixture[str]) -> None
         ("done", "found", 80),
         ("killed", "stopped", 2),
     ]
+
+
+def test_a_run_that_was_stopped_says_how_far_it_came_and_how_to_go_on(
+    runs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["show", "killed"]) == 0
+    assert capsys.readouterr().out == (
+        "killed: attack of mug, pose.\n"
+        "It was stopped before its end; evaluations kept so far: 1 of control, 1 of search.\n\n"
+        "Go on with: advsearch resume killed\n"
+    )
+    assert main(["show", "killed", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["run"] == "runs/killed" and told["ending"] is None and told["state"] == "stopped"
+    assert told["kinds"] == {"control": 1, "search": 1} and told["resume"] == "advsearch resume killed"
+    RunDirectory.create("early").close()
+    assert main(["show", "early"]) == 0
+    assert "It was stopped before its settings were written" in capsys.readouterr().out
+
+
+def test_an_interrupted_run_says_how_to_go_on(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with RunDirectory.resume("killed") as run:
+        run.write_summary(changed(ending="interrupted", run="runs/killed"))
+    assert main(["show", "killed"]) == 0
+    assert capsys.readouterr().out.endswith("\n\nGo on with: advsearch resume killed\n")
 
 
 def test_no_runs_and_no_folder_are_told(

@@ -18,7 +18,15 @@ from hypothesis import strategies as st
 
 from advsearch.cli import flags
 from advsearch.cli.sweep import axes_as_text
-from advsearch.config import AttackConfig, GapConfig, PrecisionConfig, RegionConfig, RenderConfig, SweepConfig
+from advsearch.config import (
+    AttackConfig,
+    CheckConfig,
+    GapConfig,
+    PrecisionConfig,
+    RegionConfig,
+    RenderConfig,
+    SweepConfig,
+)
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.settings import Config, all_finite, flag, parse_assignment, read_yaml, settings
 
@@ -152,7 +160,7 @@ def test_every_setting_is_documented_and_has_a_flag_of_its_own() -> None:
     assert flag("texture_resolution") == "--texture-resolution"
 
 
-CONFIGS = (AttackConfig, GapConfig, PrecisionConfig, RegionConfig, RenderConfig, SweepConfig)
+CONFIGS = (AttackConfig, CheckConfig, GapConfig, PrecisionConfig, RegionConfig, RenderConfig, SweepConfig)
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.command)

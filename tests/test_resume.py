@@ -338,6 +338,8 @@ def test_a_kill_while_the_results_were_made_leaves_a_folder_that_a_run_can_take(
     folder.mkdir()
     for name in ("results.sqlite", "results.sqlite-journal", ".lock"):
         (folder / name).touch()
+    with RunDirectory.create(folder):
+        pass  # killed before the settings were written
     with RunDirectory.create(folder) as run:
         run.write_config(configuration())
     assert (folder / "run.yaml").is_file()

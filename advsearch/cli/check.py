@@ -3,9 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
+from advsearch.report import wording
+from advsearch.runs.summary import OUT_OF_TIME
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from advsearch.config import CheckConfig
 
 HELP = "check the gradient of every parameter of a scene against differences"
 GROUPS = ("scene", "model")
@@ -23,6 +31,13 @@ FIELDS = (
 )
 """The settings of `attack` that matter here, beside those of scene and model."""
 FELL_SHORT = 3
+READING = (
+    "Each row sets a derivative as a search gets it (gradient) beside one that takes far more renders (reference).\n"
+    "ok: they agree within 5 %, and one gradient scatters by less than 20 % (noise); biased: they disagree; noisy: it\n"
+    "scatters more; reference unusable: the reference is too noisy to tell. adjoint: a second render that carries all\n"
+    "derivatives back at once; differences, secant: two renders with the parameter moved by a step."
+)
+"""What the table shows, and how to read it."""
 SINGLE = (
     "object",
     "parameter",
@@ -40,13 +55,15 @@ SINGLE = (
 _EXAMPLES = """examples:
   advsearch check --object mug --control pose
   advsearch check --object mug --control environment.rotation --loss linear --json
-  advsearch check --all --resolution 128 --loss linear
+  advsearch check --all --resolution 128 --loss linear --seconds 600 --run gradients
+  advsearch resume gradients
 """
 
 
 def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add the command."""
     from advsearch.cli.flags import add_settings
+    from advsearch.config import CheckConfig
 
     parser = subparsers.add_parser(
         "check",
@@ -56,41 +73,67 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    add_settings(parser, groups=GROUPS, fields=FIELDS)
-    parser.add_argument("--all", action="store_true", help="every control, on three bundled scenes")
-    parser.add_argument(
-        "--loss", choices=["linear", "model", "both"], default="both", help="what is differentiated (default: both)"
-    )
+    add_settings(parser, groups=(*GROUPS, "check"), fields=(*FIELDS, "run", "overwrite"), config=CheckConfig)
     output.add_flags(parser, quiet=True)
 
 
 def run(args: argparse.Namespace) -> int:
     """Check, print the table; 3 if a gradient falls short."""
     from advsearch.cli.flags import config_from
+    from advsearch.config import CheckConfig
+
+    return carry_out(config_from(args, CheckConfig, object="mug"), as_json=args.json, quiet=args.quiet)
+
+
+def carry_out(config: CheckConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
+    """Check what `config` describes, or go on with it; print the table and return the exit status."""
     from advsearch.cli.progress import at_work
-    from advsearch.config import AttackConfig
 
-    config = config_from(args, AttackConfig, object="mug")
-    losses = ("linear", "model") if args.loss == "both" else (args.loss,)
-    with at_work(as_json=args.json, quiet=args.quiet) as progress:
-        from advsearch.api.checking import check
+    with at_work(as_json=as_json, quiet=quiet) as progress:
+        from advsearch.api.checking import check_from_config
 
-        rows = check(config, losses=losses, everything=args.all, progress=progress)
-    if args.json:
-        output.print_json({"schema": 1, "command": "check", "rows": rows})
-    else:
-        print(table(rows))
-    return FELL_SHORT if any(row["status"] in ("biased", "noisy") for row in _best(rows)) else 0
+        summary = check_from_config(config, progress=progress, resumed=resumed)
+    status = output.finish(summary, answer, as_json=as_json)
+    return status or (FELL_SHORT if fell_short(summary["rows"]) else 0)
 
 
-def _best(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def fell_short(rows: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether a parameter has no good gradient by any estimator."""
+    return any(row["status"] in ("biased", "noisy") for row in _best(rows))
+
+
+def answer(summary: Mapping[str, Any]) -> str:
+    """Return what the table shows and how to read it, the table, and where the run is."""
+    rows, left = summary["rows"], summary["planned"] - summary["measured"]
+    parts = [READING, table(rows)] if rows else []
+    if left:
+        why = "The time was up" if summary["ending"] == OUT_OF_TIME else "Stopped"
+        done = f"{summary['measured']} of {summary['planned']}"
+        parts.append(f"{why} after {done} parts (a scene, its controls and a loss).")
+    short = _short(rows)
+    if short:
+        parts.append(f"No estimator is good enough for {', '.join(short)}.")
+    elif rows:
+        parts.append("Every parameter so far has a good gradient." if left else "Every parameter has a good gradient.")
+    time = wording.seconds_text(summary["seconds"]["total"])
+    return "\n\n".join([*parts, output.columns([["time", time], ["run", str(summary["run"])]])])
+
+
+def _short(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Names of what no estimator is good enough for, each once."""
+    short = [row for row in _best(rows) if row["status"] in ("biased", "noisy")]
+    names = [row["control"] if "cosine" in row else f"{row['control']}.{row['parameter']}" for row in short]
+    return list(dict.fromkeys(f"{name} ({row['status']})" for name, row in zip(names, short, strict=True)))
+
+
+def _best(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """For each parameter and loss the row with the best status: an estimator that no plan would take may fall short.
 
     Of the model's loss the rows of whole controls count: what matters is where their gradient points.
     """
     rows = [row for row in rows if row["loss"] == "linear" or "cosine" in row]
     order = ("ok", "reference unusable", "noisy", "biased")
-    best: dict[tuple[str, ...], dict[str, Any]] = {}
+    best: dict[tuple[str, ...], Mapping[str, Any]] = {}
     for row in rows:
         key = tuple(str(row[name]) for name in ("object", "environment", "loss", "control", "parameter"))
         if key not in best or order.index(row["status"]) < order.index(best[key]["status"]):
@@ -98,7 +141,7 @@ def _best(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return list(best.values())
 
 
-def table(rows: list[dict[str, Any]]) -> str:
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the rows as text: one table for each loss."""
     parts = []
     for loss, title in (
@@ -129,7 +172,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n\n".join(parts)
 
 
-def _single(row: dict[str, Any]) -> list[str]:
+def _single(row: Mapping[str, Any]) -> list[str]:
     return [
         row["object"],
         f"{row['control']}.{row['parameter']}",

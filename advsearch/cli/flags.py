@@ -20,6 +20,7 @@ GROUPS = {
     "search": "search",
     "sweep": "sweep",
     "region": "region",
+    "check": "check",
     "picture": "picture",
     "verification": "verification",
     "run": "run",

@@ -45,8 +45,18 @@ def finish(summary: Mapping[str, Any], answer: Callable[[Any], str], *, as_json:
     if as_json:
         print_json(summary)
     else:
-        print(answer(summary))
+        print(answer(summary) + go_on_text(summary))
     return INTERRUPTED if summary.get("ending") == "interrupted" else OK
+
+
+def go_on_text(summary: Mapping[str, Any]) -> str:
+    """Return how to go on with a run that was stopped; nothing of one that was not, or that is kept nowhere."""
+    from advsearch.runs.directory import shown
+    from advsearch.runs.summary import goes_on
+
+    return (
+        f"\n\nGo on with: advsearch resume {shown(summary['run'])}" if goes_on(summary) and summary.get("run") else ""
+    )
 
 
 @contextmanager

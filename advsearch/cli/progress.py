@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 PATIENCE = 2.0
 """Seconds after which a stage is announced where there is no terminal; a shorter one is not worth a line."""
 
-LINE_INTERVAL = 5.0
-"""Seconds between two lines where there is no terminal."""
+LINE_INTERVAL, LINE_SHARE = 5.0, 0.1
+"""Seconds between two lines where there is no terminal, and the share of a stage's time so far that they are at least.
+"""
 
 MOST_BARS = 5
 """Stages that a terminal shows at once."""
@@ -52,7 +53,7 @@ def watching(*, quiet: bool = False) -> Iterator[Progress]:
 
 class LineProgress:
     """Plain lines: what a stage is once it has lasted `PATIENCE` seconds, then how far it is every `LINE_INTERVAL`
-    seconds; messages at once.
+    seconds or more; messages at once.
 
     Args:
         stream: where they go.
@@ -91,7 +92,7 @@ class LineProgress:
             if self._name and not self._announced and now - self._began >= PATIENCE:
                 self._announced, self._printed = True, now
                 self._print(self._name + (f": {self._hint}" if self._hint else ""))
-            elif self._announced and now - self._printed >= LINE_INTERVAL:
+            elif self._announced and now - self._printed >= max(LINE_INTERVAL, LINE_SHARE * (now - self._began)):
                 self._printed = now
                 count = count_text(self._done, self._total, self._at_most)
                 times = times_text(now - self._began, self._done, self._total, self._at_most)

@@ -19,6 +19,7 @@ COMMANDS = {
     "gap": "GapConfig",
     "region": "RegionConfig",
     "precision": "PrecisionConfig",
+    "check": "CheckConfig",
 }
 """What the `command` of a file may say, and the configuration that it is."""
 

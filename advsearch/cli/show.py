@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
 from advsearch.errors import InputError, UnknownNameError
+
+if TYPE_CHECKING:
+    from advsearch.runs.listing import Listed
 
 HELP = "show what a run found, or the parameters of a control"
 
@@ -35,25 +38,53 @@ def run(args: argparse.Namespace) -> int:
 
 
 def show_run(name: str, as_json: bool) -> int:
-    """Print the answer of a run."""
+    """Print the answer of a run, or how far one has come that has none yet."""
     import importlib
 
     from advsearch.runs.directory import find_run
-    from advsearch.runs.summary import read_summary
+    from advsearch.runs.listing import described
+    from advsearch.runs.summary import NAME, read_summary
 
-    summary = read_summary(find_run(name))
+    path = find_run(name)
+    if not (path / NAME).is_file():
+        return _show_unfinished(described(path), as_json)
+    summary = read_summary(path)
     tables = {
         "sweep": "advsearch.cli.sweep_table",
         "gap": "advsearch.cli.studies",
         "region": "advsearch.cli.region",
         "precision": "advsearch.cli.precision",
+        "check": "advsearch.cli.check",
     }
     kind = "gap" if "parts" in summary else summary.get("command")
     answer = importlib.import_module(tables.get(str(kind), "advsearch.cli.table")).answer
     if as_json:
         output.print_json(summary)
     else:
-        print(answer(summary))
+        print(answer(summary) + output.go_on_text(summary))
+    return 0
+
+
+def _show_unfinished(found: Listed, as_json: bool) -> int:
+    """Say what a run is, how far it has come and how to go on."""
+    from advsearch.runs.directory import shown
+
+    go_on = f"advsearch resume {shown(found.path)}" if found.begun and found.state == "stopped" else None
+    if as_json:
+        output.print_json({"schema": 1, **vars(found), "run": found.path, "ending": None, "resume": go_on})
+        return 0
+    what = f"{found.command} of {found.object}, {' and '.join(found.controls) or 'nothing searched'}"
+    how = {"running": "A process is working on it"}.get(found.state, "It was stopped before its end")
+    kept = ", ".join(f"{count} of {kind}" for kind, count in found.kinds.items())
+    lines = [f"{found.name}: {what}.", f"{how}; evaluations kept so far: {kept or 'none'}."]
+    if go_on is not None:
+        lines += ["", f"Go on with: {go_on}"]
+    elif found.state == "stopped":
+        lines += [
+            "",
+            "It was stopped before its settings were written, so there is nothing to go on with; start again.",
+        ]
+    print("\n".join(lines))
     return 0
 
 

@@ -15,7 +15,7 @@ def answer(summary: Summary) -> str:
     """Return the tables of a study's summary."""
     parts = [_gap(summary)] if summary.get("command") == "gap" else [_objects(summary), _curve(summary)]
     facts = [["time", wording.seconds_text(summary["seconds"]["total"])], ["run", str(summary["run"])]]
-    ending = "Interrupted: advsearch resume goes on." if summary.get("ending") == "interrupted" else ""
+    ending = "Interrupted." if summary.get("ending") == "interrupted" else ""
     return "\n\n".join(part for part in (*parts, columns(facts), ending) if part)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
 
-from advsearch.errors import FileFormatError, InputError, RunExistsError, UnknownNameError
+from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, UnknownNameError
 from advsearch.files import open_regular
 from advsearch.runs import images, lock, replay, store, summary
 from advsearch.runs.files import PART, replacing, storage_errors, write_text
@@ -289,6 +289,12 @@ def run_path(run: str | Path) -> Path:
     return HOME / path if is_name else path.expanduser()
 
 
+def shown(path: str | Path) -> str:
+    """Return what a user types to name the run in a folder: its name in `HOME`, or its path."""
+    path = Path(path)
+    return path.name if path.parent == HOME else str(path)
+
+
 def find_run(run: str | Path) -> Path:
     """Return the directory of an existing run, called by name or by path (of the directory, or of its run.yaml).
 
@@ -329,7 +335,7 @@ def check_free(run: str | Path, *, overwrite: bool = False) -> None:
         raise RunExistsError(f"{path}: expected a folder for the run, got a file; choose another name with `run`")
     with storage_errors(path):
         bare = not path.exists() or all(_is_leftover(found) for found in path.iterdir())
-    if bare:
+    if bare or _never_began(path):
         return
     if not is_run(path):
         raise RunExistsError(f"{path}: the folder is not empty and not a run; choose another name with `run`")
@@ -361,6 +367,15 @@ def _clear(path: Path) -> None:
                 shutil.rmtree(found)
             else:
                 found.unlink()
+
+
+def _never_began(path: Path) -> bool:
+    """Whether a run was killed before its settings were written: there is nothing in it to lose."""
+    if (path / CONFIG).exists() or not store.is_ours(path / store.NAME):
+        return False
+    with suppress(AdvsearchError), store.Store(path / store.NAME, read_only=True) as results:
+        return results.count() == 0 and not (path / summary.NAME).exists()
+    return False
 
 
 def _is_leftover(path: Path) -> bool:

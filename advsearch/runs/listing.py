@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,8 @@ class Listed:
         rows: evaluated configurations in its store.
         state: ``"running"`` where a process works on it, ``"stopped"`` where it can be resumed, else its ending.
         answer: what came out, in a few words.
+        kinds: how many rows there are of each kind.
+        begun: whether its settings are there, without which it cannot be resumed.
     """
 
     name: str
@@ -36,32 +39,35 @@ class Listed:
     rows: int
     state: str
     answer: str
+    kinds: Mapping[str, int]
+    begun: bool
 
 
 def listed(folder: Path) -> list[Listed]:
     """Return the runs in a folder, by name; what cannot be read is shown as far as it can."""
     if not folder.is_dir():
         return []
-    return [_one(path) for path in sorted(folder.iterdir()) if path.is_dir() and is_run(path)]
+    return [described(path) for path in sorted(folder.iterdir()) if path.is_dir() and is_run(path)]
 
 
 def finished(path: Path) -> bool:
     """Whether a run has come to its end; one that was interrupted, or killed while its report was written, has not."""
     if (path / replay.NAME).exists():
         return False
-    return (path / summary.NAME).is_file() and summary.read_summary(path).get("ending") != "interrupted"
+    return (path / summary.NAME).is_file() and not summary.goes_on(summary.read_summary(path))
 
 
-def _one(path: Path) -> Listed:
+def described(path: Path) -> Listed:
+    """Return the run in a folder; what cannot be read is shown as far as it can."""
     config: dict[str, Any] = {}
     answer: dict[str, Any] = {}
-    rows = 0
+    kinds: dict[str, int] = {}
     with suppress(AdvsearchError):
         config = read_yaml(path / CONFIG)
     with suppress(AdvsearchError):
         answer = summary.read_summary(path)
     with suppress(AdvsearchError), store.Store(path / store.NAME, read_only=True) as results:
-        rows = sum(results.counts().values())
+        kinds = results.counts()
     controls = answer.get("controls") or list(config.get("controls") or {})
     return Listed(
         name=path.name,
@@ -69,17 +75,18 @@ def _one(path: Path) -> Listed:
         command=str(config.get("command") or answer.get("command") or "?"),
         object=str(config.get("object") or answer.get("object") or "?"),
         controls=tuple(map(str, controls)),
-        rows=rows,
+        rows=sum(kinds.values()),
         state=_state(path, answer),
         answer=_answer(answer),
+        kinds=kinds,
+        begun=bool(config),
     )
 
 
 def _state(path: Path, answer: dict[str, Any]) -> str:
     if lock.is_held(path):
         return "running"
-    ending = answer.get("ending") or ("done" if answer else "interrupted")
-    return "stopped" if ending == "interrupted" else str(ending)
+    return "stopped" if not answer or summary.goes_on(answer) else str(answer.get("ending") or "done")
 
 
 def _answer(answer: dict[str, Any]) -> str:

@@ -16,6 +16,9 @@ from advsearch.runs.files import write_text
 
 NAME = "summary.json"
 
+INTERRUPTED, OUT_OF_TIME = "interrupted", "out of time"
+"""Endings of a run that can go on."""
+
 SCHEMA = 1
 
 LARGEST = 64 << 20
@@ -42,6 +45,11 @@ _ORDER = (
     "seed",
 )
 """The fields of DESIGN 6 in its order; others follow in the order in which they were given."""
+
+
+def goes_on(answer: Mapping[str, Any]) -> bool:
+    """Whether a run with this summary was stopped before its end, so that it can be resumed."""
+    return answer.get("ending") in (INTERRUPTED, OUT_OF_TIME)
 
 
 def plain(value: Any) -> Any:

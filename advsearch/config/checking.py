@@ -1,0 +1,36 @@
+"""What `check` needs to know."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from advsearch.config.attack import AttackConfig
+from advsearch.settings import setting
+
+
+class CheckConfig(AttackConfig):
+    """Everything that decides what `check` does: gradients of a scene against differences."""
+
+    command: ClassVar[str] = "check"
+
+    all: bool = setting(False, "check", "every control, on three bundled scenes; takes hours", "true or false")
+    loss: Literal["linear", "model", "both"] = setting(
+        "both",
+        "check",
+        "what is differentiated: a smooth linear loss of the raw picture, the model's own, or both in turn",
+        "linear, model or both",
+    )
+    seconds: float | None = setting(
+        None,
+        "check",
+        "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
+        "a number greater than 0",
+        otherwise="no limit",
+        unit="seconds",
+        gt=0.0,
+    )
+
+    @property
+    def losses(self) -> tuple[str, ...]:
+        """What is differentiated, in turn."""
+        return ("linear", "model") if self.loss == "both" else (self.loss,)

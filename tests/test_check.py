@@ -1,0 +1,109 @@
+"""`check` keeps what it has measured: stopped in any way, it goes on to the same rows."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from advsearch.api import checking
+from advsearch.api.checking import Results, check_from_config
+from advsearch.api.memory import Memory
+from advsearch.cli import check as command
+from advsearch.cli.main import main
+from advsearch.config import CheckConfig
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.listing import finished, listed
+from advsearch.runs.summary import read_summary
+
+FLAGS = "check --object mug --control camera.azimuth,environment.rotation --loss linear --resolution 16 --spp 1"
+SMALL: dict[str, Any] = {
+    "object": "mug",
+    "controls": {"camera.azimuth": {}, "environment.rotation": {}},
+    "loss": "linear",
+    "resolution": 16,
+    "spp": 1,
+    "threads": 1,
+}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The summary of a check that nobody disturbed."""
+    run = tmp_path_factory.mktemp("whole") / "run"
+    return check_from_config(CheckConfig(**SMALL, run=str(run)))
+
+
+def values(summary: dict[str, Any]) -> list[dict[str, Any]]:
+    """The rows without their times."""
+    return [{name: value for name, value in row.items() if name != "seconds"} for row in summary["rows"]]
+
+
+def test_ctrl_c_leaves_rows_and_resume_ends_with_the_same(
+    tmp_path: Path, whole: dict[str, Any], capfd: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    words = [sys.executable, "-m", "advsearch", *FLAGS.split(), "--threads", "1", "--run", str(folder)]
+    child = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    assert child.stderr is not None
+    for line in child.stderr:
+        if "camera.azimuth by" in line:  # the first row
+            os.kill(child.pid, signal.SIGINT)
+            break
+    said, _ = child.communicate(timeout=120)
+    assert child.returncode == 130
+    assert "Stopped after 0 of 1 parts" in said and said.endswith(f"Go on with: advsearch resume {folder}\n")
+    stopped = read_summary(folder)
+    assert stopped["ending"] == "interrupted" and 1 <= len(stopped["rows"]) < len(whole["rows"])
+    assert values(stopped) == values(whole)[: len(stopped["rows"])]
+    assert listed(tmp_path)[0].state == "stopped"
+    main(["resume", str(folder), "--json"])
+    answer = json.loads(capfd.readouterr().out)
+    assert answer["ending"] == "done" and values(answer) == values(whole)
+    assert finished(folder) and read_summary(folder)["rows"] == answer["rows"]
+
+
+def test_seconds_end_a_check_and_resume_goes_on_for_as_long_again(
+    tmp_path: Path, whole: dict[str, Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "run"
+    config = CheckConfig(**SMALL, seconds=0.001, run=str(folder))
+    summary = check_from_config(config)
+    assert summary["ending"] == "out of time" and not finished(folder)
+    monkeypatch.setattr(checking, "Results", lambda memory, seconds=None: Results(memory))  # a sitting that is longer
+    assert values(check_from_config(config, resumed=folder)) == values(whole) and finished(folder)
+    assert main(["show", str(folder)]) == 0
+    assert command.READING.splitlines()[0] in capsys.readouterr().out
+
+
+def test_what_is_stored_is_not_measured_again(tmp_path: Path) -> None:
+    with RunDirectory.create(tmp_path / "run") as run:
+        results = Results(Memory(run))
+        assert results.get("a", lambda: {"x": (0.1 + 0.2, float("inf"))}) == {"x": [0.1 + 0.2, float("inf")]}
+        assert results.get("a", lambda: pytest.fail("measured again")) == {"x": [0.1 + 0.2, float("inf")]}
+    with RunDirectory.resume(tmp_path / "run") as run:
+        late = Results(Memory(run), seconds=0.0)
+        assert late.get("a", lambda: pytest.fail("measured again")) == {"x": [0.1 + 0.2, float("inf")]}
+        assert late.get("b", lambda: 1) == 1  # a sitting always gets on
+        with pytest.raises(checking.OutOfTime):
+            late.get("c", lambda: 1)
+
+
+def test_a_finished_part_is_not_even_loaded(whole: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checking, "problem_from_config", lambda *_, **__: pytest.fail("loaded"))
+    begun = time.perf_counter()
+    again = check_from_config(CheckConfig(**SMALL, run=whole["run"]), resumed=Path(whole["run"]))
+    assert again["rows"] == whole["rows"] and time.perf_counter() - begun < 20.0
+
+
+def test_all_goes_through_every_control_on_three_scenes() -> None:
+    parts = checking._parts(CheckConfig(object="mug", all=True), ("linear", "model"), everything=True)
+    assert [part.number for part in parts] == list(range(1, len(parts) + 1))
+    assert {part.config.object for part in parts} == {"mug", "bowl", "bottle"} and len(parts) > 80
