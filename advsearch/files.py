@@ -93,6 +93,10 @@ def read_bytes(path: Path, expected: str, limit: int) -> bytes:
     most = scaled(limit)
     with open_regular(path, expected, limit) as file:
         data = file.read(most + 1)  # a file may grow, and those of /proc give no size
+    if data is None:  # the kernel's log is such a file
+        raise FileFormatError(
+            f"{path}: expected {expected}, got a file that waits for something; name an ordinary file"
+        )
     if len(data) > most:
         raise too_large(path, f"{expected} of at most {most:,} bytes", "more")
     return data

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import socket
@@ -101,3 +102,15 @@ def test_json_of_sensible_depth_is_read() -> None:
     value = {"a": [1, {"b": [[], {}]}], "c": "x"}
     assert files.parse_json(json.dumps(value)) == value
     assert files.parse_json("[" * 99 + "]" * 99)
+
+
+def test_a_file_that_waits_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a").write_bytes(b"x")
+
+    class Waiting(io.BytesIO):
+        def read(self, size: int | None = -1) -> bytes:
+            return None  # type: ignore[return-value]
+
+    monkeypatch.setattr(files, "open_regular", lambda *_: Waiting())
+    with pytest.raises(FileFormatError, match="a: expected a label file, got a file that waits for something"):
+        files.read_bytes(tmp_path / "a", "a label file", 100)

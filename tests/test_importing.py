@@ -1033,6 +1033,33 @@ def test_a_heap_of_faces_is_laid_out_in_a_grid(tmp_path: Path, monkeypatch: pyte
     assert overlap(asset.mesh) == 0 and len(asset.mesh.faces) == 33
 
 
+def test_instances_count_as_triangles(tmp_path: Path) -> None:
+    header, rest = glb_parts(exported(tmp_path, "ball.glb", trimesh.creation.icosphere(subdivisions=3)).read_bytes())
+    header["nodes"] = [{"mesh": 0, "translation": [k, 0, 0]} for k in range(400)]
+    header["scenes"] = [{"nodes": list(range(400))}]
+    with pytest.raises(FileFormatError, match=r"a mesh of at most 500,000 triangles, got 512,000; if you trust it"):
+        import_object(written(tmp_path, "thing.glb", glb_of(header, rest)))
+
+
+def test_jpeg_with_too_many_scans_is_not_decoded(tmp_path: Path) -> None:
+    buffer = io.BytesIO()
+    Image.new("RGB", (16, 16)).save(buffer, "JPEG", progressive=True)
+    data = buffer.getvalue()
+    last = data.rindex(b"\xff\xda")
+    written(tmp_path, "wood.png", data[:-2] + data[last:-2] * 100 + data[-2:])
+    written(tmp_path, "thing.mtl", "newmtl paint\nKd 0.2 0.3 0.7\nmap_Kd wood.png\n")
+    asset = import_object(written(tmp_path, "thing.obj", "mtllib thing.mtl\nusemtl paint\n" + QUAD))
+    assert "expected a JPEG of at most 64 scans, got 110; if you trust it" in asset.warnings[0]
+
+
+def test_warnings_have_an_end(tmp_path: Path) -> None:
+    written(tmp_path, "thing.mtl", MTL)
+    faces = "".join(f"usemtl none{k}\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n" for k in range(50))
+    asset = import_object(written(tmp_path, "thing.obj", "mtllib thing.mtl\n" + QUAD_V + QUAD_UV + faces))
+    assert len(asset.warnings) == 21
+    assert asset.warnings[-1] == "thing.obj: 30 more warnings are left out"
+
+
 def test_old_gltf_materials_keep_their_diffuse_color(tmp_path: Path) -> None:
     data = glb(tmp_path, PBRMaterial(baseColorFactor=[1.0, 0.0, 0.0, 1.0])).read_bytes()
     header, rest = glb_parts(data)
@@ -1053,6 +1080,7 @@ GLTF_CHANGES: dict[str, tuple[list[Any], Any, str]] = {
     ),
     "index past the end": (["meshes", 0, "primitives", 0, "indices"], 99, r"glTF with 100 accessors, as it refers to"),
     "huge count": (["accessors", 0, "count"], 10**9, r"geometry and pictures of at most 268,435,456 bytes, got"),
+    "no values": (["accessors", 0], {"componentType": 5123, "count": 9, "type": "SCALAR"}, r"got one without values"),
     "sparse": (["accessors", 0, "sparse"], {"count": 1}, r"has sparse accessors, which are not supported"),
     "nan": (["nodes", 0, "matrix"], [float("nan")] * 16, r"matrix\[0\] is a finite number, got 'NaN'"),
     "cycle": (["nodes"], [{"children": [1], "mesh": 0}, {"children": [0]}], r"nodes that form trees, got a cycle"),

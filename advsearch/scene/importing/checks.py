@@ -14,8 +14,8 @@ from pathlib import Path
 from advsearch import files
 from advsearch.scene.importing.files import damaged, looks_like, text_of
 
-LARGEST_FACES = 2_000_000
-"""Triangles that a mesh may have, before `advsearch.files.scaled`."""
+LARGEST_FACES = 500_000
+"""Triangles that a mesh may have, before `advsearch.files.scaled`; each takes over 1 KB of memory to import."""
 
 MOST_CORNERS = 10_000
 """Corners that one face may have."""
@@ -122,8 +122,10 @@ def _check_ply(path: Path, data: bytes) -> None:
     if not data.startswith(b"ply") or not found:
         got = "half of one" if data.startswith(b"ply") else looks_like(data)
         raise damaged(path, "a PLY file with a complete header", got)
+    for count in re.findall(rb"^element\s+face\s+(\d+)", head, re.MULTILINE):
+        check_faces(path, int(count[:20]))
     if b"format ascii" in head:
-        promised = sum(int(count) for count in re.findall(rb"^element\s+\w+\s+(\d+)", head, re.MULTILINE))
+        promised = sum(int(count[:20]) for count in re.findall(rb"^element\s+\w+\s+(\d+)", head, re.MULTILINE))
         lines = sum(1 for line in body.splitlines() if line.strip())
         if lines < promised:
             raise damaged(path, f"{promised} lines after the PLY header", f"{lines}; the file is cut short")
@@ -133,6 +135,7 @@ def _check_stl(path: Path, data: bytes) -> None:
     """Check that a binary file is as long as its facet count says and that an ASCII one is closed."""
     promised = 84 + 50 * struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else 84
     if len(data) == promised:
+        check_faces(path, (promised - 84) // 50)
         return
     if data.lstrip()[:5].lower() == b"solid" and b"\x00" not in data:
         if b"endsolid" not in data.lower():

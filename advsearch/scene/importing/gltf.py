@@ -9,12 +9,13 @@ from __future__ import annotations
 import json
 import struct
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 
 from advsearch import files
 from advsearch.errors import FileFormatError
+from advsearch.scene.importing.checks import check_faces
 from advsearch.scene.importing.files import damaged, looks_like, shown, text_of
 
 LARGEST_VALUES = 1 << 28
@@ -26,8 +27,12 @@ LARGEST_TREE = 20_000
 DEEPEST_TREE = 500
 """Nodes from the root to a leaf."""
 
-MOST_VALUES = 4_000_000
-"""Lists, objects and values in a header; each takes some 60 bytes of memory, and may take two of the file."""
+MOST_VALUES = 1_000_000
+"""Lists, objects and values in a header; each takes hundreds of bytes of memory, and may take two of the file."""
+
+T = TypeVar("T")
+List = Annotated[list[T], FailFast()]
+"""A list of which only the first wrong entry is reported; a million reports take gigabytes."""
 
 Index = Annotated[int, Field(ge=0, lt=1 << 32)]
 Size = Annotated[int, Field(ge=0, lt=1 << 40)]
@@ -80,12 +85,12 @@ class Primitive(_Entry):
 
 
 class Mesh(_Entry):
-    primitives: list[Primitive]
+    primitives: List[Primitive]
     name: str | None = None
 
 
 class Node(_Entry):
-    children: list[Index] = []
+    children: List[Index] = []
     mesh: Index | None = None
     matrix: Annotated[list[float], Field(min_length=16, max_length=16)] | None = None
     translation: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
@@ -95,7 +100,7 @@ class Node(_Entry):
 
 
 class Scene(_Entry):
-    nodes: list[Index] = []
+    nodes: List[Index] = []
 
 
 class TextureUse(_Entry):
@@ -171,17 +176,17 @@ class Header(_Entry):
 
     asset: Asset
     scene: Index | None = None
-    scenes: list[Scene] = []
-    nodes: list[Node] = []
-    meshes: list[Mesh] = []
-    accessors: list[Accessor] = []
-    bufferViews: list[View] = []
-    buffers: list[Buffer] = []
-    materials: list[Material] = []
-    textures: list[Texture] = []
-    images: list[Image] = []
-    extensionsUsed: list[str] = []
-    extensionsRequired: list[str] = []
+    scenes: List[Scene] = []
+    nodes: List[Node] = []
+    meshes: List[Mesh] = []
+    accessors: List[Accessor] = []
+    bufferViews: List[View] = []
+    buffers: List[Buffer] = []
+    materials: List[Material] = []
+    textures: List[Texture] = []
+    images: List[Image] = []
+    extensionsUsed: List[str] = []
+    extensionsRequired: List[str] = []
 
 
 def read_header(path: Path, data: bytes) -> Header:
@@ -277,8 +282,6 @@ def _check(path: Path, header: Header) -> None:
         _check_index(path, "buffers", view.buffer, header.buffers)
     for accessor in header.accessors:
         _check_index(path, "bufferViews", accessor.bufferView, header.bufferViews)
-        if accessor.sparse is not None:
-            raise FileFormatError(f"{path}: has sparse accessors, which are not supported; export it without them")
     for texture in header.textures:
         _check_index(path, "images", texture.plain().source, header.images)
     for image in header.images:
@@ -319,6 +322,21 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
             raise damaged(path, f"{name} of type {kind}", accessor.type)
     if primitive.indices is not None and header.accessors[primitive.indices].type != "SCALAR":
         raise damaged(path, "indices of type SCALAR", header.accessors[primitive.indices].type)
+    for index in (*primitive.attributes.values(), primitive.indices):
+        used = None if index is None else header.accessors[index]
+        if used is not None and used.sparse is not None:
+            raise FileFormatError(f"{path}: has sparse accessors, which are not supported; export it without them")
+        if used is not None and used.bufferView is None:
+            raise damaged(path, "accessors with a bufferView", "one without values")
+
+
+def _triangles(header: Header, primitive: Primitive) -> int:
+    """Return how many triangles a primitive has, at most."""
+    index = primitive.attributes.get("POSITION") if primitive.indices is None else primitive.indices
+    if index is None or primitive.mode < 4:
+        return 0
+    count = header.accessors[index].count
+    return count // 3 if primitive.mode == 4 else max(0, count - 2)
 
 
 def _check_tree(path: Path, header: Header) -> None:
@@ -328,16 +346,19 @@ def _check_tree(path: Path, header: Header) -> None:
             _check_index(path, "nodes", root, header.nodes)
     _check_index(path, "scenes", header.scene, header.scenes)
     parents: set[int] = set()
-    pieces = 0
+    triangles = [sum(_triangles(header, primitive) for primitive in mesh.primitives) for mesh in header.meshes]
+    pieces, drawn = 0, 0
     for node in header.nodes:
         _check_index(path, "meshes", node.mesh, header.meshes)
-        pieces += 0 if node.mesh is None else len(header.meshes[node.mesh].primitives)
+        if node.mesh is not None:
+            pieces, drawn = pieces + len(header.meshes[node.mesh].primitives), drawn + triangles[node.mesh]
         for child in node.children:
             _check_index(path, "nodes", child, header.nodes)
             if child in parents:
                 raise damaged(path, "nodes with one parent each", f"two for node {child}")
             parents.add(child)
     pieces = max(pieces, sum(len(mesh.primitives) for mesh in header.meshes), len(header.nodes))
+    check_faces(path, max(drawn, sum(triangles)))
     if pieces > files.scaled(LARGEST_TREE):
         raise files.too_large(path, f"glTF of at most {files.scaled(LARGEST_TREE):,} nodes and pieces", f"{pieces:,}")
     level, reached = [index for index in range(len(header.nodes)) if index not in parents], 0

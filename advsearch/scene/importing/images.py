@@ -23,11 +23,14 @@ Floats = npt.NDArray[np.float32]
 TEXTURE_LIMIT = 1024
 """Longest side of an imported texture, in texels; larger ones are averaged down."""
 
-FORMATS = ("BMP", "DDS", "GIF", "JPEG", "JPEG2000", "PNG", "PPM", "SGI", "TGA", "TIFF", "WEBP")
+FORMATS = ("BMP", "DDS", "GIF", "JPEG", "PNG", "PPM", "SGI", "TGA", "TIFF", "WEBP")
 """Formats of pictures, as Pillow names them. Pillow knows more; for some (EPS) it runs other programs."""
 
 LARGEST_PIXELS = 1 << 26
 """Pixels that a picture may have (8192 x 8192), before `advsearch.files.scaled`; decoded they take 4 bytes each."""
+
+MOST_SCANS = 64
+"""Scans of a progressive JPEG, each of which takes as long to decode as a picture of its own; usual are ten."""
 
 _BAND = 1 << 22  # pixels of a large picture that are averaged at a time
 
@@ -89,6 +92,8 @@ def display_image(image: Image.Image, limit: int | None = TEXTURE_LIMIT, path: P
     check_pixels(path, width, height)
     if image.format not in (None, "MPO", *FORMATS):  # an MPO is a JPEG with a second picture
         raise FileFormatError(f"{path}: expected a picture such as PNG or JPEG, got {image.format}; convert it")
+    if image.format in ("JPEG", "MPO") and _scans(image) > files.scaled(MOST_SCANS):
+        raise files.too_large(path, f"a JPEG of at most {files.scaled(MOST_SCANS)} scans", f"{_scans(image)}")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of large pictures and odd metadata
         image.load()
@@ -103,6 +108,18 @@ def display_image(image: Image.Image, limit: int | None = TEXTURE_LIMIT, path: P
                 lambda top, end: np.take(linear, _steps(image.crop((0, top, width, end)))), (height, width), target
             )
         )
+
+
+def _scans(image: Image.Image) -> int:
+    """Return how many scans of an opened JPEG are still to be decoded."""
+    file = getattr(image, "fp", None)
+    if file is None:
+        return 0
+    place = file.tell()
+    file.seek(0)
+    count = int(file.read().count(b"\xff\xda"))
+    file.seek(place)
+    return count
 
 
 def _steps(image: Image.Image) -> npt.NDArray[np.uint8]:

@@ -20,6 +20,9 @@ from advsearch.scene.importing.upright import guess_up
 SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl")
 """The mesh files that can be imported."""
 
+MOST_WARNINGS = 20
+"""Warnings about one file."""
+
 
 def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = None) -> ObjectAsset:
     """Read an object from a mesh file, repaired, normalised and with a texture.
@@ -66,9 +69,16 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
         base_color=base_color,
         material=material,
         source=str(file),
-        warnings=(*notes, *(f"{file.name}: {note}" for note in repairs + bakes + blends)),
+        warnings=_first([*notes, *(f"{file.name}: {note}" for note in repairs + bakes + blends)], file.name),
         up=axis,
     )
+
+
+def _first(warnings: list[str], name: str) -> tuple[str, ...]:
+    """Return warnings about a file, and of very many the first and how many more there are."""
+    kept = warnings[:MOST_WARNINGS]
+    more = len(warnings) - len(kept)
+    return (*kept, *([f"{name}: {more:,} more warnings are left out"] if more else []))
 
 
 def _upright(parts: list[Part], file: Path, up: str | None) -> tuple[Soup, UpAxis]:
