@@ -17,6 +17,7 @@ from hypothesis import settings as examples
 from hypothesis import strategies as st
 
 from advsearch.cli import flags
+from advsearch.cli.main import main
 from advsearch.cli.sweep import axes_as_text
 from advsearch.config import (
     AttackConfig,
@@ -448,3 +449,27 @@ def test_a_bad_base_is_named(tmp_path: Path, text: str, message: str) -> None:
     path.write_text(text)
     with pytest.raises(InputError, match=message):
         AttackConfig.from_yaml(path)
+
+
+@pytest.mark.parametrize("command", ["attack", "gap", "region", "plan", "check", "render", "precision"])
+@pytest.mark.parametrize("name", ["object", "environment", "model"])
+def test_several_of_a_kind_are_for_a_sweep(
+    command: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if name == "object" and command in ("attack", "gap"):
+        return
+    monkeypatch.chdir(tmp_path)
+    flags = {"object": "mug", "environment": "noon", "model": "reference"} | {name: "one,two"}
+    words = [word for flag, value in flags.items() for word in (f"--{flag}", value)]
+    assert main([command, *words, *(["--out", "a.png"] if command == "render" else [])]) == 2
+    expected = f"error: --{name}: expected one {name}, got one,two; give one, or compare several with advsearch sweep\n"
+    assert capsys.readouterr().err.endswith(expected)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_with_a_comma_in_its_name_is_one(tmp_path: Path) -> None:
+    file = tmp_path / "a,b.pt2"
+    file.touch()
+    assert AttackConfig(object="mug", model=file).model == str(file)
+    assert SweepConfig(object="mug,bowl", environment="noon,loft", model="a,b").models == ("a", "b")
+    assert AttackConfig(object="mug,bowl").objects == ("mug", "bowl")

@@ -25,6 +25,7 @@ from advsearch.attacks import Objective, Policy, get_objective, make_policy
 from advsearch.attacks.goal import Goal
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
 from advsearch.config import AttackConfig
+from advsearch.config.scene import one_only
 from advsearch.controls import make_space
 from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
@@ -181,6 +182,8 @@ class _Job:
 
 def _job(config: AttackConfig) -> _Job:
     """Find and load everything that a configuration names."""
+    if len(config.objects) > 1:
+        raise one_only("object", config.objects)
     searched, drawn = _controls(config, config.controls, config.over)
     check_objective(config.objective, targeted=config.target is not None, minimise=config.minimise)
     objective, policy = config.objective, make_policy(config.policy_name, **_policy_options(config))

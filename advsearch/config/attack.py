@@ -25,6 +25,7 @@ class AttackConfig(SceneConfig):
     """Everything that decides what `attack` does. Frozen; unknown names are refused."""
 
     command: ClassVar[str] = "attack"
+    several: ClassVar[tuple[str, ...]] = ("object",)
 
     object: str = setting(
         ...,

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from pydantic import field_validator
+from pydantic import field_validator, model_validator
 
+from advsearch.errors import InputError
 from advsearch.settings import Config, check_once, number_or_text, setting, split_names
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
@@ -24,6 +28,9 @@ class SceneConfig(Config):
 
     A file is looked for relative to the current directory. None means "choose for me", and the description says how.
     """
+
+    several: ClassVar[tuple[str, ...]] = ()
+    """Which of object, environment and model may be several, separated by commas."""
 
     object: str = setting(
         ...,
@@ -129,6 +136,15 @@ class SceneConfig(Config):
     )
     overwrite: bool = setting(False, "run", "replace a run that is there already", "true or false")
 
+    @model_validator(mode="after")
+    def _one_of_each(self) -> Self:
+        """Refuse several objects, environments or models where one is looked at."""
+        for name in ("object", "environment", "model"):
+            names = split_names(getattr(self, name))
+            if len(names) > 1 and name not in self.several:
+                raise one_only(name, names)
+        return self
+
     @property
     def search_spp(self) -> int:
         """Samples a pixel of the search: what was asked for, or the default for the denoiser."""
@@ -214,3 +230,9 @@ class SceneConfig(Config):
     def _numbers_from_text(cls, value: Any) -> Any:
         """Read ``1e-3`` as a number: YAML takes it for text."""
         return {name: number_or_text(given) for name, given in value.items()} if isinstance(value, Mapping) else value
+
+
+def one_only(name: str, names: Sequence[str]) -> InputError:
+    """The error for several objects, environments or models where one is looked at."""
+    listed = ",".join(names)
+    return InputError(f"{name}: expected one {name}, got {listed}; give one, or compare several with advsearch sweep")

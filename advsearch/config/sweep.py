@@ -16,6 +16,7 @@ class SweepConfig(SceneConfig):
     """Everything that decides what `sweep` does: the average case over a grid, over random draws, or both."""
 
     command: ClassVar[str] = "sweep"
+    several: ClassVar[tuple[str, ...]] = ("object", "environment", "model")
 
     object: str = setting(
         ...,
