@@ -236,6 +236,21 @@ def test_nan_logits_during_the_search_end_it_and_are_counted(
     assert summary["non_finite"]["objectives"] == 3
 
 
+def test_rows_keep_what_is_right_apart_from_what_the_attack_wants(
+    scene: advsearch.Scene, level: float, tmp_path: Path
+) -> None:
+    asked: dict[str, Any] = {**FAST, "baseline": False, "minimise": True}
+    advsearch.attack(scene, model(level - 0.01), run=tmp_path / "run", **asked)
+    with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
+        rows = list(store.rows())
+    assert {row.kind for row in rows} >= {"search", "control"}
+    for row in rows:
+        assert row.margin is not None and row.objective is not None
+        assert row.correct == (row.label == "mug") == (row.margin <= 0.0)
+        assert row.success == (row.margin < 0.0), "an attack that minimises wants right answers"
+        assert row.kind.startswith("search") or row.objective == -row.margin
+
+
 def test_mistakes_are_explained_and_leave_nothing(scene: advsearch.Scene, level: float, tmp_path: Path) -> None:
     run = tmp_path / "run"
     victim = model(level)

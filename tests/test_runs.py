@@ -130,7 +130,7 @@ def test_the_store_is_readable_beside_the_writer(run: RunDirectory) -> None:
 
 def test_the_file_is_versioned_commented_and_in_wal_mode(run: RunDirectory) -> None:
     with sqlite3.connect(run.path / "results.sqlite") as db:
-        assert db.execute("PRAGMA user_version").fetchone() == (2,)
+        assert db.execute("PRAGMA user_version").fetchone() == (3,)
         assert db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
         (schema,) = db.execute("SELECT sql FROM sqlite_master WHERE name = 'evaluations'").fetchone()
         meta = dict(db.execute("SELECT key, value FROM meta"))
@@ -191,10 +191,27 @@ def test_a_file_of_version_1_is_brought_up_to_date(tmp_path: Path) -> None:
         assert (old.renders, new.renders) == (None, 13)  # nobody counted then
         assert store.note("created") is not None
     with sqlite3.connect(path) as db:
-        assert db.execute("PRAGMA user_version").fetchone() == (2,)
+        assert db.execute("PRAGMA user_version").fetchone() == (3,)
     db.close()
     with Store(path) as store:  # and not again
         assert [row.renders for row in store.rows()] == [None, 13]
+
+
+def test_a_sweep_of_version_2_says_what_was_correct_and_an_attack_keeps_its_success(tmp_path: Path) -> None:
+    path = tmp_path / "results.sqlite"
+    db = sqlite3.connect(path)
+    db.executescript(f"BEGIN; {MIGRATIONS[0]} {MIGRATIONS[1]} PRAGMA user_version = 2; COMMIT;")
+    given = [("sweep", 0, 1.5, 1), ("sweep", 1, -0.5, 0), ("sweep", 2, None, None), ("verification", 0, 2.0, 1)]
+    with db:
+        columns = "kind, step, objective, success, values_json, time"
+        db.executemany(f"INSERT INTO evaluations ({columns}) VALUES (?, ?, ?, ?, '{{}}', 0)", given)
+    db.close()
+    expected = [(None, False, 1.5), (None, True, -0.5), (None, False, None), (True, None, None)]
+    for read_only in (True, False):
+        with Store(path, read_only=read_only) as store:
+            rows = list(store.rows())
+        assert [(row.success, row.correct, row.margin) for row in rows] == expected
+    assert [row.objective for row in rows] == [1.5, -0.5, None, 2.0]
 
 
 def test_results_of_another_advsearch_or_none_are_refused(tmp_path: Path) -> None:
@@ -212,7 +229,7 @@ def test_results_of_another_advsearch_or_none_are_refused(tmp_path: Path) -> Non
     with sqlite3.connect(path) as db:
         db.execute("PRAGMA user_version = 99")
     db.close()
-    with pytest.raises(FileFormatError, match=r"expected version 2 of the results, got 99; use a newer advsearch"):
+    with pytest.raises(FileFormatError, match=r"expected version 3 of the results, got 99; use a newer advsearch"):
         Store(path)
 
 
@@ -657,7 +674,8 @@ def filled(run: RunDirectory) -> Store:
 
 
 COLUMNS = [
-    "id", "kind", "step", "seed", "spp", "objective", "success", "label", "label_index", "probability",
+    "id", "kind", "step", "seed", "spp", "objective", "success", "correct", "margin", "label", "label_index",
+    "probability",
     "pose.yaw [degrees]", "camera.target[0] [sizes]", "camera.target[1] [sizes]", "backdrop.which",
     "renders", "seconds", "time",
 ]  # fmt: skip

@@ -115,7 +115,20 @@ def rows_of(run: Path) -> list[tuple[Any, ...]]:
         return [(*(getattr(row, name) for name in COMPARED), json.dumps(row.values)) for row in opened.store.rows()]
 
 
-COMPARED = ("kind", "step", "seed", "spp", "objective", "success", "label", "label_index", "probability", "renders")
+COMPARED = (
+    "kind",
+    "step",
+    "seed",
+    "spp",
+    "objective",
+    "success",
+    "correct",
+    "margin",
+    "label",
+    "label_index",
+    "probability",
+    "renders",
+)
 TIMES = ("seconds", "renders_per_second", "run", "command_line")
 
 
@@ -458,7 +471,9 @@ def test_counts_are_those_of_the_rows(tmp_path: Path) -> None:
     summary = result.summary
     rows = list(result.rows())
     assert len(rows) == summary["configurations"] == summary["planned"] == 6 * 3 * 10
-    right = [row for row in rows if row.objective is not None and row.objective <= 0.0]
+    right = [row for row in rows if row.margin is not None and row.margin <= 0.0]
+    assert [row.correct for row in rows] == [row in right for row in rows]
+    assert all(row.success is None for row in rows)
     assert 0 < len(right) < len(rows)
     assert summary["correct"] == len(right) and summary["accuracy"] == len(right) / len(rows)
     assert summary["interval"] == list(clopper_pearson(len(right), len(rows)))
@@ -550,7 +565,7 @@ def test_answers_that_are_not_finite_are_counted_and_not_right() -> None:
     victim = advsearch.load_model(Fails(), labels=LABELS, input_size=SIZE, name="fails")
     result = advsearch.sweep("mug", victim, {"pose.yaw": "0:360:40"}, trials=0)
     bad = [row for row in result.rows() if row.objective is None]
-    assert bad and all(row.success is None for row in bad)
+    assert bad and all((row.correct, row.margin) == (False, None) for row in bad)
     assert result.summary["not_finite"] == len(bad)
     assert any("not finite; they count as not right" in text for text in result.summary["warnings"])
     assert result.summary["worst"]["claimed"]["margin"] is not None

@@ -159,9 +159,11 @@ class Memory:
         row = self._trials.get((kind, number))
         if row is None:
             return None
-        margin = float("nan") if row.objective is None else row.objective
-        right = row.label_index in goal.labels if goal.targets else margin >= 0.0 if goal.minimise else margin <= 0.0
-        return Trial(margin, int(row.label_index or 0), float(row.probability or 0.0), right)
+        score = float("nan") if row.objective is None else row.objective
+        right = row.correct
+        if right is None:  # of an older run
+            right = row.label_index in goal.labels if goal.targets else score >= 0.0 if goal.minimise else score <= 0.0
+        return Trial(score, int(row.label_index or 0), float(row.probability or 0.0), right, row.margin)
 
     def note(self, key: str) -> Any:
         """Return the JSON value that was noted, or None."""

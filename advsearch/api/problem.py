@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Domain, Evaluate, Evaluation, Objective, Trial
+from advsearch.attacks import Domain, Evaluate, Evaluation, Objective, Trial, margin
 from advsearch.attacks.evaluation import Wanted
 from advsearch.attacks.goal import Goal
 from advsearch.controls import Space
@@ -136,7 +136,8 @@ class Problem:
         probabilities = logits[0].softmax(dim=0)
         predicted = int(probabilities.argmax())
         score, right = float(self.goal.score(logits)[0]), bool(self.goal.right(logits)[0])
-        return Trial(score, predicted, float(probabilities[predicted]), right)
+        lead = float(margin(logits, logits, self.labels.indices)[0])
+        return Trial(score, predicted, float(probabilities[predicted]), right, lead)
 
     def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Value]:
         """Say a configuration of the searched controls in named values with units, under the conditions of a draw.

@@ -12,11 +12,14 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.memory import Memory
 from advsearch.api.problem import Problem
-from advsearch.attacks import Evaluation, SampleCount, SearchResult, StepRecord, Trial, Verification
+from advsearch.attacks import Evaluation, SampleCount, SearchResult, StepRecord, Trial, Verification, margin
 from advsearch.attacks.smallest import Bracket
 from advsearch.progress import Progress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
+
+MEASURED = ("centre", "region", "map")
+"""Kinds of trials that seek no answer but see what the model says."""
 
 
 @dataclass
@@ -124,6 +127,7 @@ class Recorder:
         problem = self._problem
         probabilities = evaluation.logits.softmax(dim=0)
         predicted = int(probabilities.argmax())
+        lead = float(margin(evaluation.logits[None], evaluation.logits[None], problem.goal.labels)[0])
         self.run.record(
             Row(
                 kind=kind,
@@ -132,6 +136,8 @@ class Recorder:
                 spp=problem.spp * record.samples,
                 objective=record.objective,
                 success=record.success,
+                correct=lead <= 0.0,
+                margin=lead,
                 label=problem.model.labels[predicted],
                 label_index=predicted,
                 probability=float(probabilities[predicted]),
@@ -170,7 +176,7 @@ class Recorder:
         labels = self._problem.model.labels
         told = self._problem.describe(u, seed) if described else {}
         told = {**told, **(self._problem.conditions_of(u, seed) if drawn else {})}
-        self.run.record(trial_row(kind, number, seed, spp, trial, labels, told))
+        self.run.record(trial_row(kind, number, seed, spp, trial, labels, told, sought=kind not in MEASURED))
 
 
 def trial_row(
@@ -181,15 +187,25 @@ def trial_row(
     trial: Trial,
     labels: Sequence[str],
     values: Mapping[str, Any] | None = None,
+    *,
+    sought: bool = True,
 ) -> Row:
-    """Return what the store keeps of a trial; arguments as for `Recorder.trial`."""
+    """Return what the store keeps of a trial; arguments as for `Recorder.trial`.
+
+    Args:
+        labels: of the model.
+        values: that describe it.
+        sought: whether a search sought some answer there, so that there is a success.
+    """
     return Row(
         kind=kind,
         step=number,
         seed=seed,
         spp=spp,
         objective=trial.margin,
-        success=trial.wrong,
+        success=trial.wrong if sought else None,
+        correct=trial.right,
+        margin=trial.margin if trial.wrong_lead is None else trial.wrong_lead,
         label=labels[trial.predicted],
         label_index=trial.predicted,
         probability=trial.probability,

@@ -41,12 +41,15 @@ class Trial(NamedTuple):
         predicted: index of the class the model answers.
         probability: the probability it gives that class.
         correct: whether that answer is right; None where the margin says it: it is at most 0.
+        wrong_lead: the largest logit outside the label set minus the largest inside, whatever counts as success; None
+            where that is the margin.
     """
 
     margin: float
     predicted: int
     probability: float
     correct: bool | None = None
+    wrong_lead: float | None = None
 
     @property
     def wrong(self) -> bool:

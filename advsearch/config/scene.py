@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator, model_validator
 
 from advsearch.errors import InputError
 from advsearch.settings import Config, check_once, number_or_text, setting, split_names
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
@@ -137,7 +134,7 @@ class SceneConfig(Config):
     overwrite: bool = setting(False, "run", "replace a run that is there already", "true or false")
 
     @model_validator(mode="after")
-    def _one_of_each(self) -> Self:
+    def _one_of_each(self) -> SceneConfig:
         """Refuse several objects, environments or models where one is looked at."""
         for name in ("object", "environment", "model"):
             names = split_names(getattr(self, name))

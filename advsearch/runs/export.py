@@ -22,7 +22,10 @@ from advsearch.runs.store import Row, Store
 
 FORMATS = ("csv", "json", "parquet")
 
-OWN = ("id", "kind", "step", "seed", "spp", "objective", "success", "label", "label_index", "probability")
+OWN = (
+    *("id", "kind", "step", "seed", "spp", "objective", "success", "correct", "margin"),
+    *("label", "label_index", "probability"),
+)
 AFTER = ("renders", "seconds", "time")
 """Columns of the store before and after the values."""
 

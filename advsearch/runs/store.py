@@ -70,6 +70,13 @@ MIGRATIONS = (
     -- with a multiple of the samples. NULL in rows of version 1.
     ALTER TABLE evaluations ADD COLUMN renders INTEGER;
     """,
+    """
+    -- What the model said, whatever a search was after. NULL in older rows, but those of a sweep, where `success` said
+    -- that the model was wrong; now a sweep's rows have no success: nothing is sought there.
+    ALTER TABLE evaluations ADD COLUMN correct INTEGER; -- 1 when the answer was a right one, else 0
+    ALTER TABLE evaluations ADD COLUMN margin REAL;     -- largest logit of a wrong class minus largest of a right one
+    UPDATE evaluations SET correct = coalesce(success = 0, 0), margin = objective, success = NULL WHERE kind = 'sweep';
+    """,
 )
 """What turns a file of version n into one of version n + 1. Never change one that was released; add another."""
 
@@ -84,7 +91,10 @@ class Row:
         seed: of the render.
         spp: samples per pixel of the render.
         objective: what was maximised; stored as None when it is not a number.
-        success: whether the model was wrong; None when that was not judged.
+        success: whether the answer is what the attack is after; None where nothing is sought, as in a sweep.
+        correct: whether the answer is one of the right ones; None in rows of older runs.
+        margin: the largest logit of a wrong class minus the largest of a right one, over 0 where the model is wrong;
+            stored as None when it is not a number.
         label: the class that the model answered.
         label_index: its number.
         probability: the model's probability for it, in [0, 1].
@@ -101,6 +111,8 @@ class Row:
     spp: int | None = None
     objective: float | None = None
     success: bool | None = None
+    correct: bool | None = None
+    margin: float | None = None
     label: str | None = None
     label_index: int | None = None
     probability: float | None = None
@@ -298,5 +310,6 @@ def _values(values: Mapping[str, Any]) -> str:
 def _decode(values: tuple[Any, ...]) -> Row:
     given = dict(zip((one.name for one in fields(Row)), values, strict=True))
     given["values"] = json.loads(given["values"])
-    given["success"] = None if given["success"] is None else bool(given["success"])
+    for name in ("success", "correct"):
+        given[name] = None if given[name] is None else bool(given[name])
     return Row(**given)

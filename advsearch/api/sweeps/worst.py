@@ -63,7 +63,7 @@ def check_worst(
         nonlocal number
         trial = probe(u, seed, spp)
         if run is not None and number >= known:
-            run.record(trial_row(PROBES, number, seed, spp, trial, network.labels))
+            run.record(trial_row(PROBES, number, seed, spp, trial, network.labels, sought=False))
         number += 1
         stages.progress.advance(spp)
         return trial.margin
@@ -77,7 +77,7 @@ def check_worst(
         stages.progress.advance(1)
         if run is not None and number >= len(stored):
             seed = stream(config.seed, KIND, number)
-            run.record(trial_row(KIND, number, seed, count.spp, trial, network.labels))
+            run.record(trial_row(KIND, number, seed, count.spp, trial, network.labels, sought=False))
 
     render = _after(stored, lambda at, seed, spp: view.trial(model, at, seed, spp))
     trials = run_trials(render, u, spp=count.spp, seed=config.seed, trials=config.trials, on_trial=keep)
