@@ -12,6 +12,7 @@ class CheckConfig(AttackConfig):
     """Everything that decides what `check` does: gradients of a scene against differences."""
 
     command: ClassVar[str] = "check"
+    several: ClassVar[tuple[str, ...]] = ()
 
     all: bool = setting(False, "check", "every control, on three bundled scenes; takes hours", "true or false")
     loss: Literal["linear", "model", "both"] = setting(
