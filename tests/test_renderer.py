@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -12,8 +11,7 @@ from torch import Tensor
 from advsearch.api.scene import load_scene, make_renderer
 from advsearch.controls import TextureControl, make_space
 from advsearch.errors import InputError
-from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.description import describe, metered_gain
+from advsearch.scene.description import describe
 from advsearch.scene.formation import ImageFormation, linear_to_srgb, srgb_to_linear, to_8_bit
 from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_scene import BASE_COLOR, MitsubaScene
@@ -228,16 +226,6 @@ def test_rounding_to_8_bits_leaves_256_levels() -> None:
     values = to_8_bit(torch.linspace(0.0, 1.0, 10_000))
     assert len(values.unique()) == 256
     assert torch.equal(to_8_bit(values), values)
-
-
-def test_metering_puts_a_white_card_under_uniform_light_at_its_level() -> None:
-    """Uniform radiance L gives irradiance pi L facing up, so gain * 0.8 * L must be 0.9."""
-    sky = EnvironmentAsset("uniform", np.full((64, 128, 3), 2.5, np.float32))
-    assert metered_gain(sky) * 0.8 * 2.5 == pytest.approx(0.9, rel=0.01)
-
-
-def test_a_black_environment_meters_to_one() -> None:
-    assert metered_gain(EnvironmentAsset("night", np.zeros((8, 16, 3), np.float32))) == 1.0
 
 
 def test_multijittered_samples_have_the_same_mean_and_less_noise() -> None:

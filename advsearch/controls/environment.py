@@ -26,7 +26,8 @@ from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Choices, Fixed, Number, is_number
 from advsearch.errors import InputError
 from advsearch.scene import library
-from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription, metered_gain
+from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
+from advsearch.scene.exposure import metered_gain
 
 LIT = ("adjoint", "differences")
 """Valid estimators for what only changes light."""
@@ -141,7 +142,7 @@ class EnvironmentControl(NumberControl):
         name = self.parameters[0].options[which]
         if name in (OWN_MAP, scene.bundled_environment):
             return _tensor_of(scene)
-        return _bundled(name) / metered_gain(scene.environment)
+        return _bundled(name, scene)
 
 
 @lru_cache(maxsize=4)
@@ -150,10 +151,11 @@ def _tensor_of(scene: SceneDescription) -> Tensor:
 
 
 @lru_cache(maxsize=16)
-def _bundled(name: str) -> Tensor:
-    """A bundled map in its own size, times its own metered gain, so that pictures keep their exposure."""
+def _bundled(name: str, scene: SceneDescription) -> Tensor:
+    """A bundled map in its own size, as bright as keeps the picture's exposure."""
     asset = library.load_environment(name)
-    return torch.from_numpy(asset.radiance.copy()) * metered_gain(asset)
+    share = metered_gain(replace(scene, environment=asset)) / metered_gain(scene)
+    return torch.from_numpy(asset.radiance.copy()) * share
 
 
 def turn(radiance: Tensor, degrees: Tensor) -> Tensor:

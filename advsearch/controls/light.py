@@ -1,7 +1,8 @@
 """The `light` control: one lamp with a place, a colour, a power and, if it is a ball, a size.
 
-Power is in multiples of the irradiance `E` that the metered environment puts on a surface facing its strongest light.
-A lamp of power p and linear colour c puts `p c E / d^2` on a surface that faces it at distance d (object sizes):
+Power is in multiples of the irradiance `E` with which a white surface (reflectance 0.8) gets the display value
+`LIT_WHITE`; the exposure is metered for the environment alone. A lamp of power p and linear colour c puts `p c E / d^2`
+on a surface that faces it at distance d (object sizes):
 
     point:  intensity I = p c E                      ball of radius r:  radiance L = p c E / (pi r^2)
 
@@ -23,21 +24,22 @@ from advsearch.controls.base import Choice, Parameter
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed, Number
 from advsearch.errors import InputError
-from advsearch.scene.description import METERED_WHITE, SceneDescription, metered_gain
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.exposure import WHITE, metered_gain
 from advsearch.scene.formation import srgb_to_linear
 from advsearch.scene.part_light import BallLightPart, PointLightPart
 
 TYPES = ("area", "point")
-WHITE_ALBEDO = 0.8
-"""Of the white surface that is metered, see `advsearch.scene.description.metered_gain`."""
+LIT_WHITE = 0.9
+"""Linear display value of a white surface that faces a lamp of power 1 at distance 1."""
 LIT_POWER = 6.0
 """Power of a lamp whose power is not searched and was not given: at its default place about as bright as the
 environment."""
 
 
 def metered_irradiance(scene: SceneDescription) -> float:
-    """Return the irradiance `E` that the environment's metering is based on, in scene units."""
-    return METERED_WHITE * math.pi / (WHITE_ALBEDO * metered_gain(scene.environment))
+    """Return the irradiance `E` that gives a white surface `LIT_WHITE` at the scene's metered gain, in scene units."""
+    return LIT_WHITE * math.pi / (WHITE * metered_gain(scene))
 
 
 def _place(name: str, low: float, high: float, default: float, description: str) -> Parameter:
@@ -82,7 +84,7 @@ class LightControl(NumberControl):
             0.0,
             1000.0,
             0.0,
-            "Irradiance at distance 1, in multiples of the environment's metered one.",
+            "Irradiance at distance 1, in multiples of the one that shows a white surface just below white.",
             search=(0.0, 12.0),
             estimators=("adjoint", "differences"),
         ),

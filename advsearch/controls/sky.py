@@ -26,13 +26,13 @@ from advsearch.controls.base import Choice, Parameter
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.errors import InputError
 from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.description import METERED_WHITE, SceneDescription
+from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import srgb_to_linear
 from advsearch.scene.part_sky import TURBIDITIES, Sky
 
 EXPOSURES = ("metered", "fixed")
-METERED_IRRADIANCE = METERED_WHITE * math.pi / 0.8
-"""`M`: the irradiance for which `metered_gain` is about 1."""
+METERED_IRRADIANCE = 0.9 * math.pi / 0.8
+"""`M`: the irradiance on what faces the sun, the same for every sky that is metered."""
 
 
 class SkyControl(NumberControl):

@@ -29,8 +29,6 @@ FRAME_FILL = 0.86
 """Share of the picture's half-width that the object's outline may reach when the distance is worked out."""
 OWN_MAP = "own"
 """What the scene's own environment is called where another may be chosen."""
-METERED_WHITE = 0.9
-"""Linear display value that a diffuse white surface (albedo 0.8) gets in the direction of the strongest light."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +106,9 @@ class SceneDescription:
     @property
     def gain(self) -> float:
         """Factor from scene radiance to display-linear values: the metered exposure times `camera.exposure`."""
-        stops = self.number("camera.exposure")
-        return metered_gain(self.environment) * math.pow(2.0, stops)
+        from advsearch.scene.exposure import metered_gain
+
+        return metered_gain(self) * math.pow(2.0, self.number("camera.exposure"))
 
 
 def describe(
@@ -166,59 +165,3 @@ def _environment(spec: str | Path | EnvironmentAsset) -> EnvironmentAsset:
 def _is_path(spec: str | Path) -> bool:
     """A spec with a folder or a file ending is a path; a bare word is a bundled name."""
     return isinstance(spec, Path) or "/" in spec or "\\" in spec or Path(spec).suffix != ""
-
-
-def metered_gain(environment: EnvironmentAsset) -> float:
-    """Exposure that a photographer's incident-light meter would choose, as a factor on radiance.
-
-    The irradiance `E(n)` of the environment is computed for 64 directions of the upper hemisphere; a white diffuse
-    surface (albedo 0.8) facing the strongest light then reaches `METERED_WHITE`. A black environment gets a gain of 1.
-    """
-    normals = _fibonacci_hemisphere(64)
-    strongest = float(irradiance(_coarse(environment.radiance), normals).max())
-    return METERED_WHITE * math.pi / (0.8 * strongest) if strongest > 0.0 else 1.0
-
-
-def _coarse(radiance: npt.NDArray[np.float32], rows: int = 64) -> npt.NDArray[np.float32]:
-    """Average blocks of pixels down to about `rows` rows: irradiance varies slowly, and this is much less work."""
-    step = radiance.shape[0] // rows
-    if step < 2 or radiance.shape[0] % step or radiance.shape[1] % step:
-        return radiance
-    height, width = radiance.shape[0] // step, radiance.shape[1] // step
-    return np.asarray(radiance.reshape(height, step, width, step, 3).mean(axis=(1, 3)))
-
-
-def irradiance(radiance: npt.NDArray[np.float32], normals: Doubles) -> Doubles:
-    """Mean-channel irradiance on surfaces with the given normals, from the part of the map above the ground plane.
-
-    Args:
-        radiance: (H, W, 3) linear radiance, row 0 up.
-        normals: (N, 3) unit vectors.
-
-    Returns:
-        (N,) irradiance, in the unit of radiance times steradian.
-    """
-    height, width = radiance.shape[:2]
-    theta = (np.arange(height) + 0.5) * math.pi / height
-    phi = (np.arange(width) + 0.5) * 2.0 * math.pi / width
-    directions = np.stack(
-        [
-            np.sin(theta)[:, None] * np.cos(phi)[None, :],
-            np.sin(theta)[:, None] * np.sin(phi)[None, :],
-            np.broadcast_to(np.cos(theta)[:, None], (height, width)),
-        ],
-        axis=-1,
-    )
-    solid_angle = np.sin(theta)[:, None] * (math.pi / height) * (2.0 * math.pi / width)
-    power = radiance.mean(axis=-1).astype(np.float64) * solid_angle
-    upper = height // 2
-    cosines = np.maximum(directions[:upper].reshape(-1, 3) @ normals.T, 0.0)
-    return np.asarray(power[:upper].reshape(-1) @ cosines)
-
-
-def _fibonacci_hemisphere(count: int) -> Doubles:
-    index = np.arange(count) + 0.5
-    z = 1.0 - index / count
-    radius = np.sqrt(1.0 - z * z)
-    angle = index * math.pi * (3.0 - math.sqrt(5.0))
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)

@@ -1,0 +1,127 @@
+"""Exposure: an incident-light meter held where the camera sees the object.
+
+A grey card is laid against every piece of the object's surface that the camera sees, and the light that arrives there
+is averaged over the picture: from the environment as far as the surface faces it, and from the ground plane, which is
+lit by the environment itself. What the object is made of takes no part, so that a black object stays black; nor do
+shadows, which would need a render.
+
+    E(n) = integral over directions w of L(w) max(n . w, 0),    L(w) = albedo / pi E(up) where w ends on the ground
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.coverage import NEAREST, Frame, pixels_in
+from advsearch.scene.geometry import camera_to_world, object_to_world
+
+if TYPE_CHECKING:
+    from advsearch.scene.description import SceneDescription
+
+Doubles = npt.NDArray[np.float64]
+
+RASTER = 32
+"""Pixels along the longer side of the picture in which the surface is looked at."""
+ROWS = 32
+"""Rows to which an environment is summed up: irradiance varies slowly."""
+
+
+WHITE = 0.8
+"""Reflectance of the card that is metered."""
+METERED_WHITE = 0.5
+"""Linear display value that it gets, on average over what the camera sees of the object."""
+
+
+@lru_cache(maxsize=8)
+def metered_gain(scene: SceneDescription) -> float:
+    """Return the factor on radiance with which the metered white card gets `METERED_WHITE`.
+
+    Where the camera sees nothing of the object, the card lies on the ground; where no light arrives the factor is 1.
+    """
+    seen = visible_irradiance(scene)
+    metered = float(irradiance(scene, np.array([[0.0, 0.0, 1.0]])).mean()) if seen is None else seen
+    return METERED_WHITE * math.pi / (WHITE * metered) if metered > 0.0 else 1.0
+
+
+def visible_irradiance(scene: SceneDescription) -> float | None:
+    """Return the mean irradiance (mean channel) on what the camera sees of the object; None if it sees nothing."""
+    normals = visible_normals(scene)
+    if not len(normals):
+        return None
+    return float(irradiance(scene, normals).mean())
+
+
+def irradiance(scene: SceneDescription, normals: Doubles) -> Doubles:
+    """Return the irradiance (N, 3) on unshadowed surfaces at the middle of the object, with normals (N, 3)."""
+    directions, solid, power = _arriving(scene.environment)
+    turn = math.radians(scene.number("environment.rotation"))
+    cosine, sine = math.cos(turn), math.sin(turn)
+    directions = directions @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    upper = directions[:, 2] > 0.0
+    on_ground = (power[upper] * directions[upper, 2:]).sum(axis=0)
+    color = np.array([scene.number(f"ground.{channel}") for channel in ("red", "green", "blue")])
+    bounced = srgb_to_linear(color.astype(np.float32)) * on_ground / math.pi
+    vertices = scene.base_vertices
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+    reach = np.abs(middle[:2] + directions[:, :2] * (middle[2] / np.maximum(-directions[:, 2:], 1e-9)))
+    hits = ~upper & (reach <= scene.number("ground.size") / 2.0).all(axis=1)
+    power = np.where(hits[:, None], bounced * solid[:, None], power)
+    facing = np.maximum(np.einsum("nk,wk->nw", normals, directions), 0.0)
+    return np.asarray(np.einsum("nw,wc->nc", facing, power))  # no BLAS, whose last bits depend on its threads
+
+
+def visible_normals(scene: SceneDescription) -> Doubles:
+    """Return the unit normals (N, 3) of the object's surface in the pixels of a small picture, towards the camera."""
+    camera = camera_to_world(scene)
+    points = (scene.base_vertices - camera[:3, 3]) @ camera[:3, :3]
+    faces = scene.object.mesh.faces.astype(np.int64)
+    faces = faces[(points[faces][..., 2] > NEAREST).all(axis=1)]
+    frame = Frame.of(scene.number("camera.fov"), scene.aspect)
+    pixel = max(frame.right - frame.left, frame.high - frame.low) / RASTER
+    shape = round((frame.high - frame.low) / pixel), round((frame.right - frame.left) / pixel)
+    tangents = points[faces][..., :2] / points[faces][..., 2:]
+    face, row, column, weights = pixels_in((tangents - (frame.left, frame.low)) / pixel - 0.5, shape)
+    nearness = (weights / points[faces[face]][..., 2]).sum(axis=1)  # 1 / depth is linear in the picture
+    order = np.argsort(nearness, kind="stable")
+    front = np.full(shape, -1)
+    front[row[order], column[order]] = order  # the nearest comes last
+    seen = front[front >= 0]
+    linear = object_to_world(scene)[:3, :3]
+    normals = (weights[seen, :, None] * scene.object.mesh.normals[faces[face[seen]]]).sum(axis=1) @ linear.T
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    middle = points[faces[face[seen]]].mean(axis=1) @ camera[:3, :3].T
+    return np.asarray(np.where((normals * middle).sum(axis=1, keepdims=True) > 0.0, -normals, normals))
+
+
+@lru_cache(maxsize=8)
+def _arriving(environment: EnvironmentAsset) -> tuple[Doubles, Doubles, Doubles]:
+    """Unit directions (N, 3) of a coarse map's texels, z up; their solid angles (N,); radiance times these (N, 3)."""
+    height, width = environment.radiance.shape[:2]
+    rows, columns = _edges(height, ROWS), _edges(width, 2 * ROWS)
+    polar = np.clip((np.arange(height + 1) - 0.5) / (height - 1), 0.0, 1.0) * math.pi  # rows 0 and -1 are the poles
+    solid = -np.diff(np.cos(polar)) * (2.0 * math.pi / width)
+    fine = np.concatenate([environment.radiance, np.ones((height, width, 1))], axis=2) * solid[:, None, None]
+    summed = np.add.reduceat(np.add.reduceat(fine, rows, axis=0), columns, axis=1).reshape(-1, 4)
+    ends_r, ends_c = np.append(rows[1:], height), np.append(columns[1:], width)
+    theta = (rows + ends_r - 1) * (0.5 * math.pi / (height - 1))
+    azimuth = 0.5 * math.pi - (columns + ends_c) * (math.pi / width)
+    directions = np.stack(
+        [
+            np.sin(theta)[:, None] * np.cos(azimuth),
+            np.sin(theta)[:, None] * np.sin(azimuth),
+            np.broadcast_to(np.cos(theta)[:, None], (len(rows), len(columns))),
+        ],
+        axis=-1,
+    )
+    return directions.reshape(-1, 3), summed[:, 3], summed[:, :3]
+
+
+def _edges(size: int, count: int) -> npt.NDArray[np.int64]:
+    return np.unique(np.linspace(0, size, min(count, size) + 1).astype(np.int64)[:-1])

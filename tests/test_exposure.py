@@ -1,0 +1,105 @@
+"""The exposure is metered on what the camera sees of the object, whatever that is made of."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from advsearch.api.scene import Scene, load_scene
+from advsearch.controls import EnvironmentControl, make_space
+from advsearch.scene import library
+from advsearch.scene.assets import EnvironmentAsset, Material
+from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.exposure import METERED_WHITE, WHITE, irradiance, metered_gain, visible_irradiance, visible_normals
+
+GREY = 0.214
+"""Reflectance of display-referred 0.5."""
+
+
+def lit_from(azimuth: float, elevation: float = 15.0) -> EnvironmentAsset:
+    """A map that is dark but for a lamp in one direction, degrees."""
+    radiance = np.full((64, 128, 3), 0.02, np.float32)
+    column = round((90.0 - azimuth) / 360.0 * 128 - 0.5) % 128
+    radiance[round((90.0 - elevation) / 180.0 * 64 - 0.5), column] = 200.0
+    return EnvironmentAsset("lamp", radiance)
+
+
+def grey_ball(environment: EnvironmentAsset | str, **given: float) -> SceneDescription:
+    """A matt grey ball, whose rendered radiance an incident meter should foretell."""
+    ball = library.load_object("ball")
+    matt = replace(ball, base_color=np.full((4, 4, 3), 0.5, np.float32), material=Material(1.0, 0.0, 0.0, 0.0))
+    return describe(matt, environment, given={name.replace("__", "."): value for name, value in given.items()})
+
+
+def test_under_uniform_light_the_card_gets_its_level() -> None:
+    scene = grey_ball(EnvironmentAsset("uniform", np.full((64, 128, 3), 2.5, np.float32)), ground__size=0.0)
+    assert irradiance(scene, visible_normals(scene)) == pytest.approx(2.5 * math.pi, rel=0.01)
+    assert scene.gain * WHITE * 2.5 == pytest.approx(METERED_WHITE, rel=0.01)
+
+
+def test_a_black_environment_meters_to_one() -> None:
+    assert grey_ball(EnvironmentAsset("night", np.zeros((8, 16, 3), np.float32))).gain == 1.0
+
+
+@pytest.mark.parametrize(
+    ("environment", "given"),
+    [
+        ("noon", {}),
+        ("noon", {"camera__azimuth": 220.0}),
+        ("low-sun", {"environment__rotation": 120.0}),
+        ("kitchen", {"camera__azimuth": 130.0, "ground__size": 0.0}),
+    ],
+)
+def test_what_is_metered_is_what_a_render_of_a_matt_ball_shows(environment: str, given: dict[str, float]) -> None:
+    scene = grey_ball(environment, **given)
+    render = Scene(scene).renderer("texture", resolution=32, denoise="none")
+    radiance = render.radiance(render.start, seed=0, spp=32)
+    y, x = torch.meshgrid(torch.arange(32) - 15.5, torch.arange(32) - 15.5, indexing="ij")
+    seen = float(radiance[(x**2 + y**2) < 12.5**2].mean())
+    metered = visible_irradiance(scene)
+    assert metered is not None
+    assert GREY / math.pi * metered == pytest.approx(seen, rel=0.2)  # shadows and bounces take no part
+
+
+def test_the_side_that_the_camera_sees_is_metered_and_not_the_light() -> None:
+    front, back = (grey_ball(lit_from(azimuth), camera__azimuth=30.0) for azimuth in (30.0, 210.0))
+    assert back.gain > 4.0 * front.gain
+    turned = grey_ball(lit_from(-150.0), camera__azimuth=30.0, environment__rotation=180.0)
+    assert turned.gain == pytest.approx(front.gain, rel=0.05)
+
+
+def test_the_objects_colour_and_what_comes_after_metering_take_no_part() -> None:
+    scene = describe("mug")
+    black = replace(scene, object=replace(scene.object, base_color=np.zeros((4, 4, 3), np.float32)))
+    assert black.gain == scene.gain
+    assert scene.with_values(environment__exposure=2.0).gain == scene.gain
+    assert scene.with_values(camera__exposure=1.0).gain == pytest.approx(2.0 * scene.gain)
+
+
+def test_an_object_that_is_out_of_the_picture_leaves_the_card_on_the_ground() -> None:
+    scene = describe("mug", given={"pose.x": 50.0})
+    assert visible_irradiance(scene) is None
+    up = float(irradiance(scene, np.array([[0.0, 0.0, 1.0]])).mean())
+    assert metered_gain(scene) == pytest.approx(METERED_WHITE * math.pi / (WHITE * up))
+
+
+def test_another_environment_keeps_the_exposure_it_would_be_loaded_with() -> None:
+    scene = describe("mug", "studio")
+    space = make_space([EnvironmentControl(which=["own", "noon"])], scene)
+    own, noon = (space.inputs(torch.tensor([u]))["environment.data"] * scene.gain for u in (0.25, 0.75))
+    assert torch.equal(own, torch.from_numpy(scene.environment.radiance) * scene.gain)
+    loaded = describe("mug", "noon")
+    torch.testing.assert_close(noon, torch.from_numpy(loaded.environment.radiance) * loaded.gain, rtol=1e-4, atol=1e-6)
+
+
+def test_in_real_rooms_a_grey_mug_is_neither_charcoal_nor_burnt(real_data: Path) -> None:
+    for environment in sorted((real_data / "environments").glob("*.hdr")):
+        render = load_scene(real_data / "objects" / "mug.obj", environment).renderer("texture", resolution=16)
+        with torch.no_grad():
+            body = render(render.start, spp=4)[5:12, 3:8]
+        assert 0.3 < float(body.mean()) < 0.7, environment.stem
