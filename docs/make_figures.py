@@ -27,6 +27,7 @@ from advsearch.config import (
     AttackConfig,
     CheckConfig,
     GapConfig,
+    PlanConfig,
     PrecisionConfig,
     RegionConfig,
     RenderConfig,
@@ -111,7 +112,7 @@ CONFIGS: dict[str, type[Config]] = {
     "sweep": SweepConfig,
     "gap": GapConfig,
     "region": RegionConfig,
-    "plan": AttackConfig,
+    "plan": PlanConfig,
     "check": CheckConfig,
     "precision": PrecisionConfig,
 }

@@ -23,6 +23,7 @@ from advsearch.config import (
     AttackConfig,
     CheckConfig,
     GapConfig,
+    PlanConfig,
     PrecisionConfig,
     RegionConfig,
     RenderConfig,
@@ -161,7 +162,7 @@ def test_every_setting_is_documented_and_has_a_flag_of_its_own() -> None:
     assert flag("texture_resolution") == "--texture-resolution"
 
 
-CONFIGS = (AttackConfig, CheckConfig, GapConfig, PrecisionConfig, RegionConfig, RenderConfig, SweepConfig)
+CONFIGS = (AttackConfig, CheckConfig, GapConfig, PlanConfig, PrecisionConfig, RegionConfig, RenderConfig, SweepConfig)
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.command)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +13,20 @@ import pytest
 import torch
 from test_resume import StandInProblem, carry_out, configuration, rows
 
-from advsearch.api import sweep_from_config
+from advsearch.api import planning, sweep_from_config
 from advsearch.api.attacking import attack_from_config
 from advsearch.api.mapping import region_from_config
 from advsearch.api.measuring import precision
 from advsearch.api.memory import Memory
+from advsearch.api.planning import plan
 from advsearch.api.record import Findings, Recorder, Stages
 from advsearch.api.stages import Attack
 from advsearch.attacks import make_policy
 from advsearch.attacks.region import grow
 from advsearch.attacks.sample_count import choose_spp, most_samples
 from advsearch.cli.flags import with_flags
-from advsearch.config import AttackConfig, PrecisionConfig, RegionConfig, SweepConfig
+from advsearch.cli.plan import text as plan_text
+from advsearch.config import AttackConfig, PlanConfig, PrecisionConfig, RegionConfig, SweepConfig
 from advsearch.runs.directory import RunDirectory
 
 JARGON = re.compile(r"set-up|rerank|adjoint|estimator|baseline|sample count|spp|bounces$|verification", re.IGNORECASE)
@@ -168,6 +171,39 @@ def test_every_command_says_what_it_does_and_how_far_it_is(
     progress.check()
     hints = [with_flags(one.hint) for one in progress.stages]
     assert any("--" in one for one in hints) and not any("`" in one for one in hints)
+
+
+PLANNED = PlanConfig(**SMALL, controls={"environment.rotation": {}})
+
+
+@pytest.mark.slow
+def test_a_plan_counts_what_it_says() -> None:
+    progress = Recorded()
+    whole = plan(PLANNED, progress=progress)
+    progress.check()
+    assert whole["ending"] == "done" and whole["not_measured"] == [] and whole["gains"]
+    assert sum("cosine" in text for text in progress.messages) == len(whole["cosines"])
+    assert plan_text(whole).startswith("How a search gets the derivative of each parameter")
+
+
+def test_a_plan_says_what_it_did_not_measure(monkeypatch: pytest.MonkeyPatch) -> None:
+    cut = plan(PLANNED.model_copy(update={"seconds": 1e-9}))
+    assert cut["ending"] == "out of time" and not cut["cosines"] and "gains" not in cut
+    assert cut["not_measured"][1:] == ["what can be left out", "environment with denoiser none"]
+    assert "not measured, the time was up:\n  step and samples of environment" in plan_text(cut)
+
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    for function in (planning.cosines, planning.cosine_samples):
+        monkeypatch.setattr(planning, function.__name__, partial(function, counts=(8,), factors=(1.0,)))
+    monkeypatch.setattr("advsearch.evaluation.planning.CONVERGED", 4)
+    monkeypatch.setattr(planning, "leaving_out", stopped)
+    progress = Recorded()
+    half = plan(PLANNED, progress=progress)
+    progress.check()
+    assert half["ending"] == "interrupted" and half["cosines"] and half["not_measured"] == cut["not_measured"][1:]
+    assert "not measured, it was stopped" in plan_text(half)
 
 
 # ---- what is stored is not rendered again ---------------------------------------------------------------------------

@@ -204,6 +204,25 @@ def test_unknown_cases_and_groups_are_refused() -> None:
     assert {case.group for case in chosen(["ties"], ["stiff"])} == {"objective", "stiff"}
 
 
+@pytest.mark.usefixtures("two_cases")
+def test_seconds_and_ctrl_c_end_the_suite_and_say_what_was_not_run(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["stability", "--seconds", "1e-9", "--quiet"]) == 0
+    assert "not run: bad; --case NAME runs one" in capsys.readouterr().out
+
+    def interrupted() -> Findings:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(suite, "CASES", (suite.CASES[0], replace(suite.CASES[1], find=interrupted)))
+    assert main(["stability", "--json"]) == 130
+    told = capsys.readouterr()
+    assert json.loads(told.out)["not_run"] == ["bad"] and len(json.loads(told.out)["rows"]) == 1
+    assert "good: ok" in told.err
+    assert main(["stability", "--seconds", "0"]) == 2
+    assert "--seconds: expected a number greater than 0, got 0" in capsys.readouterr().err
+
+
 # ---- the tools ------------------------------------------------------------------------------------------------------
 
 

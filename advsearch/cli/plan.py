@@ -7,13 +7,23 @@ from typing import Any
 
 from advsearch.cli import output
 from advsearch.cli.check import FIELDS, GROUPS
+from advsearch.runs.summary import OUT_OF_TIME
 
 HELP = "show how a search gets its derivatives and what it leaves out, measured on its scene, and why"
+
+
+READING = (
+    "How a search gets the derivative of each parameter, measured on this scene, and why. adjoint: a second render\n"
+    "that carries all derivatives back at once; differences, secant: two renders with the parameter moved by a step\n"
+    "(a share of its range). A cosine of 1 with the converged gradient means that a gradient points the right way."
+)
+"""What a plan shows, and how to read it."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add the command."""
     from advsearch.cli.flags import add_settings
+    from advsearch.config import PlanConfig
 
     parser = subparsers.add_parser(
         "plan",
@@ -23,7 +33,7 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    add_settings(parser, groups=GROUPS, fields=(*FIELDS, "specialise"))
+    add_settings(parser, groups=(*GROUPS, "check"), fields=(*FIELDS, "specialise"), config=PlanConfig)
     output.add_flags(parser, quiet=True)
 
 
@@ -31,9 +41,9 @@ def run(args: argparse.Namespace) -> int:
     """Measure and print the plan."""
     from advsearch.cli.flags import config_from
     from advsearch.cli.progress import at_work
-    from advsearch.config import AttackConfig
+    from advsearch.config import PlanConfig
 
-    config = config_from(args, AttackConfig, object="mug")
+    config = config_from(args, PlanConfig, object="mug")
     with at_work(as_json=args.json, quiet=args.quiet) as progress:
         from advsearch.api.planning import plan
 
@@ -50,6 +60,8 @@ def text(chosen: dict[str, Any]) -> str:
             [f"{group['control']}.{group['parameter']}", str(group["size"]), group["estimator"], step, group["reason"]]
         )
     lines = [
+        READING,
+        "",
         output.columns(rows),
         "",
         f"renders for one gradient beside the picture itself: {chosen['renders_per_gradient']}",
@@ -84,6 +96,9 @@ def text(chosen: dict[str, Any]) -> str:
             "",
             f"denoiser asked for: {denoise['asked']}; better gradients: {denoise['advised']} ({denoise['reason']})",
         ]
+    if chosen["not_measured"]:
+        why = "the time was up" if chosen["ending"] == OUT_OF_TIME else "it was stopped"
+        lines += ["", f"not measured, {why}:", *(f"  {what}" for what in chosen["not_measured"])]
     if chosen["limits"]:
         lines += ["", "limits of the material form:", *(f"  {limit}" for limit in chosen["limits"])]
     return "\n".join(lines)
@@ -93,6 +108,8 @@ def _left_out(chosen: dict[str, Any]) -> list[str]:
     """Lines on what the search doesn't compute: sentences, then what was measured."""
     if not chosen["specialised"]:
         return ["left out: nothing (--no-specialise)"]
+    if "gains" not in chosen:
+        return ["not needed:", *(f"  {sentence}" for sentence in chosen["left_out"])]
     rows = [["left out", "a gradient with it takes", "picture differs", "gradient differs"]]
     for row in chosen["gains"]:
         agrees = [_agreement(row[name]) for name in ("picture_difference", "gradient_difference")]

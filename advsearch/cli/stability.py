@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import math
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
+from advsearch.errors import InputError
 
 if TYPE_CHECKING:
+    from advsearch.evaluation.stability.case import Case
     from advsearch.evaluation.stability.suite import Row
 
 HELP = "check numerical stability on stiff and extreme cases"
-EXIT_FELL_SHORT = 3
+EXIT_FELL_SHORT, INTERRUPTED = 3, 130
 
 _EXAMPLES = """examples:
   advsearch stability
@@ -35,6 +38,9 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
     )
     parser.add_argument("--case", action="append", default=[], metavar="NAME", help="run this case; may be repeated")
     parser.add_argument("--group", action="append", default=[], metavar="NAME", help="run this group; may be repeated")
+    parser.add_argument(
+        "--seconds", type=_seconds, metavar="SECONDS", help="time after which no case is begun any more (default: none)"
+    )
     parser.add_argument("--list", action="store_true", help="list the cases and run none")
     output.add_flags(parser, quiet=True)
 
@@ -47,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
         from advsearch.evaluation.stability.suite import OK, chosen, run_cases
 
         cases = chosen(args.case, args.group)
-        rows = [] if args.list else list(run_cases(cases, progress))
+        rows, stopped = ([], False) if args.list else _rows(run_cases(cases, progress, seconds=args.seconds))
     if args.list:
         listed = [{"case": one.name, "group": one.group, "control": one.control, "holds": one.holds} for one in cases]
         if args.json:
@@ -61,14 +67,41 @@ def run(args: argparse.Namespace) -> int:
             )
         return 0
     if args.json:
-        output.print_json({"schema": 1, "command": "stability", "rows": [row.to_dict() for row in rows]})
+        left = [one.name for one in cases[len(rows) :]]
+        done = [row.to_dict() for row in rows]
+        output.print_json({"schema": 1, "command": "stability", "rows": done, "not_run": left})
     else:
-        print(table(rows))
+        print(table(rows, cases[len(rows) :]))
+    if stopped:
+        return INTERRUPTED
     return 0 if all(row.status == OK for row in rows) else EXIT_FELL_SHORT
 
 
-def table(rows: Sequence[Row]) -> str:
-    """Return the rows as text: a table, what was measured, and the number that decides where a case fell short."""
+def _seconds(text: str) -> float:
+    """A number of seconds greater than 0."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0.0 < seconds < math.inf:
+        raise InputError(f"--seconds: expected a number greater than 0, got {text}")
+    return seconds
+
+
+def _rows(running: Iterable[Row]) -> tuple[list[Row], bool]:
+    """The rows of cases as far as they were run, and whether they were stopped."""
+    rows: list[Row] = []
+    try:
+        for row in running:
+            rows.append(row)
+    except KeyboardInterrupt:
+        return rows, True
+    return rows, False
+
+
+def table(rows: Sequence[Row], left: Sequence[Case] = ()) -> str:
+    """Return the rows as text: a table, what was measured, the number that decides where a case fell short, and what
+    was not run."""
     from advsearch.evaluation.stability.suite import OK
 
     heads = ["group", "case", "finite", "error", "ending", "seconds", "status"]
@@ -95,6 +128,8 @@ def table(rows: Sequence[Row]) -> str:
         parts.append("condition numbers:\n" + "\n".join(conditions))
     short = [row for row in rows if row.status != OK]
     parts += [f"{row.case.name} fell short: {row.decides}\n  expected: {row.case.holds}" for row in short]
+    if left:
+        parts.append("not run: " + ", ".join(case.name for case in left) + "; --case NAME runs one")
     total = sum(row.seconds for row in rows)
     parts.append(f"{len(rows) - len(short)} of {len(rows)} cases hold, in {total:.0f} seconds")
     return "\n\n".join(parts)

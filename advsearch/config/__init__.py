@@ -8,7 +8,7 @@ that this package stays light.
 from __future__ import annotations
 
 from advsearch.config.attack import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
-from advsearch.config.checking import CheckConfig
+from advsearch.config.checking import CheckConfig, PlanConfig
 from advsearch.config.precision import QUANTITIES, SAMPLERS, PrecisionConfig
 from advsearch.config.questions import FEWEST_SAMPLES, GapConfig, RegionConfig
 from advsearch.config.rendering import RenderConfig
@@ -28,6 +28,7 @@ __all__ = [
     "AttackConfig",
     "CheckConfig",
     "GapConfig",
+    "PlanConfig",
     "PrecisionConfig",
     "RegionConfig",
     "RenderConfig",

@@ -1,4 +1,4 @@
-"""What `check` needs to know."""
+"""What `check` and `plan` need to know."""
 
 from __future__ import annotations
 
@@ -35,3 +35,19 @@ class CheckConfig(AttackConfig):
     def losses(self) -> tuple[str, ...]:
         """What is differentiated, in turn."""
         return ("linear", "model") if self.loss == "both" else (self.loss,)
+
+
+class PlanConfig(AttackConfig):
+    """Everything that decides what `plan` does: how a search gets its derivatives, and what it leaves out."""
+
+    command: ClassVar[str] = "plan"
+
+    seconds: float | None = setting(
+        None,
+        "check",
+        "time after which no measurement is begun any more; the plan says what it did not measure",
+        "a number greater than 0",
+        otherwise="no limit",
+        unit="seconds",
+        gt=0.0,
+    )

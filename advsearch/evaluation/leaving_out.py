@@ -60,6 +60,16 @@ class Gain:
         return self.picture <= AGREES and self.gradient <= AGREES
 
 
+REPEATS = 3
+"""Timed gradients of each."""
+
+
+def most_gradients(repeats: int = REPEATS) -> int:
+    """Return how many gradients `measured_gains` takes at most: with every item put back, with all, with all bounces
+    and with none, twice to compare and then timed."""
+    return (2 + repeats) * (len(ITEMS) + 3)
+
+
 def measured_gains(
     renderer: Renderer,
     loss: Loss,
@@ -67,7 +77,7 @@ def measured_gains(
     *,
     seed: int,
     spp: int,
-    repeats: int = 3,
+    repeats: int = REPEATS,
     depth: int | None = None,
     tick: Callable[[], None] = lambda: None,
 ) -> list[Gain]:
@@ -94,8 +104,8 @@ def measured_gains(
     if depth < scene.max_depth:
         everyone[BOUNCES] = renderer
     everyone[ALL] = renderer.like(scene.like(leave_out=NOTHING))
-    first = [_one(each, loss, u, seed, spp) for each in everyone.values()]  # compiles, and compares
-    again = [_one(each, loss, u, seeds.stream(seed, "another"), spp) for each in everyone.values()]
+    first = [_one(each, loss, u, seed, spp, tick) for each in everyone.values()]  # compiles, and compares
+    again = [_one(each, loss, u, seeds.stream(seed, "another"), spp, tick) for each in everyone.values()]
     noises = [seeds.stream(seed, "round", number) for number in range(repeats)]
     rounds = [[_seconds(each, loss, u, noise, spp, tick) for each in everyone.values()] for noise in noises]
     typical = [statistics.median(times) for times in zip(*rounds, strict=True)]
@@ -119,10 +129,14 @@ def rows_of(gains: Sequence[Gain]) -> list[dict[str, object]]:
     ]
 
 
-def _one(renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int) -> tuple[Tensor, Tensor]:
+def _one(
+    renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int, tick: Callable[[], None]
+) -> tuple[Tensor, Tensor]:
     with torch.no_grad():
         picture = renderer(u, seed, spp)
-    return picture, renderer.gradient(loss, u, seed, spp)[1]
+    gradient = renderer.gradient(loss, u, seed, spp)[1]
+    tick()
+    return picture, gradient
 
 
 def _seconds(renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int, tick: Callable[[], None]) -> float:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -209,12 +209,13 @@ def cosine_samples(
     factors: Sequence[float] = FACTORS,
     counts: Sequence[int] = COUNTS,
     repeats: int = REPEATS,
+    controls: Collection[str] | None = None,
 ) -> int:
     """Return the samples a pixel that the gradients of `cosines` take in all, at most."""
     each = repeats * sum(counts) + WITNESSES * (1 + AGAIN) * CONVERGED
     by_control: dict[str, set[str]] = {}
     for group in plan.groups:
-        if group.estimator != "none":
+        if group.estimator != "none" and (controls is None or group.control in controls):
             by_control.setdefault(group.control, set()).add(group.estimator)
     return each * sum(len(factors) if used & BY_DIFFERENCES else 1 for used in by_control.values())
 
@@ -228,19 +229,21 @@ def cosines(
     factors: Sequence[float] = FACTORS,
     counts: Sequence[int] = COUNTS,
     repeats: int = REPEATS,
+    controls: Collection[str] | None = None,
     tick: Callable[[int], None] = lambda samples: None,
 ) -> list[Cosine]:
     """Measure, control by control, the cosine of working gradients with the converged one at the same step.
 
-    Sample counts are tried in their order until one reaches the goal at a step; then the next step follows. `tick` is
-    called after each gradient with the samples a pixel that it took; `cosine_samples` bounds their sum.
+    Sample counts are tried in their order until one reaches the goal at a step; then the next step follows. With
+    `controls` only these are measured. `tick` is called after each gradient with the samples a pixel that it took;
+    `cosine_samples` bounds their sum.
     """
     base = renderer.plan
     found: list[Cosine] = []
     try:
         for control in dict.fromkeys(group.control for group in base.groups):
             names = {one.name for one in base.groups if one.control == control and one.estimator != "none"}
-            if not names:
+            if not names or (controls is not None and control not in controls):
                 continue
             by_steps = any(one.estimator in BY_DIFFERENCES for one in base.groups if one.control == control)
             mine: list[Cosine] = []

@@ -65,14 +65,19 @@ def run_case(case: Case) -> Row:
     return Row(case, findings, time.perf_counter() - begun)
 
 
-def run_cases(cases: Sequence[Case] = CASES, progress: Progress | None = None) -> Iterator[Row]:
-    """Run cases one after the other and yield each row as it is done."""
-    progress = progress or NullProgress()
+def run_cases(
+    cases: Sequence[Case] = CASES, progress: Progress | None = None, *, seconds: float | None = None
+) -> Iterator[Row]:
+    """Run cases one after the other and yield each row as it is done; after so many seconds none is begun any more."""
+    progress, begun = progress or NullProgress(), time.perf_counter()
     hint = "`case` and `group` pick some, `seconds` stops before the next one"
     progress.stage("trying extreme scenes, objectives and arithmetic", len(cases), hint=hint)
-    for case in cases:
+    for number, case in enumerate(cases):
+        if number and seconds is not None and time.perf_counter() - begun >= seconds:
+            return
         row = run_case(case)
-        progress.advance(1, after=case.name)
+        progress.message(f"{case.name}: {row.status}, {row.seconds:.1f} s")
+        progress.advance(1)
         yield row
 
 
