@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 import shlex
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
 from advsearch.files import read_text
@@ -72,6 +72,20 @@ def setting(
     return Field(**make, description=description, json_schema_extra=notes, alias=alias, **constraints)
 
 
+class Clash(NamedTuple):
+    """A setting that says nothing, or the opposite of another one, beside others.
+
+    Attributes:
+        setting: its field. It counts as given where it differs from its default.
+        with_others: whether the others of a configuration are such.
+        why: what is wrong, and what to do; completes "setting: ...".
+    """
+
+    setting: str
+    with_others: Callable[[Any], object]
+    why: str
+
+
 class Config(BaseModel):
     """What a command needs to know. Frozen; unknown names are refused. Each command's configuration is a subclass.
 
@@ -80,6 +94,7 @@ class Config(BaseModel):
     """
 
     command: ClassVar[str]
+    clashes: ClassVar[tuple[Clash, ...]] = ()
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False)
 
@@ -107,6 +122,15 @@ class Config(BaseModel):
         if not all_finite(value):
             raise ValueError("not finite")
         return value
+
+    @model_validator(mode="after")
+    def _without_clashes(self) -> Self:
+        """Refuse what would be ignored, and settings that exclude each other."""
+        defaults = {one.field: one.default for one in settings(type(self))}
+        for clash in self.clashes:
+            if getattr(self, clash.setting) != defaults[clash.setting] and clash.with_others(self):
+                raise InputError(f"{clash.setting.rstrip('_')}: {clash.why}")
+        return self
 
     @classmethod
     def from_yaml(cls, path: str | Path, overrides: Mapping[str, Any] | None = None) -> Self:

@@ -20,6 +20,7 @@ from advsearch.cli import flags
 from advsearch.cli.main import main
 from advsearch.cli.sweep import axes_as_text
 from advsearch.config import (
+    QUANTITIES,
     AttackConfig,
     CheckConfig,
     GapConfig,
@@ -224,7 +225,7 @@ def test_a_wrong_value_of_other_commands_names_its_flag(
     assert flags.with_flags(str(error.value)) == f"{flag(field)}: {message}"
 
 
-@pytest.mark.parametrize("config", [*CONFIGS, RenderConfig], ids=lambda config: config.command)
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.command)
 def test_no_value_of_any_setting_ends_in_a_traceback(config: type[Config]) -> None:
     """Refused in one line that names the setting, or accepted and then the same in every form."""
     needed = {one.field: "a.png" for one in settings(config) if one.required}
@@ -273,6 +274,53 @@ def test_slips_on_the_command_line_are_refused_in_one_sentence(line: str, messag
     with pytest.raises(InputError) as error:
         of_command_line(f"advsearch attack {'' if '--object' in line else '--object mug'} {line}")
     assert flags.with_flags(str(error.value)).startswith(message)
+
+
+CLASHES: tuple[tuple[type[Config], dict[str, Any], str], ...] = (
+    (AttackConfig, {"deterministic": True, "threads": 4}, "threads: `deterministic` works on one thread"),
+    (SweepConfig, {"overwrite": True}, "overwrite: replaces the run that `run` names, and none is named"),
+    (AttackConfig, {"smallest": True, "epsilon": "0.1,0.2"}, "smallest: finds one epsilon by itself"),
+    (AttackConfig, {"smallest": True, "object": "mug,bowl"}, "smallest: is about one object"),
+    (AttackConfig, {"smallest": True, "seconds": 5}, "smallest: takes several searches"),
+    (AttackConfig, {"smallest": True, "over": "camera"}, "smallest: cannot be combined with `over` yet"),
+    (AttackConfig, {"minimise": True, "object": "mug,bowl"}, "minimise: has no robust accuracy"),
+    (AttackConfig, {"minimise": True, "target": "bowl"}, "minimise: makes the right answer easier to give"),
+    (AttackConfig, {"minimise": True, "smallest": True}, "minimise: has no smallest change"),
+    (AttackConfig, {"over": "camera", "controls": "camera.fov"}, "over: names a control that is searched already"),
+    (AttackConfig, {"draws": 8}, "draws: is how many conditions of `over` a step looks at, and there are none"),
+    (AttackConfig, {"over": "camera", "estimators": {"camera.fov": "forward"}}, "estimators: names a control that"),
+    (AttackConfig, {"average": 10, "epsilon": "0.1,0.2"}, "average: is not part of a curve"),
+    (GapConfig, {"smallest": True}, "smallest: is not for `advsearch gap`"),
+    (GapConfig, {"epsilon": "0.1,0.2"}, "epsilon: `advsearch gap` compares over one space"),
+    (SweepConfig, {"sampler": "random", "grid": {"pose.yaw": "0,90"}}, "sampler: is how `controls` are drawn"),
+    (SweepConfig, {"trials": 0, "verify_spp": 8}, "verify_spp: is of the trials, and `trials` is 0"),
+    *(
+        (PrecisionConfig, {name: value, "quantities": ",".join({*QUANTITIES} - {left})}, f"{name}: is of the {left}, ")
+        for name, value, left in (
+            ("samplers", "independent", "image"), ("depths", "2,3", "image"), ("loss", "model", "gradient"),
+            ("policies", "random", "objective"), ("steps", 9, "objective"), ("repeats", 2, "objective"),
+        )
+    ),
+    (PrecisionConfig, {"out": "x", "run": "y"}, "out: is instead of a run"),
+    (CheckConfig, {"all": True, "controls": "pose"}, "all: takes scenes and controls of its own; leave `object`"),
+)  # fmt: skip
+"""Every pair of settings that excludes each other, or of which one would be ignored."""
+
+
+@pytest.mark.parametrize(("config", "given", "message"), CLASHES)
+def test_settings_that_would_be_ignored_or_exclude_each_other_are_refused(
+    config: type[Config], given: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(InputError) as error:
+        config(**{"object": "mug", **given})
+    assert str(error.value).startswith(message)
+
+
+def test_every_clash_has_its_example() -> None:
+    every = {(clash.setting, clash.why) for config in CONFIGS for clash in config.clashes}
+    seen = [message.partition(": ") for _, _, message in CLASHES]
+    for setting, why in every:
+        assert any(name == setting and why.startswith(begun) for name, _, begun in seen), (setting, why)
 
 
 def test_yaml_round_trip_of_everything(tmp_path: Path) -> None:
@@ -418,7 +466,7 @@ def test_a_policy_has_options_and_its_steps_are_the_runs(given: Any) -> None:
         ({"smallest": True, "over": "camera"}, "smallest: cannot be combined with `over`"),
         ({"minimise": True, "target": "bowl"}, "minimise: makes the right answer easier to give"),
         ({"minimise": True, "smallest": True}, "minimise: has no smallest change"),
-        ({"controls": "pose", "over": "pose"}, "over: pose is searched already"),
+        ({"controls": "pose", "over": "pose"}, "over: names a control that is searched already"),
     ],
 )
 def test_settings_that_exclude_each_other(data: dict[str, Any], message: str) -> None:

@@ -8,10 +8,13 @@ import pytest
 
 import advsearch
 from advsearch.api import attacking, rendering
+from advsearch.api.attacking import _with_derivatives
 from advsearch.api.naming import RUN_SETTINGS, check_run_settings, controls_of
 from advsearch.api.studies import gap_from_config
 from advsearch.api.sweeping import _job_of
+from advsearch.attacks import make_policy
 from advsearch.cli.flags import with_flags
+from advsearch.cli.main import main
 from advsearch.config import AttackConfig, GapConfig, RenderConfig, SweepConfig
 from advsearch.controls import CONTROLS
 from advsearch.controls.patch import PatchControl
@@ -158,3 +161,16 @@ def test_an_instance_says_its_own(setting: str) -> None:
     with pytest.raises(InputError, match=rf"{setting}: control texture is an instance already; give it its own"):
         controls_of([PoseControl(), TextureControl()], config)
     assert controls_of([PoseControl()], config)[0].name == "pose"
+
+
+@pytest.mark.parametrize("given", [{"estimators": {"*": "forward"}}, {"measure": "full"}])
+def test_settings_of_derivatives_are_refused_beside_a_policy_that_takes_none(given: dict[str, Any]) -> None:
+    config = AttackConfig(object="mug", policy="random", **given)
+    with pytest.raises(InputError, match="policy random takes no derivatives; leave one of the two out"):
+        _with_derivatives(make_policy("random"), config)
+    assert _with_derivatives(make_policy("pgd"), config).name == "pgd"
+
+
+def test_a_region_has_no_samples_of_a_search(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["region", "--object", "mug", "--spp", "4"]) == 2
+    assert "unknown flag '--spp'" in capsys.readouterr().err

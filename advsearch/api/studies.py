@@ -16,7 +16,6 @@ from advsearch.api.attacking import attack_from_config, resume_attack
 from advsearch.api.naming import check_run_settings, different, load_models, run_settings_for
 from advsearch.attacks import clopper_pearson, needed
 from advsearch.config import AttackConfig, GapConfig
-from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.studies import curve_figure, gap_figure
 from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, default_name, is_run
@@ -221,8 +220,6 @@ def _accuracy(rows: Sequence[Summary], epsilon: float | None) -> Summary:
 
 
 def _gap(config: GapConfig, parts: _Parts) -> Summary:
-    if config.epsilons or config.smallest:
-        raise InputError("advsearch gap: compares over one space; give one `epsilon`, and leave `smallest` out")
     check_run_settings(config)
     rows = []
     for place, name in enumerate(different(config.objects, "object")):

@@ -34,7 +34,7 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    add_settings(parser, config=RegionConfig)
+    add_settings(parser, config=RegionConfig, without=("spp",))  # nothing is searched, so there is no such count
     output.add_flags(parser, quiet=True)
 
 

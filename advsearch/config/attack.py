@@ -8,8 +8,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import field_validator, model_validator
 
 from advsearch.config.scene import SceneConfig
-from advsearch.errors import InputError
-from advsearch.settings import check_once, parse_assignment, setting
+from advsearch.settings import Clash, check_once, parse_assignment, setting
 
 TRIALS, TRIALS_OVER = 20, 200
 """Fresh renders that check an answer, and one that holds for many conditions."""
@@ -26,6 +25,49 @@ class AttackConfig(SceneConfig):
 
     command: ClassVar[str] = "attack"
     several: ClassVar[tuple[str, ...]] = ("object",)
+
+    clashes: ClassVar[tuple[Clash, ...]] = (
+        *SceneConfig.clashes,
+        Clash(
+            "smallest",
+            lambda one: one.epsilons,
+            "finds one epsilon by itself; give one `epsilon` as the largest, or none",
+        ),
+        Clash(
+            "smallest",
+            lambda one: one.is_study,
+            "is about one object; name one `object`, and one `epsilon` as the largest",
+        ),
+        Clash(
+            "smallest",
+            lambda one: one.seconds is not None,
+            "takes several searches; give `steps` for each, and leave `seconds` out",
+        ),
+        Clash("smallest", lambda one: one.over, "cannot be combined with `over` yet; leave one of them out"),
+        Clash("minimise", lambda one: one.is_study, "has no robust accuracy; name one `object` and one `epsilon`"),
+        Clash("minimise", lambda one: one.target, "makes the right answer easier to give; leave `target` out"),
+        Clash("minimise", lambda one: one.smallest, "has no smallest change; leave `smallest` out"),
+        Clash(
+            "over",
+            lambda one: {*map(instance, one.over)} & {*map(instance, one.controls)},
+            "names a control that is searched already; leave it out of one of the two",
+        ),
+        Clash(
+            "draws",
+            lambda one: not one.over,
+            "is how many conditions of `over` a step looks at, and there are none; add `over`, or leave `draws` out",
+        ),
+        Clash(
+            "estimators",
+            lambda one: {name.partition(".")[0] for name in one.estimators} & {*map(instance, one.over)},
+            "names a control that varies by chance, whose derivative nobody asks for; leave it out",
+        ),
+        Clash(
+            "average",
+            lambda one: one.command == "attack" and one.is_study,
+            "is not part of a curve; `advsearch gap` compares with the average, or name one `object` and one `epsilon`",
+        ),
+    )
 
     object: str = setting(
         ...,
@@ -181,28 +223,6 @@ class AttackConfig(SceneConfig):
         name = options.pop("name", "auto")
         return {**data, **steps, "policy": {"name": name, **options} if options else name}
 
-    @model_validator(mode="after")
-    def _together(self) -> AttackConfig:
-        """Refuse settings that exclude each other."""
-        if self.smallest and self.epsilons:
-            raise InputError("smallest: finds one epsilon by itself; give one `epsilon` as the largest, or none")
-        if self.smallest and self.is_study:
-            raise InputError("smallest: is about one object; name one `object`, and one `epsilon` as the largest")
-        if self.minimise and self.is_study:
-            raise InputError("minimise: has no robust accuracy; name one `object` and one `epsilon`")
-        if self.smallest and self.seconds is not None:
-            raise InputError("smallest: takes several searches; give `steps` for each, and leave `seconds` out")
-        if self.smallest and self.over:
-            raise InputError("smallest: cannot be combined with `over` yet; leave one of them out")
-        if self.minimise and self.target:
-            raise InputError("minimise: makes the right answer easier to give; leave `target` out")
-        if self.minimise and self.smallest:
-            raise InputError("minimise: has no smallest change; leave `smallest` out")
-        twice = set(self.over) & set(self.controls)
-        if twice:
-            raise InputError(f"over: {', '.join(sorted(twice))} is searched already; leave it out of one of the two")
-        return self
-
     @property
     def policy_name(self) -> str:
         """Name of the policy."""
@@ -227,6 +247,12 @@ class AttackConfig(SceneConfig):
     def trial_count(self) -> int:
         """Trials of each group in the verification."""
         return self.trials if self.trials is not None else TRIALS_OVER if self.over else TRIALS
+
+
+def instance(asked: str) -> str:
+    """The name of a control's instance as it is asked for: `key` of `light:key`, `camera` of `camera.azimuth`."""
+    kind, _, own = asked.partition(":")
+    return (own or kind).partition(".")[0]
 
 
 def _positive(value: Any) -> float:

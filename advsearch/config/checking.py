@@ -5,7 +5,10 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 from advsearch.config.attack import AttackConfig
-from advsearch.settings import setting
+from advsearch.settings import Clash, setting
+
+OF_ALL = {"object": "mug", "environment": "studio", "controls": {"texture": {}}, "set_": {}}
+"""What is as it is unless it is given, and has to be left so with `all`."""
 
 
 class CheckConfig(AttackConfig):
@@ -13,6 +16,15 @@ class CheckConfig(AttackConfig):
 
     command: ClassVar[str] = "check"
     several: ClassVar[tuple[str, ...]] = ()
+
+    clashes: ClassVar[tuple[Clash, ...]] = (
+        *AttackConfig.clashes,
+        Clash(
+            "all",
+            lambda one: any(getattr(one, name) != value for name, value in OF_ALL.items()),
+            "takes scenes and controls of its own; leave `object`, `environment`, `controls` and `set` out",
+        ),
+    )
 
     all: bool = setting(False, "check", "every control, on three bundled scenes; takes hours", "true or false")
     loss: Literal["linear", "model", "both"] = setting(
@@ -25,10 +37,11 @@ class CheckConfig(AttackConfig):
         None,
         "check",
         "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
-        "a number greater than 0",
+        "a number greater than 0 and at most 1e9",
         otherwise="no limit",
         unit="seconds",
         gt=0.0,
+        le=1e9,
     )
 
     @property

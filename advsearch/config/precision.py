@@ -2,23 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator
 
 from advsearch.config.attack import LARGEST_EPSILON, AttackConfig
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import PLACE, check_once, setting, split_names
+from advsearch.settings import PLACE, Clash, check_once, setting, split_names
 
 QUANTITIES = ("image", "gradient", "objective")
 SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
 """What `precision` measures, and the samplers that it knows."""
 
 
+def _without(quantity: str) -> Callable[[Any], object]:
+    return lambda one: quantity not in split_names(one.quantities)
+
+
 class PrecisionConfig(SceneConfig):
     """Everything that decides what `precision` does: error against run time, for a scene, its controls and a model."""
 
     command: ClassVar[str] = "precision"
+    clashes: ClassVar[tuple[Clash, ...]] = (
+        *SceneConfig.clashes,
+        *(
+            Clash(name, _without(quantity), f"is of the {quantity}, which `quantities` leaves out; leave it out too")
+            for name, quantity in (
+                ("samplers", "image"),
+                ("depths", "image"),
+                ("loss", "gradient"),
+                ("policies", "objective"),
+                ("steps", "objective"),
+                ("repeats", "objective"),
+            )
+        ),
+        Clash("out", lambda one: one.run is not None, "is instead of a run; leave one of `out` and `run` out"),
+    )
 
     quantities: str = setting(
         "image,gradient,objective",

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import setting
+from advsearch.settings import Clash, setting
 
 FEWEST_SAMPLES = 8
 """With fewer, not even a box without exceptions has one verdict in more than half of it, at the confidence of
@@ -17,6 +17,15 @@ class GapConfig(AttackConfig):
     """Everything that decides what `gap` does: the worst case beside the average, for each object and each control."""
 
     command: ClassVar[str] = "gap"
+    clashes: ClassVar[tuple[Clash, ...]] = (
+        *AttackConfig.clashes,
+        Clash(
+            "smallest",
+            lambda one: True,
+            "is not for `advsearch gap`, which compares over one space; leave it out",
+        ),
+        Clash("epsilon", lambda one: one.epsilons, "`advsearch gap` compares over one space; give one epsilon"),
+    )
 
     average: int = setting(
         200,

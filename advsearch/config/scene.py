@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import field_validator, model_validator
 
 from advsearch.errors import InputError
-from advsearch.settings import Config, check_once, number_or_text, setting, split_names
+from advsearch.settings import Clash, Config, check_once, number_or_text, setting, split_names
 
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
@@ -28,6 +28,18 @@ class SceneConfig(Config):
 
     several: ClassVar[tuple[str, ...]] = ()
     """Which of object, environment and model may be several, separated by commas."""
+    clashes: ClassVar[tuple[Clash, ...]] = (
+        Clash(
+            "threads",
+            lambda one: one.deterministic and one.threads != 1,
+            "`deterministic` works on one thread; leave one of them out",
+        ),
+        Clash(
+            "overwrite",
+            lambda one: one.run is None,
+            "replaces the run that `run` names, and none is named; name it, or leave `overwrite` out",
+        ),
+    )
 
     object: str = setting(
         ...,

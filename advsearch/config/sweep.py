@@ -9,7 +9,7 @@ from pydantic import field_validator
 
 from advsearch.config.attack import FEWEST_TRIALS
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import number_or_text, setting, split_names
+from advsearch.settings import Clash, number_or_text, setting, split_names
 
 
 class SweepConfig(SceneConfig):
@@ -17,6 +17,17 @@ class SweepConfig(SceneConfig):
 
     command: ClassVar[str] = "sweep"
     several: ClassVar[tuple[str, ...]] = ("object", "environment", "model")
+    clashes: ClassVar[tuple[Clash, ...]] = (
+        *SceneConfig.clashes,
+        Clash(
+            "sampler",
+            lambda one: not one.controls,
+            "is how `controls` are drawn, and none are; add `controls`, or leave `sampler` out",
+        ),
+        Clash(
+            "verify_spp", lambda one: one.trials == 0, "is of the trials, and `trials` is 0; leave one of the two out"
+        ),
+    )
 
     object: str = setting(
         ...,
