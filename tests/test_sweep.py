@@ -544,6 +544,41 @@ def test_objects_environments_and_models_are_outer_axes(tmp_path: Path) -> None:
     assert {row["axis"] for row in result.summary["axes"]} == {"object", "environment", "model", "pose.yaw"}
 
 
+def test_a_grid_is_drawn_as_a_map_of_its_cells(tmp_path: Path) -> None:
+    grid = {"pose.yaw": "0:360:12", "camera.elevation": "5:60:4"}
+    result = advsearch.sweep("mug", model(), grid, trials=0, run=tmp_path / "run")
+    cells, rows = result.summary["cells"], list(result.rows())
+    yaw, elevation = cells["axes"]
+    assert (yaw["axis"], yaw["unit"], len(yaw["values"])) == ("pose.yaw", "degrees", 12)
+    assert cells["over"] == [] and cells["configurations"] == [[1] * 12] * 4
+    for row in rows:
+        across = yaw["values"].index(row.values["pose.yaw"]["value"])
+        up = elevation["values"].index(row.values["camera.elevation"]["value"])
+        assert cells["correct"][up][across] == row.correct and cells["margin"][up][across] == row.margin
+    drawn = (tmp_path / "run" / "images" / "sweep.svg").read_text("utf-8")
+    assert (tmp_path / "run" / "images" / "sweep.png").read_bytes().startswith(b"\x89PNG")
+    for text in ("pose.yaw [degrees]", "camera.elevation [degrees]", "330", "23.33", "margin [logits]; above 0: wrong"):
+        assert f">{text}</text>" in drawn
+
+
+def test_cells_with_several_configurations_show_their_accuracy(tmp_path: Path) -> None:
+    grid = {"pose.yaw": [0, 90], "camera.elevation": [5, 60]}
+    names = "mug,bowl"
+    result = advsearch.sweep(
+        names, model(), grid, label="mug", controls="camera.azimuth", samples=3, trials=0, run=tmp_path / "run"
+    )
+    cells = result.summary["cells"]
+    assert cells["configurations"] == [[6, 6], [6, 6]] and cells["over"] == ["object"]
+    drawn = (tmp_path / "run" / "images" / "sweep.svg").read_text("utf-8")
+    assert ">accuracy</text>" in drawn and "over 1 more axis</text>" in drawn
+
+
+def test_one_axis_is_drawn_with_its_intervals(tmp_path: Path) -> None:
+    result = advsearch.sweep("mug", model(), {"pose.yaw": [0, 90]}, controls="camera", trials=0, run=tmp_path / "run")
+    assert result.summary["cells"] is None
+    assert ">95 % interval</text>" in (tmp_path / "run" / "images" / "sweep.svg").read_text("utf-8")
+
+
 def test_models_of_several_sizes_get_pictures_of_their_size() -> None:
     result = advsearch.sweep("mug", [model(0.5, "a", 16), model(0.5, "b", 24)], {"pose.yaw": [0, 90]}, trials=0)
     assert {renderer.size for renderer in FakeRenderer.made} == {(16, 16), (24, 24)}

@@ -1,8 +1,9 @@
-"""Figures of studies: robust accuracy against epsilon, the worst case beside the average, a map of the margin."""
+"""Figures of studies: robust accuracy against epsilon, worst case and average, maps of the margin and of a sweep."""
 
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -74,11 +75,8 @@ def map_figure(
 
     def draw(axes: Any) -> None:
         first, second = axes_of
-        largest = max(max(abs(value) for row in margins for value in row), 1e-6)
         extent = (first["low"], first["high"], second["low"], second["high"])
-        shown = axes.imshow(
-            margins, origin="lower", extent=extent, aspect="auto", cmap="RdBu_r", vmin=-largest, vmax=largest
-        )
+        _heat(axes, margins, extent, MARGIN, _name(first["name"], first), _name(second["name"], second))
         if min(map(min, margins)) < 0.0 < max(map(max, margins)):
             axes.contour(margins, levels=[0.0], extent=extent, colors="black", linewidths=1.0)
         across, up = box
@@ -86,12 +84,108 @@ def map_figure(
         corners_y = [up["low"], up["low"], up["high"], up["high"], up["low"]]
         axes.plot(corners_x, corners_y, color="black", linestyle="--", label="region")
         axes.plot(across["centre"], up["centre"], "k+", label="centre")
-        for set_label, one in ((axes.set_xlabel, first), (axes.set_ylabel, second)):
-            set_label(f"{one['name']} [{one['unit']}]" if one["unit"] else one["name"])
-        axes.figure.colorbar(shown, ax=axes, label="margin [logits]; above 0: wrong")
         axes.legend(loc="upper right", frameon=True)
 
     return _figure(draw, (6.0, 4.6))
+
+
+def sweep_figure(answer: Mapping[str, Any]) -> Figures:
+    """Draw a sweep: a map over two axes, or the accuracy over the only one; nothing where there is none.
+
+    A cell shows the accuracy there; where no cell has more than one configuration, the margin.
+    """
+    cells = answer.get("cells")
+    if cells:
+        return _figure(lambda axes: _cells(axes, answer, cells), _map_size(cells))
+    listed = [row for row in answer["axes"] if not isinstance(row["value"], (list, tuple))]
+    rows = listed or answer["axes"]
+    if len({row["axis"] for row in rows}) != 1 or len(rows) > MOST_POINTS:
+        return {}
+    return _figure(lambda axes: _along(axes, answer, rows), (5.6, 3.6))
+
+
+def _cells(axes: Any, answer: Mapping[str, Any], cells: Mapping[str, Any]) -> None:
+    """The map of a sweep."""
+    first, second = cells["axes"]
+    seen, correct, margin = cells["configurations"], cells["correct"], cells["margin"]
+    extent = (-0.5, len(first["values"]) - 0.5, -0.5, len(second["values"]) - 0.5)
+    labels = _name(first["axis"], first), _name(second["axis"], second)
+    if max(map(max, seen)) > 1:
+        pairs = [zip(*rows, strict=True) for rows in zip(correct, seen, strict=True)]
+        values = [[right / count if count else math.nan for right, count in row] for row in pairs]
+        _heat(axes, values, extent, ACCURACY, *labels)
+    else:
+        values = [[math.nan if one is None else one for one in row] for row in margin]
+        _heat(axes, values, extent, MARGIN, *labels)
+    axes.set_xticks(*_ticks(first["values"]), rotation=45 if _long(first["values"]) else 0)
+    axes.set_yticks(*_ticks(second["values"]))
+    more = len(cells["over"])
+    over = f", over {more} more {'axes' if more > 1 else 'axis'}" if more else ""
+    axes.set_title(f"{answer['object']}, {answer['model']}{over}")
+
+
+def _along(axes: Any, answer: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:
+    """The accuracy with its interval over one axis."""
+    at, accuracy = range(len(rows)), [row["accuracy"] for row in rows]
+    low, high = ([row["interval"][end] for row in rows] for end in (0, 1))
+    axes.vlines(at, low, high, color=BLUE, alpha=0.35, linewidth=5, label="95 % interval")
+    axes.plot(at, accuracy, "o", color=BLUE, label="accuracy")
+    axes.set_xticks(*_ticks([row["value"] for row in rows]), rotation=45 if _long([r["value"] for r in rows]) else 0)
+    axes.set(xlabel=_name(rows[0]["axis"], rows[0]), ylabel="accuracy", ylim=(-0.03, 1.03))
+    axes.margins(x=0.08)
+    axes.set_title(f"{answer['object']}, {answer['model']}")
+    axes.grid(True, axis="y")
+    axes.figure.legend(loc="outside lower center", ncols=2)
+
+
+# ---- parts ----------------------------------------------------------------------------------------------------------
+
+MARGIN, ACCURACY = "margin [logits]; above 0: wrong", "accuracy"
+"""What the colours of a map may mean: red is wrong in both."""
+
+MOST_POINTS, MOST_TICKS = 400, 16
+"""Values of an axis that are drawn, and that are written."""
+
+
+def _heat(
+    axes: Any, values: Sequence[Sequence[float]], extent: tuple[float, ...], meaning: str, across: str, up: str
+) -> None:
+    """Draw values as colours, rows from the lowest, with what they mean and the names of both axes."""
+    finite = [abs(value) for row in values for value in row if math.isfinite(value)]
+    if meaning == ACCURACY:
+        colours: dict[str, Any] = {"cmap": "RdBu", "vmin": 0.0, "vmax": 1.0}
+    else:
+        largest = max([*finite, 1e-6])
+        colours = {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest}
+    shown = axes.imshow(values, origin="lower", extent=extent, aspect="auto", **colours)
+    axes.set(xlabel=across, ylabel=up)
+    axes.figure.colorbar(shown, ax=axes, label=meaning)
+
+
+def _name(name: str, axis: Mapping[str, Any]) -> str:
+    return f"{name} [{axis['unit']}]" if axis["unit"] not in ("", "name") else name
+
+
+def _ticks(values: Sequence[Any]) -> tuple[list[int], list[str]]:
+    """Places and names of the values of an axis; of many, of some."""
+    every = -(-len(values) // MOST_TICKS)
+    places = list(range(0, len(values), every))
+    return places, [_written(values[place]) for place in places]
+
+
+def _written(value: Any) -> str:
+    if isinstance(value, (list, tuple)):
+        return " to ".join(f"{end:.3g}" for end in value)
+    return str(value) if isinstance(value, str) else f"{value:.4g}"
+
+
+def _long(values: Sequence[Any]) -> bool:
+    return sum(len(text) + 1 for text in _ticks(values)[1]) > 50
+
+
+def _map_size(cells: Mapping[str, Any]) -> tuple[float, float]:
+    wide, high = (min(len(axis["values"]), MOST_TICKS) for axis in cells["axes"])
+    return 3.2 + 0.34 * wide, 1.8 + 0.3 * high
 
 
 def _worst(row: Mapping[str, Any]) -> float:

@@ -27,8 +27,10 @@ from advsearch.attacks.draws import Seeds
 from advsearch.attacks.product import batches
 from advsearch.controls.base import Value
 from advsearch.progress import Progress
+from advsearch.report.studies import sweep_figure
 from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
+from advsearch.runs.files import write_bytes
 
 KIND = "sweep"
 """Rows of the sweep; those of the trials are called "verification"."""
@@ -301,6 +303,8 @@ class Sweep:
         }
         if self.run is not None:
             self.run.write_summary(summary)
+            for suffix, data in sweep_figure(summary).items():
+                write_bytes(self.run.path / "images" / f"sweep.{suffix}", data)
         return SweepResult(summary, None if self.run is None else self.run.path, tuple(self._kept))
 
     def _remarks(self, tally: Tally, checked: dict[str, Any] | None) -> list[str]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from advsearch.api.sweeps.axes import Axis
+from advsearch.api.sweeps.cells import Cells
 from advsearch.api.sweeps.points import Drawn, Picks
 from advsearch.attacks import Trial, Trials, clopper_pearson
 
@@ -88,6 +89,11 @@ class Tally:
         self._outer = [Count(name, "", list(dict.fromkeys(values))) for name, values in outer]
         self._grid = [Count(axis.name, axis.unit, axis.values) for axis in axes]
         self._drawn = [Count(one.name, one.unit, one.parts) for one in drawn]
+        every = [*self._grid, *reversed(self._outer), *self._drawn]
+        several = [number for number, count in enumerate(every) if len(count.values) > 1]
+        listed = [number for number in several if number < len(every) - len(self._drawn)]
+        self._mapped = listed or several
+        self._cells = Cells([(every[n].name, every[n].unit, every[n].values) for n in self._mapped])
 
     def add(self, index: int, outer: Sequence[int], picks: Picks, place: int, trial: Trial, label: str) -> None:
         """Count one configuration.
@@ -109,6 +115,8 @@ class Tally:
             count.add(digit, right)
         for count, part in zip(self._drawn, picks.parts[place], strict=True):
             count.add(part, right)
+        places = (*picks.digits[place], *reversed(outer), *picks.parts[place])
+        self._cells.add([places[number] for number in self._mapped], trial)
         if trial.wrong:
             self.answers[label] += 1
         if trial.margin != trial.margin:
@@ -128,6 +136,7 @@ class Tally:
             "not_finite": self.not_finite,
             "answers": dict(sorted(self.answers.most_common(MOST_ANSWERS), key=lambda one: (-one[1], one[0]))),
             "axes": self.table(),
+            "cells": self._cells.to_dict(),
         }
 
 
