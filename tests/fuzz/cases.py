@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import random
 
-from fuzz import gltf, meshes, pictures
+from fuzz import gltf, meshes, models, pictures
 from fuzz.case import Case, Maker
 
-MAKERS: tuple[Maker, ...] = (*meshes.MAKERS, *gltf.MAKERS, *pictures.MAKERS)
+MAKERS: tuple[Maker, ...] = (*meshes.MAKERS, *gltf.MAKERS, *pictures.MAKERS, *models.MAKERS)
 """They take turns, so that any few dozen cases in a row have some of everything."""
 
 

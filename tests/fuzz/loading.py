@@ -28,6 +28,33 @@ def load_picture(path: Path) -> None:
     advsearch.load_scene("book").renderer({"patch": {"picture": str(path), "size": [0.1, 0.2]}}, resolution=16)
 
 
+def load_model(path: Path) -> None:
+    """Read a model and ask it once."""
+    from advsearch.models import load_model
+
+    load_model(path)
+
+
+def load_labels(path: Path) -> None:
+    """Read the names of classes."""
+    from advsearch.models.labels import read_labels
+
+    read_labels(path)
+
+
+def load_settings(path: Path) -> None:
+    """Read a YAML file as `advsearch run` does."""
+    from advsearch import config
+    from advsearch.cli.run import COMMANDS
+    from advsearch.errors import UnknownNameError
+    from advsearch.settings import read_yaml
+
+    command = str(read_yaml(path).get("command", "attack"))
+    if command not in COMMANDS:
+        raise UnknownNameError("command", command, COMMANDS, f"It stands in {path}.")
+    getattr(config, COMMANDS[command]).from_yaml(path, {})
+
+
 def misbehave(path: Path) -> None:
     """Do what no loader may, as the file says; the test of the fuzz itself."""
     import subprocess
@@ -51,6 +78,9 @@ LOADERS: dict[str, Callable[[Path], object]] = {
     "object": load_object,
     "environment": load_environment,
     "picture": load_picture,
+    "model": load_model,
+    "labels": load_labels,
+    "settings": load_settings,
     "misbehave": misbehave,
 }
 """Each gets the path of a case's main file, and returns or raises an `AdvsearchError`."""
@@ -68,3 +98,10 @@ def warm_up(loaders: Iterable[str]) -> None:
         import advsearch.scene.importing.objects
 
         Image.init()
+    if "model" in loaders:
+        import torch.export
+        import torch.jit  # noqa: F401
+
+        import advsearch.models
+
+        advsearch.models.load_model("reference")
