@@ -313,6 +313,7 @@ BAD = {
     "device": (link("bad.exr", "/dev/zero"), r"expected .*environment.*, got a device; name an ordinary file"),
     "cut hdr header": (bad_hdr(b"#?RADIANCE\nFORMAT=32-"), r"expected a Radiance \.hdr picture, got half a header"),
     "xyz": (bad_hdr(b"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 8 +X 16\n"), r"got 32-bit_rle_xyze; convert it to RGB"),
+    "escapes": (bad_hdr(b"#?RADIANCE\nFORMAT=\x1b[31m\n\n-Y 8 +X 16\n"), r"got \\x1b\[31m; convert it to RGB"),
     "rotated": (
         bad_hdr(HEADER + b"+X 16 -Y 8\n"),
         r"a size like '-Y 512 \+X 1024', got '\+X 16 -Y 8'; save the picture",

@@ -1052,6 +1052,14 @@ def test_jpeg_with_too_many_scans_is_not_decoded(tmp_path: Path) -> None:
     assert "expected a JPEG of at most 64 scans, got 110; if you trust it" in asset.warnings[0]
 
 
+@pytest.mark.parametrize("line", ["f {} 1 2", "v 1 {}", "f {}"])
+def test_messages_show_what_a_file_holds_briefly_and_plainly(tmp_path: Path, line: str) -> None:
+    text = QUAD_V + line.format("\x1b]0;owned\x07" + "n" * 5000) + "\nf 1 2 3\n"
+    with pytest.raises(FileFormatError, match=r"thing\.obj") as caught:
+        import_object(written(tmp_path, "thing.obj", text))
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 400 + len(str(tmp_path))
+
+
 def test_warnings_have_an_end(tmp_path: Path) -> None:
     written(tmp_path, "thing.mtl", MTL)
     faces = "".join(f"usemtl none{k}\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n" for k in range(50))

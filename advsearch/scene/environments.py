@@ -146,7 +146,7 @@ def _read_exr(file: Path, data: bytes) -> Planes:
     names = ("R", "G", "B") if "Y" not in channels or "R" in channels else ("Y", "Y", "Y")
     missing = [name for name in dict.fromkeys(names) if name not in channels]
     if missing or ("RY" in channels and names[0] == "Y"):
-        got = ", ".join(shown(name)[1:-1] for name in sorted(channels))
+        got = ", ".join(shown(name, quoted=False) for name in sorted(channels))
         raise FileFormatError(
             f"{file}: expected the channels R, G and B (or Y alone), got {got};"
             " save the picture as plain RGB without layers"

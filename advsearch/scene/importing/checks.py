@@ -12,7 +12,7 @@ import struct
 from pathlib import Path
 
 from advsearch import files
-from advsearch.scene.importing.files import damaged, looks_like, text_of
+from advsearch.scene.importing.files import damaged, looks_like, shown, text_of
 
 LARGEST_FACES = 500_000
 """Triangles that a mesh may have, before `advsearch.files.scaled`; each takes over 1 KB of memory to import."""
@@ -68,7 +68,9 @@ def _checked_obj(path: Path, data: bytes) -> str:
         if key in counts:
             counts[key] += 1
             if rest.count(" ") < 2 and len(rest.split()) < (1 if key == "vt" else 3):
-                raise damaged(path, f"3 numbers after {key!r} on line {number}", f"{rest!r} (is the file cut short?)")
+                raise damaged(
+                    path, f"3 numbers after {key!r} on line {number}", f"{shown(rest)} (is the file cut short?)"
+                )
         elif key == "f":
             tokens = rest.split("#", 1)[0].split()
             triangles += len(tokens) - 2
@@ -89,7 +91,9 @@ def _corners(
 ) -> list[str]:
     """Return the corners of the face on line `number` with absolute indices; note the largest index of each kind."""
     if len(tokens) < 3:
-        raise damaged(path, f"3 or more corners on line {number}", f"'f {' '.join(tokens)}' (is the file cut short?)")
+        raise damaged(
+            path, f"3 or more corners on line {number}", f"{shown(' '.join(['f', *tokens]))} (is the file cut short?)"
+        )
     if len(tokens) > files.scaled(MOST_CORNERS):
         expected = f"at most {files.scaled(MOST_CORNERS):,} corners in the face on line {number}"
         raise files.too_large(path, expected, f"{len(tokens):,}")
@@ -102,10 +106,10 @@ def _corners(
             try:
                 index = int(parts[place])
             except ValueError:
-                raise damaged(path, f"whole numbers in the face on line {number}", repr(token)) from None
+                raise damaged(path, f"whole numbers in the face on line {number}", shown(token)) from None
             absolute = index if index > 0 else counts[kind] + 1 + index
             if index == 0 or absolute < 1:
-                raise damaged(path, f"indices that count from 1 in the face on line {number}", repr(token))
+                raise damaged(path, f"indices that count from 1 in the face on line {number}", shown(token))
             parts[place] = str(absolute)
             if absolute > largest[kind][0]:
                 largest[kind] = (absolute, number)

@@ -86,11 +86,11 @@ def text_of(data: bytes) -> str:
         return data.decode("latin-1")
 
 
-def shown(name: str) -> str:
-    """Return a name out of a file as a message shows it: quoted, control characters spelled out, cut to a length."""
-    if len(name) <= _LONGEST_NAME:
-        return repr(name)
-    return f"{name[: _LONGEST_NAME // 2]!r}... ({len(name):,} characters)"
+def shown(name: str, *, quoted: bool = True) -> str:
+    """Return a name out of a file as a message shows it: control characters spelled out, cut to a length."""
+    kept = name if len(name) <= _LONGEST_NAME else name[: _LONGEST_NAME // 2]
+    text = repr(kept) if quoted else repr(kept)[1:-1]
+    return text if kept == name else f"{text}... ({len(name):,} characters)"
 
 
 def safe_name(path: Path) -> str:

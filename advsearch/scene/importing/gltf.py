@@ -276,7 +276,7 @@ def _check(path: Path, header: Header) -> None:
     needed = sorted(name for name in header.extensionsRequired if any(word in name for word in _UNREADABLE))
     if needed:
         raise FileFormatError(
-            f"{path}: needs {', '.join(needed)}, which is not supported; export it without that option"
+            f"{path}: needs {shown(', '.join(needed), quoted=False)}, which is not supported; export it without that option"
         )
     for view in header.bufferViews:
         _check_index(path, "buffers", view.buffer, header.buffers)

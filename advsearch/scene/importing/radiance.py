@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.importing.files import damaged, looks_like
+from advsearch.scene.importing.files import damaged, looks_like, shown
 from advsearch.scene.importing.images import check_pixels
 
 Floats = npt.NDArray[np.float32]
@@ -41,9 +41,8 @@ def read_radiance(path: Path, data: bytes) -> Bytes:
         raise damaged(path, "a Radiance .hdr picture", got)
     coding = re.search(rb"^FORMAT=\s*(\S+)", head, re.MULTILINE)
     if coding and coding[1] != b"32-bit_rle_rgbe":
-        raise FileFormatError(
-            f"{path}: expected FORMAT=32-bit_rle_rgbe, got {coding[1].decode('latin-1')}; convert it to RGB"
-        )
+        got = shown(coding[1].decode("latin-1"), quoted=False)
+        raise FileFormatError(f"{path}: expected FORMAT=32-bit_rle_rgbe, got {got}; convert it to RGB")
     size = _RESOLUTION.match(rest)
     if not size or not int(size[2]) or not int(size[4]):
         line = rest[:30].split(b"\n")[0].decode("latin-1")
