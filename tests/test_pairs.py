@@ -1,16 +1,175 @@
-"""What a row stores of a configuration is true of it alone, whatever was rendered before."""
+"""What a row stores of a configuration is true of it alone, whatever was rendered before: over all pairs of controls.
+
+Each control is here in a small form whose values leave the start. A row is checked against a space and a renderer that
+were made for it alone, and against a scene in which the values that the row names are fixed.
+"""
 
 from __future__ import annotations
 
+import itertools
+from typing import Any
+
 import pytest
 import torch
+from torch import Tensor, nn
 
+import advsearch
 from advsearch.api.attacking import problem_from_config
+from advsearch.api.scene import framed, make_renderer
+from advsearch.api.sweeps.axes import on_grid, read_axes
+from advsearch.api.sweeps.points import Points
+from advsearch.api.sweeps.view import judge
 from advsearch.config import AttackConfig
-from advsearch.controls import make_control, make_space
+from advsearch.controls import CONTROLS, NumberControl, compose, make_control, make_space
+from advsearch.evaluation.domains import domain_of
 from advsearch.scene.description import describe
+from advsearch.scene.formation import to_8_bit
 
 SIZE = 16
+ROWS = 2
+"""Of each sweep."""
+CLOSE = 0.01
+"""Mean difference of two pictures with the same noise up to which they show the same: a value that a row names is
+rounded, so that single light paths may go another way."""
+
+GRID = {"camera.distance": [1.6, 2.6]}
+"""What varies beside a pair, unless it is the camera."""
+
+FORMS: dict[str, dict[str, Any]] = {
+    "pose": {"yaw": [0, 300], "x": [-0.2, 0.2], "scale": [0.7, 1.1]},
+    "camera": {"azimuth": [0, 300], "elevation": [10, 50], "roll": [-10, 10], "exposure": [-1, 1]},
+    "texture": {"resolution": 4, "epsilon": 0.4},
+    "material": {"which": ["wood", "steel"], "red": [0.3, 1.0]},
+    "light": {"power": [2, 8], "x": [-2, 2], "red": [0.5, 1.0]},
+    "environment": {"which": ["own", "noon", "kitchen"], "rotation": [0, 300], "exposure": [-1, 1]},
+    "sky": {"azimuth": [0, 300], "elevation": [10, 80]},
+    "geometry": {"modes": 4, "epsilon": 0.1},
+    "patch": {"resolution": 4, "azimuth": [0, 360], "size": [0.2, 0.6]},
+    "occlusion": {"which": ["card", "sphere"], "coverage": [0.1, 0.5], "direction": [0, 300]},
+    "contents": {"level": [0.3, 0.9], "milk": [0.2, 0.8]},
+    "background": {"what": ["colour", "environment"], "hue": [0, 300], "saturation": [0.5, 1.0]},
+    "haze": {"density": [0.1, 0.5], "blue": [0.3, 1.0]},
+    "lens": {"dots": 2, "opacity": [0.2, 0.9], "x": [0.1, 0.9]},
+    "corruption": {"which": ["fog", "jpeg", "gaussian_noise"], "severity": [0, 5]},
+}
+EXCLUSIVE = {frozenset(("sky", "environment"))}
+"""Pairs that set the same input and are refused."""
+
+ALL = [(one,) for one in FORMS] + [
+    pair for pair in itertools.combinations(FORMS, 2) if frozenset(pair) not in EXCLUSIVE
+]
+QUICK = ["camera-occlusion", "pose-contents", "material-patch"]
+"""Pairs in which one control goes by what the other does, or both meet in one input; the others take minutes."""
+
+
+def pairs(quick: list[str]) -> list[Any]:
+    """All pairs as parameters of a test, those marked as slow that are not quick."""
+    names = ["-".join(pair) for pair in ALL]
+    marks = [() if name in quick else pytest.mark.slow for name in names]
+    return [pytest.param(pair, id=name, marks=mark) for pair, name, mark in zip(ALL, names, marks, strict=True)]
+
+
+class Weighted(nn.Module):
+    """Four classes by fixed random weights of the pixels."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        weights = torch.randn(4, SIZE * SIZE * 3, generator=torch.Generator().manual_seed(5))
+        self.register_buffer("weights", weights - weights.mean(dim=1, keepdim=True))
+
+    def forward(self, images: Tensor) -> Tensor:
+        return (images.flatten(1) - 0.5) @ self.weights.T  # type: ignore[operator]
+
+
+@pytest.fixture(scope="module")
+def model() -> advsearch.Model:
+    return advsearch.load_model(Weighted(), labels=("mug", "vase", "bowl", "pan"), input_size=SIZE, name="weighted")
+
+
+def test_every_control_is_here() -> None:
+    assert set(FORMS) == {kind for kind in CONTROLS if CONTROLS[kind].__module__.startswith("advsearch.")}
+
+
+@pytest.mark.parametrize("pair", pairs(QUICK))
+def test_a_row_of_a_sweep_is_true_of_its_own_picture(pair: tuple[str, ...], model: advsearch.Model) -> None:
+    scene = advsearch.load_scene("mug")
+    controls = {kind: FORMS[kind] for kind in pair}
+    grid = {} if "camera" in pair else GRID
+    samples = ROWS // (2 if grid else 1)
+    found = advsearch.sweep(
+        scene, model, grid, controls=controls, samples=samples, trials=0, spp=1, denoise="none", seed=3, resolution=SIZE
+    )
+    description = framed(scene.description, SIZE)
+    drawn = tuple(make_control(kind, given) for kind, given in controls.items())
+    axes = read_axes(grid, drawn)
+    rows = {row.step: row for row in found.rows()}
+    worst = found.summary["worst"]
+    assert worst["values"] == rows[worst["configuration"]].values
+    for row in rows.values():
+        space = make_space(on_grid(drawn, axes, description), description)
+        points = Points(space, domain_of(space.controls), axes, samples, "sobol", 3)
+        picks = points.picks(row.step, 1)
+        u = points.configurations(picks)[0]
+        said = {name: value for name, value in row.values.items() if "." in name}
+        assert said == points.values(u[None], picks)[0]
+        assert_close(said, space.describe(u))
+        renderer = make_renderer(description, space, SIZE, "none", 3)
+        picture = to_8_bit(renderer(u, seed=row.seed, spp=1)[None])
+        (seen,) = judge(model, (0,), picture)
+        assert (row.label_index, row.probability) == (seen.predicted, pytest.approx(seen.probability, rel=1e-4))
+        assert_true_of_fixed_values(scene, drawn, said, picture[0], row.seed)
+
+
+def assert_close(said: dict[str, Any], other: dict[str, Any]) -> None:
+    """Check that two descriptions agree up to single precision."""
+    assert said.keys() == other.keys()
+    for name, value in said.items():
+        one, two = value["value"], other[name]["value"]
+        assert one == (two if isinstance(one, str) else pytest.approx(two, rel=1e-4, abs=1e-4)), name
+
+
+def assert_true_of_fixed_values(
+    scene: advsearch.Scene, drawn: Any, said: dict[str, Any], picture: Tensor, seed: int
+) -> None:
+    """Check that a scene with the values that a row names looks as the row's picture, and says the same of itself."""
+    if not all(isinstance(control, NumberControl) for control in drawn):
+        return
+    named: dict[str, dict[str, Any]] = {control.kind: dict(control.chosen) for control in drawn}
+    for name, value in said.items():
+        kind, parameter, *number = name.split(".")
+        if not number and parameter in {one.name for one in CONTROLS[kind].parameters}:
+            named.setdefault(kind, {})[parameter] = value["value"]
+        elif number and parameter in {one.name for one in CONTROLS[kind].parameters}:
+            return  # one number of many cannot be fixed alone
+    description = framed(scene.description, SIZE)
+    space = compose([make_control(kind, given) for kind, given in named.items()], description)
+    renderer = make_renderer(description, space, SIZE, "none", 3)
+    again = to_8_bit(renderer(space.start, seed=seed, spp=1))
+    assert float((again - picture).abs().mean()) < CLOSE
+    described = space.describe(space.start)
+    for name, value in said.items():
+        if name in described and not isinstance(value["value"], str):
+            assert described[name]["value"] == pytest.approx(value["value"], rel=1e-3, abs=1e-3), name
+
+
+@pytest.mark.parametrize("pair", pairs(QUICK[:1]))
+def test_a_row_of_an_attack_is_true_of_its_own_picture(pair: tuple[str, ...]) -> None:
+    config = AttackConfig(
+        object="mug", controls={kind: FORMS[kind] for kind in pair}, resolution=SIZE, spp=1, denoise="none",
+        measure="no", specialise=False,
+    )  # fmt: skip
+    problem, _ = problem_from_config(config)
+    draws = [problem.domain.sample(torch.Generator().manual_seed(seed))[0] for seed in (1, 2)]
+    rows = [(problem.trial(u, 7, 1), problem.describe(u)) for u in draws]
+    evaluate = problem.evaluator("search")
+    seen = [evaluate(u, index=5, gradient=False).objective for u in draws]
+    for u, (trial, values), objective in zip(draws, rows, seen, strict=True):
+        alone, _ = problem_from_config(config)
+        assert_close(values, alone.describe(u))
+        again = alone.trial(u, 7, 1)
+        assert trial.predicted == again.predicted
+        assert (trial.margin, trial.probability) == pytest.approx((again.margin, again.probability), rel=1e-3, abs=1e-3)
+        assert objective == pytest.approx(alone.evaluator("search")(u, index=5, gradient=False).objective, abs=1e-3)
 
 
 def test_an_occluder_is_described_under_the_conditions_of_its_own_draw() -> None:
