@@ -47,7 +47,7 @@ FORMS: dict[str, dict[str, Any]] = {
     "patch": {"resolution": 4, "azimuth": [0, 360], "size": [0.2, 0.6]},
     "occlusion": {"which": ["card", "sphere"], "coverage": [0.1, 0.5], "direction": [0, 300]},
     "contents": {"level": [0.3, 0.9], "milk": [0.2, 0.8]},
-    "background": {"what": ["colour", "environment"], "hue": [0, 300], "saturation": [0.5, 1.0]},
+    "background": {"ground": "keep", "hue": [0, 300], "saturation": [0.5, 1.0]},
     "haze": {"density": [0.1, 0.5], "blue": [0.3, 1.0]},
     "lens": {"dots": 2, "opacity": [0.2, 0.9], "x": [0.1, 0.9]},
     "corruption": {"which": ["fog", "jpeg", "gaussian_noise"], "severity": [0, 5]},
