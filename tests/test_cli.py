@@ -394,7 +394,8 @@ def test_several_objects_or_epsilons_are_a_curve(
     assert capsys.readouterr().out == (
         "  object   clean right   ending   epsilon   wrong   margin\n"
         "  mug      20/20         found    0.1       19/20   1.50\n"
-        "  bowl     not reached\n\n"
+        "  bowl     not reached\n"
+        "  margin: how far the wrong answer leads the right one, in logits, in the trials of the worst case\n\n"
         "  epsilon   robust   accuracy   95 % interval   wrong already\n"
         "  0.01      3/4      75 %       35-97 %         1\n\n"
         "  time   9.0 s\n"
@@ -414,7 +415,8 @@ def test_gap_builds_its_configuration_and_prints_a_row_for_each_control(
     assert given == [GapConfig(object="mug,bowl", controls={"pose": {}, "light": {}}, average=50, run="x")]
     assert capsys.readouterr().out == (
         "  object   control   right on average   95 % interval   worst: wrong   margin   ending\n"
-        "  mug      pose      150/200 (75 %)     35-97 %         20/20          3.25     found\n\n"
+        "  mug      pose      150/200 (75 %)     35-97 %         20/20          3.25     found\n"
+        "  margin: how far the wrong answer leads the right one, in logits, in the trials of the worst case\n\n"
         "  time   9.0 s\n"
         "  run    runs/mug-pose-001\n"
     )
@@ -794,7 +796,7 @@ def test_the_table_is_read_in_five_seconds() -> None:
         "  clean           mug          98 %   right in 20 of 20   83-100 %\n"
         "  adversarial     vase         91 %   wrong in 20 of 20   83-100 %\n"
         "  random search   40 renders          wrong in 1 of 20    0.1-25 %\n\n"
-        "  changed    texture within 0.1 (linf)\n"
+        "  changed    texture within 0.1 (linf: the largest change of any value)\n"
         "  search     pgd, 40 steps: found\n"
         "  renders    40 of the search, 40 gradients, 21 of the verification\n"
         "  time       14.6 s\n"
@@ -817,7 +819,7 @@ def test_the_table_has_the_average_the_bracket_the_target_and_the_conditions() -
         "  random search   40 renders                  target in 1 of 20     0.1-25 %\n"
         "  average case    200 configurations          right in 150 of 200   68-81 %\n\n"
         "  wanted     the model should answer vase\n"
-        "  changed    texture within 0.1 (linf)\n"
+        "  changed    texture within 0.1 (linf: the largest change of any value)\n"
         "  over       camera, drawn anew for every picture\n"
         "  smallest   0.0123; no search found one at 0.0118\n"
         "  search     pgd, 40 steps: found\n"

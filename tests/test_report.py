@@ -433,6 +433,16 @@ def test_several_controls_have_a_budget_each() -> None:
         controls=["texture", "pose"], epsilon={"texture": 0.05, "pose": None}, norm={"texture": "l2", "pose": None}
     )
     assert wording.budget_text(several) == "texture within 0.05 (l2) and pose"
+    assert (
+        wording.changed_text(several) == "texture within 0.05 (l2: the root of the sum of all squared changes) and pose"
+    )
+    third = changed(
+        controls=["texture", "patch"],
+        epsilon={"texture": 1 / 3, "patch": 1.0},
+        norm={"texture": "linf", "patch": "linf"},
+    )
+    meant = "texture within 0.3333 (linf: the largest change of any value) and patch within 1 (linf)"
+    assert wording.changed_text(third) == meant
     assert wording.budget_text(changed(controls=["pose", "light"], epsilon=None)) == "pose and light"
 
 

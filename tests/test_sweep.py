@@ -847,6 +847,9 @@ def test_ctrl_c_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys:
     FakeRenderer.stops_at = 20
     status, out, _ = command(capsys, "--grid", "pose.yaw=0:360:40")
     assert status == 130 and "Interrupted after 16 of 40 configurations" in out and "not verified" in out
+    assert "How often it is right at each value" in out
+    assert "margin (how far the wrong answer leads the right one, in logits)" in out
+    assert out.rstrip().splitlines()[-1].startswith("Go on with: advsearch resume ")
 
 
 def test_the_table_of_nothing() -> None:

@@ -159,7 +159,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
                 row["object"],
                 row["control"],
                 row["estimator"],
-                f"x {row['factor']:g}",
+                f"x {row['factor']:.3g}",
                 str(row["spp"]),
                 f"{row['cosine']:.3f}",
                 f"{row['converged']:.3f}",

@@ -82,7 +82,7 @@ def text(chosen: dict[str, Any]) -> str:
             [
                 row["control"],
                 row["denoise"],
-                f"x {row['factor']:g}",
+                f"x {row['factor']:.3g}",
                 str(row["spp"]),
                 f"{row['cosine']:.3f}",
                 f"{row['converged']:.3f}",

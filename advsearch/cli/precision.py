@@ -15,6 +15,12 @@ if TYPE_CHECKING:
 
 HELP = "draw error against run time: of the picture, of gradients and of policies, and what follows from it"
 INTERRUPTED = 130
+READING = (
+    "Each row is a setting: its error beside a reference of far more samples, with the 95 % interval of that error,\n"
+    "and the seconds that one picture or gradient takes. A margin is how far the wrong answer leads the right one, in\n"
+    "logits; a cosine of 1 means that a gradient points the right way."
+)
+"""What the tables show, and how to read them."""
 
 _EXAMPLES = """examples:
   advsearch precision --object mug --control pose
@@ -77,7 +83,8 @@ def answer(report: Mapping[str, Any]) -> str:
     threads = " and ".join(f"{count} of {name}" for name, count in machine["threads"].items())
     lines = [
         f"{report['object']} in {report['environment']}, {report['model']}; {machine['cpu']}, "
-        f"{machine['cores']} cores, threads: {threads}; {report['seconds']['total']:.0f} s"
+        f"{machine['cores']} cores, threads: {threads}; {report['seconds']['total']:.0f} s",
+        READING,
     ]
     for quantity, table in (("image", _errors), ("gradient", _errors), ("objective", _objectives)):
         points = [one for one in report["points"] if one["quantity"] == quantity]
@@ -101,9 +108,9 @@ def sentence(one: Mapping[str, Any], goal: float) -> str:
     what = what or f"the gradient of {one['control']}"
     if one["measure"] == "margin_error":
         what = "the margin"
-    asked = f"{100 * goal:g} % error of {what}" + (f" {one['among']}" if one["among"] else "")
+    asked = f"{100 * goal:.3g} % error of {what}" + (f" {one['among']}" if one["among"] else "")
     if one["quantity"] == "objective":
-        asked = f"{100 * (1 - goal):g} % of the largest median gain in the verified objective"
+        asked = f"{100 * (1 - goal):.3g} % of the largest median gain in the verified objective"
     if one["estimator"] is None:
         return f"{asked}: not reached by anything that was measured; give it more --seconds or a larger --error"
     if one["quantity"] == "objective":
@@ -151,7 +158,7 @@ def _slopes(slopes: Sequence[Mapping[str, Any]]) -> str:
     rows = [["what", "estimator", "against", "slope", "95 %", "theory", "points", "fixed s", ""]]
     for one in slopes:
         what = one["control"] or ("margin" if one["measure"] == "margin_error" else one["quantity"])
-        theory = "" if one["theory"] is None else f"{one['theory']:g}" + (" or steeper" if one["or_steeper"] else "")
+        theory = "" if one["theory"] is None else f"{one['theory']:.3g}" + (" or steeper" if one["or_steeper"] else "")
         low, high = one["interval"]
         verdict = {True: "agrees", False: "DISAGREES", None: "can't be told" if theory else ""}[one["agrees"]]
         rows.append(

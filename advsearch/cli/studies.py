@@ -10,6 +10,8 @@ from advsearch.report import wording
 
 Summary = Mapping[str, Any]
 
+MARGIN = f"\n  margin: {wording.MARGIN}, in the trials of the worst case"
+
 
 def answer(summary: Summary) -> str:
     """Return the tables of a study's summary."""
@@ -21,7 +23,7 @@ def answer(summary: Summary) -> str:
 
 def _objects(summary: Summary) -> str:
     heads = ["object", "clean right", "ending", "epsilon", "wrong", "margin"]
-    return columns([heads, *([row["object"], *_seen(row)] for row in summary["table"])])
+    return columns([heads, *([row["object"], *_seen(row)] for row in summary["table"])]) + MARGIN
 
 
 def _seen(row: Summary) -> list[str]:
@@ -69,10 +71,10 @@ def _gap(summary: Summary) -> str:
                 str(row["ending"]),
             ]
         )
-    return columns([heads, *rows])
+    return columns([heads, *rows]) + MARGIN
 
 
 def _plain(value: Any) -> str:
     if isinstance(value, Mapping):
         return ",".join(f"{name}={_plain(one)}" for name, one in value.items())
-    return "" if value is None else f"{value:g}"
+    return "" if value is None else wording.number_text(value)

@@ -10,6 +10,9 @@ from advsearch.report import wording
 
 Summary = Mapping[str, Any]
 
+READING = "How often it is right at each value, over all others, with the 95 % interval:"
+"""What the tables show."""
+
 BAR = 20
 """Width of a bar in characters."""
 
@@ -46,7 +49,7 @@ def _tables(summary: Summary) -> list[str]:
     by_axis: dict[str, list[Summary]] = {}
     for row in summary.get("axes") or ():
         by_axis.setdefault(str(row["axis"]), []).append(row)
-    return [_table(name, rows) for name, rows in by_axis.items()]
+    return [READING, *(_table(name, rows) for name, rows in by_axis.items())] if by_axis else []
 
 
 def _table(name: str, rows: Sequence[Summary]) -> str:
@@ -107,5 +110,5 @@ def _said(worst: Summary) -> str:
     claim, checked = worst["claimed"], worst.get("verified")
     text = f"answer {claim['label']}" + (f" ({wording.percent(claim['probability'])})" if claim["probability"] else "")
     if not checked:
-        return f"{text}, margin {claim['margin']:.2f}; not verified"
-    return f"{text}, margin {claim['margin']:.2f}; wrong in {wording.rate_text(checked)}"
+        return f"{text}; margin ({wording.MARGIN}) {claim['margin']:.3g}; not verified"
+    return f"{text}; margin ({wording.MARGIN}) {claim['margin']:.3g}; wrong in {wording.rate_text(checked)}"

@@ -67,7 +67,7 @@ def _facts(summary: Summary) -> dict[str, str]:
     searched = f"{summary.get('policy')}, {wording.count(summary.get('steps'), 'step')}: {summary.get('ending')}"
     return {
         "wanted": wording.goal_text(summary),
-        "changed": wording.budget_text(summary),
+        "changed": wording.changed_text(summary),
         "over": wording.over_text(summary),
         "smallest": wording.smallest_text(summary),
         "search": searched,

@@ -10,6 +10,10 @@ Summary = Mapping[str, Any]
 
 NO_INTERVAL = "no interval"
 
+MARGIN = "how far the wrong answer leads the right one, in logits"
+NORMS = {"linf": "the largest change of any value", "l2": "the root of the sum of all squared changes"}
+"""What these words mean, said where they are first used."""
+
 _REASONS = {
     "budget spent": "The budget is spent.",
     "stalled": "The policy had nothing more to propose.",
@@ -52,7 +56,8 @@ def remarks(summary: Summary) -> list[str]:
         own = summary.get("policy_verified") or {}
         said.append(
             "The random search beside it found a worse configuration than the policy did "
-            f"({tally(own)} with a margin of {own.get('margin', 0.0):.2f}); that of the random search is the answer."
+            f"({tally(own)} with a margin of {own.get('margin', 0.0):.2f}); that of the random search is the answer. "
+            f"The margin is {MARGIN}."
         )
     else:
         said += _against_random(summary)
@@ -173,6 +178,14 @@ def count(number: Any, thing: str) -> str:
     return f"{number or 0} {thing}{'' if number == 1 else 's'}"
 
 
+def changed_text(summary: Summary) -> str:
+    """Return `budget_text` with a word on each norm: ``texture within 0.1 (linf: the largest change of any value)``."""
+    text = budget_text(summary)
+    for norm, meaning in NORMS.items():
+        text = text.replace(f"({norm})", f"({norm}: {meaning})", 1)  # at its first use
+    return text
+
+
 def budget_text(summary: Summary) -> str:
     """Return what could change and how far: ``texture within 0.1 (linf)``, as far as the summary says."""
     epsilon, norm = summary.get("epsilon"), summary.get("norm")
@@ -185,7 +198,7 @@ def budget_text(summary: Summary) -> str:
 def _within(name: str, epsilon: Any, norm: Any) -> str:
     if not isinstance(epsilon, (int, float)):
         return name
-    return f"{name} within {epsilon:g}" + (f" ({norm})" if norm else "")
+    return f"{name} within {number_text(epsilon)}" + (f" ({norm})" if norm else "")
 
 
 def _epsilons(told: Mapping[str, float] | None) -> str:
@@ -217,13 +230,13 @@ def formation_text(summary: Summary) -> str:
     if denoiser:
         said.append("not denoised" if denoiser == "none" else f"denoised ({denoiser})")
     if formation.get("exposure") is not None:
-        said.append(f"exposure {formation['exposure']:g} stops")
+        said.append(f"exposure {number_text(formation['exposure'])} stops")
     known = ("resolution", "filter", "denoiser", "exposure")
-    return ", ".join(said + [f"{name} {_short(value)}" for name, value in formation.items() if name not in known])
+    return ", ".join(said + [f"{name} {number_text(value)}" for name, value in formation.items() if name not in known])
 
 
-def _short(value: Any) -> str:
-    """A value as text; a number with the digits that mean something to a reader."""
+def number_text(value: Any) -> str:
+    """Return a value as text; a number with the digits that mean something to a reader."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
