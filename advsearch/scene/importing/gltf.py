@@ -275,9 +275,8 @@ def _check(path: Path, header: Header) -> None:
     """Check what the types leave open: extensions, limits, and that whatever is referred to is there."""
     needed = sorted(name for name in header.extensionsRequired if any(word in name for word in _UNREADABLE))
     if needed:
-        raise FileFormatError(
-            f"{path}: needs {shown(', '.join(needed), quoted=False)}, which is not supported; export it without that option"
-        )
+        names = shown(", ".join(needed), quoted=False)
+        raise FileFormatError(f"{path}: needs {names}, which is not supported; export it without that option")
     for view in header.bufferViews:
         _check_index(path, "buffers", view.buffer, header.buffers)
     for accessor in header.accessors:
