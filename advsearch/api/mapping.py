@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -150,8 +149,9 @@ def _centre(problem: Problem, config: RegionConfig) -> Tensor:
     if config.around is None:
         return problem.domain.start.clone()
     with Store(find_run(config.around) / NAME, read_only=True) as store:
-        text = store.note(ANSWER)
-    values = None if text is None else torch.tensor(json.loads(text), dtype=torch.float32)
+        noted = store.noted(ANSWER)
+    sound = isinstance(noted, list) and all(isinstance(number, (int, float)) for number in noted)
+    values = torch.tensor(noted, dtype=torch.float32) if sound else None
     if values is None or values.shape != problem.domain.start.shape:
         raise InputError(
             f"`around` {config.around}: expected a finished run over the same controls with at most a few thousand "

@@ -167,8 +167,7 @@ class Memory:
 
     def note(self, key: str) -> Any:
         """Return the JSON value that was noted, or None."""
-        text = None if self._run is None else self._run.store.note(key)
-        return None if text is None else json.loads(text)
+        return None if self._run is None else self._run.store.noted(key)
 
     def set_note(self, key: str, value: Any) -> None:
         """Keep a JSON value."""

@@ -43,7 +43,7 @@ def show_run(name: str, as_json: bool) -> int:
 
     from advsearch.runs.directory import find_run
     from advsearch.runs.listing import described
-    from advsearch.runs.summary import NAME, read_summary
+    from advsearch.runs.summary import NAME, of_a_file, read_summary
 
     path = find_run(name)
     if not (path / NAME).is_file():
@@ -61,7 +61,9 @@ def show_run(name: str, as_json: bool) -> int:
     if as_json:
         output.print_json(summary)
     else:
-        print(answer(summary) + output.go_on_text(summary))
+        with of_a_file(path / NAME):
+            text = answer(summary) + output.go_on_text(summary)
+        print(text)
     return 0
 
 

@@ -142,6 +142,7 @@ class RunDirectory:
             FileFormatError: its results cannot be read.
         """
         path = find_run(run)
+        _check_links(path)
         held = lock.RunLock(path)
         try:
             opened = cls(path, held)
@@ -280,6 +281,17 @@ def default_name(object_name: str, controls: Iterable[str]) -> str:
     """Return ``mug-texture`` for the object ``mug`` or ``data/mug.obj`` and the control ``texture``: a safe name."""
     words = [Path(object_name).stem, *controls]
     return re.sub(r"[^a-z0-9]+", "-", "-".join(words).lower()).strip("-")[:80] or "attack"
+
+
+def _check_links(path: Path) -> None:
+    """Check that what a run writes to is its own: a folder that somebody else made may link to any file.
+
+    Raises:
+        FileFormatError: there is a link.
+    """
+    links = [name for name in (*CONTENTS, lock.NAME) if name != CONFIG and (path / name).is_symlink()]
+    if links:
+        raise FileFormatError(f"{path / links[0]}: expected a file or a folder of this run, got a link; remove it")
 
 
 def run_path(run: str | Path) -> Path:

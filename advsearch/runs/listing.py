@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from advsearch.errors import AdvsearchError
+from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.runs import lock, replay, store, summary
 from advsearch.runs.directory import CONFIG, is_run
 from advsearch.settings import read_yaml
@@ -68,13 +68,13 @@ def described(path: Path) -> Listed:
         answer = summary.read_summary(path)
     with suppress(AdvsearchError), store.Store(path / store.NAME, read_only=True) as results:
         kinds = results.counts()
-    controls = answer.get("controls") or list(config.get("controls") or {})
+    controls = answer.get("controls") or config.get("controls") or ()
     return Listed(
         name=path.name,
         path=str(path),
         command=str(config.get("command") or answer.get("command") or "?"),
         object=str(config.get("object") or answer.get("object") or "?"),
-        controls=tuple(map(str, controls)),
+        controls=tuple(map(str, controls)) if isinstance(controls, (list, tuple, dict)) else ("?",),
         rows=sum(kinds.values()),
         state=_state(path, answer),
         answer=_answer(answer),
@@ -90,6 +90,14 @@ def _state(path: Path, answer: dict[str, Any]) -> str:
 
 
 def _answer(answer: dict[str, Any]) -> str:
+    try:
+        with summary.of_a_file(Path(summary.NAME)):
+            return _answer_words(answer)
+    except FileFormatError:
+        return "?"
+
+
+def _answer_words(answer: dict[str, Any]) -> str:
     verified = answer.get("verified") or {}
     if verified.get("trials"):
         return f"{verified['successes']}/{verified['trials']}"

@@ -5,9 +5,10 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import stat
 from pathlib import Path
 
-from advsearch.errors import InputError, StorageError
+from advsearch.errors import FileFormatError, InputError, StorageError
 from advsearch.runs.files import storage_errors
 
 NAME = ".lock"
@@ -24,7 +25,10 @@ class RunLock:
     def __init__(self, folder: Path) -> None:
         self._path = folder / NAME
         with storage_errors(self._path):
-            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
+            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
+        if not stat.S_ISREG(os.fstat(self._descriptor).st_mode):
+            self.release()
+            raise FileFormatError(f"{self._path}: expected an ordinary file, got a pipe or the like; remove it")
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             os.truncate(self._descriptor, 0)
@@ -48,7 +52,7 @@ class RunLock:
 def is_held(folder: Path) -> bool:
     """Whether a process works on the run in `folder`; nothing is written."""
     try:
-        descriptor = os.open(folder / NAME, os.O_RDONLY)
+        descriptor = os.open(folder / NAME, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError:
         return False
     try:

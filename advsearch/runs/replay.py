@@ -11,6 +11,7 @@ as JSON; the body, which the head cuts into arrays. An entry that a kill has cut
 from __future__ import annotations
 
 import json
+import os
 import struct
 import zlib
 from collections.abc import Mapping
@@ -21,6 +22,8 @@ from typing import Any, BinaryIO, final
 import numpy as np
 from numpy.typing import NDArray
 
+from advsearch.errors import FileFormatError
+from advsearch.files import parse_json
 from advsearch.runs.files import storage_errors
 
 NAME = "replay.bin"
@@ -65,9 +68,13 @@ class ReplayLog:
         with storage_errors(path):
             path.touch()
             self._file: BinaryIO = path.open("r+b", buffering=0)
-            end = self._index()
-            self._file.truncate(end)
-            self._file.seek(end)
+            try:
+                end = self._index()
+                self._file.truncate(end)
+                self._file.seek(end)
+            except BaseException:
+                self._file.close()
+                raise
 
     def __contains__(self, key: tuple[str, int]) -> bool:
         """Whether there is an entry of (kind, number)."""
@@ -129,12 +136,25 @@ def _read(file: BinaryIO, place: int) -> Entry | None:
     if len(start) < _START.size:
         return None
     magic, head_size, body_size, checksum = _START.unpack(start)
-    data = file.read(head_size + body_size) if magic == _MAGIC else b""
+    there = os.fstat(file.fileno()).st_size - file.tell()
+    data = file.read(head_size + body_size) if magic == _MAGIC and head_size + body_size <= there else b""
     if len(data) < head_size + body_size or zlib.crc32(data) != checksum or not data:
         return None
-    head, arrays, begin = json.loads(data[:head_size]), {}, head_size
+    try:
+        return _entry(data, head_size)
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        # Its checksum is right: not cut short, but written by somebody else.
+        raise FileFormatError(f"{file.name}: expected what a search was told, got something else ({error})") from None
+
+
+def _entry(data: bytes, head_size: int) -> Entry:
+    """The entry in a head and the body behind it."""
+    head, arrays, begin = parse_json(data[:head_size]), {}, head_size
     for name, (dtype, shape) in head["arrays"].items():
         count = int(np.prod(shape, dtype=np.int64))
         arrays[name] = np.frombuffer(data, dtype, count, begin).reshape(shape).copy()
         begin += arrays[name].nbytes
-    return Entry(head["kind"], head["number"], head["facts"], arrays)
+    kind, number, facts = head["kind"], head["number"], head["facts"]
+    if not (isinstance(kind, str) and isinstance(number, int) and isinstance(facts, dict)):
+        raise TypeError("an entry of another type")
+    return Entry(kind, number, facts, arrays)

@@ -14,17 +14,21 @@ import os
 import sqlite3
 import time
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, fields
+from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import Any, final
+from typing import Any, final, get_args, get_type_hints
 
 from advsearch.errors import FileFormatError
-from advsearch.files import open_regular
+from advsearch.files import open_regular, parse_json
 from advsearch.runs.files import storage_errors
 from advsearch.runs.summary import plain
 
 NAME = "results.sqlite"
+
+_DAMAGED = "it is damaged, or not made by advsearch: take it from a copy, or run again"
 
 LARGEST = 64 << 30
 """Most bytes of it."""
@@ -143,11 +147,10 @@ class Store:
     def __init__(self, path: Path, *, read_only: bool = False) -> None:
         self.path = path
         self._next_sync = -math.inf
-        try:
+        with _readable(path):
             self._db = _connect_to_read(path) if read_only else _connect_to_write(path)
             _check_version(self._db, path)
-        except sqlite3.DatabaseError as error:
-            raise FileFormatError(f"{path}: expected a results.sqlite of advsearch, got {error}") from error
+            _check_schema(self._db, path)
 
     def append(self, rows: Iterable[Row]) -> None:
         """Add rows in one transaction; they survive a kill of the process when this returns.
@@ -168,28 +171,48 @@ class Store:
     def rows(self, kind: str | None = None) -> Iterator[Row]:
         """Yield the rows, or those of one kind, in the order in which they were written."""
         where, given = ("", ()) if kind is None else (" WHERE kind = ?", (kind,))
-        for values in self._db.execute(f"SELECT {', '.join(_COLUMNS)} FROM evaluations{where} ORDER BY id", given):
-            yield _decode(values)
+        with _readable(self.path):
+            cursor = self._db.execute(f"SELECT {', '.join(_COLUMNS)} FROM evaluations{where} ORDER BY id", given)
+        while True:
+            with _readable(self.path):
+                values = cursor.fetchone()
+            if values is None:
+                return
+            yield _decode(values, self.path)
 
     def count(self, kind: str | None = None) -> int:
         """Return how many rows there are, or how many of one kind."""
         where, given = ("", ()) if kind is None else (" WHERE kind = ?", (kind,))
-        return int(self._db.execute(f"SELECT count(*) FROM evaluations{where}", given).fetchone()[0])
+        with _readable(self.path):
+            return int(self._db.execute(f"SELECT count(*) FROM evaluations{where}", given).fetchone()[0])
 
     def curve(self, kind: str) -> list[tuple[int, float | None]]:
         """Return (step, objective) of every row of one kind, in the order in which they were written."""
-        return self._db.execute(
-            "SELECT step, objective FROM evaluations WHERE kind = ? ORDER BY id", (kind,)
-        ).fetchall()
+        return [(row.step, row.objective) for row in self.rows(kind)]
 
     def counts(self) -> dict[str, int]:
         """Return how many rows there are of each kind."""
-        return dict(self._db.execute("SELECT kind, count(*) FROM evaluations GROUP BY kind ORDER BY kind").fetchall())
+        with _readable(self.path):
+            found = self._db.execute("SELECT kind, count(*) FROM evaluations GROUP BY kind ORDER BY kind").fetchall()
+        return {str(kind): count for kind, count in found}
 
     def note(self, key: str) -> str | None:
         """Return what was noted under `key`, or None."""
-        found = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
+        with _readable(self.path):
+            found = self._db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
         return None if found is None else str(found[0])
+
+    def noted(self, key: str) -> Any:
+        """Return the JSON value that was noted under `key`, or None.
+
+        Raises:
+            FileFormatError: what was noted is no JSON.
+        """
+        text = self.note(key)
+        try:
+            return None if text is None else parse_json(text)
+        except ValueError as error:
+            raise FileFormatError(f"{self.path}: expected JSON in the note {key!r}, got {error}; {_DAMAGED}") from None
 
     def set_note(self, key: str, value: str) -> None:
         """Keep a text under `key`, in place of what was there.
@@ -223,8 +246,42 @@ def is_ours(path: Path) -> bool:
     return header[:15] == b"SQLite format 3" and header[68:72] == APPLICATION_ID.to_bytes(4, "big")
 
 
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Turn what SQLite says of a damaged file inside the block into an error that names it."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise FileFormatError(f"{path}: expected a results.sqlite of advsearch, got {error}; {_DAMAGED}") from error
+
+
+def _check_schema(db: sqlite3.Connection, path: Path) -> None:
+    """Check that the file has what `MIGRATIONS` make and no more: a view or a trigger is code, and may never end."""
+    if _schema(db) != _own_schema():
+        db.close()
+        raise FileFormatError(f"{path}: expected the tables of a run, got others; {_DAMAGED}")
+
+
+@cache
+def _own_schema() -> frozenset[Any]:
+    with closing(sqlite3.connect(":memory:")) as db:
+        _migrate(db)
+        return _schema(db)
+
+
+def _schema(db: sqlite3.Connection) -> frozenset[Any]:
+    """Return the tables and the like, and the columns of the rows; a column that is computed is another one."""
+    parts = db.execute("SELECT type, name FROM sqlite_master WHERE name NOT LIKE 'sqlite%'").fetchall()
+    columns = db.execute("PRAGMA table_xinfo(evaluations)").fetchall()
+    return frozenset([*parts, *((name, kind, hidden) for _, name, kind, *_, hidden in columns)])
+
+
 def _connect_to_write(path: Path) -> sqlite3.Connection:
     """Open or make the file and bring it up to date."""
+    if path.is_symlink():
+        raise FileFormatError(f"{path}: expected a file of this run, got a link to another; {_DAMAGED}")
+    if path.exists():
+        open_regular(path, "a results.sqlite", LARGEST).close()
     with storage_errors(path):
         db = sqlite3.connect(path)
         version = _version(db)
@@ -307,9 +364,34 @@ def _values(values: Mapping[str, Any]) -> str:
         return json.dumps(plain(values), allow_nan=False)
 
 
-def _decode(values: tuple[Any, ...]) -> Row:
+def _column_types() -> dict[str, tuple[type, ...]]:
+    """Return what each column of a row holds; SQLite itself takes anything anywhere."""
+    held: dict[Any, tuple[type, ...]] = {bool: (int,), float: (float, int), Mapping[str, Any]: (str,)}
+    hints = {name: get_args(hint) or (hint,) for name, hint in get_type_hints(Row).items() if name != "values"}
+    types = {name: tuple(kind for part in parts for kind in held.get(part, (part,))) for name, parts in hints.items()}
+    return {**types, "values": (str,)}
+
+
+_TYPES = _column_types()
+
+
+def _decode(values: tuple[Any, ...], path: Path) -> Row:
     given = dict(zip((one.name for one in fields(Row)), values, strict=True))
-    given["values"] = json.loads(given["values"])
+    wrong = [name for name, value in given.items() if not isinstance(value, _TYPES[name])]
+    if not wrong:
+        given["values"] = _decoded(given["values"])
+        wrong = ["values_json"] if given["values"] is None else []
+    if wrong:
+        raise FileFormatError(f"{path}: row {given['id']!r}: expected another type of {wrong[0]}; {_DAMAGED}")
     for name in ("success", "correct"):
         given[name] = None if given[name] is None else bool(given[name])
     return Row(**given)
+
+
+def _decoded(text: str) -> dict[str, Any] | None:
+    """Return the values of a row, None where they are not what `Row` says."""
+    try:
+        values = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    return values if isinstance(values, dict) else None

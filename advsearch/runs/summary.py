@@ -6,7 +6,8 @@ import dataclasses
 import enum
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,27 @@ def write_summary(folder: Path, summary: Mapping[str, Any]) -> Path:
         StorageError: it could not be written.
     """
     return write_text(folder / NAME, to_json(summary) + "\n")
+
+
+@contextmanager
+def of_a_file(path: Path) -> Iterator[None]:
+    """Turn what goes wrong inside the block with a summary that was read into an error that names its file.
+
+    Summaries are plain JSON, of as many forms as there are commands; one that lacks a part shows where it is used.
+
+    Args:
+        path: of the summary, or of its folder.
+
+    Raises:
+        FileFormatError: something in the summary is missing or of another type.
+    """
+    try:
+        yield
+    except (LookupError, TypeError, AttributeError, ValueError, OverflowError) as error:
+        raise FileFormatError(
+            f"{path}: expected the summary of a run, got one with a part that is missing or of another type "
+            f"({type(error).__name__}: {str(error)[:80]})"
+        ) from error
 
 
 def read_summary(folder: Path) -> dict[str, Any]:

@@ -1,0 +1,226 @@
+"""Run folders that are damaged, or that somebody made to do harm: one sentence that names the file, and status 2."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sqlite3
+import struct
+import zlib
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from advsearch.cli.main import main
+from advsearch.errors import AdvsearchError, FileFormatError
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.replay import ReplayLog
+from advsearch.runs.store import Row, Store
+from advsearch.settings import HEADER
+
+SUMMARY = {
+    "schema": 1,
+    "command": "attack",
+    "object": "mug",
+    "controls": ["pose"],
+    "ending": "interrupted",
+    "verified": {"successes": 3, "trials": 4},
+}
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run that was stopped, with two rows."""
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "runs" / "it"
+    folder.mkdir(parents=True)
+    (folder / "run.yaml").write_text(f"{HEADER}schema: 1\ncommand: attack\nobject: mug\ncontrols: {{pose: {{}}}}\n")
+    (folder / "summary.json").write_text(json.dumps(SUMMARY))
+    with Store(folder / "results.sqlite") as store:
+        values = {"pose.yaw": {"value": 3.0, "unit": "degrees"}}
+        store.append([Row("search", step, objective=0.5, values=values) for step in range(2)])
+        store.set_note("answer", "[0.5]")
+    return folder
+
+
+def statement(text: str) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        with sqlite3.connect(folder / "results.sqlite") as db:
+            db.executescript(text)
+        db.close()
+
+    return change
+
+
+def content(name: str, data: bytes) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).write_bytes(data) and None
+
+
+def truncated(folder: Path) -> None:
+    path = folder / "results.sqlite"
+    path.write_bytes(path.read_bytes()[:5000])
+
+
+def scribbled(folder: Path) -> None:
+    path = folder / "results.sqlite"
+    data = bytearray(path.read_bytes())
+    data[4096:] = b"\xff" * (len(data) - 4096)
+    path.write_bytes(data)
+
+
+STORES: dict[str, Callable[[Path], None]] = {
+    "truncated": truncated,
+    "scribbled over": scribbled,
+    "no rows": statement("DROP TABLE evaluations"),
+    "other columns": statement("ALTER TABLE evaluations RENAME COLUMN spp TO samples"),
+    "values that are a list": statement("UPDATE evaluations SET values_json = '[1]'"),
+    "values that are no JSON": statement("UPDATE evaluations SET values_json = '{'"),
+    "values that are nested": statement(f"UPDATE evaluations SET values_json = '{'[' * 100_000}'"),
+    "values that are bytes": statement("UPDATE evaluations SET values_json = x'ff00'"),
+    "a step that is text": statement("UPDATE evaluations SET step = 'one'"),
+    "an objective that is text": statement("UPDATE evaluations SET objective = 'much'"),
+    "a label that is bytes": statement("UPDATE evaluations SET label = x'ff'"),
+    "text that is not UTF-8": statement("UPDATE evaluations SET label = CAST(x'ff' AS TEXT)"),
+    "a trigger": statement("CREATE TRIGGER t AFTER INSERT ON evaluations BEGIN DELETE FROM evaluations; END"),
+    "a view without an end": statement(
+        "DROP TABLE evaluations; CREATE VIEW evaluations AS WITH RECURSIVE t(id) AS "
+        "(SELECT 1 UNION ALL SELECT id + 1 FROM t) SELECT * FROM t"
+    ),
+    "a computed column": statement(
+        "ALTER TABLE evaluations DROP COLUMN spp; ALTER TABLE evaluations ADD COLUMN spp INTEGER AS (step)"
+    ),
+    "another version": statement("PRAGMA user_version = 99"),
+    "another file": content("results.sqlite", b"SQLite format 3\0" + bytes(5000)),
+}
+
+
+@pytest.mark.parametrize("case", STORES)
+def test_damaged_results_are_named(case: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    STORES[case](run)
+    assert main(["export", "it"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("advsearch: error: ") and error.count("\n") == 1 and len(error) < 500 + len(str(run))
+    assert "results.sqlite: " in error
+    assert main(["runs"]) == 0 and main(["show", "it"]) == 0
+    with pytest.raises(FileFormatError, match=r"results\.sqlite: "), RunDirectory.resume("it") as opened:
+        list(opened.store.rows())
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "[]", "{", "[" * 100_000, '{"a": ' + "9" * 6000 + "}", "\0", '{"ending": NaN'],
+)
+def test_summaries_that_are_none_are_named(text: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (run / "summary.json").write_text(text)
+    for command in ("show", "resume"):
+        assert main([command, "it"]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and "summary.json: expected the summary of a run" in error and len(error) < 600
+    assert main(["runs"]) == 0
+
+
+@pytest.mark.parametrize("value", [None, 3, "text", [], [1], {}, {"a": [1]}, True, float("inf")])
+def test_summaries_of_other_types_are_named(value: Any, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Whatever part of it is of another type: shown as far as it goes, or refused with the file's name."""
+    for command in ("attack", "sweep", "gap", "region", "precision"):
+        for name in (
+            *SUMMARY,
+            "parts",
+            "clean",
+            "adversarial",
+            "box",
+            "rows",
+            "axes",
+            "seconds",
+            "renders",
+            "interval",
+        ):
+            (run / "summary.json").write_text(json.dumps({**SUMMARY, "command": command, name: value}))
+            status = main(["show", "it"])
+            captured = capsys.readouterr()
+            assert status == 0 or (status == 2 and "summary.json: expected the summary" in captured.err)
+            assert main(["runs"]) == 0
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[1]",
+        "command: [1]\n",
+        "command: attack\nobject: [1]\n",
+        "command: attack\nobject: mug\ncontrols: 3\n",
+        "command: attack\nobject: mug\nseed: 0b_\n",
+        "command: attack\nobject: mug\nbase: /dev/zero\n",
+        "command: attack\nobject: mug\nset: [1]\nsteps: x\n",
+        "\0",
+    ],
+)
+@pytest.mark.parametrize("command", [["resume", "it"], ["run", "runs/it/run.yaml"], ["region", "--around", "it"]])
+def test_damaged_configurations_are_refused(
+    command: list[str], text: str, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (run / "run.yaml").write_text(HEADER + text)
+    assert main(command) == 2
+    assert capsys.readouterr().err.splitlines()[-1].startswith("advsearch: error: ")
+    assert main(["runs"]) == 0
+
+
+@pytest.mark.parametrize("name", ["run.yaml", "results.sqlite", "summary.json", ".lock", "replay.bin"])
+def test_pipes_in_a_run_do_not_block(name: str, run: Path) -> None:
+    (run / name).unlink(missing_ok=True)
+    os.mkfifo(run / name)
+    assert main(["runs"]) == 0 and main(["show", "it"]) in (0, 2) and main(["export", "it"]) in (0, 2)
+    with suppress(AdvsearchError), RunDirectory.resume("it") as opened:
+        opened.replay.close()
+
+
+@pytest.mark.parametrize("name", ["results.sqlite", "replay.bin", ".lock", "images", "artifacts"])
+def test_a_run_that_links_elsewhere_changes_nothing_there(name: str, run: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    if (run / name).exists():
+        shutil.copy(run / name, outside)
+        (run / name).unlink()
+    else:
+        outside.write_text("mine")
+    before = outside.read_bytes()
+    (run / name).symlink_to(outside)
+    with pytest.raises(FileFormatError, match=f"{name}: expected a file or a folder of this run, got a link"):
+        RunDirectory.resume("it")
+    assert outside.read_bytes() == before
+
+
+def entry(head: bytes, body: bytes = b"") -> bytes:
+    return struct.pack("<4sIII", b"ADVr", len(head), len(body), zlib.crc32(body, zlib.crc32(head))) + head + body
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        entry(b"[]"),
+        entry(b"{"),
+        entry(b"[" * 100_000),
+        entry(b'{"kind": 3, "number": 0, "facts": {}, "arrays": {}}'),
+        entry(b'{"kind": "a", "number": 0, "facts": [], "arrays": {}}'),
+        entry(b'{"kind": "a", "number": 0, "facts": {}, "arrays": {"x": ["O", [1]]}}', bytes(8)),
+        entry(b'{"kind": "a", "number": 0, "facts": {}, "arrays": {"x": ["<f4", [1000000000000]]}}', bytes(8)),
+        entry(b'{"kind": "a", "number": 0, "facts": {}, "arrays": {"x": ["<f4", "a"]}}', bytes(8)),
+    ],
+)
+def test_what_a_search_was_told_is_checked(data: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "replay.bin"
+    path.write_bytes(data)
+    with pytest.raises(AdvsearchError, match=r"replay.bin: expected what a search was told"):
+        ReplayLog(path)
+
+
+def test_a_length_that_is_not_there_takes_no_memory(tmp_path: Path) -> None:
+    path = tmp_path / "replay.bin"
+    path.write_bytes(struct.pack("<4sIII", b"ADVr", 2**32 - 1, 2**32 - 1, 0) + b"{}")
+    ReplayLog(path).close()
+    assert path.read_bytes() == b""
