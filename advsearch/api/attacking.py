@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +14,14 @@ from torch import Tensor, nn
 from advsearch import seeds
 from advsearch.api.answers import right_answers
 from advsearch.api.memory import Memory
-from advsearch.api.naming import RUN_SETTINGS, check_run_settings, controls_of, load_models, scene_settings
+from advsearch.api.naming import (
+    RUN_SETTINGS,
+    check_run_settings,
+    controls_of,
+    load_models,
+    options_of,
+    scene_settings,
+)
 from advsearch.api.outcome import AttackResult, summarise
 from advsearch.api.problem import Problem
 from advsearch.api.record import Recorder, Stages
@@ -47,6 +54,10 @@ CLEAN_SPP = 64
 """Samples a pixel of the clean picture that an objective compares features with."""
 
 
+_OWN_ARGUMENTS = ("model", "controls", "over", "objective", "policy", "run")
+"""Arguments of `attack` that may be more than a file can say."""
+
+
 def attack(
     scene: Scene | str | Path,
     model: Model | nn.Module | str | Path = "reference",
@@ -58,7 +69,37 @@ def attack(
     run: str | Path | None = None,
     resume: bool = False,
     progress: Progress | None = None,
-    **options: Any,
+    environment: str | Path | None = None,
+    up: Literal["y", "z"] | None = None,
+    set: Mapping[str, float | str | Sequence[float]] | None = None,
+    exposure: float | None = None,
+    resolution: int | str | tuple[int, int] | None = None,
+    labels: str | Path | None = None,
+    label: str | int | Sequence[str] | None = None,
+    texture_resolution: int | None = None,
+    spp: int | Literal["auto"] | None = None,
+    denoise: Literal["oidn", "none"] = "oidn",
+    pixel_sampler: Literal["independent", "multijitter"] = "multijitter",
+    seed: int = 0,
+    threads: int | None = None,
+    deterministic: bool = False,
+    overwrite: bool = False,
+    epsilon: float | Mapping[str, float] | None = None,
+    norm: Literal["linf", "l2"] | None = None,
+    estimators: str | Mapping[str, str] | None = None,
+    measure: Literal["no", "quick", "full"] = "quick",
+    steps: int = 40,
+    seconds: float | None = None,
+    step_size: float | None = None,
+    target: str | int | Sequence[str] | None = None,
+    minimise: bool = False,
+    smallest: bool = False,
+    draws: int = 4,
+    average: int = 0,
+    specialise: bool = True,
+    baseline: bool = True,
+    verify_spp: int | None = None,
+    trials: int | None = None,
 ) -> AttackResult:
     """Search for the worst configuration of a scene, verify it, and return everything that is known about it.
 
@@ -75,12 +116,14 @@ def attack(
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
             was.
         progress: told how far it is.
-        **options: any other field of `advsearch.config.AttackConfig` by name: `label`, `epsilon`, `norm`, `steps`,
-            `spp`, `trials`, `denoise`, `baseline`, `seed`, `deterministic`, ...
+
+    All other arguments are the settings of the command line by the same names (docs/command-line.md). `environment`,
+    `up`, `set` and `exposure` belong to a scene that is named here, not to one that is loaded.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
+    options = options_of(locals(), AttackConfig, without=_OWN_ARGUMENTS)
     scene = _scene(scene, options)
     described = {
         "object": scene.description.object_spec or scene.description.object.name,

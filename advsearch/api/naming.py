@@ -151,3 +151,16 @@ def different(names: Sequence[str], setting: str) -> Sequence[str]:
             f"{setting}: expected different names, got {','.join(names)!r}; leave {', '.join(twice[:1])} out"
         )
     return names
+
+
+def options_of(arguments: Mapping[str, Any], config: type[SceneConfig], without: Collection[str]) -> dict[str, Any]:
+    """Return the arguments of a Python call that are settings of a configuration; None is one that was not given.
+
+    Args:
+        arguments: by name.
+        config: whose settings.
+        without: names that mean something else in the call than in a file.
+    """
+    names = {"set", *config.model_fields}
+    given = {name: value for name, value in arguments.items() if value is not None}
+    return {name: value for name, value in given.items() if name in names and name not in without}

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from torch import nn
 
 from advsearch.api.answers import one_label_for_several
 from advsearch.api.attacking import LOADING
-from advsearch.api.naming import check_run_settings, controls_of, different, load_models, scene_settings
+from advsearch.api.naming import check_run_settings, controls_of, different, load_models, options_of, scene_settings
 from advsearch.api.scene import Controls, Scene, load_scene, settings_of
 from advsearch.api.sweeps.axes import read_axes
 from advsearch.api.sweeps.job import Job, Place, check_scenes
@@ -39,7 +39,25 @@ def sweep(
     controls: Controls = (),
     run: str | Path | None = None,
     progress: Progress | None = None,
-    **options: Any,
+    environment: str | Path | Sequence[str] | None = None,
+    up: Literal["y", "z"] | None = None,
+    set: Mapping[str, float | str | Sequence[float]] | None = None,
+    exposure: float | None = None,
+    resolution: int | str | tuple[int, int] | None = None,
+    labels: str | Path | None = None,
+    label: str | int | Sequence[str] | None = None,
+    texture_resolution: int | None = None,
+    spp: int | None = None,
+    denoise: Literal["oidn", "none"] = "oidn",
+    pixel_sampler: Literal["independent", "multijitter"] = "multijitter",
+    seed: int = 0,
+    threads: int | None = None,
+    deterministic: bool = False,
+    overwrite: bool = False,
+    sampler: Literal["sobol", "random"] = "sobol",
+    batch: int = 16,
+    trials: int = 20,
+    verify_spp: int | None = None,
 ) -> SweepResult:
     """Render every configuration of a grid, and draws by chance, and say how often the model is right.
 
@@ -53,12 +71,13 @@ def sweep(
         controls: what is drawn by chance, as for `attack`.
         run: folder to keep the run in; None keeps it in memory, which then grows with every configuration.
         progress: told how far it is.
-        **options: any other field of `advsearch.config.SweepConfig` by name: `environment`, `label`, `spp`,
-            `resolution`, `sampler`, `batch`, `trials`, `seed`, ...
+
+    All other arguments are the settings of the command line by the same names (docs/command-line.md).
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
+    options = options_of(locals(), SweepConfig, without=("model", "controls", "grid", "samples", "run"))
     scenes = _several(scene)
     networks = _several(model)
     names = [split_names(one) if isinstance(one, str) else (str(one),) for one in scenes if not isinstance(one, Scene)]
