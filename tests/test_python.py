@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import inspect
+import sys
+import types
+from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+from torch import Tensor, nn
 
 import advsearch
 from advsearch.config import AttackConfig, SceneConfig, SweepConfig
+from advsearch.errors import InputError
 
 BY_SCENE = {"environment", "up", "set", "exposure"}
 """Settings that a loaded scene has already, so that they have no default of their own."""
@@ -34,3 +40,72 @@ def test_signatures_have_every_setting_with_its_default(function: Any, config: t
 def test_an_argument_that_there_is_not_is_python_s_own_error() -> None:
     with pytest.raises(TypeError, match="unexpected keyword argument 'epsilonn'"):
         advsearch.attack("mug", epsilonn=0.1)  # type: ignore[call-arg]
+
+
+class Middle(nn.Module):
+    """Says the first class where the middle of a picture is dark, the second where it is bright."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        score = 40.0 * (images[:, :, 4:-4, 4:-4].mean(dim=(1, 2, 3)) - 0.9)
+        return torch.stack([-score, score], dim=1)
+
+
+@pytest.fixture(scope="module")
+def model() -> advsearch.Model:
+    return advsearch.load_model(Middle(), labels=["mug", "vase"], input_size=16, name="middle")
+
+
+@pytest.fixture(scope="module")
+def attacked(model: advsearch.Model, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    path = tmp_path_factory.mktemp("python") / "run"
+    return advsearch.attack("mug", model, steps=2, spp=1, verify_spp=1, baseline=False, measure="no", run=path)
+
+
+@pytest.fixture(scope="module")
+def swept(model: advsearch.Model) -> advsearch.SweepResult:
+    return advsearch.sweep("mug", model, {"pose.yaw": [0, 90], "camera.elevation": [10, 60]}, spp=1, trials=0)
+
+
+class Frame:
+    """What a `pandas.DataFrame` is given."""
+
+    def __init__(self, data: Any, columns: Any) -> None:
+        self.data, self.columns = data, columns
+
+
+def test_texts_are_short(model: advsearch.Model, attacked: Any, swept: advsearch.SweepResult) -> None:
+    scene = advsearch.load_scene("mug", environment="loft", settings={"camera.azimuth": 60.0})
+    assert repr(scene) == "Scene('mug', 'loft', camera.azimuth=60.0)"
+    assert repr(model) == "Model('middle', 2 classes, 16 x 16 pixels)"
+    assert repr(attacked).startswith("AttackResult('mug', 'texture', ") and len(repr(attacked)) < 250
+    right = swept.summary["correct"]
+    assert repr(swept) == f"SweepResult('mug', 'middle', {right} of 4 right, run=None)"
+
+
+def test_a_notebook_shows_verdict_pictures_and_tables(attacked: Any, swept: advsearch.SweepResult) -> None:
+    page = attacked._repr_html_()
+    assert page.count('<img src="data:image/png;base64,') == 2 and "<th>95 % interval</th>" in page
+    assert "<td>clean</td>" in page and "<script" not in page
+    page = swept._repr_html_()
+    assert page.count("<img") == 1 and "<td>pose.yaw</td>" in page and "<td>90 degrees</td>" in page
+
+
+def test_rows_become_a_table_of_pandas(
+    attacked: Any, swept: advsearch.SweepResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", types.SimpleNamespace(DataFrame=Frame))
+    table = swept.to_pandas()
+    assert [row["pose.yaw [degrees]"] for row in table.data] == [0.0, 0.0, 90.0, 90.0]
+    assert {"correct", "margin", "label", "camera.elevation [degrees]"} <= set(table.columns)
+    searched = attacked.to_pandas("search")
+    assert [row["kind"] for row in searched.data] == ["search"] * len(searched.data) and searched.data
+    assert len(attacked.to_pandas().data) > len(searched.data)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(InputError, match="needs pandas; pip install pandas, or export the run as csv or parquet"):
+        swept.to_pandas()
+
+
+def test_rows_of_an_attack_that_was_not_kept_are_not_there(attacked: Any, tmp_path: Path) -> None:
+    gone = type(attacked)(**{**{name: getattr(attacked, name) for name in attacked.__dataclass_fields__}, "run": None})
+    with pytest.raises(InputError, match="rows: expected a run that was kept, got none"):
+        list(gone.rows())

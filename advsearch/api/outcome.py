@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import statistics
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,12 @@ from advsearch.attacks import Ending, SearchResult, Trial, Trials, Verification,
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.smallest import Bracket
 from advsearch.config import AttackConfig
+from advsearch.errors import InputError
+from advsearch.report.notebook import attack_html
 from advsearch.report.page import write_report
-from advsearch.runs import images
+from advsearch.runs import images, store
 from advsearch.runs.directory import RunDirectory
+from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
 from advsearch.scene.formation import to_8_bit
 
@@ -31,7 +34,7 @@ PICTURE_SPP = 64
 """Samples a pixel of the pictures that are kept, unless verification needed more."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class AttackResult:
     """The answer of an attack.
 
@@ -57,6 +60,36 @@ class AttackResult:
     def found(self) -> bool:
         """Whether a verified configuration was found."""
         return bool(self.summary["ending"] == Ending.FOUND.value)
+
+    def rows(self, kind: str | None = None) -> Iterator[store.Row]:
+        """Yield every evaluated configuration, or those of one kind ("search", "verification", ...), in order.
+
+        Raises:
+            InputError: the run was not kept, so that nothing but the answer is there.
+        """
+        if self.run is None:
+            raise InputError("rows: expected a run that was kept, got none; give the attack a `run` to keep it in")
+        with store.Store(self.run / store.NAME, read_only=True) as results:
+            yield from results.rows(kind)
+
+    def to_pandas(self, kind: str | None = None) -> Any:
+        """Return these rows as a `pandas.DataFrame`; columns as in an export (docs/runs.md).
+
+        Raises:
+            InputError: the run was not kept, or pandas is not installed.
+        """
+        return to_pandas(self.rows(kind))
+
+    def __repr__(self) -> str:
+        summary, run = self.summary, None if self.run is None else str(self.run)
+        rated = summary.get("verified") or {}
+        verified = f", verified {rated['successes']}/{rated['trials']}" if rated else ""
+        controls = ",".join(summary["controls"])
+        return f"AttackResult({summary['object']!r}, {controls!r}, {summary['ending']!r}{verified}, run={run!r})"
+
+    def _repr_html_(self) -> str:
+        pictures = {"clean": self.clean.numpy(), "adversarial": self.adversarial.numpy()}
+        return attack_html(self.summary, pictures)
 
 
 def summarise(

@@ -26,7 +26,7 @@ DEFAULT_RESOLUTION = 128
 
 
 @final
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scene:
     """An object under an environment, with some parameters fixed. Made by `load_scene`.
 
@@ -64,6 +64,12 @@ class Scene:
         space = make_space(as_controls(controls), description)
         return make_renderer(description, space, resolution, denoise, seed, estimators, sampler=sampler)
 
+    def __repr__(self) -> str:
+        described = self.description
+        object, environment = described.object_spec, described.environment_spec
+        fixed = "".join(f", {name}={described.values[name]!r}" for name in sorted(described.given & described.values.keys()))
+        return f"Scene({object or described.object.name!r}, {environment or described.environment.name!r}{fixed})"
+
     def with_settings(self, given: Mapping[str, float]) -> Scene:
         """Return the scene with some of its parameters fixed to other values.
 
@@ -88,7 +94,8 @@ def load_scene(
         object: a bundled name ("mug"), a path to an .obj, .ply or .glb file, or an asset.
         environment: a bundled name, a path to an .hdr or .exr file, an asset; default "studio".
         up: the up axis of a mesh file, "y" or "z"; by default what its format or else its shape says.
-        settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``.
+        settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a picture belongs to none of them
+            but to what makes it: `resolution` of `attack`, `sweep`, `render` and `Scene.renderer`.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of range.

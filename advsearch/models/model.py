@@ -42,7 +42,7 @@ class Answer:
 
 
 @final
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Model:
     """A network with everything that is needed to show it an image and read its answer. Made by `load_model`.
 
@@ -69,6 +69,10 @@ class Model:
     named: bool = True
     dtype: torch.dtype = torch.float32
     device: torch.device = CPU
+
+    def __repr__(self) -> str:
+        height, width = self.input_size
+        return f"Model({self.name!r}, {self.classes} classes, {height} x {width} pixels)"
 
     @property
     def input_size(self) -> tuple[int, int]:

@@ -8,6 +8,7 @@ column for each: ``camera.target[0]``. What a row has not is empty.
 from __future__ import annotations
 
 import csv
+import importlib
 import io
 import itertools
 import json
@@ -75,6 +76,20 @@ def record(row: Row) -> dict[str, Any]:
     """Return a row as column to value."""
     own = {one.name: getattr(row, one.name) for one in fields(row) if one.name != "values"}
     return own | _values(row.values)
+
+
+def to_pandas(rows: Iterable[Row]) -> Any:
+    """Return rows as a `pandas.DataFrame` with the columns of an export.
+
+    Raises:
+        InputError: pandas is not installed.
+    """
+    try:
+        pandas = importlib.import_module("pandas")
+    except ImportError:
+        raise InputError("to_pandas: needs pandas; pip install pandas, or export the run as csv or parquet") from None
+    listed = list(rows)
+    return pandas.DataFrame([record(row) for row in listed], columns=columns(listed))
 
 
 def _records(rows: Iterable[Row]) -> Iterator[dict[str, Any]]:

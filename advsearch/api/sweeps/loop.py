@@ -27,9 +27,11 @@ from advsearch.attacks.draws import Seeds
 from advsearch.attacks.product import batches
 from advsearch.controls.base import Value
 from advsearch.progress import Progress
+from advsearch.report.notebook import sweep_html
 from advsearch.report.studies import sweep_figure
 from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
+from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
 
 KIND = "sweep"
@@ -48,7 +50,7 @@ READ_AT_ONCE = 256
 """Pictures whose places are worked out at once when rows are read back."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SweepResult:
     """The answer of a sweep.
 
@@ -75,6 +77,25 @@ class SweepResult:
             return
         with store.Store(self.run / store.NAME, read_only=True) as results:
             yield from results.rows(KIND)
+
+    def to_pandas(self) -> Any:
+        """Return every configuration as a row of a `pandas.DataFrame`; columns as in an export (docs/runs.md).
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        return to_pandas(self.rows())
+
+    def __repr__(self) -> str:
+        right = f"{self.summary['correct']} of {self.summary['configurations']} right"
+        return f"SweepResult({self.summary['object']!r}, {self.summary['model']!r}, {right}, run={self._place})"
+
+    def _repr_html_(self) -> str:
+        return sweep_html(self.summary)
+
+    @property
+    def _place(self) -> str:
+        return "None" if self.run is None else repr(str(self.run))
 
 
 class Sweep:
