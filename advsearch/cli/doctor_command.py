@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from typing import Any
 
 from advsearch.cli import output
@@ -20,4 +21,5 @@ def run(args: argparse.Namespace) -> int:
     """Check, print, and return the checks' exit status."""
     from advsearch.cli import doctor
 
+    print("advsearch: trying every part, a first render among them; that takes some seconds", file=sys.stderr)
     return doctor.run(json=args.json)

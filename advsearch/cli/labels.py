@@ -40,7 +40,9 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: no class is like the word, or the model has no names for its classes.
     """
-    with output.output_kept_clean():
+    from advsearch.cli.progress import at_work
+
+    with at_work(as_json=True, quiet=False):
         from advsearch.models import matching_labels
 
         labels = class_names(getattr(args, "model", "reference"), getattr(args, "labels", None))

@@ -34,8 +34,10 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the names of one kind, or of all."""
+    from advsearch.cli.progress import at_work
+
     kinds = list(REGISTRIES) if args.kind == "all" else [args.kind]
-    with output.output_kept_clean():
+    with at_work(as_json=True, quiet=False):
         found = {kind: names(kind) for kind in kinds}
     if args.json:
         output.print_json({"schema": 1, **{kind: list(entries) for kind, entries in found.items()}})

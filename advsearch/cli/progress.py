@@ -201,7 +201,7 @@ def _bars() -> Iterator[Bars]:
             times = times_text(elapsed, task.completed, task.total, at_most)
             return Text(", ".join(part for part in (count, times, task.fields["info"]) if part))
 
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=20), Counted())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(bar_width=12), Counted())
     with Bars(*columns, console=Console(file=raw(sys.stderr)), transient=True) as bars:
         yield bars
 

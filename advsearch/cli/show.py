@@ -91,7 +91,9 @@ def _show_unfinished(found: Listed, as_json: bool) -> int:
 
 
 def _show_control(name: str, as_json: bool) -> int:
-    with output.output_kept_clean():
+    from advsearch.cli.progress import at_work
+
+    with at_work(as_json=True, quiet=False):
         from advsearch.cli.list import first_line
         from advsearch.controls import CONTROLS
 
