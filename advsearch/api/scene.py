@@ -67,7 +67,8 @@ class Scene:
     def __repr__(self) -> str:
         described = self.description
         object, environment = described.object_spec, described.environment_spec
-        fixed = "".join(f", {name}={described.values[name]!r}" for name in sorted(described.given & described.values.keys()))
+        names = sorted(described.given & described.values.keys())
+        fixed = "".join(f", {name}={described.values[name]!r}" for name in names)
         return f"Scene({object or described.object.name!r}, {environment or described.environment.name!r}{fixed})"
 
     def with_settings(self, given: Mapping[str, float]) -> Scene:

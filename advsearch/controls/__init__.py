@@ -39,9 +39,10 @@ CONTROLS: Registry[type[Control]] = Registry(
     "advsearch.controls",
     {kind: f"{__name__}.{kind}:{name}" for kind, name in OWN.items()},
     "a subclass of Control whose kind is the name of the entry point",
-    lambda name, entry: isinstance(entry, type) and issubclass(entry, Control) and entry.kind == name,
+    lambda name, entry: isinstance(entry, type) and issubclass(entry, Control) and entry.kind == name != "",
+    imports=True,
 )
-"""Every control by its word on the command line, imported when it is asked for."""
+"""Every control by its word on the command line, imported when it is asked for; and any by "package.module:Class"."""
 
 
 def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Control:
@@ -50,6 +51,7 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
     Args:
         asked: "kind"; "kind:name" for an instance with a name of its own (light:key); or "kind.parameter" to search
             one parameter only, over its default range. With "kind" among the settings, this is the instance's name.
+            A kind is a word, or "package.module:Class" where the class has a capital and the module is no control.
         settings: values for its parameters and choices; None or missing keeps the default.
 
     Raises:
@@ -85,6 +87,8 @@ def _read_name(asked: str, given: dict[str, object]) -> tuple[str, str, str | No
     said = given.pop("kind", None)
     if said is not None:
         return str(said), asked, None
+    if CONTROLS.names_class(asked):
+        return asked, CONTROLS[asked].kind, None
     if colon and not name.isidentifier():
         raise InputError(f"`controls` {asked}: expected a name of letters, digits and _ after the colon, got {name!r}")
     return kind, name or kind, parameter if dot else None

@@ -5,9 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import os
-import sys
 import traceback
-from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -20,9 +18,10 @@ from advsearch.models.model import Model
 from advsearch.models.preprocessing import PRESETS
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source, load_weights, source_of
+from advsearch.registry import current_directory_importable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable
 
 
 def split_weights(spec: str) -> tuple[str, Path | None]:
@@ -66,7 +65,7 @@ def load_callable(spec: str) -> Source | Model:
 
 
 def _import_module(name: str, spec: str) -> ModuleType:
-    with _current_directory_importable():
+    with current_directory_importable():
         try:
             return importlib.import_module(name)
         except ModuleNotFoundError as error:
@@ -93,20 +92,6 @@ def _build(value: Any, spec: str) -> nn.Module | Model:
             f"model {spec}: expected it to return an nn.Module or an advsearch Model, got {type(value).__name__}"
         )
     return value
-
-
-@contextmanager
-def _current_directory_importable() -> Iterator[None]:
-    directory = os.getcwd()
-    added = directory not in sys.path and "" not in sys.path
-    if added:
-        sys.path.append(directory)
-        importlib.invalidate_caches()
-    try:
-        yield
-    finally:
-        if added and directory in sys.path:
-            sys.path.remove(directory)
 
 
 def _where(error: BaseException) -> str:
