@@ -50,6 +50,7 @@ from advsearch.evaluation import reference_scenes
 from advsearch.models import calibration, loading, reference
 from advsearch.runs import directory, export, store
 from advsearch.scene import environments, exposure, formation, library, mitsuba_scene
+from advsearch.scene.description import FRAME_FILL
 from advsearch.scene.importing import objects
 from advsearch.scene.importing.images import TEXTURE_LIMIT
 from advsearch.scene.settings import SETTINGS, resolve
@@ -281,6 +282,7 @@ MADE_BY_HAND = [
     ("questions.md", f"at most {100 * (1 - clopper_pearson(200, 200)[0]):.1f} % of the box has another verdict"),
     ("runs.md", {1.0: "may lose the rows of the last second"}[store.SYNC_INTERVAL]),
     ("runs.md", f"more than {100 * store.SYNC_SHARE:.0f} % of the time"),
+    ("scenes.md", f"reaches to {100 * FRAME_FILL:.0f} % of the way"),
     ("scenes.md", f"gets the linear value {exposure.METERED_WHITE}"),
     ("scenes.md", f"averaged down to at most {TEXTURE_LIMIT} texels"),
     ("scenes.md", "Maps larger than {1} x {0} are".format(*environments.LARGEST)),

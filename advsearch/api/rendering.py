@@ -17,7 +17,7 @@ from advsearch.config import RenderConfig
 from advsearch.config.rendering import PICTURE_SPP, PICTURES
 from advsearch.controls import Control, compose
 from advsearch.controls.clean import sentences
-from advsearch.errors import InputError
+from advsearch.errors import InputError, StorageError
 from advsearch.models import Model, load_model
 from advsearch.models.model import Answer
 from advsearch.progress import NullProgress, Progress
@@ -79,11 +79,14 @@ class Rendering:
             StorageError: the file could not be written.
         """
         file = _writable(path, len(self.views))
-        if file.suffix.lower() == ".exr":
-            write_exr(file, self.views[0].linear)
-            return self.formation.resolution
-        sheet = self.sheet() if len(self.views) > 1 else self.views[0].picture.numpy()
-        write_png(file, sheet)
+        try:
+            if file.suffix.lower() == ".exr":
+                write_exr(file, self.views[0].linear)
+                return self.formation.resolution
+            sheet = self.sheet() if len(self.views) > 1 else self.views[0].picture.numpy()
+            write_png(file, sheet)
+        except StorageError as error:
+            raise StorageError(str(error).replace("`run`", "`out`")) from error
         return sheet.shape[0], sheet.shape[1]
 
     def sheet(self) -> Any:
