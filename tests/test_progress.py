@@ -204,6 +204,7 @@ def test_a_plan_says_what_it_did_not_measure(monkeypatch: pytest.MonkeyPatch) ->
     progress.check()
     assert half["ending"] == "interrupted" and half["cosines"] and half["not_measured"] == cut["not_measured"][1:]
     assert "not measured, it was stopped" in plan_text(half)
+    assert half["denoise"] == {"asked": "oidn", "advised": "oidn", "reason": "the other one was not measured"}
 
 
 # ---- what is stored is not rendered again ---------------------------------------------------------------------------

@@ -433,6 +433,8 @@ def test_several_controls_have_a_budget_each() -> None:
         controls=["texture", "pose"], epsilon={"texture": 0.05, "pose": None}, norm={"texture": "l2", "pose": None}
     )
     assert wording.budget_text(several) == "texture within 0.05 (l2) and pose"
+    assert wording.renders_text({"renders": {"search": 8, "gradient": 0}}) == "8 of the search"
+    assert (wording.renders_text({"renders": {"search": 0}}), wording.renders_text({})) == ("none", "unknown")
     assert (
         wording.changed_text(several) == "texture within 0.05 (l2: the root of the sum of all squared changes) and pose"
     )

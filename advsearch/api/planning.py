@@ -16,6 +16,7 @@ from advsearch.evaluation.gradients import inside
 from advsearch.evaluation.leaving_out import measured_gains, most_gradients, resolved_texels, rows_of
 from advsearch.evaluation.planning import GOAL, Cosine, cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.progress import NullProgress, Progress
+from advsearch.report.wording import count
 from advsearch.runs.summary import INTERRUPTED, OUT_OF_TIME
 from advsearch.scene.plan import BY_DIFFERENCES, GradientPlan
 
@@ -100,7 +101,7 @@ class _Measurements:
         renderer, seed = self._problem.renderer, seeds.stream(self._config.seed, "measure")
         gradients = plan_gradients(renderer.plan, every=True)
         if gradients:
-            hint = f"{gradients} gradients of {self._problem.spp} samples a pixel; `resolution` shortens it"
+            hint = f"{gradients} gradients of {count(self._problem.spp, 'sample')} a pixel; `resolution` shortens it"
             self._progress.stage("comparing ways to differentiate", gradients, hint=hint)
         renderer.plan = measured_plan(
             renderer,
@@ -200,6 +201,8 @@ def quieter(tables: Mapping[str, Sequence[Cosine]], asked: str) -> dict[str, str
         return not reached, sum(row.seconds for row in best) if reached else -min(row.cosine for row in best)
 
     measured = [name for name in tables if tables[name]]
+    if len(measured) == 1 and len(tables) > 1:
+        return {"asked": asked, "advised": asked, "reason": "the other one was not measured"}
     advised = min(measured, key=rank) if measured else asked
     reached = bool(measured) and not rank(advised)[0]
     why = (

@@ -40,6 +40,7 @@ from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, 
 from advsearch.config import AttackConfig
 from advsearch.evaluation.gradients import inside
 from advsearch.evaluation.planning import cosine_samples, cosines, measured_plan, plan_gradients, tuned
+from advsearch.report.wording import count
 
 FIRST_LOOK = 4
 """Renders of the clean configuration before the search; wrong in all of them, it goes through the full trials first."""
@@ -139,7 +140,7 @@ class Attack:
                 "setup",
                 "measuring which gradients are best here",
                 gradients,
-                hint=f"{gradients} gradients of {problem.spp} samples a pixel; `measure=no` leaves it out",
+                hint=f"{gradients} gradients of {count(problem.spp, 'sample')} a pixel; `measure=no` leaves it out",
             )
         problem.plan = measured_plan(
             renderer,
@@ -387,7 +388,7 @@ class Attack:
     def _begin_search(self, name: str, title: str, steps: int, shorter: str) -> None:
         """Begin the stage of a search of at most so many steps, and its ranking."""
         renders = planned_renders(steps, close=self.config.close_looks)
-        hint = f"{renders} pictures of {self.problem.spp} samples a pixel; {shorter}"
+        hint = f"{renders} pictures of {count(self.problem.spp, 'sample')} a pixel; {shorter}"
         self.stages.begin(name, title, renders, hint=hint, at_most=True)
 
     def _begin_trials(
@@ -401,7 +402,7 @@ class Attack:
     ) -> None:
         """Begin a stage of so many trials."""
         most = "at most " if at_most else ""
-        hint = f"{most}{trials} pictures of {self.findings.spp} samples a pixel; {flags} shorten it"
+        hint = f"{most}{trials} pictures of {count(self.findings.spp, 'sample')} a pixel; {flags} shorten it"
         self.stages.begin(name, title, trials, hint=hint, at_most=at_most)
 
     def _advance(self, steps: int = 1) -> None:

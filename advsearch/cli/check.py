@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
 from advsearch.report import wording
-from advsearch.runs.summary import OUT_OF_TIME
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -104,6 +103,8 @@ def fell_short(rows: Sequence[Mapping[str, Any]]) -> bool:
 
 def answer(summary: Mapping[str, Any]) -> str:
     """Return what the table shows and how to read it, the table, and where the run is."""
+    from advsearch.runs.summary import OUT_OF_TIME
+
     rows, left = summary["rows"], summary["planned"] - summary["measured"]
     parts = [READING, table(rows)] if rows else []
     if left:

@@ -7,7 +7,6 @@ from typing import Any
 
 from advsearch.cli import output
 from advsearch.cli.check import FIELDS, GROUPS
-from advsearch.runs.summary import OUT_OF_TIME
 
 HELP = "show how a search gets its derivatives and what it leaves out, measured on its scene, and why"
 
@@ -53,6 +52,8 @@ def run(args: argparse.Namespace) -> int:
 
 def text(chosen: dict[str, Any]) -> str:
     """Return a plan as text."""
+    from advsearch.runs.summary import OUT_OF_TIME
+
     rows = [["parameter", "numbers", "estimator", "step", "why"]]
     for group in chosen["groups"]:
         step = f"{group['step']:.3g}" if group["estimator"] not in ("adjoint", "image", "none", "material") else ""

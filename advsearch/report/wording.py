@@ -215,7 +215,8 @@ def renders_text(summary: Summary) -> str:
     renders = summary.get("renders") or {}
     known = {"search": "of the search", "gradient": "gradients", "verification": "of the verification"}
     known["baseline"] = "of the random search"
-    return ", ".join(f"{number} {known.get(name, f'of {name}')}" for name, number in renders.items()) or "unknown"
+    spent = [f"{number} {known.get(name, f'of {name}')}" for name, number in renders.items() if number]
+    return ", ".join(spent) or ("none" if renders else "unknown")
 
 
 def formation_text(summary: Summary) -> str:

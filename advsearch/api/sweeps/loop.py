@@ -29,6 +29,7 @@ from advsearch.controls.base import Value
 from advsearch.progress import Progress
 from advsearch.report.notebook import sweep_html
 from advsearch.report.studies import sweep_figure
+from advsearch.report.wording import count
 from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.export import to_pandas
@@ -139,7 +140,7 @@ class Sweep:
             self.stages.progress.message(text)
         try:
             self._open(min(first, self.total - 1) // self.models // self.per_scene)
-            hint = f"{self.total} answers, pictures of {self.samples} samples a pixel; `resolution`, `spp`"
+            hint = f"{self.total} answers, pictures of {count(self.samples, 'sample')} a pixel; `resolution`, `spp`"
             hint += " or fewer points shorten it"
             self.stages.begin("sweep", "rendering and classifying", self.total, hint=hint)
             self.stages.progress.advance(first)
