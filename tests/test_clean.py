@@ -236,7 +236,10 @@ def test_a_row_names_the_environment_that_lights_it() -> None:
     plain = {"resolution": 8, "spp": 1, "trials": 0}
 
     def lit_by(**options: Any) -> list[Any]:
-        return [row.values["environment"]["value"] for row in advsearch.sweep("mug", **options, **plain).rows()]
+        found = advsearch.sweep("mug", **options, **plain)
+        named = [row.values["environment"]["value"] for row in found.rows()]
+        assert found.summary["environment"] == (named[0] if len(set(named)) == 1 else "studio")
+        return named
 
     assert lit_by(grid={"environment.which": ["noon", "own"]}) == ["noon", "studio"]
     assert lit_by(controls={"environment": {"which": "noon", "rotation": [0, 90]}}, samples=1) == ["noon"]

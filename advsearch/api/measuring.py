@@ -277,7 +277,7 @@ def _head(config: PrecisionConfig, problem: Problem) -> dict[str, Any]:
         "run": None,
         "object": config.object,
         "model": problem.model.name,
-        "environment": config.environment,
+        "environment": problem.space.environment or config.environment,
         "controls": list(config.controls),
         "image_formation": problem.renderer.formation.summary(),
         "depth": problem.renderer.scene.max_depth,

@@ -24,6 +24,7 @@ from advsearch.controls import NumberControl, Parameter, Space
 from advsearch.controls.base import BoundControl, Value
 from advsearch.controls.numbers import BoundNumbers
 from advsearch.controls.values import Choices, Fixed, Range, to_value
+from advsearch.scene.description import ENVIRONMENT
 
 BINS = 10
 """Equal parts into which the range of a drawn parameter is cut for the table."""
@@ -189,6 +190,12 @@ class Points:
         length = block.epsilon * shares[:, -1:] ** (1.0 / block.size)
         norm = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-30)
         return np.asarray(self._start[part] + direction * (length / norm))
+
+    @property
+    def environment(self) -> str | None:
+        """What lights all pictures in the place of the scene's environment; None if that does, or if it varies."""
+        varies = any(group.setting == ENVIRONMENT for _, group in self._space.groups)
+        return None if varies else self._space.environment
 
     def lit_by(self, values: Mapping[str, Value]) -> str | None:
         """Return what lights a picture in the place of the scene's environment, by what is stored of it."""
