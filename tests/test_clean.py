@@ -15,6 +15,7 @@ from advsearch.cli.flags import with_flags
 from advsearch.config import SweepConfig
 from advsearch.controls import Space, make_control, make_space
 from advsearch.controls.clean import sentences
+from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.scene.assets import EnvironmentAsset
@@ -224,6 +225,15 @@ def test_a_sweep_refuses_what_contradicts_its_scenes(options: dict[str, Any], me
     with pytest.raises(InputError) as error:
         sweep_from_config(SweepConfig(**{"object": "mug", "trials": 0, **options}))
     assert message in with_flags(str(error.value))
+
+
+def test_the_grid_of_a_control_of_ones_own_is_checked_too() -> None:
+    class Squat(PoseControl):
+        kind = "squat"
+
+    controls = [Squat(roll=[0, 10])]
+    found = advsearch.sweep("mug", grid={"squat.yaw": [0, 90]}, controls=controls, trials=0, resolution=8, spp=1)
+    assert [row.values["squat.yaw"]["value"] for row in found.rows()] == [0.0, 90.0]
 
 
 def test_a_sweep_of_a_loaded_scene_refuses_the_same() -> None:

@@ -100,12 +100,13 @@ def check_scenes(places: Sequence[Place], controls: Sequence[Control], axes: Seq
         InputError: a parameter is fixed and in the grid, or several environments meet a control that chooses one.
     """
     given = {name for place in places for name in place.scene.description.given}
-    for axis in axes:
-        setting = CONTROLS[axis.control].setting(axis.parameter)
+    kinds = {control.name: type(control) for control in controls}
+    settings = {axis: (kinds.get(axis.instance) or CONTROLS[axis.control]).setting(axis.parameter) for axis in axes}
+    for axis, setting in settings.items():
         if setting in given and setting != ENVIRONMENT:
             raise InputError(f"`grid` {axis.name}: `set` fixes it already; leave it out of one of the two")
     environments = list(dict.fromkeys(place.environment for place in places))
-    choosing = [f"`grid` {axis.name}" for axis in axes if CONTROLS[axis.control].setting(axis.parameter) == ENVIRONMENT]
+    choosing = [f"`grid` {axis.name}" for axis, setting in settings.items() if setting == ENVIRONMENT]
     choosing += [
         f"`controls` {control.name}"
         for control in controls
