@@ -19,8 +19,10 @@ if TYPE_CHECKING:
         Scene,
         SweepResult,
         attack,
+        gap,
         load_model,
         load_scene,
+        region,
         render,
         sweep,
     )
@@ -34,8 +36,10 @@ __all__ = [
     "Scene",
     "SweepResult",
     "attack",
+    "gap",
     "load_model",
     "load_scene",
+    "region",
     "render",
     "sweep",
 ]

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.config import AttackConfig, SceneConfig, SweepConfig
+from advsearch.config import AttackConfig, GapConfig, RegionConfig, SceneConfig, SweepConfig
 from advsearch.errors import InputError
 
 BY_SCENE = {"environment", "up", "set", "exposure"}
@@ -24,16 +24,25 @@ def test_dir_lists_the_public_names() -> None:
     assert set(dir(advsearch)) == {*advsearch.__all__, "__version__"}
 
 
-@pytest.mark.parametrize(("function", "config"), [(advsearch.attack, AttackConfig), (advsearch.sweep, SweepConfig)])
+QUESTIONS = [
+    (advsearch.attack, AttackConfig),
+    (advsearch.sweep, SweepConfig),
+    (advsearch.gap, GapConfig),
+    (advsearch.region, RegionConfig),
+]
+
+
+@pytest.mark.parametrize(("function", "config"), QUESTIONS)
 def test_signatures_have_every_setting_with_its_default(function: Any, config: type[SceneConfig]) -> None:
     parameters = inspect.signature(function).parameters
     assert not [one for one in parameters.values() if one.kind is one.VAR_KEYWORD]
     names = {"set" if name == "set_" else name for name in config.model_fields} - {"object"}
-    assert names <= set(parameters) and set(parameters) - names <= {"scene", "resume", "progress"}
+    assert names <= set(parameters) and set(parameters) - names <= {"scene", "object", "resume", "progress"}
     for name in names - BY_SCENE - {"model", "controls", "over", "grid"}:
         default = config.model_fields[name].get_default(call_default_factory=True)
         assert parameters[name].default == (default or None if isinstance(default, dict) else default), name
-    assert all(parameters[name].default is None for name in BY_SCENE)
+    if "scene" in parameters:
+        assert all(parameters[name].default is None for name in BY_SCENE)
     assert all(one.annotation is not inspect.Parameter.empty for one in parameters.values())
 
 
@@ -109,3 +118,14 @@ def test_rows_of_an_attack_that_was_not_kept_are_not_there(attacked: Any, tmp_pa
     gone = type(attacked)(**{**{name: getattr(attacked, name) for name in attacked.__dataclass_fields__}, "run": None})
     with pytest.raises(InputError, match="rows: expected a run that was kept, got none"):
         list(gone.rows())
+
+
+def test_the_gap_is_asked_for_by_name(tmp_path: Path) -> None:
+    quick: dict[str, Any] = {"resolution": 16, "spp": 1, "verify_spp": 1, "steps": 2, "trials": 6, "average": 6}
+    found = advsearch.gap(
+        "mug", controls=["camera"], policy="random", baseline=False, run=tmp_path / "run", threads=1, **quick
+    )
+    assert [(row["object"], row["control"]) for row in found["table"]] == [("mug", "camera")]
+    assert found["table"][0]["average"]["configurations"] == 6
+    with pytest.raises(InputError, match=r"^map: expected a whole number from 0 to 512, got 600"):
+        advsearch.region("mug", controls="camera", map=600)

@@ -6,6 +6,7 @@ from advsearch import threads as threads  # before torch: it sets how OpenMP wai
 from advsearch.api.attacking import attack, attack_from_config, resume_attack
 from advsearch.api.mapping import region_from_config
 from advsearch.api.outcome import AttackResult
+from advsearch.api.questions import gap, region
 from advsearch.api.rendering import Rendering, render, render_from_config
 from advsearch.api.scene import Scene, load_scene
 from advsearch.api.studies import curve_from_config, gap_from_config
@@ -22,9 +23,11 @@ __all__ = [
     "attack",
     "attack_from_config",
     "curve_from_config",
+    "gap",
     "gap_from_config",
     "load_model",
     "load_scene",
+    "region",
     "region_from_config",
     "render",
     "render_from_config",
