@@ -139,6 +139,7 @@ def _gradient_reaches(model: Model, images: Tensor) -> bool:
 def first_line(error: BaseException) -> str:
     """Return a foreign error as one short line."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    lines = ["".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in line) for line in lines[:1]]
     text = f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__
     return text if len(text) <= 300 else text[:297] + "..."
 

@@ -252,7 +252,8 @@ def _readable(path: Path) -> Iterator[None]:
     try:
         yield
     except sqlite3.Error as error:
-        raise FileFormatError(f"{path}: expected a results.sqlite of advsearch, got {error}; {_DAMAGED}") from error
+        text = repr(str(error))[1:-1][:200]  # it quotes what is in the file
+        raise FileFormatError(f"{path}: expected a results.sqlite of advsearch, got {text}; {_DAMAGED}") from error
 
 
 def _check_schema(db: sqlite3.Connection, path: Path) -> None:

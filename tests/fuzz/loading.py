@@ -55,6 +55,24 @@ def load_settings(path: Path) -> None:
     getattr(config, COMMANDS[command]).from_yaml(path, {})
 
 
+def load_run(path: Path) -> None:
+    """List a run folder, and read what it holds as `show` and `export` do."""
+    import io
+
+    from advsearch.cli.table import answer
+    from advsearch.runs.export import export
+    from advsearch.runs.listing import described
+    from advsearch.runs.store import NAME, Store
+    from advsearch.runs.summary import of_a_file, read_summary
+
+    described(path.parent)
+    with Store(path.parent / NAME, read_only=True) as store:
+        export(store, "json", None, io.BytesIO())
+    summary = read_summary(path.parent)
+    with of_a_file(path.parent):
+        answer(summary)
+
+
 def misbehave(path: Path) -> None:
     """Do what no loader may, as the file says; the test of the fuzz itself."""
     import subprocess
@@ -81,6 +99,7 @@ LOADERS: dict[str, Callable[[Path], object]] = {
     "model": load_model,
     "labels": load_labels,
     "settings": load_settings,
+    "run": load_run,
     "misbehave": misbehave,
 }
 """Each gets the path of a case's main file, and returns or raises an `AdvsearchError`."""
@@ -98,7 +117,7 @@ def warm_up(loaders: Iterable[str]) -> None:
         import advsearch.scene.importing.objects
 
         Image.init()
-    if "model" in loaders:
+    if {"model", "labels"} & set(loaders):
         import torch.export
         import torch.jit  # noqa: F401
 

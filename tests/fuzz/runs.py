@@ -1,0 +1,53 @@
+"""Run folders with a file that is damaged: the results, the summary, the settings."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import tempfile
+from contextlib import closing
+from functools import cache
+from pathlib import Path
+
+from advsearch.runs.store import Row, Store
+from advsearch.settings import HEADER
+from fuzz.case import Case, Maker, Random
+from fuzz.mutations import as_json, confused, damaged
+
+SUMMARY = {
+    "schema": 1,
+    "command": "attack",
+    "object": "mug",
+    "controls": ["pose"],
+    "ending": "interrupted",
+    "clean": {"label": "mug", "successes": 0, "trials": 6},
+    "verified": {"successes": 5, "trials": 6, "interval": [0.4, 1.0]},
+    "seconds": {"total": 3.0},
+}
+SETTINGS = f"{HEADER}schema: 1\ncommand: attack\nobject: mug\ncontrols: {{pose: {{}}}}\n".encode()
+
+
+@cache
+def results() -> bytes:
+    """Return an honest results.sqlite."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "results.sqlite"
+        with Store(path) as store:
+            values = {"pose.yaw": {"value": 3.0, "unit": "degrees"}}
+            store.append(Row("search", step, seed=step, objective=0.5, values=values) for step in range(40))
+        with closing(sqlite3.connect(path)) as db:
+            db.execute("PRAGMA journal_mode = DELETE")  # or reading it makes a log beside it
+        return path.read_bytes()
+
+
+def folder(random: Random) -> Case:
+    """A run folder with one bad file."""
+    files = {"run.yaml": SETTINGS, "summary.json": json.dumps(SUMMARY).encode(), "results.sqlite": results()}
+    name = random.choice(("results.sqlite", "results.sqlite", "summary.json", "run.yaml"))
+    what, files[name] = damaged(random, files[name])
+    if name == "summary.json" and random.random() < 0.7:
+        what, files[name] = "confused", as_json(confused(random, SUMMARY))
+    return Case(f"run: {name} {what}", "run", "run.yaml", files)
+
+
+MAKERS: tuple[Maker, ...] = (folder,)
