@@ -13,7 +13,7 @@ import pytest
 import torch
 from test_resume import StandInProblem, carry_out, configuration, rows
 
-from advsearch.api import planning, sweep_from_config
+from advsearch.api import planning
 from advsearch.api.attacking import attack_from_config
 from advsearch.api.mapping import region_from_config
 from advsearch.api.measuring import precision
@@ -21,6 +21,8 @@ from advsearch.api.memory import Memory
 from advsearch.api.planning import plan
 from advsearch.api.record import Findings, Recorder, Stages
 from advsearch.api.stages import Attack
+from advsearch.api.sweeping import resume_sweep, sweep_from_config
+from advsearch.api.sweeps.view import View
 from advsearch.attacks import make_policy
 from advsearch.attacks.region import grow
 from advsearch.attacks.sample_count import choose_spp, most_samples
@@ -235,9 +237,28 @@ def test_a_resumed_run_takes_its_probes_from_the_store(tmp_path: Path, monkeypat
     assert rows(tmp_path / "run") == rows(tmp_path / "whole")
 
 
-def test_the_probes_of_a_sweeps_worst_configuration_are_stored(tmp_path: Path) -> None:
-    config = SweepConfig(**SMALL, grid={"pose.yaw": "0,90"}, trials=6, run=str(tmp_path / "run"))
-    found = sweep_from_config(config)
-    with RunDirectory.resume(tmp_path / "run") as run:
-        kept = run.store.counts()
-    assert kept["sample count worst"] + 6 == found.summary["renders"]["verification"]
+def test_a_resumed_sweep_takes_the_probes_of_its_worst_configuration_from_the_store(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = SweepConfig(**SMALL, grid={"pose.yaw": "0,90"}, trials=14, run=str(tmp_path / "whole"))
+    whole = sweep_from_config(config)
+    rendered, stop = 0, 5
+    once = View.trial
+
+    def trial(self: Any, *given: Any) -> Any:
+        nonlocal rendered
+        rendered += 1
+        if rendered == stop:
+            raise KeyboardInterrupt
+        return once(self, *given)
+
+    monkeypatch.setattr(View, "trial", trial)
+    cut = sweep_from_config(config.model_copy(update={"run": str(tmp_path / "run")}))
+    assert cut.summary["ending"] == "interrupted"
+    stop, rendered = 0, 0
+    resumed = resume_sweep(tmp_path / "run")
+    assert rendered + 4 == whole.summary["renders"]["verification"] == resumed.summary["renders"]["verification"]
+    assert resumed.summary["worst"] == whole.summary["worst"]
+    with RunDirectory.resume(tmp_path / "run") as run, RunDirectory.resume(tmp_path / "whole") as other:
+        counts = run.store.counts()
+        assert counts == other.store.counts() and counts["sample count worst"] + 14 == rendered + 4
