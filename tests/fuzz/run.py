@@ -22,8 +22,8 @@ CPU_SECONDS = 10.0
 MEMORY = 1 << 30
 """What one case may take, over what the process has with its libraries loaded."""
 
-WALL_SECONDS = 60.0
-"""A case that has not ended by then waits for something."""
+IDLE_SECONDS = 60.0
+"""A case that has used no CPU time for so long waits for something."""
 
 _TICKS, _PAGE = os.sysconf("SC_CLK_TCK"), os.sysconf("SC_PAGE_SIZE")
 _POLL = 0.05
@@ -164,7 +164,7 @@ class _Worker:
 
     def _answer(self, process: subprocess.Popen[bytes], cpu: float, resident: int) -> tuple[dict | None, str]:
         """Wait for the answer; give up when the case takes more than it may."""
-        deadline = time.monotonic() + WALL_SECONDS
+        active, deadline = cpu, time.monotonic() + IDLE_SECONDS
         while True:
             line = self._line(process, time.monotonic() + _POLL)
             if line:
@@ -177,8 +177,10 @@ class _Worker:
                 return None, f"takes more than {CPU_SECONDS:g} CPU seconds"
             if memory - resident > MEMORY:
                 return None, "takes more than 1 GiB of memory"
+            if spent - active > 0.1:
+                active, deadline = spent, time.monotonic() + IDLE_SECONDS
             if time.monotonic() > deadline:
-                return None, f"has not ended after {WALL_SECONDS:g} seconds"
+                return None, f"has done nothing for {IDLE_SECONDS:g} seconds"
 
     @staticmethod
     def _line(process: subprocess.Popen[bytes], deadline: float) -> bytes | None:
