@@ -1,12 +1,17 @@
 """Compares estimators of the gradient over six pose parameters at 224 x 224: squared error x time, as ratios.
 
     python benchmarks/gradients.py [--size 224] [--repeats 6] [--guided-repeats 1]
+    python benchmarks/gradients.py --steps [--size 96] [--repeats 6]
 
 The parameters are a rotation vector and a shift of the bundled mug, the loss is linear and smooth. Each estimator gives
 several gradients with seeds of their own; its error is measured against the mean of many central differences. Mitsuba's
 projective integrator is taken as it comes (octree guiding) and with guiding off, at its own share of samples. A camera
 cannot be differentiated by Mitsuba at all, so that there is nothing to compare the six camera parameters with: their
 differences are measured alone.
+
+With `--steps` it compares the widths of differences of the model's own loss over poses and cameras, at equal renders:
+how often they have the sign of what the loss does over 2 to 5 % of the range, which is how far a search goes at a time,
+and their noise as a multiple of that slope.
 """
 
 from __future__ import annotations
@@ -24,8 +29,11 @@ from advsearch import threads
 
 threads.configure()
 
+from advsearch.api.attacking import problem_from_config  # noqa: E402
 from advsearch.api.scene import load_scene  # noqa: E402
-from advsearch.evaluation.gradients import estimated, inside, smooth_loss  # noqa: E402
+from advsearch.config import AttackConfig  # noqa: E402
+from advsearch.evaluation.gradients import Loss, estimated, inside, smooth_loss  # noqa: E402
+from advsearch.scene.plan import GroupPlan  # noqa: E402
 from advsearch.scene.renderer import Renderer  # noqa: E402
 
 POSE = {"pose": {"on_ground": "no", "rotation": [-30, 30], "x": [-0.15, 0.15], "y": [-0.15, 0.15], "z": [0.05, 0.35]}}
@@ -50,7 +58,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--guided-repeats", type=int, default=1, help="gradients with guiding, minutes each (default 1)"
     )
+    parser.add_argument("--steps", action="store_true", help="compare the widths of differences of the model's loss")
     args = parser.parse_args(argv)
+    if args.steps:
+        return compare_steps(args.size, args.repeats)
     scene = load_scene("mug")
     for name, controls, estimators in (
         ("six pose parameters", POSE, ("differences", "forward", "material", "boundary", "guided")),
@@ -70,6 +81,53 @@ def main(argv: Sequence[str] | None = None) -> int:
                 print(f"  Mitsuba's projective integrator {words}: {products[rival] / chosen:.0f} times ours")
         print()
     return 0
+
+
+SCENES = (("mug", "studio"), ("teapot", "loft"))
+FAR = (0.02, 0.03, 0.05)
+"""Half-widths over which a search's slope is measured, in u."""
+FAR_SEEDS, FAR_SPP, NEAR_SPP = 3, 16, 8
+
+
+def compare_steps(size: int, repeats: int) -> int:
+    """Print, for each parameter, how differences over a pixel and over the plan's step agree with a search's slope."""
+    print(
+        f"{size} x {size}, {NEAR_SPP} samples a pixel, {repeats} seeds: share with a search's sign, noise / its slope"
+    )
+    print(f"{'parameter':32} {'slope':>16} {'over a pixel':>16} {'plan':>16}")
+    for name, environment in SCENES:
+        config = AttackConfig(
+            object=name, environment=environment, resolution=(size, size), controls=["camera", "pose"]
+        )
+        problem, _ = problem_from_config(config)
+        renderer, loss = problem.renderer, problem.loss
+        for group in renderer.plan.groups:
+            if group.step_reason and group.size == 1:
+                cells = [f"{name}, {group.name}".ljust(32)]
+                far = [
+                    statistics.fmean(difference(renderer, loss, group, half, 100 + seed, FAR_SPP) for half in FAR)
+                    for seed in range(FAR_SEEDS)
+                ]
+                slope = statistics.fmean(far)
+                cells.append(f"{slope:8.2f} +- {statistics.stdev(far) / FAR_SEEDS**0.5:4.2f}")
+                for half in (group.pixel, group.step):
+                    found = [difference(renderer, loss, group, half, seed, NEAR_SPP) for seed in range(repeats)]
+                    same = sum((one > 0.0) == (slope > 0.0) for one in found)
+                    cells.append(f"{same} of {repeats}, {statistics.stdev(found) / abs(slope):6.2f}".rjust(16))
+                print(" ".join(cells), flush=True)
+    return 0
+
+
+def difference(renderer: Renderer, loss: Loss, group: GroupPlan, half: float, seed: int, spp: int) -> float:
+    """Return a central difference of the loss over one coordinate, all others as in the scene."""
+    values = []
+    for side in (half, -half):
+        u = renderer.start.clone()
+        at = min(max(float(u[group.begin]), 0.1), 0.9) + side
+        u[group.begin] = at % 1.0 if group.periodic else min(max(at, 0.0), 1.0)
+        with torch.no_grad():
+            values.append(float(loss(renderer(u, seed=seed, spp=spp))))
+    return (values[0] - values[1]) / (2.0 * half)
 
 
 def measure(

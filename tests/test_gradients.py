@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from advsearch.api import load_scene
+from advsearch.api.attacking import problem_from_config
 from advsearch.api.checking import WHOLE, attempts, check
 from advsearch.cli.check import table
 from advsearch.config import AttackConfig
@@ -30,7 +31,7 @@ from advsearch.evaluation.gradients import (
     verdict,
 )
 from advsearch.evaluation.planning import TELLS, Cosine, contested, cosines, measured_plan, tuned
-from advsearch.scene.plan import ESTIMATORS, GroupPlan, first_plan
+from advsearch.scene.plan import ESTIMATORS, SEARCH_STEP, GroupPlan, first_plan
 from advsearch.scene.renderer import Renderer
 
 SIZE = 48
@@ -39,6 +40,7 @@ SIZE = 48
 def renderer(controls: Any, *, object: str = "mug", transfer: str = "linear", **options: Any) -> Renderer:
     made = load_scene(object).renderer(controls, resolution=SIZE, denoise="none", **options)
     made.formation = replace(made.formation, transfer=transfer)
+    made.plan = made.plan.at_a_pixel()  # as `check` does for smooth losses, which these are
     return made
 
 
@@ -111,6 +113,43 @@ def test_differences_are_central_differences_of_the_picture_with_one_seed() -> N
     with torch.no_grad():
         rise = (weights * (render(u + step, common, 4) - render(u - step, common, 4))).sum()
     assert float(leaf.grad[1]) == pytest.approx(float(rise) / (2.0 * first.step), rel=1e-3)
+
+
+def test_a_step_is_one_that_a_search_can_follow_and_never_under_a_pixel() -> None:
+    both = torch.tensor([0.001, 0.1])
+    fast, slow = first_plan((group("a.b", 0, 1, ("secant",)), group("a.c", 1, 1, ("secant",))), both).groups
+    assert (fast.step, fast.pixel) == (SEARCH_STEP, pytest.approx(0.001)) and slow.step == slow.pixel == both[1]
+    assert fast.step_reason == "30 times as wide as moves an outline by a pixel, so that a search can follow"
+    assert slow.step_reason == "an outline moves by a pixel, or nothing moves"
+    for lit in (("adjoint", "differences"), ("image",)):  # what moves no outline is as it was
+        assert first_plan((group("a.b", 0, 1, lit),), both).groups[0].step == pytest.approx(0.001)
+    assert first_plan((group("a.b", 0, 2, ("secant",)),), both).groups[0].step == pytest.approx(0.001)
+    endless = first_plan((group("a.b", 0, 1, ("secant",)),), 1e-6 * both, across=100.0).groups[0]
+    assert endless.step == pytest.approx(0.4 * 100.0 * 1e-9)  # things stay in sight
+    narrow = first_plan((group("a.b", 0, 1, ("secant",)),), both).at_a_pixel()
+    assert narrow.groups[0].step == pytest.approx(0.001)
+
+
+def test_a_plan_says_its_steps_in_the_parameters_unit_and_why() -> None:
+    config = AttackConfig(object="mug", controls={"camera": {"azimuth": [0, 360]}}, resolution=(32, 32))
+    problem, _ = problem_from_config(config)
+    (found,) = problem.plan_summary(problem.plan)["groups"]
+    assert found["step"] == SEARCH_STEP and found["unit"] == "degrees"
+    assert found["step_in_unit"] == pytest.approx(0.03 * 360.0, abs=0.01)
+    assert "so that a search can follow" in found["step_reason"]
+
+
+@pytest.mark.slow
+def test_the_azimuth_of_the_mug_has_the_sign_of_what_the_loss_does_over_degrees() -> None:
+    """96 x 96: differences over a pixel, 0.3 degrees, had the other one in two of three seeds."""
+    problem, _ = problem_from_config(AttackConfig(object="mug", controls=["camera.azimuth"], resolution=(96, 96)))
+    renderer, start = problem.renderer, problem.domain.start
+    steps = [half * degrees / 360.0 for half in (1.0, -1.0) for degrees in (7.2, 10.8, 18.0)]
+    with torch.no_grad():
+        seen = [float(problem.loss(renderer((start + step) % 1.0, seed=9, spp=64))) for step in steps]
+    slope = sum(seen[:3]) - sum(seen[3:])
+    for seed in range(6):
+        assert float(renderer.gradient(problem.loss, start, seed, 8)[1][0]) * slope > 0.0
 
 
 def test_a_secant_differences_the_loss_itself() -> None:
@@ -403,7 +442,7 @@ def test_the_cheapest_setting_that_reaches_the_goal_is_taken() -> None:
         Cosine("pose", 3.0, 16, 0.93, 0.99, 2.0),
     ]
     chosen, spp = tuned(plan, rows)
-    assert spp == 16 and chosen.groups[0].step == pytest.approx(0.03)
+    assert spp == 16 and chosen.groups[0].step == pytest.approx(3.0 * SEARCH_STEP)
     poor, spp = tuned(plan, rows[:1])
     assert spp == 8 and "below 0.9, the best that was found" in poor.groups[0].reason
     assert tuned(plan, [])[1] is None
@@ -539,7 +578,7 @@ def azimuth_speed(**fixed: float) -> float:
     """Pixels a degree of azimuth."""
     scene = load_scene("mug", settings={name.replace("_", ".", 1): value for name, value in fixed.items()})
     made = scene.renderer({"camera": {"azimuth": [30, 50]}}, resolution=SIZE, denoise="none")
-    return 1.0 / made.plan.groups[0].step / 20.0
+    return 1.0 / made.plan.groups[0].pixel / 20.0
 
 
 def test_the_camera_follows_what_is_seen_behind_the_object() -> None:

@@ -276,6 +276,7 @@ def _linear(part: Part, title: str, results: Results, progress: Progress) -> Ite
     config = part.config
     problem, _ = problem_from_config(config, denoise="none")
     problem.renderer.formation = replace(problem.renderer.formation, transfer="linear")
+    problem.renderer.plan = problem.renderer.plan.at_a_pixel()
     loss = smooth_loss(problem.renderer.formation.resolution, config.seed)
     yield from _rows(
         problem,

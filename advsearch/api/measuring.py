@@ -139,6 +139,7 @@ class _Job:
         loss: Loss = problem.loss
         if config.loss == "linear":
             renderer = renderer.like(denoiser="none", transfer="linear")
+            renderer.plan = renderer.plan.at_a_pixel()
             loss = smooth_loss(renderer.formation.resolution, config.seed)
         u = inside(renderer)
         exact = renderer.like(renderer.scene.like(sampler=REFERENCE_SAMPLER))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -18,7 +18,7 @@ from advsearch.controls.base import Value
 from advsearch.evaluation.domains import domain_of
 from advsearch.models import LabelSet, Model
 from advsearch.scene.formation import to_8_bit
-from advsearch.scene.plan import GradientPlan
+from advsearch.scene.plan import GradientPlan, GroupPlan
 from advsearch.scene.renderer import Renderer
 
 
@@ -147,6 +147,25 @@ class Problem:
             draw: seed of the conditions; None for those that the scene comes with.
         """
         return self.space.describe(self.whole(u, draw), self.space.controls[: self.searched])
+
+    def plan_summary(self, plan: GradientPlan) -> dict[str, Any]:
+        """Return what a summary holds of a plan: `GradientPlan.to_dict`, and each step in its parameter's unit."""
+        summary: dict[str, Any] = plan.to_dict()
+        for group, row in zip(plan.groups, summary["groups"], strict=True):
+            row["step_in_unit"], row["unit"] = self._in_unit(group) if group.step_reason else (None, "")
+        return summary
+
+    def _in_unit(self, group: GroupPlan) -> tuple[float | None, str]:
+        """The step of one number in the middle of its range, and its unit; None of what has no number of its own."""
+        u, half = self.whole(self.domain.start).clone(), min(group.step, 0.5)
+        ends = []
+        for side in (0.5 - half, 0.5 + half):
+            u[group.coordinates] = side
+            ends.append(self.space.describe(u).get(group.name))
+        low, high = ends
+        if group.size != 1 or low is None or high is None or not isinstance(low["value"], (int, float)):
+            return None, ""
+        return abs(float(high["value"]) - float(low["value"])) / 2.0, str(low["unit"])
 
     def conditions_of(self, u: Tensor, draw: int) -> dict[str, Value]:
         """Say the conditions of a draw in named values with units; empty where there are none."""

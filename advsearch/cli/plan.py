@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from typing import Any
 
 from advsearch.cli import output
@@ -50,13 +51,30 @@ def run(args: argparse.Namespace) -> int:
     return output.finish(chosen, text, as_json=args.json)
 
 
+def _step(group: Mapping[str, Any]) -> str:
+    """The step of a difference in u, and in the parameter's unit where it has one."""
+    if not group["step_reason"]:
+        return ""
+    own = "" if group["step_in_unit"] is None else f" ({group['step_in_unit']:.3g} {group['unit']})"
+    return f"{group['step']:.3g}{own}"
+
+
+def _steps(chosen: Mapping[str, Any]) -> list[str]:
+    """Why the steps are as wide as they are, each reason once with its parameters."""
+    reasons: dict[str, list[str]] = {}
+    for group in chosen["groups"]:
+        if group["step_reason"]:
+            reasons.setdefault(group["step_reason"], []).append(f"{group['control']}.{group['parameter']}")
+    return [f"step of {', '.join(names)}: {reason}" for reason, names in reasons.items()]
+
+
 def text(chosen: dict[str, Any]) -> str:
     """Return a plan as text."""
     from advsearch.runs.summary import OUT_OF_TIME
 
     rows = [["parameter", "numbers", "estimator", "step", "why"]]
     for group in chosen["groups"]:
-        step = f"{group['step']:.3g}" if group["estimator"] not in ("adjoint", "image", "none", "material") else ""
+        step = _step(group)
         rows.append(
             [f"{group['control']}.{group['parameter']}", str(group["size"]), group["estimator"], step, group["reason"]]
         )
@@ -67,6 +85,7 @@ def text(chosen: dict[str, Any]) -> str:
         "",
         f"renders for one gradient beside the picture itself: {chosen['renders_per_gradient']}",
         f"samples a pixel: {chosen['spp']}",
+        *_steps(chosen),
         *_left_out(chosen),
     ]
     if chosen["cosines"]:

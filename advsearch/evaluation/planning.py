@@ -25,7 +25,7 @@ from advsearch.scene.renderer import Renderer
 GOAL = 0.9
 """Cosine with the converged gradient that a working gradient should have."""
 FACTORS = (1.0, 3.0, 9.0)
-"""Steps that are tried, as multiples of the one that moves an outline by a pixel; the last only where no other will do:
+"""Steps that are tried, as multiples of the plan's; the last only where no other will do:
 it smooths away all but the coarse shape of the loss."""
 COUNTS = (8, 16, 32, 64, 128)
 """Sample counts that are tried."""

@@ -7,6 +7,7 @@ says which has the least variance x time. Any of them can be forced by name.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -45,6 +46,13 @@ DEFAULT_PIXELS = 1.0
 """How far the fastest point of an outline moves over half a difference, in pixels (DESIGN 5.1)."""
 STEP_RANGE = (1e-6, 0.15)
 """Smallest and largest step in u."""
+SEARCH_STEP = 0.03
+"""Smallest step in u of one number that moves outlines. Over a pixel a classifier's loss is rough: what it does over
+the 2 to 5 % of a range that a search goes at a time has another sign as often as not, and more noise hides it.
+`benchmarks/gradients.py --steps` shows that, and that 3 % is enough."""
+SEARCH_SHARE = 0.4
+"""Share of the picture that such a step moves the fastest outline over at most: of an endless range, 3 % would move all
+things out of sight."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +67,7 @@ class GroupPlan:
         estimator: a key of `ESTIMATORS`.
         valid: the estimators that were valid, preferred first.
         step: half-width of a difference in u; 0 where none is taken.
+        pixel: that half-width over which the fastest outline moves by a pixel; that of the group where nothing moves.
         periodic: 0 and 1 are the same value.
         reason: why this estimator, in words.
         measured: what a measurement found for each valid estimator: variance x time, if one was made.
@@ -71,6 +80,7 @@ class GroupPlan:
     estimator: str
     valid: tuple[str, ...]
     step: float = 0.0
+    pixel: float = 0.0
     periodic: bool = False
     reason: str = ""
     measured: Mapping[str, float] = field(default_factory=dict)
@@ -84,6 +94,15 @@ class GroupPlan:
     def name(self) -> str:
         """`control.parameter`."""
         return f"{self.control}.{self.parameter}"
+
+    @property
+    def step_reason(self) -> str:
+        """Why the step is as wide as it is, in words; empty where none is taken."""
+        if self.estimator not in BY_DIFFERENCES:
+            return ""
+        if self.step == self.pixel:
+            return "an outline moves by a pixel, or nothing moves"
+        return f"{self.step / self.pixel:.2g} times as wide as moves an outline by a pixel, so that a search can follow"
 
     @property
     def renders(self) -> int:
@@ -137,6 +156,10 @@ class GradientPlan:
         scaled = tuple(replace(one, step=min(high, max(low, one.step * factor))) for one in self.groups)
         return replace(self, groups=scaled)
 
+    def at_a_pixel(self) -> GradientPlan:
+        """Return the plan with steps over which outlines move by a pixel: for smooth losses, which bend over more."""
+        return replace(self, groups=tuple(replace(one, step=one.pixel) for one in self.groups))
+
     def restored(self, stored: Mapping[str, Any]) -> GradientPlan:
         """Return the plan with the choices that `to_dict` has stored of a plan for the same space."""
         chosen = {f"{one['control']}.{one['parameter']}": one for one in stored["groups"]}
@@ -165,6 +188,7 @@ class GradientPlan:
                     "estimator": one.estimator,
                     "valid": list(one.valid),
                     "step": one.step,
+                    "step_reason": one.step_reason,
                     "reason": one.reason,
                     "variance_x_seconds": dict(one.measured),
                 }
@@ -174,15 +198,20 @@ class GradientPlan:
 
 
 def first_plan(
-    groups: Sequence[GroupPlan], steps: Tensor, forced: Mapping[str, str] | None = None, spp: int | None = None
+    groups: Sequence[GroupPlan],
+    steps: Tensor,
+    forced: Mapping[str, str] | None = None,
+    spp: int | None = None,
+    across: float = math.inf,
 ) -> GradientPlan:
     """Return the plan before anything was measured: each group's preferred estimator, or the one forced on it.
 
     Args:
         groups: with `valid` filled in; `estimator` is set here.
-        steps: (d,) half-widths of differences in u.
+        steps: (d,) half-widths of differences in u over which outlines move by a pixel.
         forced: estimator by "control.parameter", "control", or "*" for all where it is valid.
         spp: samples a pixel of differences.
+        across: longer side of the picture in pixels.
 
     Raises:
         InputError: an estimator is unknown, or not valid where it was forced by name.
@@ -195,11 +224,14 @@ def first_plan(
     for name in forced:
         if name != "*" and name not in names:
             raise UnknownNameError("control in `estimators`", name, sorted(names))
-    return GradientPlan(tuple(_first(group, steps, forced) for group in groups), spp)
+    return GradientPlan(tuple(_first(group, steps, forced, across) for group in groups), spp)
 
 
-def _first(group: GroupPlan, steps: Tensor, forced: Mapping[str, str]) -> GroupPlan:
-    step = float(steps[group.coordinates].min()) if group.size else 0.0
+def _first(group: GroupPlan, steps: Tensor, forced: Mapping[str, str], across: float) -> GroupPlan:
+    pixel = float(steps[group.coordinates].min()) if group.size else 0.0
+    outline = group.size == 1 and not {"adjoint", "image"} & {*group.valid}
+    step = max(pixel, min(SEARCH_STEP, SEARCH_SHARE * across * pixel)) if outline else pixel
+    group = replace(group, pixel=pixel)
     if not group.valid:
         return replace(group, estimator="none", reason="a discrete choice has no derivative")
     wanted = forced.get(group.name) or forced.get(group.control)

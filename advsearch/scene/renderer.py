@@ -87,7 +87,7 @@ class Renderer:
         self.non_finite = 0
         self._left_out: frozenset[str] = frozenset()
         groups = space.group_plans()
-        self.plan = first_plan(groups, self._steps(groups, motion), estimators)
+        self.plan = first_plan(groups, self._steps(groups, motion), estimators, across=max(formation.resolution))
         self.routes = self._find_routes(groups)
 
     @property

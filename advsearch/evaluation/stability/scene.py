@@ -58,7 +58,10 @@ def small(
     denoise: str = "none",
     estimators: Mapping[str, str] | None = None,
 ) -> Renderer:
-    """Return `render(u, seed, spp)` of a small picture: as `Scene.renderer`, with parts of our own."""
+    """Return `render(u, seed, spp)` of a small picture: as `Scene.renderer`, with parts of our own.
+
+    Its differences are taken over a pixel: the losses of these cases are smooth.
+    """
     description = describe(object, environment or plain_environment(), given=settings)
     for part in parts:
         description = description.with_part(part)
@@ -67,7 +70,9 @@ def small(
     formation = ImageFormation(denoiser=denoise, resolution=(size, size), gain=description.gain)
     scene = MitsubaScene(description, (size, size), filter=formation.filter)
     motion = Motion(description, (size, size), scene.assembly)
-    return Renderer(scene, space, formation, 0, motion=motion, estimators=estimators)
+    renderer = Renderer(scene, space, formation, 0, motion=motion, estimators=estimators)
+    renderer.plan = renderer.plan.at_a_pixel()
+    return renderer
 
 
 # ---- things to put into a scene -------------------------------------------------------------------------------------
