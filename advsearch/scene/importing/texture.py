@@ -161,8 +161,12 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[Surface]) -> Floats:
     rows, columns, face, weights = _rasterised(uvs, size)
     image, inside = np.zeros((size, size, 3), np.float32), np.zeros((size, size), np.bool_)
     factor = np.einsum("tk,tkc->tc", weights, soup.colors[face])
-    for number in np.unique(soup.part):
-        here = soup.part[face] == number
+    part = soup.part[face]
+    order = np.argsort(part, kind="stable")
+    for here in np.split(order, np.flatnonzero(np.diff(part[order])) + 1):
+        if not len(here):  # no texel at all
+            continue
+        number = int(part[here[0]])
         surface, at = surfaces[number], np.einsum("tk,tkc->tc", weights[here], soup.uvs[face[here]])
         if surface.texture is None or not np.isfinite(at).all():
             color: Floats = (
@@ -179,10 +183,10 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[Surface]) -> Floats:
 def _baked_size(soup: Soup, surfaces: Sequence[Surface]) -> int:
     """Return a power of two, `BAKED_SIZE` to `TEXTURE_LIMIT`, that has room for the texels that the object shows."""
     texels, areas = 0.0, np.nan_to_num(np.abs(uv_areas(soup.uvs)))
-    for number in np.unique(soup.part):
+    for number, area in enumerate(np.bincount(soup.part, areas)):
         texture = surfaces[number].texture
         if texture is not None:
-            texels += float(areas[soup.part == number].sum()) * texture.shape[0] * texture.shape[1]
+            texels += float(area) * texture.shape[0] * texture.shape[1]
     size = BAKED_SIZE
     while size < TEXTURE_LIMIT and size * size * _FILLED < texels:
         size *= 2
