@@ -259,7 +259,7 @@ def test_a_wrong_range_says_what_to_do(text: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ([0, 90, 0], r"`grid` pose.yaw: expected different values, got 0 twice; leave one of them out"),
+        ([0, 90, 0], r"`grid` pose.yaw: expected different choices, got 0 twice; leave one of them out"),
         ([0, 90, 360], r"expected different values, got 0 and 360, the same angle"),
         ([0, math.nan], r"expected a number from -3600 to 3600 \(degrees\), got nan"),
         ([0, math.inf], r"expected a number from -3600 to 3600 \(degrees\), got inf"),
