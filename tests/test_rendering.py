@@ -99,7 +99,7 @@ def test_a_person_reads_what_was_written_and_what_the_model_sees(
         (["--object", "mug", "--out", "folder.png"], "--out: expected the name of a file, got the folder folder.png"),
         (
             ["--object", "mug", "--out", "room.exr/a.png"],
-            "a part of the path is a file, not a folder; choose another place with --out",
+            "a file of that name stands where a folder is needed; choose another place with --out",
         ),
         (["--object", "mug", "--out", "a.exr", "--around", "4"], "--out: a sheet of several views has text in it"),
         (["--object", "mug", "--out", "a.png", "--around", "1"], "--around: expected a whole number from 2 to 64"),

@@ -160,8 +160,7 @@ def render(
         description = framed(description, size)
         space = compose(instances, description)
         renderer = make_renderer(description, space, size, denoise, seed, sampler=sampler)
-        formation = formation or renderer.formation
-        renderer = renderer.like(gain=formation.gain)  # one exposure for the whole sheet
+        formation = renderer.formation  # the same for all, exposure included
         with torch.no_grad():
             radiance = renderer.radiance(space.start, seeds.stream(seed, "pictures"), spp)
             picture = to_8_bit(space.picture(space.start, formation.display(radiance)))

@@ -5,12 +5,16 @@ is averaged over the picture: from the environment as far as the surface faces i
 lit by the environment itself. What the object is made of takes no part, so that a black object stays black; nor do
 shadows, which would need a render.
 
+The meter is held with camera, pose and rotation of the environment as they are by default, and then left alone. So a
+configuration has the same exposure whether its camera is a setting, a control's fixed value or a point of a grid.
+
     E(n) = integral over directions w of L(w) max(n . w, 0),    L(w) = albedo / pi E(up) where w ends on the ground
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -21,6 +25,7 @@ from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.coverage import NEAREST, Frame, pixels_in
 from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.settings import SETTINGS
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription
@@ -39,12 +44,18 @@ METERED_WHITE = 0.5
 """Linear display value that it gets, on average over what the camera sees of the object."""
 
 
+MOVED = ("camera.", "pose.", "environment.")
+"""Settings whose defaults are metered, by the beginning of their names: those that controls move."""
+
+
 @lru_cache(maxsize=8)
 def metered_gain(scene: SceneDescription) -> float:
     """Return the factor on radiance with which the metered white card gets `METERED_WHITE`.
 
     Where the camera sees nothing of the object, the card lies on the ground; where no light arrives the factor is 1.
     """
+    default = {name: setting.default for name, setting in SETTINGS.items() if name.startswith(MOVED)}
+    scene = replace(scene, values={**scene.values, **default}, aspect=1.0)
     seen = visible_irradiance(scene)
     metered = float(irradiance(scene, np.array([[0.0, 0.0, 1.0]])).mean()) if seen is None else seen
     return METERED_WHITE * math.pi / (WHITE * metered) if metered > 0.0 else 1.0
