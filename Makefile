@@ -5,6 +5,8 @@ PYTHON ?= python3
 # an index of CPU wheels (200 MB): make TORCH_INDEX=ITS-ADDRESS setup. TORCH_INDEX=none silences the advice.
 TORCH_INDEX ?=
 ARGS ?=
+# Tests that run side by side; most of them keep one processor busy.
+JOBS ?= 2
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -29,7 +31,7 @@ attack: $(STAMP) ## search the worst texture for a mug; more flags through ARGS=
 	@$(BIN)/advsearch attack --object mug --control texture $(ARGS)
 
 test: $(STAMP) ## run the tests; ARGS="-k name" picks some
-	@$(BIN)/python -m pytest $(ARGS)
+	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal $(ARGS)
 
 test-slow: $(STAMP) ## run the tests that take minutes
 	@$(BIN)/python -m pytest -m slow $(ARGS)

@@ -9,6 +9,7 @@ more, or names, are a choice.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeGuard
@@ -87,7 +88,7 @@ def read(where: str, parameter: Parameter, given: object) -> Spec:
 
 def _choices(where: str, values: Sequence[Number]) -> Choices:
     """The values, of which none may come twice: it would be drawn twice as often."""
-    twice = [value for number, value in enumerate(values) if value in values[:number]]
+    twice = [value for value, count in Counter(values).items() if count > 1]
     if twice:
         raise InputError(f"{where}: expected different choices, got {_shown(twice[0])} twice; leave one of them out")
     return Choices(tuple(values))
