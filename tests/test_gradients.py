@@ -491,7 +491,7 @@ def test_a_noisy_reference_only_lowers_a_cosine() -> None:
         ({"yaw": "north"}, "pose.yaw: expected a number in degrees, got 'north'"),
         ({"yaw": True}, "pose.yaw: expected a number in degrees, got True"),
         ({"yaw": {"low": 1}}, r"pose.yaw: expected \{choices: \[value, ...\]\}"),
-        ({"yaw": [5]}, r"pose.yaw: expected a number, \[low, high\] or a list of values"),
+        ({"yaw": [5]}, r"pose.yaw: expected a value, \[low, high\] or a list of values"),
         ({"on_ground": "maybe"}, "pose.on_ground: expected yes or no"),
         ({"jaw": 5}, "unknown setting of control pose 'jaw'. Did you mean 'yaw'"),
     ],
