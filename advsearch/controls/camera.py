@@ -20,15 +20,12 @@ from torch import Tensor
 
 from advsearch.controls.base import Parameter
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Fixed
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
 
 ORBIT = ("secant", "differences", "forward", "simultaneous")
 """Mitsuba has no derivative of sensors, so a camera is differentiated by differences."""
-FRAMING = ("azimuth", "elevation", "roll", "fov")
-"""Parameters that decide from how far away the object fits into the picture."""
 SENSOR_WIDTH = 36.0
 """Width in millimetres of the full-frame sensor that a focal length refers to."""
 CLEARANCE = 0.02
@@ -85,7 +82,7 @@ class CameraControl(NumberControl):
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> float | str:
         if parameter.name == "distance" or parameter.name == "focus":
-            return fitted_distance(self._described(scene))
+            return fitted_distance(scene)
         if parameter.name == "focal_length":
             return SENSOR_WIDTH / 2.0 / math.tan(math.radians(scene.number("camera.fov")) / 2.0)
         return super().default(scene, parameter)
@@ -96,7 +93,7 @@ class CameraControl(NumberControl):
 
     def search_range(self, scene: SceneDescription, parameter: Parameter) -> tuple[float, float] | None:
         if parameter.name == "distance" and parameter.search is not None:
-            fitted = fitted_distance(self._described(scene))
+            fitted = fitted_distance(scene)
             return parameter.search[0] * fitted, parameter.search[1] * fitted
         return parameter.search
 
@@ -121,19 +118,9 @@ class CameraControl(NumberControl):
 
     def _following(self, scene: SceneDescription, fov: Tensor) -> Tensor:
         """The distance that keeps the object's size in the picture."""
-        scene = self._described(scene)
         half = math.tan(math.radians(scene.number("camera.fov")) / 2.0)
         wanted = fitted_distance(scene) * half / torch.tan(torch.deg2rad(fov) / 2.0)
         return wanted.clamp_min(_radius(scene) + CLEARANCE)
-
-    def _described(self, scene: SceneDescription) -> SceneDescription:
-        """The scene with what is fixed of the camera, which frames the object as the same settings would."""
-        fixed = {
-            self.setting(parameter): spec.value
-            for parameter in self.parameters
-            if isinstance(spec := self.specs.get(parameter.name), Fixed) and parameter.name in FRAMING
-        }
-        return replace(scene, values={**scene.values, **{name: float(value) for name, value in fixed.items()}})
 
     def _orbit(self, scene: SceneDescription, values: Values, distance: Tensor) -> Tensor:
         azimuth, elevation, roll = (torch.deg2rad(values[name]) for name in ("azimuth", "elevation", "roll"))
