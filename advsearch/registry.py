@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import importlib
 import os
-import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -65,8 +64,11 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
 
     def names_class(self, name: str) -> bool:
         """Whether a name is that of a class to import, and not of an instance of a registered entry ("light:Key")."""
-        found = re.fullmatch(r"([^\W\d]\w*)[\w.]*:[A-Z]\w*", name) if self._imports else None
-        return found is not None and found[1] not in self._own and found[1] not in self._installed
+        module, colon, attribute = name.partition(":")
+        if not (self._imports and colon and attribute[:1].isupper() and attribute.isidentifier()):
+            return False
+        parts = module.split(".")
+        return all(part.isidentifier() for part in parts) and not (parts[0] in self._own or parts[0] in self._installed)
 
     def _class(self, name: str) -> Entry:
         """Import "package.module:Class".
