@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import json
 import os
+import subprocess
+import sys
 import warnings
 import zipfile
 from collections.abc import Callable, Iterator
@@ -370,6 +372,44 @@ class Prints(Scripted):
         return x.mean((2, 3))
 
 
+class NeverEnds(Scripted):
+    def forward(self, x: Tensor) -> Tensor:
+        i = 0
+        while i >= 0:
+            i = 0
+        return x.mean((2, 3)) * i
+
+
+class NeverEndsLoading(Scripted):
+    @torch.jit.export
+    def __getstate__(self) -> tuple[Tensor, bool]:
+        return (self.weight, self.training)
+
+    @torch.jit.export
+    def __setstate__(self, state: tuple[Tensor, bool]) -> None:
+        i = 0
+        while i >= 0:
+            i = 0
+        self.weight, self.path, self.note, self.training = state[0], "", "", state[1]  # type: ignore
+
+
+class Restores(Scripted):
+    @torch.jit.export
+    def __getstate__(self) -> tuple[Tensor, bool]:
+        return (self.weight, self.training)
+
+    @torch.jit.export
+    def __setstate__(self, state: tuple[Tensor, bool]) -> None:
+        self.weight, self.path, self.note, self.training = state[0], "", "", state[1]  # type: ignore
+
+
+class SumsForYears(nn.Module):
+    """Without a loop: a tensor of one number, as large as can be."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x.mean((2, 3)) + x[0, 0, 0, :1].expand(10**15).sum()
+
+
 @pytest.fixture(scope="module")
 def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return scripted(Scripted(), tmp_path_factory.mktemp("models") / "net.pt")
@@ -389,6 +429,41 @@ def test_torchscript_touches_nothing(kind: type[Scripted], tmp_path: Path, capfd
     with pytest.raises(FileFormatError, match=r"'code/__torch__/test_hostile_models.py' uses '\w+', which no plain"):
         load_model(scripted(module, tmp_path / "net.pt"), input_size=8)
     assert not trace.exists() and "\x1b" not in capfd.readouterr().out
+
+
+ANSWER = """
+import sys
+from advsearch.cli.main import main
+sys.exit(main(["labels", "mug", "--model", sys.argv[1]]))
+"""
+
+
+def exported_program(module: nn.Module, path: Path) -> Path:
+    torch.export.save(torch.export.export(module.eval(), (torch.rand(1, 3, 8, 8),)), path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("module", "save"),
+    [(NeverEnds(), scripted), (NeverEndsLoading(), scripted), (SumsForYears(), exported_program)],
+    ids=["loop", "loop while loading", "sum"],
+)
+def test_a_model_without_an_end_ends_with_one_sentence(
+    module: nn.Module, save: Callable[[nn.Module, Path], Path], tmp_path: Path
+) -> None:
+    path = save(module, tmp_path / "net.pt2")
+    command = [sys.executable, "-c", ANSWER, str(path)]
+    environment = {**os.environ, "ADVSEARCH_LIMITS": "0.03"}  # 3 seconds
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    said = [line for line in done.stderr.splitlines() if line.startswith("advsearch: error")]
+    assert done.returncode == 2 and len(said) == 1, done.stderr
+    assert "no answer within 3 seconds; if you trust it, ADVSEARCH_LIMITS=10 in the environment" in said[0]
+
+
+def test_torchscript_that_runs_a_part_of_itself_while_it_loads_is_loaded(tmp_path: Path) -> None:
+    images = torch.rand((1, 8, 8, 3), generator=torch.Generator().manual_seed(0))
+    expected = Scripted()(images.permute(0, 3, 1, 2))
+    torch.testing.assert_close(load_model(scripted(Restores(), tmp_path / "net.pt"), input_size=8)(images), expected)
 
 
 @pytest.mark.parametrize("text", ["getattr(torch, '\\163ave')", "x = '\\033[2J'", "torch.classes.other.X()"])

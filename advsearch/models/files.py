@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import io
 import logging
 import os
 import warnings
@@ -21,6 +22,7 @@ from advsearch.errors import FileFormatError, ModelError
 from advsearch.files import open_regular
 from advsearch.models import exported, torchscript
 from advsearch.models.archive import LARGEST, Archive, open_archive, refused
+from advsearch.models.deadline import TookTooLong, try_torchscript
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source, source_of
 
@@ -113,10 +115,21 @@ def _near_files(path: Path) -> str:
 
 def _load_torchscript(path: Path, archive: Archive) -> Source:
     checked = torchscript.rewritten(archive)
+    if torchscript.runs_while_loading(archive):
+        _try_to_load(path, checked)
     with warnings.catch_warnings(), _damaged(path, "TorchScript"):
         warnings.filterwarnings("ignore", message=r".*torch\.jit\.\w+.* is deprecated", category=DeprecationWarning)
         module = torch.jit.load(checked, map_location="cpu")  # type: ignore[no-untyped-call]
     return source_of(module, path.stem)
+
+
+def _try_to_load(path: Path, checked: io.BytesIO) -> None:
+    try:
+        wrong = try_torchscript(checked)
+    except TookTooLong as error:
+        wrong = str(error)
+    if wrong:
+        raise FileFormatError(f"model file {path}: {wrong}")
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import ModelError
+from advsearch.models.deadline import TookTooLong, within
 from advsearch.models.labels import fitting_labels
 from advsearch.models.model import Model, ModelWarning, logits_of
 
@@ -19,6 +20,9 @@ PROBABILITY_TOLERANCE = 1e-3
 
 #: Two answers are the same if they differ by less than this times the largest logit (float32 kernels differ by 1e-6).
 REPEAT_TOLERANCE = 1e-3
+
+PROGRAMS = (torch.fx.GraphModule, torch.jit.ScriptModule)
+"""What torch makes of a model file."""
 
 
 def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> Model:
@@ -80,9 +84,14 @@ def _run(model: Model, images: Tensor) -> Tensor:
 
 
 def _guarded(model: Model, call: Callable[[], Any]) -> Any:
-    """Return what the foreign network returns; whatever it raises becomes a ModelError with advice."""
+    """Return what the foreign network returns; whatever it raises becomes a ModelError with advice.
+
+    A program has to end, for nothing ends it; code of one's own that does not is ended by Ctrl-C.
+    """
     try:
-        return call()
+        return within(call) if isinstance(model.module, PROGRAMS) else call()
+    except TookTooLong as error:
+        raise ModelError(f"model {model.name}: {error}") from None
     except Exception as error:  # any network may raise anything
         height, width = model.input_size
         preprocessing = model.preprocessing

@@ -73,6 +73,11 @@ def rewritten(archive: Archive) -> io.BytesIO:
     return buffer
 
 
+def runs_while_loading(archive: Archive) -> bool:
+    """Whether torch runs a part of the code while it loads the archive, which has been checked."""
+    return any(b"__setstate__" in archive.read(name, LARGEST_CODE) for name in archive.members if _is_code(name))
+
+
 def _is_code(name: str) -> bool:
     return name.startswith("code/") and name.endswith(".py")
 
