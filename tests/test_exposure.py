@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from advsearch.api.scene import Scene, load_scene
 from advsearch.controls import EnvironmentControl, make_space
@@ -16,6 +17,8 @@ from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, Material
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.exposure import METERED_WHITE, WHITE, irradiance, metered_gain, visible_irradiance, visible_normals
+from advsearch.scene.renderer import Renderer
+from advsearch.scene.settings import SETTINGS
 
 GREY = 0.214
 """Reflectance of display-referred 0.5."""
@@ -84,15 +87,48 @@ def test_a_setting_that_a_control_could_move_leaves_the_exposure_alone(given: di
     assert grey_ball(lit_from(0.0), **given).gain == grey_ball(lit_from(0.0)).gain
 
 
-@pytest.mark.parametrize(("parameter", "value"), [("pose.yaw", 90.0), ("material.roughness", 0.9)])
-def test_a_setting_a_fixed_value_and_a_point_of_a_range_are_one_picture(parameter: str, value: float) -> None:
+@pytest.mark.parametrize(
+    ("parameter", "value"),
+    [
+        ("camera.azimuth", 200.0),
+        ("camera.elevation", 70.0),
+        ("camera.roll", 30.0),
+        ("camera.fov", 60.0),
+        ("pose.yaw", 90.0),
+        ("material.roughness", 0.9),
+    ],
+)
+@pytest.mark.parametrize("size", [16, (12, 20)])
+def test_a_setting_a_fixed_value_and_a_point_of_a_grid_are_one_picture(
+    parameter: str, value: float, size: int | tuple[int, int]
+) -> None:
     kind, _, name = parameter.partition(".")
     searched: dict[str, dict[str, object]] = {"corruption": {"severity": [0.0, 1.0]}}
-    by_setting = load_scene("mug", settings={parameter: value}).renderer(searched, resolution=16)
-    by_value = load_scene("mug").renderer({kind: {name: value}, **searched}, resolution=16)
+    grid = {kind: {name: {"choices": [SETTINGS[parameter].default or 0.1, value]}}}
+    renders = [
+        load_scene("hammer", settings={parameter: value}).renderer(searched, resolution=size),
+        load_scene("hammer").renderer({kind: {name: value}, **searched}, resolution=size),
+        load_scene("hammer").renderer({**grid, **searched}, resolution=size),
+    ]
     with torch.no_grad():
-        pictures = [render(render.start, seed=3, spp=1) for render in (by_setting, by_value)]
-    torch.testing.assert_close(*pictures, rtol=0.0, atol=2e-3)
+        pictures = [render(u, seed=3, spp=1) for render, u in zip(renders, _at_second(renders), strict=True)]
+    torch.testing.assert_close(pictures[1], pictures[0], rtol=0.0, atol=2e-3)
+    torch.testing.assert_close(pictures[2], pictures[0], rtol=0.0, atol=2e-3)
+
+
+def test_a_fixed_focal_length_is_its_field_of_view() -> None:
+    fov = math.degrees(2.0 * math.atan(18.0 / 50.0))
+    renders = [
+        load_scene("hammer", settings={"camera.fov": fov}).renderer("camera", resolution=16),
+        load_scene("hammer").renderer({"camera": {"focal_length": 50.0}}, resolution=16),
+    ]
+    one, other = (render.space.inputs(render.start)["camera.to_world"] for render in renders)
+    torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
+def _at_second(renders: list[Renderer]) -> list[Tensor]:
+    """The starts of two renderers, and of the third with the second option of its first coordinate."""
+    return [renders[0].start, renders[1].start, torch.cat([torch.tensor([0.75]), renders[2].start[1:]])]
 
 
 def test_the_objects_colour_and_what_comes_after_metering_take_no_part() -> None:

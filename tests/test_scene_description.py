@@ -7,6 +7,7 @@ import pytest
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import FRAME_FILL, SceneDescription, describe
+from advsearch.scene.framing import middle
 from advsearch.scene.geometry import camera_to_world, object_to_world, rotation
 from advsearch.scene.settings import SETTINGS, resolve
 
@@ -22,12 +23,36 @@ def projected(description: SceneDescription) -> np.ndarray:
     return np.column_stack([local[:, :2] / local[:, 2:3] / half, local[:, 2]])
 
 
-@pytest.mark.parametrize("name", ["mug", "banana", "lamp", "wine-glass"])
-@pytest.mark.parametrize("azimuth", [0.0, 40.0, 275.0])
-def test_the_default_camera_frames_the_whole_object_and_fills_the_frame(name: str, azimuth: float) -> None:
-    points = projected(describe(name, given={"camera.azimuth": azimuth}))
+@pytest.mark.parametrize("name", ["mug", "bowl", "lamp", "wine-glass"])
+@pytest.mark.parametrize("fov", [20.0, 35.0, 60.0])
+def test_the_default_camera_frames_the_whole_object_and_fills_the_frame(name: str, fov: float) -> None:
+    points = projected(describe(name, given={"camera.fov": fov}))
     assert points[:, 2].min() > 0.0
     assert np.abs(points[:, :2]).max() == pytest.approx(FRAME_FILL, abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["mug", "banana", "hammer", "chair", "teapot"])
+def test_no_azimuth_takes_any_of_the_object_out_of_the_picture(name: str) -> None:
+    reached = [
+        np.abs(projected(describe(name, given={"camera.azimuth": float(azimuth)}))[:, :2]).max()
+        for azimuth in range(0, 360, 5)
+    ]
+    assert max(reached) <= 1.0 + 1e-6
+    assert max(reached) > 0.98 or np.abs(projected(describe(name))[:, :2]).max() == pytest.approx(FRAME_FILL)
+
+
+@pytest.mark.parametrize("name", ["azimuth", "elevation", "roll"])
+def test_the_distance_does_not_depend_on_where_the_camera_is_moved_to(name: str) -> None:
+    scene = describe("banana")
+    distance = np.linalg.norm(camera_to_world(scene)[:3, 3] - middle(scene))
+    moved = camera_to_world(scene.with_values(**{f"camera__{name}": 70.0}))
+    assert np.linalg.norm(moved[:3, 3] - middle(scene)) == pytest.approx(distance, abs=1e-12)
+
+
+def test_a_very_wide_lens_does_not_enter_the_object() -> None:
+    scene = describe("dumbbell", given={"camera.fov": 170.0})
+    radius = np.linalg.norm(scene.object.mesh.vertices - middle(scene), axis=1).max()
+    assert np.linalg.norm(camera_to_world(scene)[:3, 3] - middle(scene)) >= radius + 0.02 - 1e-9
 
 
 def test_a_camera_at_azimuth_zero_and_no_elevation_looks_from_plus_x_with_z_up() -> None:

@@ -1,10 +1,8 @@
 """The `camera` control: an orbit around the object, the lens, and the exposure.
 
-The camera looks at the middle of the object in its default pose. "Keeps what it frames": while the distance is not
-searched or set, it follows the field of view so that the object's size in the picture stays the same (a dolly zoom),
-down to where the camera would enter the object.
-
-    distance(fov) = distance_0 * tan(fov_0 / 2) / tan(fov / 2)
+The camera looks at the middle of the object in its default pose. While the distance is not searched or set, it follows
+the field of view so that the object keeps its place in the picture (a dolly zoom), down to where the camera would enter
+the sphere around the object: see `advsearch.scene.framing`.
 """
 
 from __future__ import annotations
@@ -18,18 +16,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Parameter
+from advsearch.controls.base import Parameter, scalar
 from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.values import Fixed
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
+from advsearch.scene.framing import framing_distance, middle
 from advsearch.scene.geometry import camera_to_world
 
 ORBIT = ("secant", "differences", "forward", "simultaneous")
 """Mitsuba has no derivative of sensors, so a camera is differentiated by differences."""
 SENSOR_WIDTH = 36.0
 """Width in millimetres of the full-frame sensor that a focal length refers to."""
-CLEARANCE = 0.02
-"""Smallest distance, in object sizes, that a distance worked out here keeps from the object's bounding sphere."""
 
 
 def _moving(
@@ -82,7 +80,7 @@ class CameraControl(NumberControl):
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> float | str:
         if parameter.name == "distance" or parameter.name == "focus":
-            return fitted_distance(scene)
+            return fitted_distance(self._described(scene))
         if parameter.name == "focal_length":
             return SENSOR_WIDTH / 2.0 / math.tan(math.radians(scene.number("camera.fov")) / 2.0)
         return super().default(scene, parameter)
@@ -93,15 +91,18 @@ class CameraControl(NumberControl):
 
     def search_range(self, scene: SceneDescription, parameter: Parameter) -> tuple[float, float] | None:
         if parameter.name == "distance" and parameter.search is not None:
-            fitted = fitted_distance(scene)
+            fitted = fitted_distance(self._described(scene))
             return parameter.search[0] * fitted, parameter.search[1] * fitted
         return parameter.search
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         fov = values["fov"]
         if "focal_length" in self.specs:
-            fov = torch.rad2deg(2.0 * torch.atan(SENSOR_WIDTH / 2.0 / values["focal_length"]))
-        distance = values["distance"] if self._distance_is_free(scene) else self._following(scene, fov)
+            fov = _fov_of(values["focal_length"])
+        if self._distance_is_free(scene):
+            distance = values["distance"]
+        else:
+            distance = framing_distance(scene, fov, scene.aspect).float()
         inputs = {"camera.to_world": self._orbit(scene, values, distance), "camera.fov": fov.reshape(1)}
         if scene.thin_lens and ("aperture" in self.specs or "focus" in self.specs):
             inputs["camera.aperture"] = values["aperture"].clamp_min(1e-5).reshape(1)
@@ -116,11 +117,14 @@ class CameraControl(NumberControl):
     def _distance_is_free(self, scene: SceneDescription) -> bool:
         return "distance" in self.specs or not self.asked or "camera.distance" in scene.given
 
-    def _following(self, scene: SceneDescription, fov: Tensor) -> Tensor:
-        """The distance that keeps the object's size in the picture."""
-        half = math.tan(math.radians(scene.number("camera.fov")) / 2.0)
-        wanted = fitted_distance(scene) * half / torch.tan(torch.deg2rad(fov) / 2.0)
-        return wanted.clamp_min(_radius(scene) + CLEARANCE)
+    def _described(self, scene: SceneDescription) -> SceneDescription:
+        """The scene with a fixed lens, for which the distance is worked out as for the same setting."""
+        fov, focal_length = self.specs.get("fov"), self.specs.get("focal_length")
+        if isinstance(fov, Fixed):
+            return scene.with_values(camera__fov=float(fov.value))
+        if isinstance(focal_length, Fixed):
+            return scene.with_values(camera__fov=_fov_of(scalar(float(focal_length.value))).item())
+        return scene
 
     def _orbit(self, scene: SceneDescription, values: Values, distance: Tensor) -> Tensor:
         azimuth, elevation, roll = (torch.deg2rad(values[name]) for name in ("azimuth", "elevation", "roll"))
@@ -129,21 +133,16 @@ class CameraControl(NumberControl):
         left = torch.stack([azimuth.sin(), -azimuth.cos(), zero])
         up = torch.linalg.cross(-outwards, left)
         left, up = roll.cos() * left + roll.sin() * up, roll.cos() * up - roll.sin() * left
-        place = torch.from_numpy(_middle(scene)).float() + distance * outwards
+        place = torch.from_numpy(middle(scene)).float() + distance * outwards
         top = torch.stack([left, up, -outwards, place], dim=1)
         return torch.cat([top, torch.tensor([[0.0, 0.0, 0.0, 1.0]])])
 
 
 def fitted_distance(scene: SceneDescription) -> float:
-    """Return the distance of the scene's own camera to what it looks at, for a square picture; object sizes."""
-    return float(np.linalg.norm(camera_to_world(scene)[:3, 3] - _middle(scene)))
+    """Return the distance of the scene's own camera to what it looks at; object sizes."""
+    return float(np.linalg.norm(camera_to_world(scene)[:3, 3] - middle(scene)))
 
 
-def _middle(scene: SceneDescription) -> np.ndarray:
-    vertices = scene.object.mesh.vertices.astype(np.float64)
-    return np.asarray((vertices.min(axis=0) + vertices.max(axis=0)) / 2.0)
-
-
-def _radius(scene: SceneDescription) -> float:
-    offsets = scene.object.mesh.vertices.astype(np.float64) - _middle(scene)
-    return float(np.linalg.norm(offsets, axis=1).max())
+def _fov_of(focal_length: Tensor) -> Tensor:
+    """The field of view, degrees, of a lens of a focal length in millimetres."""
+    return torch.rad2deg(2.0 * torch.atan(SENSOR_WIDTH / 2.0 / focal_length))

@@ -1,9 +1,9 @@
 """The scenes that the reference model is trained and tested on: this pipeline's own, with everything randomised.
 
 Varied are the instance (proportions, texture, material), pose, camera, exposure, ground, environment, its rotation,
-tint and one added soft light. Training and test differ in the instances (disjoint seeds) and in the environments (the
-library's
-"train" and "heldout" halves), not in the ranges.
+tint and one added soft light; the camera comes as near as the object fits from where it looks. Training and test differ
+in the instances (disjoint seeds) and in the environments (the library's "train" and "heldout" halves), not in the
+ranges.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import ImageFormation
+from advsearch.scene.framing import filling_distance
 from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
@@ -81,7 +82,8 @@ def random_scene(name: str, environments: str, rng: np.random.Generator) -> Scen
         "ground.size": 0.0 if rng.random() < 0.08 else rng.uniform(2.0, 7.0),
         **dict(zip(("ground.red", "ground.green", "ground.blue"), np.clip(ground, 0.02, 0.98), strict=True)),
     }
-    return SceneDescription(asset, environment, resolve({key: float(value) for key, value in given.items()}))
+    scene = SceneDescription(asset, environment, resolve({key: float(value) for key, value in given.items()}))
+    return scene.with_values(camera__distance=filling_distance(scene))
 
 
 def _recoloured(asset: ObjectAsset, rng: np.random.Generator) -> ObjectAsset:

@@ -6,8 +6,10 @@ import math
 
 import numpy as np
 import numpy.typing as npt
+import torch
 
-from advsearch.scene.description import FRAME_FILL, SceneDescription
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.framing import camera_axes, framing_distance, middle
 
 Doubles = npt.NDArray[np.float64]
 
@@ -50,43 +52,11 @@ def camera_to_world(description: SceneDescription, aspect: float | None = None) 
     """
     aspect = description.aspect if aspect is None else aspect
     number = description.number
-    vertices = description.object.mesh.vertices.astype(np.float64)
-    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
-    azimuth, elevation = math.radians(number("camera.azimuth")), math.radians(number("camera.elevation"))
-    outwards = np.array(
-        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
-    )
-    forward = -outwards
-    left = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
-    up = np.cross(forward, left)
-    roll = math.radians(number("camera.roll"))
-    left, up = math.cos(roll) * left + math.sin(roll) * up, math.cos(roll) * up - math.sin(roll) * left
+    axes = camera_axes(number("camera.azimuth"), number("camera.elevation"), number("camera.roll"))
     distance = description.values["camera.distance"]
     if distance is None:
-        distance = fitting_distance(vertices - middle, left, up, outwards, number("camera.fov"), aspect)
+        distance = float(framing_distance(description, torch.tensor(number("camera.fov"), dtype=torch.float64), aspect))
     matrix = np.eye(4)
-    matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = left, up, forward
-    matrix[:3, 3] = middle + distance * outwards
+    matrix[:3, 0], matrix[:3, 1], matrix[:3, 2] = axes[0], axes[1], -axes[2]
+    matrix[:3, 3] = middle(description) + distance * axes[2]
     return matrix
-
-
-def fitting_distance(
-    offsets: Doubles, left: Doubles, up: Doubles, outwards: Doubles, fov: float, aspect: float = 1.0
-) -> float:
-    """Smallest distance at which every vertex projects inside `FRAME_FILL` of the picture.
-
-    A vertex at offset `o` from the middle projects at `(o.left, o.up) / (distance - o.outwards)`, so that each vertex
-    asks for `distance >= o.outwards + max(|o.left| / tx, |o.up| / ty)`; the largest of these is the answer.
-
-    Args:
-        offsets: (V, 3) vertices minus the point that the camera looks at.
-        left: (3,) unit vector to the left in the picture.
-        up: (3,) unit vector upwards in the picture.
-        outwards: (3,) unit vector from the object to the camera.
-        fov: field of view along the larger side, degrees.
-        aspect: width over height of the picture.
-    """
-    larger = math.tan(math.radians(fov) / 2.0) * FRAME_FILL
-    tangent_x, tangent_y = larger * min(1.0, aspect), larger * min(1.0, 1.0 / aspect)
-    needed = np.maximum(np.abs(offsets @ left) / tangent_x, np.abs(offsets @ up) / tangent_y) + offsets @ outwards
-    return float(needed.max())
