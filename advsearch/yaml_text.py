@@ -76,10 +76,23 @@ def parse_yaml(text: str) -> Any:
         return yaml.load(text, _Loader)
     except RecursionError:
         raise ValueError(f"lists or mappings nested deeper than {DEPTH}") from None
+    except yaml.MarkedYAMLError as error:
+        raise ValueError(_short(_marked(error))) from None
     except (yaml.YAMLError, ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
         # The constructors of PyYAML raise all of these for values that do not fit their tags.
-        words = " ".join(str(error).split())
-        raise ValueError(words if len(words) <= 200 else f"{words[:197]}...") from None
+        raise ValueError(_short(str(error))) from None
+
+
+def _marked(error: yaml.MarkedYAMLError) -> str:
+    """What is there, and where: ours by itself, and what a rule of YAML says as an aside."""
+    what = error.note or f"other text ({error.problem or error.context})"
+    mark = error.problem_mark or error.context_mark
+    return what if mark is None else f"{what} in line {mark.line + 1}, column {mark.column + 1}"
+
+
+def _short(text: str) -> str:
+    words = " ".join(text.split())
+    return words if len(words) <= 200 else f"{words[:197]}..."
 
 
 def _check(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
@@ -103,4 +116,4 @@ def _check(node: yaml.Node, depth: int, counts: dict[int, int]) -> int:
 
 
 def _problem(node: yaml.Node, what: str) -> yaml.YAMLError:
-    return yaml.constructor.ConstructorError(None, None, f"got {what}", node.start_mark)
+    return yaml.constructor.ConstructorError(None, None, what, node.start_mark, note=what)

@@ -280,6 +280,7 @@ CLASHES: tuple[tuple[type[Config], dict[str, Any], str], ...] = (
     (AttackConfig, {"deterministic": True, "threads": 4}, "threads: `deterministic` works on one thread"),
     (SweepConfig, {"overwrite": True}, "overwrite: replaces the run that `run` names, and none is named"),
     (AttackConfig, {"smallest": True, "epsilon": "0.1,0.2"}, "smallest: finds one epsilon by itself"),
+    (CheckConfig, {"loss": "linear", "objective": "logit-gap"}, "objective: is of the model's loss, which"),
     (AttackConfig, {"smallest": True, "object": "mug,bowl"}, "smallest: is about one object"),
     (AttackConfig, {"smallest": True, "seconds": 5}, "smallest: takes several searches"),
     (AttackConfig, {"smallest": True, "over": "camera"}, "smallest: cannot be combined with `over` yet"),

@@ -102,6 +102,12 @@ def test_what_is_wrong_is_told(run: Path, capsys: pytest.CaptureFixture[str]) ->
         assert message in capsys.readouterr().err
 
 
+def test_a_table_that_cannot_be_written_names_out(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (run.parent / "file").touch()
+    assert main(["export", str(run), "--out", str(run.parent / "file" / "rows.csv")]) == 2
+    assert capsys.readouterr().err.endswith("choose another place with --out\n")
+
+
 def test_an_unknown_kind_leaves_no_file(run: Path) -> None:
     with Store(run / NAME, read_only=True) as store, pytest.raises(UnknownNameError):
         export(store, "csv", run / "x.csv", io.BytesIO(), "none")

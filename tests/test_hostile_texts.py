@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -93,6 +94,22 @@ def test_numbers_and_dates_of_yaml() -> None:
     text = "[-5, +0b101, -0x1F, 017, 1_000, 2026-11-22, 0:360:24, 0b_, '5', 09]"
     assert parse_yaml(text) == [-5, 5, -31, 15, 1000, "2026-11-22", "0:360:24", "0b_", "5", "09"]
     assert parse_yaml("- &x {a: 1}\n- <<: *x\n  b: 2") == [{"a": 1}, {"a": 1, "b": 2}]
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("a: !!python/name:os.system x", "got the tag 'tag:yaml.org,2002:python/name:os.system', which no setting has"),
+        ("a: [", "got other text (expected the node content, but found '<stream end>') in line 1, column 5; correct"),
+        (f"\nseed: {'9' * 400}", "got a number of more than 300 digits in line 2, column 7; correct"),
+        ("a: \x01", "got unacceptable character"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_with_yaml_is_one_sentence(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "run.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(FileFormatError, match="^" + re.escape(f"{path}: expected YAML, {message}")):
+        read_yaml(path)
 
 
 def test_what_is_no_yaml_on_the_command_line_is_text() -> None:

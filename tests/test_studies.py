@@ -13,11 +13,13 @@ import pytest
 
 import advsearch
 from advsearch.api import mapping, studies
+from advsearch.cli.main import main
 from advsearch.cli.region import answer as region_text
 from advsearch.cli.studies import answer
 from advsearch.config import AttackConfig, GapConfig, RegionConfig
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.runs.directory import RunDirectory
+from advsearch.runs.listing import finished, listed
 
 FLIPS = {"mug": 0.02, "bowl": 0.1, "vase": 0.0, "pan": 9.0}
 """The epsilon at which each object flips; 0: it is wrong already."""
@@ -143,6 +145,26 @@ def test_a_region_is_told_in_the_units_of_its_parameters(tmp_path: Path) -> None
     assert summary["same"] <= summary["samples"] == 8 and len(summary["map"]["margins"]) == 2
     assert (tmp_path / "run" / "images" / "map.png").is_file()
     assert "fresh samples of this box" in region_text(summary)
+
+
+def test_a_region_that_is_interrupted_says_how_to_go_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: Any, **__: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(mapping, "grow", stopped)
+    monkeypatch.setattr(mapping, "_verdict", lambda attack, centre: attack.one_trial("centre", 0, centre).wrong)
+    folder = tmp_path / "run"
+    flags = (
+        f"region --object mug --control pose.yaw --resolution 16 --denoise none --verify-spp 2 --run {folder} --quiet"
+    )
+    assert main(flags.split()) == 130
+    said = capsys.readouterr().out
+    assert said.startswith("Stopped before the box was known.") and "renders   1\n" in said
+    assert said.endswith(f"Go on with: advsearch resume {folder}\n")
+    assert main(["show", str(folder)]) == 0 and capsys.readouterr().out == said
+    assert not finished(folder) and listed(tmp_path)[0].state == "stopped"
 
 
 @pytest.mark.parametrize(

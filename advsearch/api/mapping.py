@@ -24,6 +24,7 @@ from advsearch.report.studies import map_figure
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.store import NAME, Store
+from advsearch.runs.summary import INTERRUPTED
 from advsearch.settings import split_names
 
 MOST = 8
@@ -52,7 +53,7 @@ def region_from_config(config: RegionConfig, *, progress: Progress | None = None
     Returns:
         What `summary.json` holds: `verdict` at the centre; `box`, the range of each parameter with its unit;
         `same`, how many fresh samples of the box had that verdict, with the 95 % interval of its share; `volume`, the
-        share of the whole space; `map`, if one was asked for.
+        share of the whole space; `map`, if one was asked for. None of these where `ending` is "interrupted".
 
     Raises:
         InputError: the verdict at the centre depends on the noise, the parameters do not fit, and what a scene raises.
@@ -71,39 +72,11 @@ def region_from_config(config: RegionConfig, *, progress: Progress | None = None
     with opened as run:
         memory = Memory(run)
         attack = Attack(problem, as_attack, make_policy("random"), Recorder(run, problem, memory), memory, stages)
-        attack.choose_spp({"centre": centre})
-        verdict = _verdict(attack, centre)
-
-        def at(values: Tensor) -> Tensor:
-            u = centre.clone()
-            u[varied.places] = values
-            return u
-
-        spp = attack.findings.spp
-        hint = f"in rounds, pictures of {spp} samples a pixel; fewer parameters in `vary` or `verify_spp` shorten it"
-        stages.begin("search", "growing the box", LEVELS, hint=hint)
-        checks = 0
-
-        def on_part(part: Part) -> None:
-            nonlocal checks
-            if part == "level":
-                stages.progress.advance(1)
-                return
-            if checks == 0:
-                most = ATTEMPTS * config.samples
-                hint = f"{config.samples} pictures, and as many again where one is an exception; `samples` shortens it"
-                stages.begin("search", "checking the box with fresh samples", most, hint=hint, at_most=True)
-            checks += 1
-
-        def same(values: Tensor, number: int) -> bool:
-            trial = attack.one_trial("region", number, at(values))
-            if checks:
-                stages.progress.advance(1)
-            return trial.wrong == verdict
-
-        seed = seeds.stream(config.seed, "region")
-        found = grow(same, centre[varied.places], seed=seed, samples=config.samples, on_part=on_part)
-        box = _box(problem, found, at, varied)
+        try:
+            found, ending = _found(attack, config, varied, centre, run), "done"
+        except KeyboardInterrupt:
+            found, ending = {}, INTERRUPTED
+        stages.end()
         answer = {
             "schema": 1,
             "command": "region",
@@ -112,23 +85,11 @@ def region_from_config(config: RegionConfig, *, progress: Progress | None = None
             "environment": problem.space.environment or config.environment,
             "model": problem.model.name,
             "controls": [bound.name for bound in problem.space.controls],
-            "ending": "done",
-            "verdict": "wrong" if verdict else "right",
-            "box": box,
-            "same": found.same,
-            "samples": found.samples,
-            "rate": found.same / found.samples,
-            "interval": list(found.interval),
-            "volume": found.volume,
-            "spp": attack.findings.spp,
+            "ending": ending,
+            **found,
             "image_formation": problem.renderer.formation.summary(),
             "clean": {"moved": [one.to_dict() for one in problem.space.moved]},
             "warnings": said,
-        }
-        if config.map:
-            answer["map"] = _map(attack, config.map, at, varied, box, run)
-        stages.end()
-        answer |= {
             "renders": {"verification": attack.findings.verification_renders},
             "seconds": {**stages.seconds, "total": stages.total},
             "seed": config.seed,
@@ -136,6 +97,54 @@ def region_from_config(config: RegionConfig, *, progress: Progress | None = None
         }
         run.write_summary(answer)
         return answer
+
+
+def _found(attack: Attack, config: RegionConfig, varied: Varied, centre: Tensor, run: RunDirectory) -> dict[str, Any]:
+    """Look at the centre, grow the box, check it, and draw the map if one was asked for."""
+    problem, stages = attack.problem, attack.stages
+    attack.choose_spp({"centre": centre})
+    verdict, spp = _verdict(attack, centre), attack.findings.spp
+
+    def at(values: Tensor) -> Tensor:
+        u = centre.clone()
+        u[varied.places] = values
+        return u
+
+    hint = f"in rounds, pictures of {spp} samples a pixel; fewer parameters in `vary` or `verify_spp` shorten it"
+    stages.begin("search", "growing the box", LEVELS, hint=hint)
+    checks = 0
+
+    def on_part(part: Part) -> None:
+        nonlocal checks
+        if part == "level":
+            stages.progress.advance(1)
+            return
+        if checks == 0:
+            most = ATTEMPTS * config.samples
+            hint = f"{config.samples} pictures, and as many again where one is an exception; `samples` shortens it"
+            stages.begin("search", "checking the box with fresh samples", most, hint=hint, at_most=True)
+        checks += 1
+
+    def same(values: Tensor, number: int) -> bool:
+        trial = attack.one_trial("region", number, at(values))
+        if checks:
+            stages.progress.advance(1)
+        return trial.wrong == verdict
+
+    seed = seeds.stream(config.seed, "region")
+    found = grow(same, centre[varied.places], seed=seed, samples=config.samples, on_part=on_part)
+    box = _box(problem, found, at, varied)
+    return {
+        "verdict": "wrong" if verdict else "right",
+        "box": box,
+        "same": found.same,
+        "samples": found.samples,
+        "rate": found.same / found.samples,
+        "interval": list(found.interval),
+        "volume": found.volume,
+        "spp": spp,
+        **({"map": _map(attack, config.map, at, varied, box, run)} if config.map else {}),
+    }
 
 
 def _budget(around: str) -> dict[str, Any]:

@@ -17,11 +17,12 @@ from advsearch.config import RenderConfig
 from advsearch.config.rendering import PICTURE_SPP, PICTURES
 from advsearch.controls import Control, compose
 from advsearch.controls.clean import sentences
-from advsearch.errors import InputError, StorageError
+from advsearch.errors import InputError
 from advsearch.models import Model, load_model
 from advsearch.models.model import Answer
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.contact_sheet import contact_sheet
+from advsearch.runs.files import placed_by
 from advsearch.runs.images import write_exr, write_png
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import ImageFormation, to_8_bit
@@ -79,14 +80,12 @@ class Rendering:
             StorageError: the file could not be written.
         """
         file = _writable(path, len(self.views))
-        try:
+        with placed_by("out"):
             if file.suffix.lower() == ".exr":
                 write_exr(file, self.views[0].linear)
                 return self.formation.resolution
             sheet = self.sheet() if len(self.views) > 1 else self.views[0].picture.numpy()
             write_png(file, sheet)
-        except StorageError as error:
-            raise StorageError(str(error).replace("`run`", "`out`")) from error
         return sheet.shape[0], sheet.shape[1]
 
     def sheet(self) -> Any:

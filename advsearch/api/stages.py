@@ -78,6 +78,8 @@ class Attack:
 
     def carry_out(self) -> Findings:
         """Do everything; what an interrupt leaves undone is missing from the findings."""
+        if self.config.smallest:
+            scaled(self.problem.domain, 1.0)  # refuses what has no budget before anything is rendered
         try:
             self.plan()
             if self.worth_attacking():
@@ -166,7 +168,8 @@ class Attack:
             problem.spp = problem.spp if config.spp is not None or spp is None else spp
 
     def worth_attacking(self) -> bool:
-        """Look at the clean configuration; one that is wrong in every look goes through the full trials at once."""
+        """Look at the clean configuration; one that is wrong in every look goes through the full trials at once, as
+        does one whose smallest change is wanted."""
         problem, config, findings = self.problem, self.config, self.findings
         seed, start = seeds.stream(config.seed, "first look"), problem.domain.start
         self.stages.begin(
@@ -180,7 +183,8 @@ class Attack:
             trials=FIRST_LOOK,
             on_trial=lambda *_: self._advance(),
         )
-        if not self.rule.control or any(trial.right for trial in findings.first_look):
+        looks_right = any(trial.right for trial in findings.first_look)
+        if not self.rule.control or (looks_right and not config.smallest):
             return True
         self.choose_spp({"clean": start})
         self._begin_trials("checking the clean scene with fresh renders", config.trial_count)
@@ -258,6 +262,8 @@ class Attack:
         self._begin_trials("checking the answer with fresh renders", groups * self.config.trial_count)
         self.clean_trials()
         findings.verification = self.verified("verification", found)
+        if findings.verification.ending is Ending.ALREADY_WRONG:
+            findings.smallest = None  # seen with other samples than before: no change at all flips the answer
         if baseline is not None:
             findings.baseline_verification = self.verified("baseline verification", baseline)
             self._take_the_worse(found, baseline)
@@ -440,8 +446,6 @@ def find_smallest(attack: Attack) -> None:
     What is verified at the end is the configuration at the upper end of the bracket.
     """
     problem, config, findings = attack.problem, attack.config, attack.findings
-    scaled(problem.domain, 1.0)  # refuses what has no budget before anything is rendered
-    attack.choose_spp({"clean": problem.domain.start})
     results: list[SearchResult] = []
 
     def found(inside: Domain, number: int) -> Tensor:

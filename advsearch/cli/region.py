@@ -70,6 +70,13 @@ def answer(summary: Mapping[str, Any]) -> str:
     """Return the box and what is known of it."""
     from advsearch.report import wording
 
+    cost = [
+        ["renders", str(summary["renders"]["verification"])],
+        ["time", wording.seconds_text(summary["seconds"]["total"])],
+        ["run", str(summary["run"])],
+    ]
+    if "box" not in summary:
+        return "Stopped before the box was known.\n\n" + output.columns(cost)
     low = 100.0 * summary["interval"][0]
     said = (
         f"The model is {summary['verdict']} in {summary['same']} of {summary['samples']} fresh samples of this box: "
@@ -80,10 +87,5 @@ def answer(summary: Mapping[str, Any]) -> str:
         [one["name"], f"{one['low']:.4g}", f"{one['high']:.4g}", f"{one['centre']:.4g}", one["unit"]]
         for one in summary["box"]
     ]
-    facts = [
-        ["share of the space", wording.percent(summary["volume"])],
-        ["renders", str(summary["renders"]["verification"])],
-        ["time", wording.seconds_text(summary["seconds"]["total"])],
-        ["run", str(summary["run"])],
-    ]
+    facts = [["share of the space", wording.percent(summary["volume"])], *cost]
     return "\n\n".join([said, output.columns(rows), output.columns(facts)])

@@ -24,6 +24,11 @@ class CheckConfig(AttackConfig):
             lambda one: any(getattr(one, name) != value for name, value in OF_ALL.items()),
             "takes scenes and controls of its own; leave `object`, `environment`, `controls` and `set` out",
         ),
+        Clash(
+            "objective",
+            lambda one: one.loss == "linear",
+            "is of the model's loss, which `loss=linear` leaves out; leave one of the two out",
+        ),
     )
 
     all: bool = setting(False, "check", "every control, on three bundled scenes; takes hours", "true or false")

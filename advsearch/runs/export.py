@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.runs.files import replacing
+from advsearch.runs.files import placed_by, replacing
 from advsearch.runs.store import Row, Store
 
 FORMATS = ("csv", "json", "parquet")
@@ -59,7 +59,7 @@ def export(store: Store, format: str, out: Path | None, stream: IO[bytes], kind:
     if out is None:
         write(_records(store.rows(kind)), names, stream)
     else:
-        with replacing(out) as part, part.open("wb") as file:
+        with placed_by("out"), replacing(out) as part, part.open("wb") as file:
             write(_records(store.rows(kind)), names, file)
     return counts[kind] if kind is not None else sum(counts.values())
 

@@ -52,6 +52,15 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 
 @contextmanager
+def placed_by(setting: str) -> Iterator[None]:
+    """Let the advice of a `StorageError` inside the block name the setting that says where the file goes."""
+    try:
+        yield
+    except StorageError as error:
+        raise StorageError(str(error).replace("`run`", f"`{setting}`")) from error
+
+
+@contextmanager
 def replacing(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """Yield a path to write to; when the block ends well its file takes the place of `path` in one step.
 

@@ -91,8 +91,8 @@ def _check_type(where: str, kind: str, value: Any) -> None:
     """Refuse a value of another type than an option's field has; its range is the policy's own business."""
     number = isinstance(value, (int, float)) and not isinstance(value, bool) and not abs(value) > MOST
     wrong = {
-        "float": None if number else f"a number up to {MOST}",
-        "int": None if number and value % 1 == 0 else f"a whole number up to {MOST}",
+        "float": None if number else f"a finite number from {-MOST} to {MOST}",
+        "int": None if number and value % 1 == 0 else f"a whole number from {-MOST} to {MOST}",
         "bool": None if isinstance(value, bool) else "true or false",
     }.get(kind)
     if wrong:
