@@ -9,48 +9,49 @@ Nothing heavy is imported until one of these is used.
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from advsearch.api import (
-        AttackResult,
-        Model,
-        Rendering,
-        Scene,
-        SweepResult,
-        attack,
-        gap,
-        load_model,
-        load_scene,
-        region,
-        render,
-        sweep,
-    )
+    from advsearch.api.attack import attack as attack
+    from advsearch.api.questions import gap as gap
+    from advsearch.api.questions import region as region
+    from advsearch.api.render import Rendering as Rendering
+    from advsearch.api.render import render as render
+    from advsearch.api.sweep import sweep as sweep
+    from advsearch.engine.loading import Scene as Scene
+    from advsearch.engine.loading import load_scene as load_scene
+    from advsearch.engine.outcome import AttackResult as AttackResult
+    from advsearch.engine.sweeps.loop import SweepResult as SweepResult
+    from advsearch.models import Model as Model
+    from advsearch.models import load_model as load_model
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "AttackResult",
-    "Model",
-    "Rendering",
-    "Scene",
-    "SweepResult",
-    "attack",
-    "gap",
-    "load_model",
-    "load_scene",
-    "region",
-    "render",
-    "sweep",
-]
+_HOMES = {
+    "AttackResult": "advsearch.engine.outcome",
+    "Model": "advsearch.models",
+    "Rendering": "advsearch.api.render",
+    "Scene": "advsearch.engine.loading",
+    "SweepResult": "advsearch.engine.sweeps.loop",
+    "attack": "advsearch.api.attack",
+    "gap": "advsearch.api.questions",
+    "load_model": "advsearch.models",
+    "load_scene": "advsearch.engine.loading",
+    "region": "advsearch.api.questions",
+    "render": "advsearch.api.render",
+    "sweep": "advsearch.api.sweep",
+}
+"""The public names, and the module of each."""
+
+__all__ = list(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
     """Import the interface on first use (PEP 562)."""
-    if name in __all__:
-        from advsearch import api
-
-        return getattr(api, name)
+    if name in _HOMES:
+        import_module("advsearch.api")  # sets the threads before torch is imported
+        return getattr(import_module(_HOMES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -21,10 +21,10 @@ from typing import Any
 from torch import Tensor
 
 from advsearch import seeds, threads
-from advsearch.api.attacking import problem_from_config
-from advsearch.api.problem import Problem
+from advsearch.api.attack import problem_from_config
 from advsearch.attacks import make_policy, search
 from advsearch.config import CLOSE_LOOKS, AttackConfig
+from advsearch.engine.problem import Problem
 
 TRIALS, TRIAL_SPP = 8, 64
 

@@ -20,8 +20,8 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.api.scene import load_scene  # noqa: E402
 from advsearch.attacks import margin  # noqa: E402
+from advsearch.engine.loading import load_scene  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 
 COUNTS = (4, 8, 16, 64, 256)

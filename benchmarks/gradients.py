@@ -29,11 +29,11 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.api.attacking import problem_from_config  # noqa: E402
-from advsearch.api.scene import load_scene  # noqa: E402
+from advsearch.api.attack import problem_from_config  # noqa: E402
 from advsearch.config import AttackConfig  # noqa: E402
-from advsearch.evaluation.gradients import Loss, estimated, inside, smooth_loss  # noqa: E402
-from advsearch.scene.plan import GroupPlan  # noqa: E402
+from advsearch.engine.gradients import Loss, estimated, inside, smooth_loss  # noqa: E402
+from advsearch.engine.loading import load_scene  # noqa: E402
+from advsearch.scene.gradients.plan import GroupPlan  # noqa: E402
 from advsearch.scene.renderer import Renderer  # noqa: E402
 
 POSE = {"pose": {"on_ground": "no", "rotation": [-30, 30], "x": [-0.15, 0.15], "y": [-0.15, 0.15], "z": [0.05, 0.35]}}

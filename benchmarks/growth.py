@@ -27,11 +27,11 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.api.problem import Problem  # noqa: E402
-from advsearch.api.scene import load_scene, make_renderer  # noqa: E402
 from advsearch.attacks import get_objective, make_policy  # noqa: E402
 from advsearch.attacks.goal import Goal  # noqa: E402
 from advsearch.controls import TextureControl, make_space  # noqa: E402
+from advsearch.engine.loading import load_scene, make_renderer  # noqa: E402
+from advsearch.engine.problem import Problem  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 
 

@@ -24,11 +24,11 @@ from typing import Any
 import torch
 
 from advsearch import seeds
-from advsearch.api.attacking import problem_from_config
-from advsearch.api.bounces import bounces_of
-from advsearch.api.problem import Problem
+from advsearch.api.attack import problem_from_config
 from advsearch.config import AttackConfig
-from advsearch.evaluation.gradients import inside, smooth_loss
+from advsearch.engine.bounces import bounces_of
+from advsearch.engine.gradients import inside, smooth_loss
+from advsearch.engine.problem import Problem
 from advsearch.scene.leaving_out import NOTHING
 
 PAIRS = (

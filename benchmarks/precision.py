@@ -19,10 +19,10 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.api.attacking import problem_from_config  # noqa: E402
-from advsearch.api.measuring import precision  # noqa: E402
+from advsearch.api.attack import problem_from_config  # noqa: E402
+from advsearch.api.precision import precision  # noqa: E402
 from advsearch.config import PrecisionConfig  # noqa: E402
-from advsearch.evaluation.gradients import inside, smooth_loss  # noqa: E402
+from advsearch.engine.gradients import inside, smooth_loss  # noqa: E402
 from advsearch.evaluation.precision.gradient import GradientBench, parts_of  # noqa: E402
 from advsearch.evaluation.precision.image import (  # noqa: E402
     REFERENCE_SAMPLER,

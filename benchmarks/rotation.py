@@ -24,9 +24,9 @@ threads.configure()
 
 from torch import Tensor  # noqa: E402
 
-from advsearch.api.scene import load_scene  # noqa: E402
-from advsearch.evaluation.gradients import estimated, inside, smooth_loss  # noqa: E402
-from advsearch.evaluation.planning import measured_plan  # noqa: E402
+from advsearch.engine.gradients import estimated, inside, smooth_loss  # noqa: E402
+from advsearch.engine.loading import load_scene  # noqa: E402
+from advsearch.engine.planning import measured_plan  # noqa: E402
 
 ASKED, SURE = 0.02, 0.01
 """Largest bias, and the standard error at which it counts as known."""

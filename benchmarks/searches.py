@@ -27,10 +27,10 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds, threads
-from advsearch.api.attacking import problem_from_config
-from advsearch.api.problem import Problem
+from advsearch.api.attack import problem_from_config
 from advsearch.attacks import make_policy, search
 from advsearch.config import AttackConfig
+from advsearch.engine.problem import Problem
 
 TRIALS, TRIAL_SPP = 12, 64
 BLIND = ("random", "nes")

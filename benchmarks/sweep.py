@@ -26,19 +26,19 @@ from advsearch import threads
 
 threads.configure()
 
-from advsearch.api.scene import as_controls, framed, load_scene  # noqa: E402
-from advsearch.api.sweeps import view  # noqa: E402
-from advsearch.api.sweeps.axes import read_axes  # noqa: E402
-from advsearch.api.sweeps.job import Job, Place  # noqa: E402
-from advsearch.api.sweeps.loop import Sweep  # noqa: E402
 from advsearch.config import SweepConfig  # noqa: E402
+from advsearch.engine.loading import as_controls, framed, load_scene  # noqa: E402
+from advsearch.engine.sweeps import view  # noqa: E402
+from advsearch.engine.sweeps.axes import read_axes  # noqa: E402
+from advsearch.engine.sweeps.job import Job, Place  # noqa: E402
+from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.runs.directory import RunDirectory  # noqa: E402
-from advsearch.scene.denoise import Denoiser  # noqa: E402
 from advsearch.scene.formation import ImageFormation  # noqa: E402
 from advsearch.scene.leaving_out import EVERYTHING  # noqa: E402
-from advsearch.scene.mitsuba_scene import MitsubaScene  # noqa: E402
+from advsearch.scene.mitsuba_backend.denoise import Denoiser  # noqa: E402
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene  # noqa: E402
 
 ASKED_PER_SECOND, ASKED_SHARE = 10_000, 0.95
 GRID = {"pose.yaw": "0:360:24", "camera.elevation": "5:60:8"}

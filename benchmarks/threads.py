@@ -95,7 +95,7 @@ def report(size: int, results: dict[str, dict[str, float]]) -> None:
 
 def measure(torch_threads: int, drjit_threads: int, size: int, repetitions: int) -> dict[str, float]:
     """Medians in seconds, in this process: the halves alone and the alternating step."""
-    from advsearch.scene.backend import mitsuba  # sets OpenMP's environment, so before torch
+    from advsearch.scene.mitsuba_backend.variant import mitsuba  # sets OpenMP's environment, so before torch
 
     import torch  # isort: skip
 

@@ -18,9 +18,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from advsearch.api import load_scene
-from advsearch.api.scene import as_controls, make_renderer
+from advsearch import load_scene
 from advsearch.controls import OWN, make_space
+from advsearch.engine.loading import as_controls, make_renderer
 from advsearch.scene.formation import to_8_bit
 
 FOLDER = Path(__file__).resolve().parent / "images" / "controls"

@@ -71,7 +71,7 @@ def picture(
     import mitsuba as mi
     import torch
 
-    from advsearch.scene.denoise import Denoiser
+    from advsearch.scene.mitsuba_backend.denoise import Denoiser
 
     if mi.variant() is None:
         mi.set_variant("llvm_ad_rgb")

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.problem import Problem
 from advsearch.config import AttackConfig
+from advsearch.engine.problem import Problem
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
 from advsearch.runs.store import Row, Store
 

@@ -52,12 +52,13 @@ RULES = {
     "controls": Rule({"scene"}),
     "models": Rule(set(), {"torch", "numpy", "safetensors"}),
     "attacks": Rule(set(), {"torch", "numpy", "scipy", "cma"}),
-    "evaluation": Rule({"scene", "bundled", "controls", "models", "attacks"}),
+    "engine": Rule({"scene", "bundled", "controls", "models", "attacks", "runs", "report", "config", "settings"}),
+    "evaluation": Rule({"scene", "bundled", "controls", "models", "attacks", "engine", "report"}),
     "runs": Rule({"config", "settings"}, {"numpy", "pydantic", "imageio", "OpenEXR", "PIL", "pyarrow"}),
     "report": Rule({"runs", "config", "settings"}, {"numpy", "PIL", "matplotlib"}, HEAVY),
     "api": Rule(None),
     "cli": Rule(None),
-    "": Rule({"api"}, set()),
+    "": Rule({"api", "engine", "models"}, set()),
 }
 """DESIGN, section 2. The empty name is `advsearch/__init__.py`."""
 
@@ -216,7 +217,8 @@ SHOW_HEAVY = f"import sys; print([m for m in {LATE} if m in sys.modules])"
     "code",
     [
         "import advsearch, advsearch.errors, advsearch.seeds, advsearch.threads, advsearch.settings, advsearch.config",
-        "import advsearch.runs, advsearch.report, advsearch.scene, advsearch.scene.assets, advsearch.scene.llvm",
+        "import advsearch.runs, advsearch.report, advsearch.scene, advsearch.scene.assets\n"
+        "import advsearch.scene.mitsuba_backend.llvm",
         "import contextlib, io\n"
         "from advsearch.cli.main import main\n"
         "with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit): main(['--help'])\n"

@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 
-from advsearch.api import checking
-from advsearch.api.checking import Results, check_from_config
-from advsearch.api.memory import Memory
+from advsearch.api import check as checking
+from advsearch.api.check import Results, check_from_config
 from advsearch.cli import check as command
 from advsearch.cli.main import main
 from advsearch.config import CheckConfig
+from advsearch.engine.memory import Memory
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed
 from advsearch.runs.summary import read_summary

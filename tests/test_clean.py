@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.api.sweeping import sweep_from_config
+from advsearch.api.sweep import sweep_from_config
 from advsearch.cli.flags import with_flags
 from advsearch.config import SweepConfig
 from advsearch.controls import Space, make_control, make_space

@@ -50,26 +50,32 @@ class Result:
     run: Path = Path("runs/x")
 
 
-API = ("attack_from_config", "curve_from_config", "resume_attack", "gap_from_config", "region_from_config")
-"""What the command line calls in `advsearch.api`; `advsearch.api.sweeping` has the rest."""
+API = {
+    "advsearch.api.attack": ("attack_from_config", "resume_attack"),
+    "advsearch.api.gap": ("curve_from_config", "gap_from_config"),
+    "advsearch.api.region": ("region_from_config",),
+    "advsearch.api.sweep": ("sweep_from_config", "resume_sweep"),
+}
+"""What the command line calls, by module."""
 
 
 def stand_ins(attack: Api | None, **others: Api) -> dict[str, types.ModuleType]:
-    """Modules in the place of `advsearch.api`: the functions that are given, and others that must not be called."""
+    """Modules in the place of those of `advsearch.api`: the functions given, and others that must not be called."""
 
     def not_wanted(*args: Any, **named: Any) -> Any:
         raise AssertionError("the command line called something else than what was asked for")
 
     given = others if attack is None else {"attack_from_config": attack, **others}
-    api, sweeping = types.ModuleType("advsearch.api"), types.ModuleType("advsearch.api.sweeping")
-    vars(api).update({name: given.get(name, not_wanted) for name in API}, __path__=[])
-    vars(sweeping).update({name: given.get(name, not_wanted) for name in ("sweep_from_config", "resume_sweep")})
-    return {"advsearch.api": api, "advsearch.api.sweeping": sweeping}
+    found = {}
+    for module, names in API.items():
+        found[module] = types.ModuleType(module)
+        vars(found[module]).update({name: given.get(name, not_wanted) for name in names})
+    return found
 
 
 @pytest.fixture
 def api(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Put stand-ins in the place of `advsearch.api.attack_from_config` and of what else is named."""
+    """Put stand-ins in the place of `attack_from_config` and of what else is named."""
 
     def install(attack: Api | None = None, **others: Api) -> None:
         for name, module in stand_ins(attack, **others).items():

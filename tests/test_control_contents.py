@@ -11,13 +11,13 @@ import torch
 
 import advsearch
 from advsearch.controls import make_space
-from advsearch.controls.contents import INGREDIENTS, BoundContents, ContentsControl, liquid
+from advsearch.controls.contents.control import INGREDIENTS, BoundContents, ContentsControl, liquid
+from advsearch.controls.contents.vessel import BRIM, interior
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.library import list_objects, load_object
-from advsearch.scene.vessel import BRIM, interior
 
 VESSELS = {"bottle", "bowl", "frying-pan", "mug", "vase", "wine-glass"}
 AGREEMENT = 0.1

@@ -13,11 +13,14 @@ from PIL import Image
 from scipy import stats
 from torch import Tensor
 
-from advsearch.controls import corruption_blur, corruption_digital, corruption_noise, make_space
-from advsearch.controls.corruption import NAMES, STEPPED, CorruptionControl, corrupted
-from advsearch.controls.corruption_noise import poisson
-from advsearch.controls.corruption_tools import blurred
-from advsearch.controls.corruption_weather import fractal
+from advsearch.controls import make_space
+from advsearch.controls.corruption.control import NAMES, STEPPED, CorruptionControl, corrupted
+from advsearch.controls.corruption.control import blur as corruption_blur
+from advsearch.controls.corruption.control import digital as corruption_digital
+from advsearch.controls.corruption.control import noise as corruption_noise
+from advsearch.controls.corruption.noise import poisson
+from advsearch.controls.corruption.tools import blurred
+from advsearch.controls.corruption.weather import fractal
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import SceneDescription, describe
 

@@ -13,11 +13,11 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls import make_control
-from advsearch.controls.geometry import OFFSETS, BoundGeometry, GeometryControl
+from advsearch.controls.geometry.control import OFFSETS, BoundGeometry, GeometryControl
+from advsearch.controls.geometry.modes import WALL_STRAIN, Limits, body, shape_modes
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.shape_modes import WALL_STRAIN, Limits, body, shape_modes
 
 FORMS = ("modes", "large-steps")
 

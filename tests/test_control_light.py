@@ -10,13 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.controls.light import LIT_POWER, LightControl, metered_irradiance
+from advsearch.controls.light.control import LIT_POWER, LightControl, metered_irradiance
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.formation import srgb_to_linear
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.mitsuba_scene import MitsubaScene
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 
 DARK = EnvironmentAsset("dark", np.zeros((4, 8, 3), np.float32))
 SIDE = 32

@@ -12,16 +12,16 @@ import torch
 import advsearch
 from advsearch.controls import make_space
 from advsearch.controls.camera import CameraControl
-from advsearch.controls.occlusion import BUNDLED, OPTIONS, OcclusionControl, Placement
+from advsearch.controls.occlusion.control import BUNDLED, OPTIONS, OcclusionControl, Placement
+from advsearch.controls.occlusion.occluders import loaded, made
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.backend import mitsuba
-from advsearch.scene.coverage import Frame, Sweep, middle_axes, pixels_in, silhouette
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.library import list_objects
-from advsearch.scene.occluders import loaded, made
+from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.parts import MeshPart
+from advsearch.scene.silhouettes import Frame, Sweep, middle_axes, pixels_in, silhouette
 
 ACCURACY = 0.02
 """Allowed error of a hidden share: silhouettes have 128 pixels along their longer side."""

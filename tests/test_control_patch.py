@@ -14,13 +14,13 @@ from torch import Tensor
 
 import advsearch
 from advsearch.controls import make_control, make_space
-from advsearch.controls.patch import BASE_COLOR, BoundPatch, PatchControl
+from advsearch.controls.patch.control import BASE_COLOR, BoundPatch, PatchControl
+from advsearch.controls.patch.sticker import towards_camera
 from advsearch.controls.texture import TextureControl
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.library import list_objects, load_object
-from advsearch.scene.sticker import towards_camera
 from advsearch.scene.surface_map import Surface, rasterised, texel_area, texel_positions
 
 SIDE = 512

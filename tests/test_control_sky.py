@@ -11,13 +11,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.controls.sky import METERED_IRRADIANCE, SkyControl
+from advsearch.controls.sky.control import METERED_IRRADIANCE, SkyControl
+from advsearch.controls.sky.part import COLUMNS, ROWS, SUN_APERTURE, Sky, angle_between, direction, sun_irradiance
 from advsearch.errors import InputError
-from advsearch.scene.backend import mitsuba
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.exposure import irradiance
-from advsearch.scene.mitsuba_scene import MitsubaScene
-from advsearch.scene.part_sky import COLUMNS, ROWS, SUN_APERTURE, Sky, angle_between, direction, sun_irradiance
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.mitsuba_backend.variant import mitsuba
 
 PLUGIN_UNIT = 106.750
 """Mitsuba divides by the integral of the CIE luminosity function; maps here do not."""

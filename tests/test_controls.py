@@ -10,12 +10,12 @@ import pytest
 import torch
 from hostile import SHORT, shown
 
-from advsearch.api import load_scene
+from advsearch import load_scene
 from advsearch.controls import CONTROLS, BoundControl, TextureControl, make_control, make_space
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import describe
 from advsearch.scene.formation import srgb_to_linear
-from advsearch.scene.plan import ESTIMATORS
+from advsearch.scene.gradients.plan import ESTIMATORS
 
 every_control = pytest.mark.parametrize("kind", CONTROLS)
 

@@ -21,10 +21,9 @@ from PIL import Image
 
 import advsearch
 import advsearch.config
-from advsearch.api import attacking, mapping, outcome, stages, studies
-from advsearch.api.naming import check_run_settings, controls_of
-from advsearch.api.scene import as_controls
-from advsearch.api.sweeps.axes import read_axes
+from advsearch.api import attack as attacking
+from advsearch.api import gap as studies
+from advsearch.api import region as mapping
 from advsearch.attacks import (
     POLICIES,
     clopper_pearson,
@@ -46,13 +45,18 @@ from advsearch.cli.run import COMMANDS as IN_FILES
 from advsearch.cli.sweep import axes_as_text
 from advsearch.config import TRIALS, TRIALS_OVER, AttackConfig, RegionConfig, RenderConfig, SceneConfig, SweepConfig
 from advsearch.controls import CONTROLS, texture
+from advsearch.engine import outcome, stages
+from advsearch.engine.loading import as_controls
+from advsearch.engine.naming import check_run_settings, controls_of
+from advsearch.engine.sweeps.axes import read_axes
 from advsearch.evaluation import reference_scenes
 from advsearch.models import calibration, loading, reference
 from advsearch.runs import directory, export, store
-from advsearch.scene import environments, exposure, formation, library, mitsuba_scene
+from advsearch.scene import environments, exposure, formation, library
 from advsearch.scene.description import FRAME_FILL
 from advsearch.scene.importing import objects
 from advsearch.scene.importing.images import TEXTURE_LIMIT
+from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
 from advsearch.scene.settings import SETTINGS, resolve
 from advsearch.settings import parse_assignment, read_yaml, settings
 

@@ -12,7 +12,7 @@ import pytest
 
 from advsearch.cli import doctor
 from advsearch.cli.doctor_probe import TRIALS
-from advsearch.scene import llvm
+from advsearch.scene.mitsuba_backend import llvm
 
 ALL_WELL = {name: (True, "tried") for name in TRIALS} | {"": (True, "")}
 
@@ -157,7 +157,7 @@ def test_an_old_llvm_takes_the_probe_down_and_nothing_else(monkeypatch: pytest.M
     if not old:
         pytest.skip("no libLLVM 15 or 16 on this machine")
     code = (
-        "import runpy, advsearch.scene.llvm as llvm, advsearch.cli.doctor_probe as probe\n"
+        "import runpy, advsearch.scene.mitsuba_backend.llvm as llvm, advsearch.cli.doctor_probe as probe\n"
         "llvm.MINIMUM = 15; probe.TRIALS = {'render': probe.render}; probe.main()"
     )
     monkeypatch.setenv(llvm.VARIABLE, str(old[0]))

@@ -11,8 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.api.scene import Scene, load_scene
 from advsearch.controls import EnvironmentControl, make_space
+from advsearch.engine.loading import Scene, load_scene
 from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, Material
 from advsearch.scene.description import SceneDescription, describe

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from advsearch.api import load_scene
+from advsearch import load_scene
+from advsearch.engine.gradients import smooth_loss
 from advsearch.errors import InputError
-from advsearch.evaluation.gradients import smooth_loss
 from advsearch.scene.assets import EnvironmentAsset
 
 SIZE = 24

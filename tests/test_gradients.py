@@ -11,14 +11,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.api import load_scene
-from advsearch.api.attacking import problem_from_config
-from advsearch.api.checking import WHOLE, attempts, check
+from advsearch import load_scene
+from advsearch.api.attack import problem_from_config
+from advsearch.api.check import WHOLE, attempts, check
 from advsearch.cli.check import table
 from advsearch.config import AttackConfig
 from advsearch.controls import make_control
-from advsearch.errors import InputError, UnknownNameError
-from advsearch.evaluation.gradients import (
+from advsearch.engine.gradients import (
     Estimate,
     Probe,
     Reference,
@@ -30,8 +29,9 @@ from advsearch.evaluation.gradients import (
     smooth_loss,
     verdict,
 )
-from advsearch.evaluation.planning import TELLS, Cosine, contested, cosines, measured_plan, tuned
-from advsearch.scene.plan import ESTIMATORS, SEARCH_STEP, GroupPlan, first_plan
+from advsearch.engine.planning import TELLS, Cosine, contested, cosines, measured_plan, tuned
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.gradients.plan import ESTIMATORS, SEARCH_STEP, GroupPlan, first_plan
 from advsearch.scene.renderer import Renderer
 
 SIZE = 48

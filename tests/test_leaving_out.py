@@ -7,15 +7,15 @@ from typing import Any
 import pytest
 import torch
 
-from advsearch.api import attack, load_scene
-from advsearch.api.attacking import problem_from_config
-from advsearch.api.planning import plan
-from advsearch.api.problem import OnImage
+from advsearch import attack, load_scene
+from advsearch.api.attack import problem_from_config
+from advsearch.api.plan import plan
 from advsearch.cli.plan import text
 from advsearch.config import AttackConfig
 from advsearch.controls import LightControl, TextureControl
-from advsearch.evaluation.bounces import BOUND, measured_bounces
-from advsearch.evaluation.gradients import inside, smooth_loss
+from advsearch.engine.gradients import inside, smooth_loss
+from advsearch.engine.path_length import BOUND, measured_bounces
+from advsearch.engine.problem import OnImage
 from advsearch.evaluation.leaving_out import ALL, WHAT, measured_gains, resolved_texels
 from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.renderer import Renderer

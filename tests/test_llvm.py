@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from advsearch.errors import EnvironmentSetupError
-from advsearch.scene import llvm
+from advsearch.scene.mitsuba_backend import llvm
 
 DEBIAN = "ID=debian\nVERSION_ID=12\n"
 UBUNTU = 'ID=ubuntu\nID_LIKE=debian\nVERSION_ID="24.04"\n'
@@ -194,7 +194,7 @@ def test_this_machine_has_a_usable_one_and_it_tells_the_version_of_its_name() ->
 
 
 def test_command_prints_the_choice_or_fails_with_the_message(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "advsearch.scene.llvm"]
+    command = [sys.executable, "-m", "advsearch.scene.mitsuba_backend.llvm"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "libLLVM" in done.stdout or "LLVM-C" in done.stdout
     environ = os.environ | {llvm.VARIABLE: str(tmp_path / "none.so")}
@@ -205,7 +205,7 @@ def test_command_prints_the_choice_or_fails_with_the_message(tmp_path: Path) -> 
 
 def test_mitsuba_comes_with_our_variant_few_messages_and_all_threads() -> None:
     from advsearch import threads
-    from advsearch.scene.backend import VARIANT, mitsuba
+    from advsearch.scene.mitsuba_backend.variant import VARIANT, mitsuba
 
     mi = mitsuba()
     import drjit as dr

@@ -10,9 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.scene.backend import mitsuba
+from advsearch.scene.gradients.material_form import LIMITS, material_adjoint
 from advsearch.scene.library import load_environment, load_object
-from advsearch.scene.material_form import LIMITS, material_adjoint
+from advsearch.scene.mitsuba_backend.variant import mitsuba
 
 SIZE = 48
 SPP = 64

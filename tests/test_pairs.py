@@ -14,14 +14,14 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.attacking import problem_from_config
-from advsearch.api.scene import framed, make_renderer
-from advsearch.api.sweeps.axes import on_grid, read_axes
-from advsearch.api.sweeps.points import Points
-from advsearch.api.sweeps.view import judge
+from advsearch.api.attack import problem_from_config
 from advsearch.config import AttackConfig
 from advsearch.controls import CONTROLS, NumberControl, compose, make_control, make_space
-from advsearch.evaluation.domains import domain_of
+from advsearch.engine.domains import domain_of
+from advsearch.engine.loading import framed, make_renderer
+from advsearch.engine.sweeps.axes import on_grid, read_axes
+from advsearch.engine.sweeps.points import Points
+from advsearch.engine.sweeps.view import judge
 from advsearch.scene.description import describe
 from advsearch.scene.formation import to_8_bit
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from advsearch.api.measuring_report import Section, _rounding
 from advsearch.cli.main import main
 from advsearch.config import PrecisionConfig
 from advsearch.errors import InputError
@@ -44,10 +43,11 @@ from advsearch.evaluation.precision.points import (
     reference_through,
     typical_seconds,
 )
+from advsearch.evaluation.precision.report import Section, _rounding
 from advsearch.evaluation.precision.rounds import LEAST, Budget, gather, in_rounds, part_samples
 from advsearch.report.diagrams import precision_figures
-from advsearch.scene.plan import GroupPlan
-from advsearch.scene.samplers import next_count
+from advsearch.scene.gradients.plan import GroupPlan
+from advsearch.scene.mitsuba_backend.samplers import next_count
 
 SIZE = 400
 """Numbers in a synthetic picture."""
@@ -396,7 +396,7 @@ def test_variants_have_a_family_and_a_theory() -> None:
 
 
 def test_every_count_that_is_measured_is_one_that_its_sampler_takes() -> None:
-    from advsearch.scene.backend import mitsuba
+    from advsearch.scene.mitsuba_backend.variant import mitsuba
 
     mi = mitsuba()
     for one in variants((*COUNTS, "stratified", "multijitter", "ldsampler"), (2,), 6):

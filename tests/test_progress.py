@@ -13,22 +13,22 @@ import pytest
 import torch
 from test_resume import StandInProblem, carry_out, configuration, rows
 
-from advsearch.api import planning
-from advsearch.api.attacking import attack_from_config
-from advsearch.api.mapping import region_from_config
-from advsearch.api.measuring import precision
-from advsearch.api.memory import Memory
-from advsearch.api.planning import plan
-from advsearch.api.record import Findings, Recorder, Stages
-from advsearch.api.stages import Attack
-from advsearch.api.sweeping import resume_sweep, sweep_from_config
-from advsearch.api.sweeps.view import View
+from advsearch.api import plan as planning
+from advsearch.api.attack import attack_from_config
+from advsearch.api.plan import plan
+from advsearch.api.precision import precision
+from advsearch.api.region import region_from_config
+from advsearch.api.sweep import resume_sweep, sweep_from_config
 from advsearch.attacks import make_policy
 from advsearch.attacks.region import grow
 from advsearch.attacks.sample_count import choose_spp, most_samples
 from advsearch.cli.flags import with_flags
 from advsearch.cli.plan import text as plan_text
 from advsearch.config import AttackConfig, PlanConfig, PrecisionConfig, RegionConfig, SweepConfig
+from advsearch.engine.memory import Memory
+from advsearch.engine.record import Findings, Recorder, Stages
+from advsearch.engine.stages import Attack
+from advsearch.engine.sweeps.view import View
 from advsearch.runs.directory import RunDirectory
 
 JARGON = re.compile(r"set-up|rerank|adjoint|estimator|baseline|sample count|spp|bounces$|verification", re.IGNORECASE)
@@ -222,7 +222,7 @@ def test_a_plan_says_what_it_did_not_measure(monkeypatch: pytest.MonkeyPatch) ->
 
     for function in (planning.cosines, planning.cosine_samples):
         monkeypatch.setattr(planning, function.__name__, partial(function, counts=(8,), factors=(1.0,)))
-    monkeypatch.setattr("advsearch.evaluation.planning.CONVERGED", 4)
+    monkeypatch.setattr("advsearch.engine.planning.CONVERGED", 4)
     monkeypatch.setattr(planning, "leaving_out", stopped)
     progress = Recorded()
     half = plan(PLANNED, progress=progress)

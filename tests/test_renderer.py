@@ -8,13 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.api.scene import load_scene, make_renderer
 from advsearch.controls import TextureControl, make_space
+from advsearch.engine.loading import load_scene, make_renderer
 from advsearch.errors import InputError
 from advsearch.scene.description import describe
 from advsearch.scene.formation import ImageFormation, linear_to_srgb, srgb_to_linear, to_8_bit
 from advsearch.scene.leaving_out import EVERYTHING
-from advsearch.scene.mitsuba_scene import BASE_COLOR, MitsubaScene
+from advsearch.scene.mitsuba_backend.scene import BASE_COLOR, MitsubaScene
 from advsearch.scene.renderer import Renderer
 
 SIZE = 32

@@ -19,12 +19,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.api.memory import Memory
-from advsearch.api.record import Findings, Recorder, Stages
-from advsearch.api.stages import Attack
 from advsearch.attacks import Block, Domain, Evaluation, Policy, Proposal, Trial, make_policy
 from advsearch.attacks.goal import Goal
 from advsearch.config import AttackConfig
+from advsearch.engine.memory import Memory
+from advsearch.engine.record import Findings, Recorder, Stages
+from advsearch.engine.stages import Attack
 from advsearch.errors import FileFormatError, InputError
 from advsearch.progress import NullProgress
 from advsearch.runs.directory import RunDirectory

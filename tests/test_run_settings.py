@@ -7,19 +7,20 @@ from typing import Any
 import pytest
 
 import advsearch
-from advsearch.api import attacking, rendering
-from advsearch.api.attacking import _with_derivatives
-from advsearch.api.naming import RUN_SETTINGS, check_run_settings, controls_of
-from advsearch.api.studies import gap_from_config
-from advsearch.api.sweeping import _job_of
+from advsearch.api import attack as attacking
+from advsearch.api import render as rendering
+from advsearch.api.attack import _with_derivatives
+from advsearch.api.gap import gap_from_config
+from advsearch.api.sweep import _job_of
 from advsearch.attacks import make_policy
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig, GapConfig, RenderConfig, SweepConfig
 from advsearch.controls import CONTROLS
-from advsearch.controls.patch import PatchControl
+from advsearch.controls.patch.control import PatchControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
+from advsearch.engine.naming import RUN_SETTINGS, check_run_settings, controls_of
 from advsearch.errors import InputError, UnknownNameError
 
 ALL: dict[str, Any] = {"epsilon": 0.07, "norm": "l2", "texture_resolution": 16}
@@ -112,7 +113,7 @@ def test_a_sweep_and_a_render_give_every_texture_its_resolution(asked: Any, monk
 def test_a_gap_gives_each_control_what_it_takes(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     seen = []
 
-    monkeypatch.setattr("advsearch.api.studies._Parts.attack", lambda self, config, name: _seen(config, seen))
+    monkeypatch.setattr("advsearch.api.gap._Parts.attack", lambda self, config, name: _seen(config, seen))
     config = GapConfig(object="mug", controls="texture,pose,geometry", run=str(tmp_path / "gap"), **ALL)
     gap_from_config(config)
     assert seen == [(0.07, "l2", 16), (None, None, None), (0.07, None, None)]

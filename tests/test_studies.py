@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 
 import advsearch
-from advsearch.api import mapping, studies
+from advsearch.api import gap as studies
+from advsearch.api import region as mapping
 from advsearch.cli.main import main
 from advsearch.cli.region import answer as region_text
 from advsearch.cli.studies import answer

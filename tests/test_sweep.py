@@ -24,11 +24,7 @@ from hypothesis import strategies as st
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.sweeping import _job_of, resume_sweep, sweep_from_config
-from advsearch.api.sweeps import view
-from advsearch.api.sweeps.axes import axis_values, on_grid, read_axes
-from advsearch.api.sweeps.loop import KIND, Sweep
-from advsearch.api.sweeps.points import BINS, Points
+from advsearch.api.sweep import _job_of, resume_sweep, sweep_from_config
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.draws import NET, Draws, Seeds
 from advsearch.attacks.product import Product, batches
@@ -40,8 +36,12 @@ from advsearch.cli.sweep_table import answer
 from advsearch.config import SweepConfig
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
+from advsearch.engine.domains import domain_of
+from advsearch.engine.sweeps import view
+from advsearch.engine.sweeps.axes import axis_values, on_grid, read_axes
+from advsearch.engine.sweeps.loop import KIND, Sweep
+from advsearch.engine.sweeps.points import BINS, Points
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
-from advsearch.evaluation.domains import domain_of
 from advsearch.progress import NullProgress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row

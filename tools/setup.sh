@@ -61,8 +61,8 @@ install_packages() {
     pip install -qq --no-build-isolation -c constraints.txt ${index:+--extra-index-url "$index"} -e '.[dev]'
 }
 
-# Dr.Jit needs LLVM 17 or later (advsearch/scene/llvm.py says why); Debian's and Ubuntu's package is installed if we may.
-llvm() { "$venv/bin/python" -m advsearch.scene.llvm "$@"; }
+# Dr.Jit needs LLVM 17 or later (advsearch/scene/mitsuba_backend/llvm.py says why); Debian's and Ubuntu's package is installed if we may.
+llvm() { "$venv/bin/python" -m advsearch.scene.mitsuba_backend.llvm "$@"; }
 
 as_root() { if [ "$(id -u)" = 0 ]; then "$@"; else sudo -n "$@"; fi; }
 

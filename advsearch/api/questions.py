@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from advsearch.api.mapping import region_from_config
-from advsearch.api.naming import options_of
-from advsearch.api.studies import gap_from_config
+from advsearch.api.gap import gap_from_config
+from advsearch.api.region import region_from_config
 from advsearch.config import GapConfig, RegionConfig
+from advsearch.engine.naming import options_of
 from advsearch.progress import Progress
 
 Named = str | Sequence[str] | Mapping[str, Mapping[str, Any] | None]

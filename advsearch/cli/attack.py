@@ -49,7 +49,8 @@ def carry_out(config: AttackConfig, *, as_json: bool, quiet: bool, resumed: Path
     from advsearch.cli.progress import at_work
 
     with at_work(as_json=as_json, quiet=quiet) as progress:
-        from advsearch.api import attack_from_config, curve_from_config, resume_attack
+        from advsearch.api.attack import attack_from_config, resume_attack
+        from advsearch.api.gap import curve_from_config
 
         if config.is_study:
             summary = curve_from_config(config, progress=progress, resumed=resumed)

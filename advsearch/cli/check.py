@@ -89,7 +89,7 @@ def carry_out(config: CheckConfig, *, as_json: bool, quiet: bool, resumed: Path 
     from advsearch.cli.progress import at_work
 
     with at_work(as_json=as_json, quiet=quiet) as progress:
-        from advsearch.api.checking import check_from_config
+        from advsearch.api.check import check_from_config
 
         summary = check_from_config(config, progress=progress, resumed=resumed)
     status = output.finish(summary, answer, as_json=as_json)

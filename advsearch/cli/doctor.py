@@ -173,7 +173,7 @@ def _reinstall(name: str) -> str:
 
 def llvm() -> Part:
     """The libLLVM that will be used, what else there is, and why that is not used."""
-    from advsearch.scene.llvm import VARIABLE, ensure_llvm, find, install_command
+    from advsearch.scene.mitsuba_backend.llvm import VARIABLE, ensure_llvm, find, install_command
 
     given = os.environ.get(VARIABLE, "")
     others = find()

@@ -45,7 +45,7 @@ def torch() -> str:
 
 def render() -> str:
     """Render a few pixels of a lit wall and differentiate them with respect to its colour, which is linear."""
-    from advsearch.scene.backend import VARIANT, mitsuba
+    from advsearch.scene.mitsuba_backend.variant import VARIANT, mitsuba
 
     mi = mitsuba()
     import drjit as dr

@@ -49,7 +49,7 @@ def carry_out(config: GapConfig, *, as_json: bool, quiet: bool, resumed: Path | 
     from advsearch.cli.progress import at_work
 
     with at_work(as_json=as_json, quiet=quiet) as progress:
-        from advsearch.api import gap_from_config
+        from advsearch.api.gap import gap_from_config
 
         summary = gap_from_config(config, progress=progress, resumed=resumed)
     from advsearch.cli.studies import answer

@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
 
     config = config_from(args, PlanConfig, object="mug")
     with at_work(as_json=args.json, quiet=args.quiet) as progress:
-        from advsearch.api.planning import plan
+        from advsearch.api.plan import plan
 
         chosen = plan(config, progress=progress)
     return output.finish(chosen, text, as_json=args.json)

@@ -67,7 +67,7 @@ def carry_out(config: PrecisionConfig, *, as_json: bool, quiet: bool, resumed: P
             f"{resumed}: times are measured in one sitting, so that there is nothing to go on with; run again"
         )
     with at_work(as_json=as_json, quiet=quiet) as progress:
-        from advsearch.api.measuring import precision
+        from advsearch.api.precision import precision
 
         report = precision(config, progress=progress)
     if as_json:

@@ -60,7 +60,7 @@ def carry_out(config: RegionConfig, *, as_json: bool, quiet: bool, resumed: Path
     from advsearch.cli.progress import at_work
 
     with at_work(as_json=as_json, quiet=quiet) as progress:
-        from advsearch.api import region_from_config
+        from advsearch.api.region import region_from_config
 
         summary = region_from_config(config, progress=progress, resumed=resumed)
     return output.finish(summary, answer, as_json=as_json)

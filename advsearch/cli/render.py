@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
 
     config = config_from(args, RenderConfig)
     with at_work(as_json=args.json, quiet=args.quiet) as progress:
-        from advsearch.api import render_from_config
+        from advsearch.api.render import render_from_config
 
         found = render_from_config(config, progress=progress)
     return output.finish(found, text, as_json=args.json)

@@ -55,7 +55,7 @@ def carry_out(config: SweepConfig, *, as_json: bool, quiet: bool, resumed: Path 
     from advsearch.cli.progress import at_work
 
     with at_work(as_json=as_json, quiet=quiet) as progress:
-        from advsearch.api.sweeping import resume_sweep, sweep_from_config
+        from advsearch.api.sweep import resume_sweep, sweep_from_config
 
         if resumed is not None:
             result = resume_sweep(resumed, progress=progress)

@@ -45,7 +45,7 @@ class Parameter:
         search: the range that is searched when nothing is said about the parameter; None: it stays at its default.
         log: the unit interval runs over the logarithm of the value (scales, powers, distances).
         options: the names of a discrete choice; empty for numbers.
-        estimators: the valid ways to differentiate it, preferred first (keys of `advsearch.scene.plan.ESTIMATORS`).
+        estimators: the valid ways to differentiate it, preferred first (keys of `gradients.plan.ESTIMATORS`).
     """
 
     name: str

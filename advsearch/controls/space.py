@@ -12,7 +12,7 @@ from advsearch.controls.base import NOTHING, BoundControl, Group, Value
 from advsearch.controls.clean import Moved
 from advsearch.errors import InputError
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
-from advsearch.scene.plan import WITH_BOUNDARY, GroupPlan
+from advsearch.scene.gradients.plan import WITH_BOUNDARY, GroupPlan
 
 
 @dataclass(frozen=True, eq=False)

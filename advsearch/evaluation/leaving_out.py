@@ -18,10 +18,10 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.evaluation.gradients import Loss
+from advsearch.engine.gradients import Loss
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
-from advsearch.scene.mitsuba_scene import MitsubaScene
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 
 ALL = "everything above"

@@ -156,7 +156,7 @@ def default_views(spp: int = 64) -> dict[str, float]:
     from advsearch.scene import library
     from advsearch.scene.description import describe
     from advsearch.scene.formation import ImageFormation
-    from advsearch.scene.mitsuba_scene import MitsubaScene
+    from advsearch.scene.mitsuba_backend.scene import MitsubaScene
     from advsearch.scene.renderer import Renderer
 
     model = reference.load()

@@ -22,7 +22,7 @@ from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.framing import filling_distance
 from advsearch.scene.leaving_out import EVERYTHING
-from advsearch.scene.mitsuba_scene import MitsubaScene
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import resolve
 

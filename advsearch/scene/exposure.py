@@ -23,9 +23,9 @@ import numpy.typing as npt
 
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.coverage import NEAREST, Frame, pixels_in
 from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.settings import SETTINGS
+from advsearch.scene.silhouettes import NEAREST, Frame, pixels_in
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
-from advsearch.scene.samplers import SAMPLER, SAMPLERS
+from advsearch.scene.mitsuba_backend.samplers import SAMPLER, SAMPLERS
 
 DENOISERS = ("oidn", "none")
 FILTERS = ("box", "gaussian")

@@ -32,14 +32,14 @@ def flat(value: Any) -> Any:
 
 def number(value: Any) -> Any:
     """A single number."""
-    from advsearch.scene.backend import mitsuba
+    from advsearch.scene.mitsuba_backend.variant import mitsuba
 
     return mitsuba().Float(value.array)
 
 
 def color(value: Any) -> Any:
     """Three numbers: an RGB colour."""
-    from advsearch.scene.backend import mitsuba
+    from advsearch.scene.mitsuba_backend.variant import mitsuba
 
     mi = mitsuba()
     import drjit as dr
@@ -49,7 +49,7 @@ def color(value: Any) -> Any:
 
 def point(value: Any) -> Any:
     """Three numbers: a place."""
-    from advsearch.scene.backend import mitsuba
+    from advsearch.scene.mitsuba_backend.variant import mitsuba
 
     mi = mitsuba()
     import drjit as dr
@@ -59,7 +59,7 @@ def point(value: Any) -> Any:
 
 def transform(value: Any) -> Any:
     """A 4 x 4 matrix, row by row."""
-    from advsearch.scene.backend import mitsuba
+    from advsearch.scene.mitsuba_backend.variant import mitsuba
 
     mi = mitsuba()
     import drjit as dr
@@ -147,7 +147,7 @@ class MeshPart(Part):
     extra: dict[str, Any] = field(default_factory=dict)
 
     def plugins(self) -> dict[str, Any]:
-        from advsearch.scene.mesh_plugin import mitsuba_mesh, principled
+        from advsearch.scene.mitsuba_backend.plugins import mitsuba_mesh, principled
 
         surface = principled(self.base_color, self.material, self.extra)
         return {self.name: mitsuba_mesh(self.name, self.mesh, self.to_world, surface)}

@@ -20,11 +20,11 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.errors import InputError
 from advsearch.scene.assembly import ON_PICTURE
-from advsearch.scene.denoise import Denoiser
 from advsearch.scene.formation import ImageFormation
-from advsearch.scene.mitsuba_scene import MitsubaScene
-from advsearch.scene.motion import Motion, steps_for
-from advsearch.scene.plan import BY_ADJOINT, BY_DIFFERENCES, DIRECTIONS, TURN_STEP, GroupPlan, first_plan
+from advsearch.scene.gradients.motion import Motion, steps_for
+from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, DIRECTIONS, TURN_STEP, GroupPlan, first_plan
+from advsearch.scene.mitsuba_backend.denoise import Denoiser
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 
 MAX_SPP = 65536
 

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.evaluation.gradients import EXPENSIVE, Loss, Probe, estimated, reference
+from advsearch.engine.gradients import EXPENSIVE, Loss, Probe, estimated, reference
 from advsearch.evaluation.precision.fits import INDEPENDENT, STRATIFIED, UNKNOWN, Theory
 from advsearch.evaluation.precision.points import Array, Reference, Setting, reference_of
 from advsearch.evaluation.precision.rounds import Budget, gather, part_samples
-from advsearch.scene.plan import BY_ADJOINT, DIRECTIONS, GroupPlan
+from advsearch.scene.gradients.plan import BY_ADJOINT, DIRECTIONS, GroupPlan
 from advsearch.scene.renderer import Renderer
 
 COUNTS = (4, 8, 16, 32, 64, 128, 256)

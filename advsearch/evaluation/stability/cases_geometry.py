@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.evaluation.gradients import smooth_loss
+from advsearch.engine.gradients import smooth_loss
 from advsearch.evaluation.stability.case import Case, Check, Findings, holds
 from advsearch.evaluation.stability.scene import (
     BARE,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from advsearch.evaluation.gradients import smooth_loss
+from advsearch.engine.gradients import smooth_loss
 from advsearch.evaluation.stability.case import Case, Check, Findings, holds
 from advsearch.evaluation.stability.scene import ERROR, REFERENCE_SPP, SPP, Controls, examine, small
 from advsearch.scene import library

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain, make_policy, search
-from advsearch.evaluation.gradients import probes, reference, smooth_loss
+from advsearch.engine.gradients import probes, reference, smooth_loss
 from advsearch.evaluation.stability.case import Case, Check, Findings, holds
 from advsearch.evaluation.stability.scene import REFERENCE_SPP, Controls, compared, examine, small
 from advsearch.evaluation.stability.search import Toy

@@ -21,7 +21,7 @@ from advsearch import seeds, threads
 from advsearch.attacks import Block, Domain, make_policy, search
 from advsearch.attacks.policies.base import one_thread
 from advsearch.attacks.projections import project_l2_box
-from advsearch.evaluation.gradients import smooth_loss
+from advsearch.engine.gradients import smooth_loss
 from advsearch.evaluation.stability.case import Case, Check, Findings, holds
 from advsearch.evaluation.stability.scene import SIZE, Controls, small
 from advsearch.evaluation.stability.search import Toy

@@ -16,7 +16,7 @@ from torch import Tensor
 from advsearch.attacks import PGD, Policy, SearchResult, make_policy, search
 from advsearch.controls.base import Parameter
 from advsearch.controls.values import Range, read, to_unit, to_value
-from advsearch.evaluation.gradients import smooth_loss
+from advsearch.engine.gradients import smooth_loss
 from advsearch.evaluation.stability.case import Case, Check, Findings
 from advsearch.evaluation.stability.scene import SHARPNESS, Controls, Evaluator, domain_of, examine, small
 from advsearch.evaluation.stability.search import Toy, Value, condition_number, hessian, numbers, quadratic, valley

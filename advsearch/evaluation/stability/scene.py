@@ -15,15 +15,15 @@ from torch import Tensor
 from advsearch.attacks import PGD, Domain, Evaluation, Policy, SearchResult, search
 from advsearch.attacks.evaluation import Wanted
 from advsearch.controls import Space, make_control, make_space
-from advsearch.evaluation import domains
-from advsearch.evaluation.gradients import Loss, Probe, estimates, probes, reference, scale_of, smooth_loss, verdict
+from advsearch.engine import domains
+from advsearch.engine.gradients import Loss, Probe, estimates, probes, reference, scale_of, smooth_loss, verdict
 from advsearch.evaluation.stability.case import Check, Findings, holds
 from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, Material, Mesh, ObjectAsset
 from advsearch.scene.description import describe
 from advsearch.scene.formation import ImageFormation
-from advsearch.scene.mitsuba_scene import MitsubaScene
-from advsearch.scene.motion import Motion
+from advsearch.scene.gradients.motion import Motion
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.parts import Part
 from advsearch.scene.renderer import Renderer
 

@@ -1,0 +1,365 @@
+"""`attack`: the worst configuration of a scene inside a budget, searched for and verified, beside a random search."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from advsearch import seeds
+from advsearch.attacks import Objective, Policy, get_objective, make_policy
+from advsearch.attacks.goal import Goal
+from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
+from advsearch.config import AttackConfig
+from advsearch.config.scene import one_only
+from advsearch.controls import make_space
+from advsearch.controls.base import Control
+from advsearch.controls.clean import sentences
+from advsearch.engine.answers import right_answers
+from advsearch.engine.loading import Controls, Scene, framed, load_scene, make_renderer, settings_of
+from advsearch.engine.memory import Memory
+from advsearch.engine.naming import (
+    RUN_SETTINGS,
+    check_run_settings,
+    controls_of,
+    load_models,
+    options_of,
+    scene_settings,
+)
+from advsearch.engine.outcome import AttackResult, summarise
+from advsearch.engine.problem import Problem
+from advsearch.engine.record import Recorder, Stages
+from advsearch.engine.samples import search_samples
+from advsearch.engine.stages import Attack
+from advsearch.errors import InputError
+from advsearch.models import LabelSet, Model
+from advsearch.models.features import features_of
+from advsearch.progress import NullProgress, Progress
+from advsearch.runs.directory import CONFIG, RunDirectory, check_free, find_run, is_run, run_path
+from advsearch.scene.leaving_out import EVERYTHING, NOTHING
+from advsearch.scene.renderer import Renderer
+
+OVER_CONDITIONS = {"momentum": 0.9, "step_size": 0.2}
+"""Options of `pgd` where conditions vary."""
+
+LOADING, PREPARING = "loading the scene and the model", "preparing the scene for rendering"
+"""What a person who waits is told before the first picture."""
+
+CLEAN_SPP = 64
+"""Samples a pixel of the clean picture that an objective compares features with."""
+
+
+_OWN_ARGUMENTS = ("model", "controls", "over", "objective", "policy", "run")
+"""Arguments of `attack` that may be more than a file can say."""
+
+
+def attack(
+    scene: Scene | str | Path,
+    model: Model | nn.Module | str | Path = "reference",
+    *,
+    controls: Controls = ("texture",),
+    objective: str | Callable[..., Tensor] = "margin",
+    policy: str | Policy[Any] = "auto",
+    over: Controls = (),
+    run: str | Path | None = None,
+    resume: bool = False,
+    progress: Progress | None = None,
+    environment: str | Path | None = None,
+    up: Literal["y", "z"] | None = None,
+    set: Mapping[str, float | str | Sequence[float]] | None = None,
+    exposure: float | None = None,
+    resolution: int | str | tuple[int, int] | None = None,
+    labels: str | Path | None = None,
+    label: str | int | Sequence[str] | None = None,
+    texture_resolution: int | None = None,
+    spp: int | Literal["auto"] | None = None,
+    denoise: Literal["oidn", "none"] = "oidn",
+    pixel_sampler: Literal["independent", "multijitter"] = "multijitter",
+    seed: int = 0,
+    threads: int | None = None,
+    deterministic: bool = False,
+    overwrite: bool = False,
+    epsilon: float | Mapping[str, float] | None = None,
+    norm: Literal["linf", "l2"] | None = None,
+    estimators: str | Mapping[str, str] | None = None,
+    measure: Literal["no", "quick", "full"] = "quick",
+    steps: int = 40,
+    seconds: float | None = None,
+    step_size: float | None = None,
+    target: str | int | Sequence[str] | None = None,
+    minimise: bool = False,
+    smallest: bool = False,
+    draws: int = 4,
+    average: int = 0,
+    specialise: bool = True,
+    baseline: bool = True,
+    verify_spp: int | None = None,
+    trials: int | None = None,
+) -> AttackResult:
+    """Search for the worst configuration of a scene, verify it, and return everything that is known about it.
+
+    Args:
+        scene: from `load_scene`, or what that takes.
+        model: from `load_model`, or what that takes.
+        controls: what may vary: names, instances, or a mapping from names to settings.
+        objective: "margin", "log_odds", "cross_entropy", "dlr", "feature_distance", or a function of (logits (N, C),
+            images (N, H, W, 3), indices of the right answers, or of the target's where there is one) that returns (N,)
+            values, which are maximised.
+        policy: a name, or an instance with options of its own.
+        over: controls that vary by chance: the answer has to hold for all of their values.
+        run: folder to keep the run in; None keeps it in memory only.
+        resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
+            was.
+        progress: told how far it is.
+
+    All other arguments are the settings of the command line by the same names (docs/command-line.md). `environment`,
+    `up`, `set` and `exposure` belong to a scene that is named here, not to one that is loaded.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    options = options_of(locals(), AttackConfig, without=_OWN_ARGUMENTS)
+    scene = _scene(scene, options)
+    described = {
+        "object": scene.description.object_spec or scene.description.object.name,
+        "environment": scene.description.environment_spec or scene.description.environment.name,
+        "up": scene.description.up,
+        "model": model if isinstance(model, str) else getattr(model, "name", None) or type(model).__name__,
+        "controls": settings_of(controls),
+        "over": settings_of(over),
+        "objective": objective if isinstance(objective, str) else getattr(objective, "__name__", "custom"),
+        "policy": policy if isinstance(policy, str) else policy.name,
+        "set": _set_by(scene, options),
+    }
+    config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
+    check_objective(objective, targeted=config.target is not None, minimise=config.minimise)
+    searched, drawn = _controls(config, controls, over)
+    job = _Job(config, scene, _model(model, config), searched, drawn, objective, policy, run is not None)
+    if resume and run is not None and is_run(run_path(run)):
+        return _go_on(job, run, progress or NullProgress())
+    return _carry_out(job, progress or NullProgress())
+
+
+def attack_from_config(config: AttackConfig, *, progress: Progress | None = None) -> AttackResult:
+    """Do what a configuration describes and keep it in a run directory; see `attack`."""
+    if config.run is not None:
+        check_free(config.run, overwrite=config.overwrite)
+    progress = progress or NullProgress()
+    progress.stage(LOADING)
+    return _carry_out(_job(config), progress)
+
+
+def resume_attack(run: str | Path, *, progress: Progress | None = None) -> AttackResult:
+    """Go on with a run that was stopped, where it was stopped; what was evaluated is not rendered again.
+
+    Args:
+        run: its name or path.
+        progress: told how far it is.
+
+    Raises:
+        UnknownNameError: there is no such run.
+        InputError: another process works on it, or it cannot be continued.
+    """
+    progress = progress or NullProgress()
+    path = find_run(run)
+    config = AttackConfig.from_yaml(path / CONFIG)
+    progress.stage(LOADING)
+    return _go_on(_job(config), path, progress)
+
+
+def problem_from_config(config: AttackConfig, *, denoise: str | None = None) -> tuple[Problem, list[str]]:
+    """Load what a configuration describes without searching: the problem, and warnings on the way.
+
+    Args:
+        config: what.
+        denoise: another denoiser than the configuration's.
+    """
+    job = _job(config if denoise is None else config.model_copy(update={"denoise": denoise}))
+    problem = _problem(job)
+    return problem, [*job.loaded[1], *sentences(problem.space.moved)]
+
+
+def _scene(scene: Scene | str | Path, options: Mapping[str, Any]) -> Scene:
+    """The scene as it was given, or the one that a name and the options describe."""
+    told = {"set": options.get("set", options.get("set_")), **{one: options.get(one) for one in ("environment", "up")}}
+    told["exposure"] = options.get("exposure")
+    if isinstance(scene, Scene):
+        clash = [name for name, value in told.items() if value is not None]
+        if clash:
+            raise InputError(f"{', '.join(clash)}: belongs to the scene, which is given already; give it to load_scene")
+        return scene
+    settings = scene_settings(told["set"], told["exposure"])
+    return load_scene(scene, told["environment"], up=told["up"], settings=settings)
+
+
+def _set_by(scene: Scene, options: Mapping[str, Any]) -> dict[str, float]:
+    """The parameters of the scene that were fixed, but for the exposure where an option says it."""
+    values, given = scene.description.values, scene.description.given
+    fixed = {name: value for name, value in values.items() if name in given and value is not None}
+    if options.get("exposure"):
+        fixed.pop("camera.exposure", None)
+    return fixed
+
+
+# ---- from names to things -------------------------------------------------------------------------------------------
+
+
+@dataclass
+class _Job:
+    """Everything that was asked for, found and loaded."""
+
+    config: AttackConfig
+    scene: Scene
+    loaded: tuple[Model, list[str]]
+    controls: tuple[Any, ...]
+    over: tuple[Any, ...]
+    objective: str | Callable[..., Tensor]
+    policy: str | Policy[Any]
+    keep: bool
+
+
+def _job(config: AttackConfig) -> _Job:
+    """Find and load everything that a configuration names."""
+    if len(config.objects) > 1:
+        raise one_only("object", config.objects)
+    searched, drawn = _controls(config, config.controls, config.over)
+    check_objective(config.objective, targeted=config.target is not None, minimise=config.minimise)
+    objective, policy = config.objective, make_policy(config.policy_name, **_policy_options(config))
+    given = scene_settings(config.set_, config.exposure)
+    scene = load_scene(config.object, config.environment, up=config.up, settings=given)
+    model = _model(config.model, config)
+    return _Job(config, scene, model, searched, drawn, objective, policy, True)
+
+
+def _controls(
+    config: AttackConfig, searched: Controls, drawn: Controls
+) -> tuple[tuple[Control, ...], tuple[Control, ...]]:
+    """The controls that are searched and those that vary by chance, with the run's settings; only a search has a
+    budget."""
+    check_run_settings(config)
+    return controls_of(searched, config), controls_of(drawn, config, [one for one in RUN_SETTINGS if one != "epsilon"])
+
+
+def _model(model: Model | nn.Module | str | Path, config: AttackConfig) -> tuple[Model, list[str]]:
+    """Load the model; its warnings become sentences of the run."""
+    (loaded,), said = load_models([model], config)
+    return loaded, said
+
+
+def _policy_options(config: AttackConfig) -> dict[str, Any]:
+    return config.policy_options | ({} if config.step_size is None else {"step_size": config.step_size})
+
+
+def _problem(job: _Job) -> Problem:
+    config, (model, _) = job.config, job.loaded
+    description = job.scene.description
+    labels = right_answers(model, job.scene, config.object, config)
+    resolution = config.resolution or (model.input_size[0], model.input_size[1])
+    description = framed(description, resolution)
+    space = make_space((*job.controls, *job.over), description)
+    renderer = make_renderer(
+        description,
+        space,
+        resolution,
+        config.denoise,
+        config.seed,
+        config.estimators,
+        leave_out=EVERYTHING if config.specialise else NOTHING,
+        sampler=config.pixel_sampler,
+    )
+    goal = _goal(model, labels, config)
+    objective = _objective(job, goal, renderer)
+    return Problem(
+        renderer,
+        space,
+        model,
+        labels,
+        objective,
+        goal,
+        search_samples(config),
+        config.seed,
+        searched=len(job.controls),
+        draws=config.draws if job.over else 1,
+    )
+
+
+def _objective(job: _Job, goal: Goal, renderer: Renderer) -> Objective:
+    """What is maximised. One that compares features with those of the clean picture is shown that first."""
+    kind = OBJECTIVE_KINDS.get(job.objective) if isinstance(job.objective, str) else None
+    if kind is None or not kind.needs_features:
+        return get_objective(job.objective, target=goal.targets, minimise=goal.minimise)
+    features = features_of(job.loaded[0])
+    if not features.penultimate:
+        job.loaded[1].append(features.source)
+    with torch.no_grad():
+        clean = renderer(renderer.start, seed=seeds.stream(job.config.seed, "clean features"), spp=CLEAN_SPP)
+    return get_objective(job.objective, features=features, clean=clean)
+
+
+def _goal(model: Model, labels: LabelSet, config: AttackConfig) -> Goal:
+    """What counts as success."""
+    if config.target is None:
+        return Goal(labels.indices, minimise=config.minimise)
+    try:
+        targets = model.label_set(config.target)
+    except InputError as error:
+        raise InputError(f"target: {error}") from None
+    return Goal(labels.indices, targets.indices)
+
+
+# ---- carrying it out ------------------------------------------------------------------------------------------------
+
+
+def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -> AttackResult:
+    """Do it all, in a run directory of its own unless one is given that was begun already."""
+    stages = Stages(progress)
+    stages.begin("setup", PREPARING)
+    problem = _problem(job)
+    own = job.scene.description
+    said = [*own.object.notes, *own.environment.warnings, *job.loaded[1], *sentences(problem.space.moved)]
+    for text in said:
+        progress.message(text)
+    policy = _policy(job, problem)
+    with _directory(job, run) as kept:
+        memory = Memory(kept)
+        attack = Attack(problem, job.config, policy, Recorder(kept, problem, memory), memory, stages)
+        findings = attack.carry_out()
+        return summarise(job.config, problem, findings, attack.recorder, stages, said)
+
+
+def _policy(job: _Job, problem: Problem) -> Policy[Any]:
+    """The policy. Where conditions vary, every gradient is one of others, so `auto` follows a longer mean of them."""
+    if not isinstance(job.policy, str):
+        return _with_derivatives(job.policy, job.config)
+    balls = all(block.norm != "box" for block in problem.domain.blocks)
+    if job.policy == "auto" and problem.conditions is not None and balls:
+        return make_policy("pgd", **OVER_CONDITIONS)
+    return _with_derivatives(make_policy(job.policy, **_policy_options(job.config)), job.config)
+
+
+def _with_derivatives(policy: Policy[Any], config: AttackConfig) -> Policy[Any]:
+    """Refuse settings of derivatives beside a policy that takes none; return the policy."""
+    given = "estimators" if config.estimators else "measure" if config.measure == "full" else None
+    if given and not policy.uses_gradient:
+        raise InputError(f"{given}: policy {policy.name} takes no derivatives; leave one of the two out")
+    return policy
+
+
+def _go_on(job: _Job, run: str | Path, progress: Progress) -> AttackResult:
+    """Carry out what is left of a run."""
+    with RunDirectory.resume(run, job.config) as kept:
+        return _carry_out(job, progress, kept)
+
+
+@contextmanager
+def _directory(job: _Job, run: RunDirectory | None) -> Iterator[RunDirectory | None]:
+    if run is not None or not job.keep:
+        yield run
+        return
+    with RunDirectory.create_for(job.config) as made:
+        yield made

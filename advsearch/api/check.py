@@ -1,0 +1,454 @@
+"""Checks gradients of a scene as it is: what `advsearch check` does."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from advsearch import seeds
+from advsearch.api.attack import LOADING, problem_from_config
+from advsearch.config import AttackConfig, CheckConfig
+from advsearch.controls import CONTROLS
+from advsearch.engine.gradients import (
+    EXPENSIVE,
+    FACTORS,
+    Estimate,
+    Loss,
+    Probe,
+    Reference,
+    estimates,
+    inside,
+    probes,
+    reference,
+    scale_of,
+    smooth_loss,
+    verdict,
+)
+from advsearch.engine.memory import Memory
+from advsearch.engine.naming import run_settings_for
+from advsearch.engine.planning import (
+    CONVERGED,
+    COUNTS,
+    Cosine,
+    cosine_samples,
+    cosines,
+    measured_plan,
+    plan_gradients,
+    tuned,
+)
+from advsearch.engine.problem import Problem
+from advsearch.progress import NullProgress, Progress
+from advsearch.runs.directory import RunDirectory, default_name
+from advsearch.runs.summary import INTERRUPTED, OUT_OF_TIME
+from advsearch.scene.description import DEFAULT_ENVIRONMENT
+from advsearch.scene.gradients.plan import STEP_RANGE, GroupPlan
+
+SCENES = (("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"))
+"""Bundled scenes that `check --all` goes through."""
+LOSSES = ("linear", "model")
+RAW_SPP = 16
+"""Samples a pixel of a working gradient of the linear loss, which is taken without denoiser."""
+MOST = 256
+"""Samples a pixel of the dearest gradient of the model's loss that is tried; `advsearch plan` stops before."""
+REFERENCE_SPP, SEEDS = 64, (6, 16)
+"""Samples a pixel of a reference render, and how many seeds it gets: until its noise is small."""
+FEW_SEEDS = (3, 6)
+"""Seeds of a reference of the model's loss, whose renders have more samples."""
+WHOLE = "*"
+"""What stands for the parameter in rows about a whole control."""
+REPEATS, AGAIN = 6, 8
+"""Gradients of one estimator, from which its mean and its noise come; and of one with a wider step."""
+IN_SAMPLES = "counted in samples a pixel; `resolution` or fewer controls shorten it, `seconds` ends it"
+IN_PARAMETERS = "one for each parameter; `resolution` or fewer controls shorten it, `seconds` ends it"
+"""What whoever waits is told of the long stages."""
+
+
+def check(
+    config: AttackConfig, *, losses: Sequence[str] = LOSSES, everything: bool = False, progress: Progress | None = None
+) -> list[dict[str, Any]]:
+    """Compare the gradient of every parameter with differences, on the actual scene.
+
+    Args:
+        config: scene, model, controls, resolution, samples and seed.
+        losses: "linear", a smooth linear loss of the raw picture before the tone curve; "model", the model's own loss
+            in the run's image formation.
+        everything: every control, on each of `SCENES`.
+        progress: told how far it is.
+
+    Returns:
+        One row for each parameter, estimator and loss, as DESIGN section 6 lists them. For the model's loss the
+        estimator, the step and the samples are those that reach the goal soonest, and rows with `WHOLE` for their
+        parameter have the cosine of a control's working gradients with the converged one.
+    """
+    results = Results(Memory(None))
+    parts = _parts(config, losses, everything)
+    return [row for part in parts for row in _rows_of(part, len(parts), results, progress or NullProgress())]
+
+
+def check_from_config(
+    config: CheckConfig, *, progress: Progress | None = None, resumed: Path | None = None
+) -> dict[str, Any]:
+    """Do what a configuration describes, or go on with it, and keep it in a run directory; see `check`.
+
+    What is measured is stored at once, so that a check that was stopped, by Ctrl-C, by a kill or because its `seconds`
+    were over, goes on where it was and ends with the same rows; only times differ.
+
+    Returns:
+        What `summary.json` holds: `rows` so far; `ending`, "done", "interrupted" or "out of time"; of how many `parts`
+        (a scene with a control and a loss) how many are `measured`.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    progress, begun = progress or NullProgress(), time.perf_counter()
+    progress.stage(LOADING)
+    parts = _parts(config, config.losses, config.all)
+    opened = RunDirectory.resume(resumed, config) if resumed is not None else _new_run(config)
+    with opened as run:
+        results, measured, ending = Results(Memory(run), config.seconds), 0, INTERRUPTED
+        rows: list[dict[str, Any]] = []
+
+        def summary() -> dict[str, Any]:
+            return {
+                "schema": 1,
+                "command": "check",
+                "run": str(run.path),
+                "object": ",".join(dict.fromkeys(part.config.object for part in parts)),
+                "environment": ",".join(dict.fromkeys(part.config.environment for part in parts)),
+                "controls": list(dict.fromkeys(name for part in parts for name in part.config.controls)),
+                "ending": ending,
+                "measured": measured,
+                "planned": len(parts),
+                "rows": rows,
+                "seconds": {"total": time.perf_counter() - begun},
+                "seed": config.seed,
+                "command_line": config.command_line(),
+            }
+
+        try:
+            for part in parts:
+                for row in _rows_of(part, len(parts), results, progress):
+                    rows.append(row)
+                measured += 1
+                run.write_summary(summary())
+            ending = "done"
+        except KeyboardInterrupt:
+            pass
+        except OutOfTime:
+            ending = OUT_OF_TIME
+        answer = summary()
+        run.write_summary(answer)
+        return answer
+
+
+# ---- what is measured, and what was ---------------------------------------------------------------------------------
+
+
+class OutOfTime(Exception):
+    """The time that a check was given is over."""
+
+
+class Results:
+    """What a check has measured, in the run's store; measures what is not there, until the time is up.
+
+    Args:
+        memory: of the run.
+        seconds: after which nothing more is measured; one measurement is always made, so that it gets on.
+    """
+
+    def __init__(self, memory: Memory, seconds: float | None = None) -> None:
+        self._memory = memory
+        self._end = math.inf if seconds is None else time.monotonic() + seconds
+        self._made = 0
+
+    def get(self, key: str, measure: Callable[[], Any]) -> Any:
+        """Return a JSON value: the one that is stored under a key, or what `measure` returns, which is stored then.
+
+        Raises:
+            OutOfTime: it is not stored, and the time is over.
+        """
+        stored = self._memory.note(key)
+        if stored is None:
+            if self._made and time.monotonic() >= self._end:
+                raise OutOfTime
+            self._made += 1
+            stored = json.loads(json.dumps(measure()))
+            self._memory.set_note(key, stored)
+        return stored
+
+    def put(self, key: str, value: Any) -> None:
+        """Store a JSON value."""
+        self._memory.set_note(key, value)
+
+    def stored(self, key: str) -> Any:
+        """Return what is stored under a key, or None."""
+        return self._memory.note(key)
+
+
+@dataclass(frozen=True)
+class Part:
+    """One scene with its controls and one loss: what is checked in one go.
+
+    Attributes:
+        number: from 1.
+        config: the scene, and what may vary.
+        loss: one of `LOSSES`.
+    """
+
+    number: int
+    config: AttackConfig
+    loss: str
+
+    @property
+    def key(self) -> str:
+        """Under which its results are stored."""
+        return f"check {self.number}"
+
+
+def _new_run(config: CheckConfig) -> RunDirectory:
+    name = "all" if config.all else config.object
+    run = RunDirectory.create(config.run, overwrite=config.overwrite, default=default_name(name, ["check"]))
+    try:
+        run.write_config(config)
+    except BaseException:
+        run.discard()
+        raise
+    return run
+
+
+def _parts(config: AttackConfig, losses: Sequence[str], everything: bool) -> list[Part]:
+    asked = [(one, loss) for one in _configurations(config, everything) for loss in losses]
+    return [Part(number, one, loss) for number, (one, loss) in enumerate(asked, start=1)]
+
+
+def _configurations(config: AttackConfig, everything: bool) -> Iterator[AttackConfig]:
+    if not everything:
+        yield config
+        return
+    for object, environment in SCENES:
+        for control in CONTROLS:
+            if control == "contents" and object == "bottle":
+                continue  # a bottle is closed
+            if control == "sky" and environment != DEFAULT_ENVIRONMENT:
+                continue  # a sky takes the place of the environment
+            update: dict[str, Any] = {
+                "object": object,
+                "environment": environment,
+                "controls": {control: {}},
+                "label": None,
+                **run_settings_for(config, control, {}),
+            }
+            yield config.model_copy(update=update)
+
+
+def _rows_of(part: Part, parts: int, results: Results, progress: Progress) -> Iterator[dict[str, Any]]:
+    """The rows of a part, as they come; of one that was measured before, without loading anything."""
+    stored = results.stored(part.key)
+    if stored is not None:
+        yield from stored
+        return
+    config = part.config
+    what = f"{config.object} in {config.environment}, {' and '.join(config.controls)}"
+    title = f"{what} ({part.number} of {parts})" if parts > 1 else what
+    progress.stage(f"loading {title}")
+    rows = []
+    for row in (_linear if part.loss == "linear" else _model)(part, title, results, progress):
+        row = json.loads(json.dumps(row))
+        rows.append(row)
+        yield row
+        progress.message(_line(row))  # whoever reads it can stop the check and find the row kept
+    results.put(part.key, rows)
+
+
+def _line(row: Mapping[str, Any]) -> str:
+    """A row in a line, for whoever waits."""
+    name = row["control"] if row["parameter"] == WHOLE else f"{row['control']}.{row['parameter']}"
+    how = f"cosine {row['cosine']:.2f}" if "cosine" in row else f"{row['gradient']:.3g}"
+    return f"{row['object']}, {name} by {row['estimator']}: {how}, {row['status']}"
+
+
+def _linear(part: Part, title: str, results: Results, progress: Progress) -> Iterator[dict[str, Any]]:
+    config = part.config
+    problem, _ = problem_from_config(config, denoise="none")
+    problem.renderer.formation = replace(problem.renderer.formation, transfer="linear")
+    problem.renderer.plan = problem.renderer.plan.at_a_pixel()
+    loss = smooth_loss(problem.renderer.formation.resolution, config.seed)
+    yield from _rows(
+        problem,
+        part,
+        title,
+        loss,
+        config.spp if isinstance(config.spp, int) else RAW_SPP,
+        results,
+        progress,
+        tried=attempts,
+        high=REFERENCE_SPP,
+        repeats=SEEDS,
+        factors=FACTORS[:2],
+    )
+
+
+def _model(part: Part, title: str, results: Results, progress: Progress) -> Iterator[dict[str, Any]]:
+    config = part.config
+    problem, _ = problem_from_config(config)
+    renderer, u = problem.renderer, inside(problem.renderer)
+    counts = tuple(count for count in (*COUNTS, MOST) if count >= problem.spp) or (problem.spp,)
+
+    def measured() -> dict[str, object]:
+        progress.stage(f"{title}: comparing ways to differentiate", plan_gradients(renderer.plan))
+        seed, tick = seeds.stream(config.seed, "measure"), lambda: progress.advance(1)
+        return measured_plan(renderer, problem.loss, u, seed=seed, spp=problem.spp, counted=True, tick=tick).to_dict()
+
+    def compared() -> list[dict[str, Any]]:
+        most = cosine_samples(renderer.plan, counts=counts)
+        progress.stage(f"{title}: the model's gradients", most, hint=IN_SAMPLES, at_most=True)
+        table = cosines(renderer, problem.loss, u, seed=config.seed, counts=counts, tick=progress.advance)
+        return [vars(row) for row in table]
+
+    renderer.plan = renderer.plan.restored(results.get(f"{part.key} plan", measured))
+    steps = {group.name: group.step for group in renderer.plan.groups}
+    table = [Cosine(**row) for row in results.get(f"{part.key} cosines", compared)]
+    renderer.plan, spp = tuned(renderer.plan, table)
+    for row in table:
+        taken = [group.estimator for group in renderer.plan.groups if group.control == row.control]
+        names = {"parameter": WHOLE, "estimator": ", ".join(dict.fromkeys(taken))}
+        yield {**_place(part), **vars(row), **names, "status": row.status}
+    wider = {group.name: group.step / steps[group.name] for group in renderer.plan.groups if steps[group.name]}
+    for one in _rows(
+        problem,
+        part,
+        title,
+        problem.loss,
+        spp or problem.spp,
+        results,
+        progress,
+        tried=lambda group: [(group.estimator, 1.0)],
+        high=CONVERGED,
+        repeats=FEW_SEEDS,
+        factors=(1.0,),
+    ):
+        group = f"{one['control']}.{one['parameter'].partition('.')[0]}"  # coordinates of one have a number behind it
+        one["factor"] = one["reference_factor"] = wider.get(group, 1.0)
+        yield one
+
+
+def _rows(
+    problem: Problem,
+    part: Part,
+    title: str,
+    loss: Loss,
+    spp: int,
+    results: Results,
+    progress: Progress,
+    *,
+    tried: Callable[[GroupPlan], list[tuple[str, float]]],
+    high: int,
+    repeats: tuple[int, int],
+    factors: Sequence[float],
+) -> Iterator[dict[str, Any]]:
+    """Rows of single parameters, with references of `high` samples, so many seeds, and steps so many times as wide."""
+    renderer, seed = problem.renderer, seeds.stream(part.config.seed, "check")
+    u = inside(renderer)
+    progress.stage(f"{title}: choosing directions")
+    along = probes(renderer, loss, u, seed, spp)
+    for control in dict.fromkeys(probe.group.control for probe in along):
+        mine = [probe for probe in along if probe.group.control == control]
+        progress.stage(f"{title}: references for {control}", len(mine), hint=IN_PARAMETERS)
+        references: dict[str, Reference] = {}
+        for probe in mine:
+
+            def referred(probe: Probe = probe) -> dict[str, Any]:
+                # what acts on the picture clips: its mean depends on the noise, so both get the same
+                many = spp if probe.group.estimator == "image" else max(spp, high)
+                return vars(reference(renderer, loss, u, probe, seed=seed, spp=many, repeats=repeats, factors=factors))
+
+            kept = results.get(_key(part, "reference", [probe]), referred)
+            references[probe.name] = Reference(**{**kept, "steps": tuple(kept["steps"])})
+            progress.advance(1)
+        sets = _sets(mine)
+        most = sum(len(tried(group[0].group)) for group in sets)
+        progress.stage(f"{title}: gradients for {control}", most, hint=f"{REPEATS} by each estimator", at_most=True)
+        for group in sets:
+            good: set[str] = set()
+            for estimator, factor in tried(group[0].group):
+                wanted = group if factor == 1.0 else [one for one in group if one.name not in good]
+                if not wanted:
+                    break
+
+                def estimated(
+                    wanted: Sequence[Probe] = wanted, estimator: str = estimator, factor: float = factor
+                ) -> list[dict[str, Any]]:
+                    many = REPEATS if factor == 1.0 else AGAIN  # another try has to be surer
+                    found = estimates(
+                        renderer, loss, u, estimator, wanted, seed=seed, spp=spp, repeats=many, factor=factor
+                    )
+                    return [vars(one) for one in found]
+
+                stored = results.get(_key(part, f"{estimator} x {factor:g}", wanted), estimated)
+                for probe, one in zip(wanted, stored, strict=True):
+                    against = references[probe.name]
+                    row = _row(probe, Estimate(**one), against, scale_of(against, list(references.values())))
+                    good |= {probe.name} if row["status"] == "ok" else set()
+                    yield {**_place(part), **row, "spp": spp}
+                progress.advance(1)
+
+
+def _key(part: Part, what: str, along: Sequence[Probe]) -> str:
+    """Under which a measurement is stored."""
+    return f"{part.key} {what} {','.join(probe.name for probe in along)}"
+
+
+def attempts(group: GroupPlan) -> list[tuple[str, float]]:
+    """Estimators to measure on a group, with the multiple of the step; other steps for what falls short with the first.
+
+    Differences of the loss and of the picture are the same for a linear loss, so that wider steps are tried with one.
+    """
+    forced = "forced" in group.reason
+    names = [group.estimator] if forced else [one for one in group.valid if one not in EXPENSIVE]
+    wide = next((one for one in ("differences", "secant", "forward") if one in names), None)
+    found = [(one, 1.0) for one in names]
+    if wide is None:
+        return found
+    tried = {group.step}
+    for factor in FACTORS[1:]:
+        step = min(factor * group.step, STEP_RANGE[1])
+        if step not in tried:
+            tried.add(step)
+            found.append((wide, factor))
+    return found
+
+
+def _row(probe: Probe, estimate: Estimate, against: Reference, size: float) -> dict[str, Any]:
+    status, error = verdict(estimate, against, size)
+    return {
+        "control": probe.group.control,
+        "parameter": probe.name.partition(".")[2],
+        "estimator": estimate.estimator,
+        "factor": estimate.factor,
+        "gradient": estimate.value,
+        "reference": against.value,
+        "reference_steps": list(against.steps),
+        "reference_factor": against.factor,
+        "reference_noise": against.noise,
+        "relative_error": error,
+        "noise": estimate.noise / size if size else float("inf"),
+        "seconds": estimate.seconds,
+        "status": status,
+    }
+
+
+def _sets(found: Sequence[Probe]) -> list[list[Probe]]:
+    """Probes that one gradient answers together: of one control, with the same valid estimators."""
+    sets: dict[tuple[str, tuple[str, ...], str], list[Probe]] = {}
+    for probe in found:
+        sets.setdefault((probe.group.control, probe.group.valid, probe.group.estimator), []).append(probe)
+    return list(sets.values())
+
+
+def _place(part: Part) -> dict[str, Any]:
+    return {"object": part.config.object, "environment": part.config.environment, "loss": part.loss}

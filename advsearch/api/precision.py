@@ -1,0 +1,312 @@
+"""Error against run time of a scene as it is: what `advsearch precision` does."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.api.attack import LOADING, problem_from_config
+from advsearch.attacks import make_policy
+from advsearch.config import PrecisionConfig
+from advsearch.engine.gradients import Loss, inside, smooth_loss
+from advsearch.engine.planning import measured_plan, plan_gradients
+from advsearch.engine.problem import Problem
+from advsearch.errors import InputError
+from advsearch.evaluation.precision.fits import UNKNOWN, Theory
+from advsearch.evaluation.precision.gradient import GradientBench, Part, parts_of, theory_of
+from advsearch.evaluation.precision.image import REFERENCE_SAMPLER, PictureBench, variants
+from advsearch.evaluation.precision.machine import machine
+from advsearch.evaluation.precision.objective import ObjectiveBench, curve_of
+from advsearch.evaluation.precision.points import Point, Sample, Setting, point_of
+from advsearch.evaluation.precision.report import Section, figures_of, report_of
+from advsearch.evaluation.precision.rounds import Budget, Rounds, in_rounds
+from advsearch.progress import NullProgress, Progress
+from advsearch.runs.directory import RunDirectory, check_free, default_name
+from advsearch.runs.files import write_bytes, write_text
+from advsearch.runs.summary import to_json
+from advsearch.settings import split_names
+
+SHARES = {"image": 0.45, "gradient": 0.3, "objective": 0.25}
+"""Of the time, by quantity; what one doesn't use is the others'."""
+REFERENCE_SHARE = 0.35
+"""Of the time of a quantity, for its reference."""
+CONFIRM_SHARE, CONFIRM_LEAST, CONFIRM_MOST = 0.4, 4, 64
+"""Of the time of a gradient's measurements, for measuring the recommended setting again; how often at least for that to
+count, and at most."""
+VERIFY_SPP, VERIFY_RENDERS = 64, 4
+"""Samples a pixel, and fresh renders, that verify what a search held."""
+NUMBERS, FIGURE = "precision.json", "precision"
+
+
+def precision(config: PrecisionConfig, *, progress: Progress | None = None) -> dict[str, Any]:
+    """Measure error against run time and write figures and numbers.
+
+    Args:
+        config: scene, model, controls, what to measure and for how long.
+        progress: told how far it is.
+
+    Returns:
+        The report (DESIGN section 6), with the paths of its figures.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    progress = progress or NullProgress()
+    if config.run is not None and config.out is None:
+        check_free(config.run, overwrite=config.overwrite)
+    begun = time.perf_counter()
+    progress.stage(LOADING, hint=f"then {config.seconds:g} seconds of measurements; `seconds` sets them")
+    policies = {name: make_policy(name) for name in split_names(config.policies)}
+    problem, said = problem_from_config(config.as_attack())
+    for text in said:
+        progress.message(text)
+    job = _Job(config, problem, progress, Budget(config.seconds))
+    setup = time.perf_counter() - begun
+    wanted = [name for name in ("image", "gradient", "objective") if name in split_names(config.quantities)]
+    if "gradient" in wanted and not any(group.valid for group in problem.renderer.plan.groups):
+        raise InputError(
+            f"`controls` {','.join(config.controls)}: has no derivative; leave gradient out of `quantities`"
+        )
+    measure: dict[str, Callable[[Budget], None]] = {
+        "image": job.image,
+        "gradient": job.gradient,
+        "objective": lambda share: job.objective(share, policies),
+    }
+    try:
+        for number, name in enumerate(wanted):
+            measure[name](job.budget.share(SHARES[name] / sum(SHARES[one] for one in wanted[number:])))
+    except KeyboardInterrupt:
+        job.section.interrupted = True
+    seconds = {"budget": config.seconds, "setup": setup, "total": time.perf_counter() - begun}
+    report = report_of(_head(config, problem), job.section, config.error, seconds)
+    return _kept(config, report)
+
+
+@dataclass
+class _Job:
+    """What is measured, quantity by quantity, and what came out so far."""
+
+    config: PrecisionConfig
+    problem: Problem
+    progress: Progress
+    budget: Budget
+    section: Section = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.section = Section(self.config.pixel_sampler)
+
+    @property
+    def seed(self) -> int:
+        """Root of the measurements' seeds."""
+        return seeds.stream(self.config.seed, "precision")
+
+    def image(self, budget: Budget) -> None:
+        """The picture and the model's margin."""
+        renderer, problem = self.problem.renderer, self.problem
+        depths = [int(part) for part in split_names(self.config.depths)]
+        chosen = variants(
+            split_names(self.config.samplers), depths, renderer.scene.max_depth, volumetric=renderer.scene.volumetric
+        )
+
+        def margin(picture: Tensor) -> float:
+            with torch.no_grad():
+                return -float(problem.goal.score(problem.model(picture))[0])
+
+        self.progress.stage("the picture: preparing every sampler and path length")
+        bench = PictureBench(renderer, problem.whole(problem.domain.start), margin, chosen)
+        share = budget.share(REFERENCE_SHARE)
+        bench.refer(share, self.seed, self._timed("the picture: rendering references", share))
+        for family, one in bench.pictures.items():
+            self.section.refer("image", family, "", one, bench.part_spp[family], bench.margins[family])
+        theories = {one.series: one.theory for one in chosen}
+        families = {one.series: one.family for one in chosen}
+        found = self._rounds("the picture", bench.settings, bench.measure, budget)
+        for measure in ("error", "margin_error"):
+            self._take(found, measure, bench.floor, lambda series: theories[series])
+        self.section.families |= {("image", "", series): family for series, family in families.items()}
+
+    def gradient(self, budget: Budget) -> None:
+        """Every control's gradient."""
+        config, problem, renderer = self.config, self.problem, self.problem.renderer
+        loss: Loss = problem.loss
+        if config.loss == "linear":
+            renderer = renderer.like(denoiser="none", transfer="linear")
+            renderer.plan = renderer.plan.at_a_pixel()
+            loss = smooth_loss(renderer.formation.resolution, config.seed)
+        u = inside(renderer)
+        exact = renderer.like(renderer.scene.like(sampler=REFERENCE_SAMPLER))
+        parts = parts_of(renderer.plan.groups, linear=config.loss == "linear")
+        for number, part in enumerate(parts):
+            bench = GradientBench(renderer, loss, u, part, exact)
+            self._one_gradient(bench, part, budget.share(1.0 / (len(parts) - number)))
+
+    def _one_gradient(self, bench: GradientBench, part: Part, budget: Budget) -> None:
+        share = budget.share(REFERENCE_SHARE)
+        bench.refer(share, self.seed, self._timed(f"gradient of {part.name}: references", share))
+        if bench.reference is None:
+            return
+        self.section.refer("gradient", bench.by, part.name, bench.reference, bench.part_spp)
+        said = bench.bias(budget, self.seed)
+        self.section.warnings += [said] if said else []
+        share = budget.share(1.0 - CONFIRM_SHARE)
+        found = self._rounds(f"gradient of {part.name}", bench.settings, bench.measure, share)
+        linear, sampler = self.config.loss == "linear", self.config.pixel_sampler
+        self._take(found, "error", bench.floor, lambda series: theory_of(series, sampler) if linear else UNKNOWN)
+        self._confirm(bench, part, budget)
+
+    def _confirm(self, bench: GradientBench, part: Part, budget: Budget) -> None:
+        """Measure the setting that is recommended so far again, with seeds of its own."""
+        one = self.section.recommended("gradient", part.name, self.config.error)
+        if one is None:
+            return
+        like = next(setting for setting in bench.settings if setting.line == one.line)
+        setting = replace(like, spp=one.spp, cost=like.cost / like.spp * one.spp)
+        tick = self._timed(f"gradient of {part.name}: {one.line[2]} with {one.spp} samples again", budget)
+        found = in_rounds(
+            [setting],
+            bench.measure,
+            budget,
+            rounds=CONFIRM_MOST,
+            seed=seeds.stream(self.seed, "confirm"),
+            on_done=lambda _: tick(),
+        )
+        samples = [Sample(numbers, seconds) for numbers, seconds in found.results.get(setting, [])]
+        if len(samples) >= CONFIRM_LEAST:
+            floor = bench.floor(setting, "error")
+            self.section.again[one.line, "error"] = point_of(setting, samples, "error", floor)
+
+    def objective(self, budget: Budget, policies: dict[str, Any]) -> None:
+        """The best verified objective of each policy."""
+        problem, config = self.problem, self.config
+        if any(policy.uses_gradient for policy in policies.values()):
+            self.progress.stage("measuring which gradients are best here", plan_gradients(problem.plan))
+            at, seed = inside(problem.renderer), seeds.stream(config.seed, "measure")
+            problem.plan = measured_plan(
+                problem.renderer,
+                problem.loss,
+                at,
+                seed=seed,
+                spp=problem.spp,
+                counted=True,
+                tick=lambda: self.progress.advance(1),
+            )
+        bench = ObjectiveBench(problem.evaluator, problem.domain, policies, config.steps, self._verified, budget)
+        self.section.start = self._verified(problem.domain.start)
+        settings = bench.settings(problem.spp)
+        tick = self._timed("searching with each policy", budget)
+        found = in_rounds(
+            settings,
+            bench.measure,
+            budget,
+            rounds=config.repeats,
+            seed=self.seed,
+            least=1,
+            warm_up=0,
+            on_done=lambda setting: tick(policy=setting.series),
+        )
+        self.section.left_out += found.left_out
+        for setting, taken in found.results.items():
+            self.section.curves.append((setting, curve_of(setting.series, [marks for marks, _ in taken if marks])))
+
+    def _verified(self, u: Tensor) -> float:
+        """The mean objective of a configuration over fresh renders, rounded to 8 bits; the same seeds for all."""
+        u = self.problem.domain.project(u)
+        values = []
+        for number in range(VERIFY_RENDERS):
+            seed = seeds.stream(self.config.seed, "precision verification", number)
+            with torch.no_grad():
+                values.append(float(self.problem.loss(self.problem.picture(u, seed, VERIFY_SPP))))
+        return sum(values) / len(values)
+
+    # ---- inside -----------------------------------------------------------------------------------------------------
+
+    def _rounds(self, name: str, settings: Sequence[Setting], measure: Any, budget: Budget) -> Rounds[dict[str, float]]:
+        tick = self._timed(f"{name}: measuring every setting in rounds", budget)
+        found: Rounds[dict[str, float]] = in_rounds(
+            settings,
+            measure,
+            budget,
+            rounds=self.config.rounds,
+            seed=self.seed,
+            on_done=lambda setting: tick(now=setting.series, samples=setting.spp),
+        )
+        self.section.left_out += found.left_out
+        return found
+
+    def _take(
+        self,
+        found: Rounds[dict[str, float]],
+        measure: str,
+        floor: Callable[[Setting, str], float],
+        theory: Callable[[str], Theory],
+    ) -> None:
+        """Make points of what was measured."""
+        lines: dict[tuple[str, str, str], list[Point]] = {}
+        for setting, taken in found.results.items():
+            samples = [Sample(numbers, seconds) for numbers, seconds in taken]
+            point = point_of(setting, samples, measure, floor(setting, measure))
+            lines.setdefault(setting.line, []).append(point)
+        for line, points in lines.items():
+            self.section.add(line, points, theory(line[2]))
+
+    def _timed(self, name: str, budget: Budget) -> Callable[..., None]:
+        """Begin a stage that ends with a budget of seconds, and return what tells how many have passed."""
+        total, done = math.ceil(budget.left), 0
+        self.progress.stage(name, total, hint="counted in seconds; `seconds` sets them", at_most=True)
+
+        def tick(**info: float | str) -> None:
+            nonlocal done
+            passed = min(total, total - math.ceil(budget.left))
+            self.progress.advance(passed - done, **info)
+            done = passed
+
+        return tick
+
+
+def _head(config: PrecisionConfig, problem: Problem) -> dict[str, Any]:
+    return {
+        "schema": 1,
+        "command": "precision",
+        "run": None,
+        "object": config.object,
+        "model": problem.model.name,
+        "environment": problem.space.environment or config.environment,
+        "controls": list(config.controls),
+        "image_formation": problem.renderer.formation.summary(),
+        "depth": problem.renderer.scene.max_depth,
+        "loss": config.loss,
+        "objective": config.objective,
+        "spp": problem.spp,
+        "seed": config.seed,
+        "machine": machine(),
+    }
+
+
+def _kept(config: PrecisionConfig, report: dict[str, Any]) -> dict[str, Any]:
+    """Write the figures and the numbers into `--out` or a run directory, and return the report with their paths."""
+    if config.out is not None:
+        folder = Path(config.out).expanduser()
+        report["figures"] = _write(folder, report)
+        write_text(folder / NUMBERS, to_json(report) + "\n")
+        return report
+    default = default_name(config.object, ("precision",))
+    with RunDirectory.create(config.run, overwrite=config.overwrite, default=default) as kept:
+        kept.write_config(config)
+        report["run"] = str(kept.path)
+        report["figures"] = _write(kept.path / "images", report)
+        kept.write_summary(report)
+    return report
+
+
+def _write(folder: Path, report: dict[str, Any]) -> list[str]:
+    folder.mkdir(parents=True, exist_ok=True)
+    figures = figures_of(report)
+    return [str(write_bytes(folder / f"{FIGURE}.{kind}", data)) for kind, data in figures.items()]

@@ -1,0 +1,258 @@
+"""`region`: the box around a configuration in which the model's verdict stays, and a map of its margin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.api.attack import LOADING, problem_from_config
+from advsearch.attacks import make_policy
+from advsearch.attacks.region import ATTEMPTS, LEVELS, Part, Region, grow
+from advsearch.config import AttackConfig, RegionConfig, SceneConfig
+from advsearch.engine.memory import ANSWER, Memory
+from advsearch.engine.problem import Problem
+from advsearch.engine.record import Recorder, Stages
+from advsearch.engine.stages import Attack
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.progress import NullProgress, Progress
+from advsearch.report.studies import map_figure
+from advsearch.runs.directory import CONFIG, RunDirectory, find_run
+from advsearch.runs.files import write_bytes
+from advsearch.runs.store import NAME, Store
+from advsearch.runs.summary import INTERRUPTED
+from advsearch.settings import split_names
+
+MOST = 8
+"""A box is grown in at most so many parameters."""
+
+AT_CENTRE = 20
+"""Trials of the centre."""
+
+
+@dataclass(frozen=True, eq=False)
+class Varied:
+    """The parameters in which the box grows.
+
+    Attributes:
+        names: of each.
+        places: (k,) where they lie in u.
+    """
+
+    names: tuple[str, ...]
+    places: Tensor
+
+
+def region_from_config(config: RegionConfig, *, progress: Progress | None = None, resumed: Path | None = None) -> Any:
+    """Grow the region that a configuration describes and keep it in a run directory.
+
+    Returns:
+        What `summary.json` holds: `verdict` at the centre; `box`, the range of each parameter with its unit;
+        `same`, how many fresh samples of the box had that verdict, with the 95 % interval of its share; `volume`, the
+        share of the whole space; `map`, if one was asked for. None of these where `ending` is "interrupted".
+
+    Raises:
+        InputError: the verdict at the centre depends on the noise, the parameters do not fit, and what a scene raises.
+    """
+    stages = Stages(progress or NullProgress())
+    stages.begin("setup", LOADING)
+    as_attack = AttackConfig(**{name: getattr(config, name) for name in SceneConfig.model_fields})
+    budget = {} if config.around is None else _budget(config.around)
+    as_attack = as_attack.model_copy(update={"measure": "no", "verify_spp": config.verify_spp, **budget})
+    problem, said = problem_from_config(as_attack)
+    for text in said:
+        stages.progress.message(text)
+    varied = _varied(problem, config)
+    centre = _centre(problem, config)
+    opened = RunDirectory.resume(resumed, config) if resumed is not None else RunDirectory.create_for(config)
+    with opened as run:
+        memory = Memory(run)
+        attack = Attack(problem, as_attack, make_policy("random"), Recorder(run, problem, memory), memory, stages)
+        try:
+            found, ending = _found(attack, config, varied, centre, run), "done"
+        except KeyboardInterrupt:
+            found, ending = {}, INTERRUPTED
+        stages.end()
+        answer = {
+            "schema": 1,
+            "command": "region",
+            "run": str(run.path),
+            "object": config.object,
+            "environment": problem.space.environment or config.environment,
+            "model": problem.model.name,
+            "controls": [bound.name for bound in problem.space.controls],
+            "ending": ending,
+            **found,
+            "image_formation": problem.renderer.formation.summary(),
+            "clean": {"moved": [one.to_dict() for one in problem.space.moved]},
+            "warnings": said,
+            "renders": {"verification": attack.findings.verification_renders},
+            "seconds": {**stages.seconds, "total": stages.total},
+            "seed": config.seed,
+            "command_line": config.command_line(),
+        }
+        run.write_summary(answer)
+        return answer
+
+
+def _found(attack: Attack, config: RegionConfig, varied: Varied, centre: Tensor, run: RunDirectory) -> dict[str, Any]:
+    """Look at the centre, grow the box, check it, and draw the map if one was asked for."""
+    problem, stages = attack.problem, attack.stages
+    attack.choose_spp({"centre": centre})
+    verdict, spp = _verdict(attack, centre), attack.findings.spp
+
+    def at(values: Tensor) -> Tensor:
+        u = centre.clone()
+        u[varied.places] = values
+        return u
+
+    hint = f"in rounds, pictures of {spp} samples a pixel; fewer parameters in `vary` or `verify_spp` shorten it"
+    stages.begin("search", "growing the box", LEVELS, hint=hint)
+    checks = 0
+
+    def on_part(part: Part) -> None:
+        nonlocal checks
+        if part == "level":
+            stages.progress.advance(1)
+            return
+        if checks == 0:
+            most = ATTEMPTS * config.samples
+            hint = f"{config.samples} pictures, and as many again where one is an exception; `samples` shortens it"
+            stages.begin("search", "checking the box with fresh samples", most, hint=hint, at_most=True)
+        checks += 1
+
+    def same(values: Tensor, number: int) -> bool:
+        trial = attack.one_trial("region", number, at(values))
+        if checks:
+            stages.progress.advance(1)
+        return trial.wrong == verdict
+
+    seed = seeds.stream(config.seed, "region")
+    found = grow(same, centre[varied.places], seed=seed, samples=config.samples, on_part=on_part)
+    box = _box(problem, found, at, varied)
+    return {
+        "verdict": "wrong" if verdict else "right",
+        "box": box,
+        "same": found.same,
+        "samples": found.samples,
+        "rate": found.same / found.samples,
+        "interval": list(found.interval),
+        "volume": found.volume,
+        "spp": spp,
+        **({"map": _map(attack, config.map, at, varied, box, run)} if config.map else {}),
+    }
+
+
+def _budget(around: str) -> dict[str, Any]:
+    """How far a run's controls may go, so that its answer lies within."""
+    theirs = AttackConfig.from_yaml(find_run(around) / CONFIG)
+    return {"epsilon": theirs.epsilon, "norm": theirs.norm}
+
+
+def _centre(problem: Problem, config: RegionConfig) -> Tensor:
+    """The configuration that the box grows around."""
+    if config.around is None:
+        return problem.domain.start.clone()
+    with Store(find_run(config.around) / NAME, read_only=True) as store:
+        noted = store.noted(ANSWER)
+    sound = isinstance(noted, list) and all(isinstance(number, (int, float)) for number in noted)
+    values = torch.tensor(noted, dtype=torch.float32) if sound else None
+    if values is None or values.shape != problem.domain.start.shape:
+        raise InputError(
+            f"`around` {config.around}: expected a finished run over the same controls with at most a few thousand "
+            "numbers, got another one; leave `controls` out so that the run's own are taken"
+        )
+    return problem.domain.project(values)
+
+
+def _varied(problem: Problem, config: RegionConfig) -> Varied:
+    """Where the parameters lie that the box grows in."""
+    places: dict[str, Tensor] = {}
+    begin = 0
+    for control, group in problem.space.groups:
+        numbers = torch.arange(begin, begin + group.size)
+        begin += group.size
+        if group.options:
+            continue
+        for number, place in enumerate(numbers):
+            places[f"{control.name}.{group.name}" + (f".{number}" if group.size > 1 else "")] = place[None]
+    names = tuple(places) if config.vary is None else split_names(config.vary)
+    for name in names:
+        if name not in places:
+            raise UnknownNameError("parameter in `vary`", name, places)
+    if not 1 <= len(names) <= MOST:
+        raise InputError(f"vary: expected 1 to {MOST} parameters, got {len(names)}; name some of {', '.join(places)}")
+    if config.map and len(names) != 2:
+        raise InputError(f"map: expected two parameters in `vary`, got {len(names)}: {', '.join(names)}")
+    return Varied(names, torch.cat([places[name] for name in names]))
+
+
+def _verdict(attack: Attack, centre: Tensor) -> bool:
+    """Whether the model is wrong at the centre.
+
+    Raises:
+        InputError: that depends on the noise.
+    """
+    attack.stages.begin("verification", "looking at the centre", AT_CENTRE)
+    wrong = 0
+    for number in range(AT_CENTRE):
+        wrong += attack.one_trial("centre", number, centre).wrong
+        attack.stages.progress.advance(1)
+    needed = attack.rule.needed(AT_CENTRE)
+    if AT_CENTRE - needed < wrong < needed:
+        raise InputError(
+            f"the model is wrong in {wrong} of {AT_CENTRE} trials at the centre, so its verdict there depends on the "
+            "noise; choose another centre, or more samples with `verify_spp`"
+        )
+    return wrong >= needed
+
+
+def _box(problem: Problem, found: Region, at: Any, varied: Varied) -> list[dict[str, Any]]:
+    """The range of every parameter of the box in its unit."""
+    ends = [problem.describe(at(values)) for values in (found.low, found.high, found.centre)]
+    rows = []
+    for name in varied.names:
+        stem, _, number = name.rpartition(".")
+        known = name if name in ends[0] else stem
+        if known not in ends[0]:  # one of many numbers, which nobody describes
+            place = varied.names.index(name)
+            sides = (found.low, found.high, found.centre)
+            low, high, centre = (float(side[place]) for side in sides)
+            rows.append({"name": name, "unit": "of the range", "low": low, "high": high, "centre": centre})
+            continue
+        low, high, centre = (_number(end[known], number if known == stem else "") for end in ends)
+        unit = str(ends[0][known].get("unit", ""))
+        rows.append({"name": name, "unit": unit, "low": low, "high": high, "centre": centre})
+    return rows
+
+
+def _number(told: Any, number: str) -> float:
+    value = told["value"]
+    return float(value[int(number)] if number else value)
+
+
+def _map(attack: Attack, side: int, at: Any, varied: Varied, box: Any, run: RunDirectory) -> dict[str, Any]:
+    """The margin on a grid over two parameters, as numbers and as a picture."""
+    hint = f"{side * side} pictures of {attack.findings.spp} samples a pixel; `map` or `verify_spp` shorten it"
+    attack.stages.begin("map", "drawing the map", side * side, hint=hint)
+    steps = torch.linspace(0.0, 1.0, side) if side > 1 else torch.tensor([0.5])
+
+    def margin(row: int, column: int) -> float:
+        trial = attack.one_trial("map", row * side + column, at(torch.stack([steps[column], steps[row]])))
+        attack.stages.progress.advance(1)
+        return trial.margin
+
+    margins = [[margin(row, column) for column in range(len(steps))] for row in range(len(steps))]
+    ends = [attack.problem.describe(at(torch.full((2,), end))) for end in (0.0, 1.0)]
+    axes = []
+    for one in box:
+        known = one["name"] in ends[0]
+        low, high = (_number(end[one["name"]], "") for end in ends) if known else (0.0, 1.0)
+        axes.append({"name": one["name"], "unit": one["unit"], "low": low, "high": high})
+    for suffix, data in map_figure(margins, axes, box).items():
+        write_bytes(run.path / "images" / f"map.{suffix}", data)
+    return {"axes": axes, "margins": margins}

@@ -1,0 +1,53 @@
+"""`render`: pictures of a scene, written to a file, with what the model says of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from advsearch.config import RenderConfig
+from advsearch.engine.loading import load_scene
+from advsearch.engine.naming import check_run_settings, controls_of, load_models, scene_settings
+from advsearch.engine.rendering import Rendering as Rendering
+from advsearch.engine.rendering import render as render
+from advsearch.engine.rendering import writable
+from advsearch.errors import InputError
+from advsearch.progress import NullProgress, Progress
+
+
+def render_from_config(config: RenderConfig, *, progress: Progress | None = None) -> dict[str, Any]:
+    """Render what a configuration describes, write the file, and return what is known about it as JSON values.
+
+    Raises:
+        InputError: as for `render`, or the file would replace one that is read.
+        StorageError: the file could not be written.
+    """
+    progress = progress or NullProgress()
+    out = writable(config.out, config.around or 1)
+    for spec in (config.object, config.environment, config.model, config.labels):
+        if spec is not None and out.exists() and Path(spec).exists() and out.samefile(spec):
+            raise InputError(f"out: would replace {spec}, which is read; choose another name")
+    progress.stage("loading the scene and the model")
+    check_run_settings(config)
+    controls = controls_of(config.controls, config)
+    given = scene_settings(config.set_, config.exposure)
+    scene = load_scene(config.object, config.environment, up=config.up, settings=given)
+    (model,), said = load_models([config.model], config)
+    found = render(
+        scene,
+        model,
+        controls=controls,
+        around=config.around,
+        resolution=config.resolution,
+        spp=config.spp,
+        denoise=config.denoise,
+        sampler=config.pixel_sampler,
+        seed=config.seed,
+        progress=progress,
+    )
+    warnings = [*found.warnings, *said]
+    for text in warnings:
+        progress.message(text)
+    size = found.save(out)
+    written = {"out": str(out), "size": list(size)}
+    return {"schema": 1, "command": "render", **written, **found.to_dict(), "warnings": warnings}

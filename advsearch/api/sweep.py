@@ -1,0 +1,244 @@
+"""`sweep`: the average case of a scene over a grid, over draws by chance, or both."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from torch import nn
+
+from advsearch.api.attack import LOADING
+from advsearch.config import SweepConfig
+from advsearch.engine.answers import one_label_for_several
+from advsearch.engine.loading import Controls, Scene, load_scene, settings_of
+from advsearch.engine.naming import check_run_settings, controls_of, different, load_models, options_of, scene_settings
+from advsearch.engine.sweeps.axes import read_axes
+from advsearch.engine.sweeps.job import Job, Place, check_scenes
+from advsearch.engine.sweeps.loop import SweepResult, carry_out
+from advsearch.errors import InputError
+from advsearch.models import Model
+from advsearch.progress import NullProgress, Progress
+from advsearch.runs.directory import CONFIG, RunDirectory, check_free, default_name, find_run, is_run, run_path
+from advsearch.runs.listing import finished
+from advsearch.settings import split_names
+
+SAMPLES = 100
+"""Draws where there is no grid and nothing is said."""
+
+AnyScene = Scene | str | Path
+AnyModel = Model | nn.Module | str | Path
+
+
+def sweep(
+    scene: AnyScene | Sequence[AnyScene],
+    model: AnyModel | Sequence[AnyModel] = "reference",
+    grid: Mapping[str, Any] | None = None,
+    *,
+    samples: int | None = None,
+    controls: Controls = (),
+    run: str | Path | None = None,
+    progress: Progress | None = None,
+    environment: str | Path | Sequence[str] | None = None,
+    up: Literal["y", "z"] | None = None,
+    set: Mapping[str, float | str | Sequence[float]] | None = None,
+    exposure: float | None = None,
+    resolution: int | str | tuple[int, int] | None = None,
+    labels: str | Path | None = None,
+    label: str | int | Sequence[str] | None = None,
+    texture_resolution: int | None = None,
+    spp: int | None = None,
+    denoise: Literal["oidn", "none"] = "oidn",
+    pixel_sampler: Literal["independent", "multijitter"] = "multijitter",
+    seed: int = 0,
+    threads: int | None = None,
+    deterministic: bool = False,
+    overwrite: bool = False,
+    sampler: Literal["sobol", "random"] = "sobol",
+    batch: int = 16,
+    trials: int = 20,
+    verify_spp: int | None = None,
+) -> SweepResult:
+    """Render every configuration of a grid, and draws by chance, and say how often the model is right.
+
+    With `run` naming a sweep of the same settings that was stopped, it goes on where that was stopped.
+
+    Args:
+        scene: from `load_scene`, or what that takes; or several.
+        model: from `load_model`, or what that takes; or several, which are shown the same pictures.
+        grid: parameter to its values: a list, a range, or "FIRST:LAST:COUNT".
+        samples: draws of `controls` at each point of the grid; by default 1, or 100 without a grid.
+        controls: what is drawn by chance, as for `attack`.
+        run: folder to keep the run in; None keeps it in memory, which then grows with every configuration.
+        progress: told how far it is.
+
+    All other arguments are the settings of the command line by the same names (docs/command-line.md).
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    options = options_of(locals(), SweepConfig, without=("model", "controls", "grid", "samples", "run"))
+    scenes = _several(scene)
+    networks = _several(model)
+    names = [split_names(one) if isinstance(one, str) else (str(one),) for one in scenes if not isinstance(one, Scene)]
+    if names and len(names) < len(scenes):
+        raise InputError("scene: expected scenes from load_scene or names of objects, got some of each")
+    described: dict[str, Any] = {
+        "model": ",".join(_model_name(one) for one in networks),
+        "controls": settings_of(controls),
+        "grid": dict(grid or {}),
+        "samples": samples,
+    }
+    loaded = tuple(_place(one) for one in scenes if isinstance(one, Scene))
+    if loaded:
+        described |= _described(loaded)
+    else:
+        described["object"] = ",".join(name for some in names for name in some)
+    config = SweepConfig(**{**described, **options, "run": None if run is None else str(run)})
+    progress = progress or NullProgress()
+    resumed = _stopped(config)
+    if config.run is not None and resumed is None:
+        check_free(config.run, overwrite=config.overwrite)
+    asked = [name for one in networks for name in (split_names(one) if isinstance(one, str) else (one,))]
+    job = _job(config, loaded or _places(config), asked, controls)
+    return _kept(job, progress, resumed) if config.run is not None else carry_out(job, None, progress)
+
+
+def sweep_from_config(config: SweepConfig, *, progress: Progress | None = None) -> SweepResult:
+    """Do what a configuration describes and keep it in a run directory; see `sweep`."""
+    if config.run is not None:
+        check_free(config.run, overwrite=config.overwrite)
+    progress = progress or NullProgress()
+    progress.stage(LOADING)
+    return _kept(_job_of(config), progress, None)
+
+
+def resume_sweep(run: str | Path, *, progress: Progress | None = None) -> SweepResult:
+    """Go on with a sweep that was stopped; what is stored is not rendered again.
+
+    Args:
+        run: its name or path.
+        progress: told how far it is.
+
+    Raises:
+        UnknownNameError: there is no such run.
+        InputError: another process works on it, or what it names is no longer there.
+    """
+    progress = progress or NullProgress()
+    path = find_run(run)
+    progress.stage(LOADING)
+    return _kept(_job_of(SweepConfig.from_yaml(path / CONFIG)), progress, path)
+
+
+# ---- from names to things -------------------------------------------------------------------------------------------
+
+
+def _several(given: Any) -> list[Any]:
+    found = list(given) if isinstance(given, (list, tuple)) else [given]
+    if not found:
+        raise InputError("scene and model: expected at least one of each, got an empty list")
+    return found
+
+
+def _model_name(model: AnyModel) -> str:
+    if isinstance(model, (str, Path)):
+        return str(model)
+    return str(getattr(model, "name", None) or type(model).__name__)
+
+
+def _place(scene: Scene) -> Place:
+    described = scene.description
+    object_name = described.object_spec or described.object.name
+    return Place(object_name, described.environment_spec or described.environment.name, scene)
+
+
+def _described(places: Sequence[Place]) -> dict[str, Any]:
+    """Settings that say what loaded scenes are."""
+    first = places[0].scene.description
+    given = {name: value for name, value in first.values.items() if name in first.given and value is not None}
+    return {
+        "object": ",".join(dict.fromkeys(place.object for place in places)),
+        "environment": ",".join(dict.fromkeys(place.environment for place in places)),
+        "up": first.up,
+        "set": given if len(places) == 1 else {},
+    }
+
+
+def _job_of(config: SweepConfig) -> Job:
+    """Find and load everything that a configuration names."""
+    return _job(config, _places(config), config.models, config.controls)
+
+
+def _job(config: SweepConfig, places: Sequence[Place], models: Sequence[AnyModel], controls: Controls) -> Job:
+    check_run_settings(config)
+    drawn = controls_of(controls, config)
+    axes = read_axes(config.grid, drawn)
+    if config.samples is not None and not drawn:
+        raise InputError(
+            "samples: expected `controls` beside it, which says what is drawn by chance; add `controls=pose`, say, or "
+            "leave `samples` out"
+        )
+    if not axes and not drawn and len(places) * len(models) == 1:
+        raise InputError(
+            "grid: expected something that varies, got nothing; add an axis such as `grid` pose.yaw=0:360:24, or "
+            "`controls=pose` `samples=100`"
+        )
+    samples = config.samples or (SAMPLES if drawn and not axes else 1)
+    check_scenes(places, drawn, axes)
+    networks, said = _models(models, config)
+    own = {place.object: place.scene.description.object.label for place in places}
+    said += one_label_for_several(networks, config.label, own)
+    for place in places:
+        said += [*place.scene.description.object.notes, *place.scene.description.environment.warnings]
+    return Job(config, tuple(places), networks, drawn, axes, samples, tuple(dict.fromkeys(said)))
+
+
+def _places(config: SweepConfig) -> tuple[Place, ...]:
+    """Every object under every environment; each is loaded once."""
+    given = scene_settings(config.set_, config.exposure)
+    objects, environments = different(config.objects, "object"), different(config.environments, "environment")
+    firsts = {name: load_scene(name, environments[0], up=config.up, settings=given) for name in objects}
+    lights = {environments[0]: firsts[objects[0]].description.environment}
+    for name in environments[1:]:
+        lights[name] = load_scene(firsts[objects[0]].description.object, name).description.environment
+    return tuple(
+        Place(name, light, load_scene(firsts[name].description.object, lights[light], settings=given))
+        for name in objects
+        for light in environments
+    )
+
+
+def _models(models: Sequence[AnyModel], config: SweepConfig) -> tuple[tuple[Model, ...], list[str]]:
+    """Load the models; their warnings become sentences of the run."""
+    names = [_model_name(one) for one in models]
+    if len(set(names)) < len(names):
+        raise InputError(
+            f"model: expected models with different names, got {', '.join(names)}; from Python, "
+            "load_model(..., name=...) gives one"
+        )
+    return load_models(models, config)
+
+
+# ---- where it is kept -----------------------------------------------------------------------------------------------
+
+
+def _stopped(config: SweepConfig) -> Path | None:
+    """The folder of a sweep of the same settings that was stopped, if `run` names one."""
+    if config.run is None or config.overwrite or not is_run(run_path(config.run)):
+        return None
+    path = run_path(config.run)
+    recipe = path / CONFIG
+    same = recipe.is_file() and recipe.read_text(encoding="utf-8") == config.recipe().to_yaml()
+    return path if same and not finished(path) else None
+
+
+def _kept(job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
+    """Sweep in a run directory: a new one, or one that was begun."""
+    if resumed is not None:
+        with RunDirectory.resume(resumed, job.config) as run:
+            return carry_out(job, run, progress)
+    config = job.config
+    stem = "-".join(Path(name).stem for name in config.objects)
+    with RunDirectory.create(config.run, overwrite=config.overwrite, default=default_name(stem, ["sweep"])) as run:
+        run.write_config(config)
+        return carry_out(job, run, progress)

@@ -1,0 +1,89 @@
+"""The `haze` control: a uniform haze around camera and object, by how dense it is and of which colour.
+
+A share `1 - exp(-density * l)` of the light is taken out of a line of length l (Beer and Lambert), and scattered light
+comes in: `advsearch.controls.haze.path` has the equation. Colour is the share that is scattered and not absorbed, per
+channel: white haze takes nothing away, dark haze is smoke. Haze fills a ball; the environment is outside of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advsearch.controls.base import Parameter
+from advsearch.controls.haze.part import HazePart
+from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.values import Fixed, Number, Range
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.formation import srgb_to_linear
+from advsearch.scene.geometry import camera_to_world
+
+LEAST_RADIUS = 4.0
+"""The haze reaches at least this far from the scene's middle, object sizes."""
+BEHIND_CAMERA = 1.5
+"""It reaches at least so many times as far as the camera is away."""
+THIN_HAZE = 0.1
+"""Density where it is not searched and was not given."""
+
+
+def _tint(name: str) -> Parameter:
+    description = f"{name.capitalize()} of the haze: what it scatters and does not absorb."
+    return Parameter(
+        name, (), "sRGB", 0.02, 1.0, 1.0, description, search=(0.6, 1.0), estimators=("adjoint", "differences")
+    )
+
+
+class HazeControl(NumberControl):
+    """A uniform haze around camera and object."""
+
+    kind: ClassVar[str] = "haze"
+    amount: ClassVar[str | None] = "density"
+    summary: ClassVar[str] = "A uniform haze around camera and object: how dense it is, and its colour."
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter(
+            "density",
+            (),
+            "per object size",
+            0.0,
+            2.0,
+            0.0,
+            "Extinction: over 1 / density the haze takes 63 % of the light out of a ray.",
+            search=(0.0, 0.3),
+            estimators=("adjoint", "differences"),
+        ),
+        _tint("red"),
+        _tint("green"),
+        _tint("blue"),
+    )
+
+    def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
+        if parameter.name == "density" and self.asked and not self.searches_density:
+            return THIN_HAZE
+        return parameter.default
+
+    def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
+        return parameter.default
+
+    @property
+    def searches_density(self) -> bool:
+        """Whether the density is among what is searched."""
+        spec = self.specs.get("density")
+        return not self.asked if spec is None else not isinstance(spec, Fixed)
+
+    def estimators(self, scene: SceneDescription, parameter: Parameter) -> tuple[str, ...]:
+        if parameter.name != "density":
+            return parameter.estimators
+        spec = self.specs.get("density")
+        return parameter.estimators if isinstance(spec, Range) and spec.low > 0.0 else ("differences",)
+
+    def prepare(self, scene: SceneDescription) -> SceneDescription:
+        away = float(np.linalg.norm(camera_to_world(scene)[:3, 3]))
+        return scene.with_part(HazePart(self.name, max(LEAST_RADIUS, BEHIND_CAMERA * away)))
+
+    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        albedo = srgb_to_linear(torch.stack([values[channel] for channel in ("red", "green", "blue")]))
+        return {f"{self.name}.density": values["density"].reshape(1), f"{self.name}.albedo": albedo}

@@ -1,0 +1,175 @@
+"""A path tracer for a uniform haze in a ball around the scene, with its adjoint. Import it only where haze is used.
+
+    L(x, w) = e^(-s l) L_o + integral_0^l s a e^(-s t) L_i(x + t w) dt,      L_i = mean over the sphere of L
+
+with extinction s (grey, per object size), single-scattering albedo a (per channel), l the length of the segment inside
+the ball, and L_o what leaves the next surface or comes from outside. Distances are sampled in proportion to
+`s e^(-s t)`, light from emitters through the haze is worked out exactly, and the derivative is path replay
+backpropagation (Vicini et al. 2021, Path Replay Backpropagation, sections 4 and 5) with detached samples.
+
+Why not Mitsuba's `prbvolpath`: it starts every path outside of all media, so a camera inside haze sees none up to the
+first surface (its source says so: "TODO: support sensors inside media"). Knowing that there is one uniform medium in
+one ball also spares the boundary's intersections and the walk through them towards emitters.
+
+Derivatives are right for the haze's colour, for emission and for everything that surfaces look up; for the density
+where it is greater than 0. Moving geometry has none.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from advsearch.scene.mitsuba_backend.variant import mitsuba
+
+mi: Any = mitsuba()
+
+import drjit  # noqa: E402  (both need the library and the variant that are set above)
+from mitsuba.ad.integrators.common import RBIntegrator, mis_weight  # noqa: E402
+
+dr: Any = drjit
+
+PHASE = 1.0 / (4.0 * math.pi)
+"""Isotropic phase function, per steradian."""
+NO_EXTINCTION = 1e-20
+MOST_SCATTERINGS = 8
+"""Longest chain of scatterings in the haze along a path. They do not count as bounces off surfaces, so that haze of
+density 0 is no haze. Where the haze's optical radius is 1.2, what is cut off is below 1 % of the light."""
+
+
+class HazePath(RBIntegrator):  # type: ignore[misc]
+    """The integrator `advsearch_haze`.
+
+    Properties beside those of `prb`: `medium`, a homogeneous medium with grey extinction, and `radius`, that of the
+    ball around the origin which it fills.
+    """
+
+    def __init__(self, props: Any) -> None:
+        super().__init__(props)
+        self.haze = props["medium"]
+        self.radius = props["radius"]
+
+    def stretch(self, origin: Any, towards: Any, distance: Any) -> tuple[Any, Any]:
+        """Return where the haze begins on a segment, and for how long it lasts (0 if it misses the ball)."""
+        middle = -dr.dot(origin, towards)
+        half = dr.sqrt(dr.maximum(dr.square(middle) - dr.squared_norm(origin) + self.radius**2, 0.0))
+        begin = dr.maximum(middle - half, 0.0)
+        return begin, dr.maximum(dr.minimum(middle + half, distance) - begin, 0.0)
+
+    def coefficients(self) -> tuple[Any, Any]:
+        """Return the scattering coefficient (3 channels) and the extinction (1 number), with derivatives if wanted."""
+        scattering, _, extinction = self.haze.get_scattering_coefficients(dr.zeros(mi.MediumInteraction3f))
+        return scattering, extinction[0]
+
+    @dr.syntax  # type: ignore[untyped-decorator]
+    def sample(
+        self,
+        mode: Any,
+        scene: Any,
+        sampler: Any,
+        ray: Any,
+        δL: Any,
+        state_in: Any,
+        active: Any,
+        **rest: Any,
+    ) -> Any:
+        """See `RBIntegrator.sample`."""
+        primal = mode == dr.ADMode.Primal
+        context = mi.BSDFContext()
+
+        ray = mi.Ray3f(dr.detach(ray))
+        bounces, scatterings = mi.UInt32(0), mi.UInt32(0)
+        L = mi.Spectrum(0 if primal else state_in)
+        δL = mi.Spectrum(δL if δL is not None else 0)
+        β = mi.Spectrum(1)
+        active = mi.Bool(active)
+        last = dr.zeros(mi.Interaction3f)
+        last_pdf = mi.Float(1)
+        last_delta = mi.Bool(True)
+
+        longest = self.max_depth + MOST_SCATTERINGS
+        while dr.hint(active, max_iterations=longest, label=f"Haze path ({mode.name})"):
+            # ---- the next event: a surface, the outside, or the haze in between -------------------------------------
+            first = bounces + scatterings == 0
+            si = scene.ray_intersect(ray, mi.RayFlags.All, first, active)
+            if dr.hint(self.hide_emitters, mode="scalar"):
+                skipped = active & first & si.is_valid() & (si.shape.emitter() != None)  # noqa: E711
+                beyond = self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, skipped)
+                si[skipped] = beyond.compute_surface_interaction(ray, mi.RayFlags.All, skipped)
+            begin, length = self.stretch(ray.o, ray.d, si.t)
+            with dr.resume_grad(when=not primal):
+                scattering, extinction = self.coefficients()
+                flight = -dr.log(1.0 - sampler.next_1d()) / dr.maximum(dr.detach(extinction), NO_EXTINCTION)
+                scattered = active & (flight < length)
+                passed = dr.exp(-extinction * dr.minimum(flight, length))
+                weight = dr.select(scattered, scattering * passed, passed)
+            albedo = dr.detach(scattering) / dr.maximum(dr.detach(extinction), NO_EXTINCTION)
+            β = dr.select(scattered, β * albedo, β)
+            at_surface = active & ~scattered
+
+            here = dr.zeros(mi.Interaction3f)
+            here.t = dr.select(scattered, begin + flight, si.t)
+            here.p = dr.select(scattered, ray(begin + flight), si.p)
+            here.n = dr.select(scattered, mi.Normal3f(0.0), si.n)
+            here.time = ray.time
+            here.wavelengths = ray.wavelengths
+
+            # ---- emission of the surface or of the outside ----------------------------------------------------------
+            shining = at_surface
+            if dr.hint(self.hide_emitters, mode="scalar"):
+                shining = at_surface & ~(first & ~si.is_valid())
+            seen = mi.DirectionSample3f(scene, si, last)
+            share = mis_weight(last_pdf, scene.pdf_emitter_direction(last, seen, shining & ~last_delta))
+            with dr.resume_grad(when=not primal):
+                Le = β * share * seen.emitter.eval(si, shining)
+
+            # ---- light that emitters send here, through the haze ----------------------------------------------------
+            may_bounce = si.is_valid() & (bounces + 1 < self.max_depth)
+            may_scatter = scatterings < MOST_SCATTERINGS
+            going_on = active & ((scattered & may_scatter) | (~scattered & may_bounce))
+            at_surface &= going_on
+            bsdf = si.bsdf(ray)
+            lit = going_on & (scattered | mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth))
+            to_light, emitted = scene.sample_emitter_direction(here, sampler.next_2d(), True, lit)
+            lit &= to_light.pdf != 0.0
+            outside = mi.has_flag(to_light.emitter.flags(), mi.EmitterFlags.Infinite)
+            _, hazy = self.stretch(here.p, to_light.d, dr.select(outside, dr.inf, to_light.dist))
+            with dr.resume_grad(when=not primal):
+                if dr.hint(not primal, mode="scalar"):
+                    attached = scene.eval_emitter_direction(here, to_light, lit)
+                    emitted = dr.replace_grad(emitted, attached * dr.select(lit, dr.rcp(to_light.pdf), 0.0))
+                value, pdf = bsdf.eval_pdf(context, si, si.to_local(to_light.d), lit & at_surface)
+                value = dr.select(scattered, PHASE, value)
+                pdf = dr.select(scattered, PHASE, pdf)
+                share = dr.select(to_light.delta, 1.0, mis_weight(to_light.pdf, pdf))
+                Lr_dir = dr.select(lit, β * share * value * emitted * dr.exp(-extinction * hazy), 0.0)
+
+            # ---- the direction to go on -----------------------------------------------------------------------------
+            bounce, bounce_weight = bsdf.sample(context, si, sampler.next_1d(), sampler.next_2d(), at_surface)
+            anywhere = mi.warp.square_to_uniform_sphere(sampler.next_2d())
+            towards = dr.select(scattered, anywhere, si.to_world(bounce.wo))
+            L = (L + Le + Lr_dir) if primal else (L - Le - Lr_dir)
+            β = dr.select(scattered, β, β * bounce_weight)
+            going_on &= dr.max(β) != 0.0
+
+            # ---- derivatives ----------------------------------------------------------------------------------------
+            if dr.hint(not primal, mode="scalar"):
+                with dr.resume_grad():
+                    reflected = bsdf.eval(context, si, bounce.wo, going_on & at_surface)
+                    further = dr.select(at_surface, L * dr.relative_grad(reflected), L)
+                    Lo = (Le + Lr_dir + further) * dr.relative_grad(weight)
+                    if dr.hint(dr.grad_enabled(Lo), mode="scalar"):
+                        dr.backward_from(δL * Lo)
+
+            ray = here.spawn_ray(towards)
+            last = here
+            last_pdf = dr.select(scattered, PHASE, bounce.pdf)
+            last_delta = ~scattered & mi.has_flag(bounce.sampled_type, mi.BSDFFlags.Delta)
+            scatterings[scattered] += 1
+            bounces[~scattered & si.is_valid()] += 1
+            active = going_on
+
+        return (L if primal else δL, bounces + scatterings != 0, [], L)
+
+
+mi.register_integrator("advsearch_haze", lambda props: HazePath(props))

@@ -1,0 +1,148 @@
+"""The `light` control: one lamp with a place, a colour, a power and, if it is a ball, a size.
+
+Power is in multiples of the irradiance `E` with which a white surface (reflectance 0.8) gets the display value
+`LIT_WHITE`; the exposure is metered for the environment alone. A lamp of power p and linear colour c puts `p c E / d^2`
+on a surface that faces it at distance d (object sizes):
+
+    point:  intensity I = p c E                      ball of radius r:  radiance L = p c E / (pi r^2)
+
+The second is the irradiance of a uniform ball, `pi L r^2 / d^2` (Cohen and Wallace 1993, Radiosity and Realistic Image
+Synthesis, section 2.4), solved for L, so that size changes how soft the shadows are and not how bright the lamp is. One
+lamp is one instance; a second one needs a name of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from advsearch.controls.base import Choice, Parameter
+from advsearch.controls.light.part import BallLightPart, PointLightPart
+from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.values import Fixed, Number
+from advsearch.errors import InputError
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.exposure import WHITE, metered_gain
+from advsearch.scene.formation import srgb_to_linear
+
+TYPES = ("area", "point")
+LIT_WHITE = 0.9
+"""Linear display value of a white surface that faces a lamp of power 1 at distance 1."""
+LIT_POWER = 6.0
+"""Power of a lamp whose power is not searched and was not given: at its default place about as bright as the
+environment."""
+
+
+def metered_irradiance(scene: SceneDescription) -> float:
+    """Return the irradiance `E` that gives a white surface `LIT_WHITE` at the scene's metered gain, in scene units."""
+    return LIT_WHITE * math.pi / (WHITE * metered_gain(scene))
+
+
+def _place(name: str, low: float, high: float, default: float, description: str) -> Parameter:
+    return Parameter(
+        name,
+        (),
+        "object sizes",
+        -1000.0,
+        1000.0,
+        default,
+        description,
+        moves_silhouettes=True,
+        search=(low, high),
+        estimators=("differences",),
+    )
+
+
+def _tint(name: str) -> Parameter:
+    description = f"{name.capitalize()} of the lamp's colour."
+    return Parameter(
+        name, (), "sRGB", 0.0, 1.0, 1.0, description, search=(0.6, 1.0), estimators=("adjoint", "differences")
+    )
+
+
+class LightControl(NumberControl):
+    """One lamp beside the environment."""
+
+    kind: ClassVar[str] = "light"
+    amount: ClassVar[str | None] = "power"
+    summary: ClassVar[str] = "A lamp: where it stands, its colour, its power, and the size of an area light."
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        _place("x", -2.0, 2.0, 1.5, "Where the lamp's middle is, along x."),
+        _place("y", -2.0, 2.0, -1.0, "Where the lamp's middle is, along y."),
+        _place("z", 2.0, 3.5, 2.0, "Height of the lamp's middle above the ground plane."),
+        _tint("red"),
+        _tint("green"),
+        _tint("blue"),
+        Parameter(
+            "power",
+            (),
+            "1",
+            0.0,
+            1000.0,
+            0.0,
+            "Irradiance at distance 1, in multiples of the one that shows a white surface just below white.",
+            search=(0.0, 12.0),
+            estimators=("adjoint", "differences"),
+        ),
+        Parameter(
+            "size",
+            (),
+            "object sizes",
+            0.001,
+            10.0,
+            0.2,
+            "Diameter of an area light; a point has none.",
+            moves_silhouettes=True,
+            search=(0.05, 0.6),
+            log=True,
+            estimators=("differences",),
+        ),
+    )
+    choices: ClassVar[tuple[Choice, ...]] = (
+        Choice("type", "area", "area (a ball that glows: soft shadows, visible) or point (sharp shadows, invisible)."),
+    )
+
+    def check_choices(self) -> None:
+        if self.chosen["type"] not in TYPES:
+            raise InputError(f"{self.name}.type: expected one of {', '.join(TYPES)}, got {self.chosen['type']!r}")
+        if self.chosen["type"] == "point" and "size" in self._given:
+            raise InputError(
+                f"{self.name}.size: expected none for a point light, got {self._given['size']!r}; leave it out, or set "
+                f"{self.name}.type to area"
+            )
+
+    def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
+        if parameter.name == "power" and self.asked and isinstance(self.specs.get("power", Fixed(0.0)), Fixed):
+            return LIT_POWER
+        return parameter.default
+
+    def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
+        return parameter.default
+
+    def search_range(self, scene: SceneDescription, parameter: Parameter) -> tuple[float, float] | None:
+        is_point = self.chosen["type"] == "point"
+        return None if is_point and parameter.name == "size" else parameter.search
+
+    def prepare(self, scene: SceneDescription) -> SceneDescription:
+        lamp = PointLightPart if self.chosen["type"] == "point" else BallLightPart
+        power = self.specs.get("power")
+        return scene.with_part(lamp(self.name, dark=isinstance(power, Fixed) and power.value == 0.0))
+
+    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        place = torch.stack([values[axis] for axis in ("x", "y", "z")])
+        tint = srgb_to_linear(torch.stack([values[channel] for channel in ("red", "green", "blue")]))
+        intensity = tint * values["power"] * metered_irradiance(scene)
+        if self.chosen["type"] == "point":
+            return {f"{self.name}.position": place, f"{self.name}.intensity": intensity}
+        radius = values["size"] / 2.0
+        return {f"{self.name}.ball": ball(place, radius), f"{self.name}.radiance": intensity / (math.pi * radius**2)}
+
+
+def ball(place: Tensor, radius: Tensor) -> Tensor:
+    """Return the pose (4, 4) of the unit ball at a place (3,) with a radius ()."""
+    turned = torch.cat([torch.eye(3) * radius, place[:, None]], dim=1)
+    return torch.cat([turned, torch.tensor([[0.0, 0.0, 0.0, 1.0]])])

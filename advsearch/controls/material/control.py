@@ -1,0 +1,150 @@
+"""The `material` control: how the object's surface reflects, its tint, and which named material it is made of.
+
+The numbers are those of the principled BSDF (Burley, *Physically based shading at Disney*, SIGGRAPH 2012 course notes).
+A tint multiplies reflectance:
+
+    base_color = linear(tint) * (the object's texture, or the named material's pattern)
+
+A named material is a seamless pattern of `patterns` with numbers of its own: the shape of one thing and
+the surface of another, as in 3DB (Leclerc et al. 2021, arXiv 2106.03805).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from advsearch.controls.base import Parameter
+from advsearch.controls.material.patterns import PATTERNS, covering
+from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.values import Choices, Fixed, Number
+from advsearch.scene.assets import Material, Mesh
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
+
+BASE_COLOR = "object.base_color"
+OWN = "own"
+NUMBERS = ("roughness", "metallic", "specular", "clearcoat")
+TINT = ("red", "green", "blue")
+RENDERED = {"metallic": (0.0, 0.999), "specular": (0.02, 1.0), "clearcoat": (1e-4, 1.0)}
+"""What is really rendered: a value beyond is moved to the nearest of these, where the adjoint is right.
+
+Measured (docs/controls/material.md): at a metallic of exactly 1 the adjoint has the wrong sign, at a clearcoat of
+exactly 0 it is 0, and towards a specular of 0 it grows without bound (the refractive index goes with the root).
+"""
+
+
+def _number(name: str, default: str, text: str, search: tuple[float, float]) -> Parameter:
+    return Parameter(name, (), "1", 0.0, 1.0, default, text, search=search, estimators=("adjoint", "differences"))
+
+
+def _tint(name: str) -> Parameter:
+    text = f"{name.capitalize()} of the tint that multiplies the colour; 1 leaves it."
+    return Parameter(name, (), "sRGB", 0.0, 1.0, 1.0, text, search=(0.3, 1.0), estimators=("adjoint", "differences"))
+
+
+class MaterialControl(NumberControl):
+    """The object's gloss, metal, coat and tint, and which named material covers it."""
+
+    kind: ClassVar[str] = "material"
+    summary: ClassVar[str] = "The object's gloss, metal, coat and tint, and which named material covers it."
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter(
+            "which",
+            (),
+            "name",
+            0.0,
+            float(len(PATTERNS)),
+            OWN,
+            "The object's own surface, or a named material in its place.",
+            differentiable=False,
+            options=(OWN, *PATTERNS),
+        ),
+        _number("roughness", "the material's own", "0 is polished, 1 is matt.", (0.1, 1.0)),
+        _number("metallic", "the material's own", "0 is paint, wood or glaze, 1 is bare metal.", (0.0, 1.0)),
+        _number("specular", "the material's own", "Strength of the reflection off what is not metal.", (0.0, 1.0)),
+        _number("clearcoat", "the material's own", "Strength of a clear coat on top.", (0.0, 1.0)),
+        *(_tint(name) for name in TINT),
+    )
+
+    def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
+        if parameter.name in NUMBERS:
+            return float(getattr(self._own(scene, self._fixed()), parameter.name))
+        return parameter.default
+
+    def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
+        given = self.setting(parameter) in scene.given
+        return scene.number(self.setting(parameter)) if given else self.default(scene, parameter)
+
+    def refines(self, scene: SceneDescription) -> frozenset[str]:
+        return frozenset({BASE_COLOR}) if self._colours() else frozenset()
+
+    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        which = (OWN, *PATTERNS)[int(values["which"])]
+        own = self._own(scene, which)
+        inputs: dict[str, Tensor] = {}
+        for name in NUMBERS:
+            if self._varies(name):
+                inputs[f"object.{name}"] = _rendered(name, values[name]).reshape(1)
+            elif self._names_a_material():
+                inputs[f"object.{name}"] = torch.tensor([float(getattr(own, name))])
+        if self._colours():
+            tint = torch.stack([values[name] for name in TINT])
+            inputs[BASE_COLOR] = srgb_to_linear(tint) * self._reflectance(scene, which, so_far)
+        return inputs
+
+    def kept_pictures(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        if not self._colours():
+            return {}
+        return {self.name: linear_to_srgb(self.scene_inputs(scene, values, so_far)[BASE_COLOR])}
+
+    # ---- inside -----------------------------------------------------------------------------------------------------
+
+    def _varies(self, name: str) -> bool:
+        """Whether a parameter was set or is searched; otherwise it is the named material's own."""
+        return name in self.specs or not self.asked
+
+    def _fixed(self) -> str:
+        """The material that the numbers start from: the fixed or first one of `which`."""
+        spec = self.specs.get("which")
+        if isinstance(spec, Fixed):
+            return str(spec.value)
+        if isinstance(spec, Choices) and OWN not in spec.values:
+            return str(spec.values[0])
+        return OWN
+
+    def _names_a_material(self) -> bool:
+        """Whether anything but the object's own surface can be chosen."""
+        spec = self.specs.get("which")
+        names = spec.values if isinstance(spec, Choices) else (spec.value,) if isinstance(spec, Fixed) else (OWN,)
+        return names != (OWN,)
+
+    def _colours(self) -> bool:
+        return self._names_a_material() or any(self._varies(name) for name in TINT)
+
+    @staticmethod
+    def _own(scene: SceneDescription, which: str) -> Material:
+        return scene.material if which == OWN else PATTERNS[which].material
+
+    @staticmethod
+    def _reflectance(scene: SceneDescription, which: str, so_far: Mapping[str, Tensor]) -> Tensor:
+        """Linear reflectance (h, w, 3) before the tint: what the controls before made of the texture, or a pattern."""
+        if which == OWN:
+            before = so_far.get(BASE_COLOR)
+            return srgb_to_linear(torch.from_numpy(scene.object.base_color.copy())) if before is None else before
+        return _linear_covering(scene.object.mesh, which)
+
+
+def _rendered(name: str, value: Tensor) -> Tensor:
+    """Move a value into the range that is rendered; the derivative passes as if it had not been moved."""
+    low, high = RENDERED.get(name, (0.0, 1.0))
+    return value + (value.clamp(low, high) - value).detach()
+
+
+@lru_cache(maxsize=len(PATTERNS))
+def _linear_covering(mesh: Mesh, which: str) -> Tensor:
+    return srgb_to_linear(torch.from_numpy(covering(mesh, which)))

@@ -1,0 +1,375 @@
+"""The `occlusion` control: a second object between the camera and the object, hiding a wanted share of it.
+
+The occluder comes in from one side of the picture and stops where it hides as much as was asked for. It moves on a
+sphere around the camera and keeps its side towards it, so its distance and its size in the picture stay the same:
+
+    place = camera + distance * turned(line of sight, direction, angle),    hidden(angle) = coverage
+
+`angle` is found by bisection on rasterised silhouettes (`scene.silhouettes`). How much a classifier loses to an
+occluder at a known share is a standard question of robustness (3DB, Leclerc et al. 2021, arXiv 2106.03805, section 4).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from advsearch.controls.base import Choice, Parameter, Value
+from advsearch.controls.numbers import NumberControl, Values
+from advsearch.controls.occlusion.occluders import MADE, loaded, made
+from advsearch.controls.values import Choices, Fixed
+from advsearch.errors import InputError
+from advsearch.scene.assets import ObjectAsset
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.parts import MeshPart
+from advsearch.scene.silhouettes import Frame, Silhouette, Sweep, angle_outside, middle_axes, silhouette
+
+Doubles = npt.NDArray[np.float64]
+
+BUNDLED = ("book", "bottle", "vase", "chair", "banana", "hammer")
+OPTIONS = (*MADE, *BUNDLED)
+MOVING = ("secant", "differences", "forward", "simultaneous")
+EASE = 0.02
+"""Below this coverage the occluder slides in from outside the frame, so that the picture changes without a jump."""
+CLEARANCE = 0.05
+"""Smallest distance in object sizes between the camera and the occluder."""
+PARKED = 1e-3
+"""Size of an occluder that is put away, behind the camera."""
+SURROUNDINGS = ("camera.to_world", "camera.fov", "camera.shift", "object.to_world", "object.offsets")
+"""Inputs of other controls that an occluder goes by."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Where an occluder goes, in the camera's coordinates.
+
+    Attributes:
+        axes: (3, 3) rows: right, up and forward of a camera that looks at the middle of what is seen of the object.
+        angle: from that middle to the occluder, radians.
+        size: in object sizes, made smaller where it would not fit.
+        distance: from the camera, in object sizes, changed where it would not fit.
+        hidden: share of the object's picture area that is hidden.
+        away: it is put away, out of sight.
+    """
+
+    axes: Doubles
+    angle: float
+    size: float
+    distance: float
+    hidden: float
+    away: bool
+
+
+class OcclusionControl(NumberControl):
+    """A second object between the camera and the object."""
+
+    kind: ClassVar[str] = "occlusion"
+    amount: ClassVar[str | None] = "coverage"
+    summary: ClassVar[str] = "A second object between the camera and the object, hiding a wanted share of it."
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter(
+            "which",
+            (),
+            "name",
+            0.0,
+            len(OPTIONS) - 1.0,
+            "card",
+            "What it is: a piece of cardboard, a grey sphere, or a bundled object.",
+            differentiable=False,
+            moves_silhouettes=True,
+            options=OPTIONS,
+        ),
+        Parameter(
+            "coverage",
+            (),
+            "1",
+            0.0,
+            0.9,
+            0.0,
+            "Share of the object's picture area that it hides; at 0 it is out of the frame.",
+            moves_silhouettes=True,
+            search=(0.0, 0.5),
+            estimators=MOVING,
+        ),
+        Parameter(
+            "direction",
+            (),
+            "degrees",
+            -3600.0,
+            3600.0,
+            0.0,
+            "Side of the picture it comes in from: 0 is the right, 90 the top, counter-clockwise.",
+            periodic=True,
+            moves_silhouettes=True,
+            search=(0.0, 360.0),
+            estimators=MOVING,
+        ),
+        Parameter(
+            "size",
+            (),
+            "object sizes",
+            0.05,
+            5.0,
+            0.6,
+            "Its largest extent.",
+            moves_silhouettes=True,
+            search=(0.3, 1.0),
+            log=True,
+            estimators=MOVING,
+        ),
+        Parameter(
+            "distance",
+            (),
+            "1",
+            0.1,
+            0.9,
+            0.5,
+            "Where between the camera and the object's middle: 0 is the camera, 1 the middle.",
+            moves_silhouettes=True,
+            search=(0.3, 0.7),
+            estimators=MOVING,
+        ),
+        Parameter(
+            "turn",
+            (),
+            "degrees",
+            -3600.0,
+            3600.0,
+            0.0,
+            "Rotation of the occluder about its own upright axis.",
+            periodic=True,
+            moves_silhouettes=True,
+            estimators=MOVING,
+        ),
+    )
+    choices: ClassVar[tuple[Choice, ...]] = (
+        Choice("object", None, "Another occluder in place of `which`: any bundled object, or a path to a mesh file."),
+    )
+
+    def check_choices(self) -> None:
+        given = self.chosen["object"]
+        if given is None:
+            return
+        if not isinstance(given, (str, Path)) or not str(given).strip():
+            raise InputError(
+                f"{self.name}.object: expected the name of a bundled object or a path to a mesh file, got {given!r}"
+            )
+        if "which" in self._given:
+            raise InputError(f"{self.name}: object and which both say what the occluder is; leave one of them out")
+        self._given["object"] = self.chosen["object"] = str(given)
+
+    def prepare(self, scene: SceneDescription) -> SceneDescription:
+        away = _put_away(torch.from_numpy(camera_to_world(scene))).numpy()
+        for option in self._candidates():
+            asset = self._asset(option)
+            part = MeshPart(self._part(option), asset.mesh, away, asset.base_color, asset.material)
+            scene = scene.with_part(part)
+        return scene
+
+    def refines(self, scene: SceneDescription) -> frozenset[str]:
+        """Nothing is changed; but it has to come after whatever moves the camera or the object."""
+        return frozenset(SURROUNDINGS)
+
+    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        chosen = self._option(values)
+        camera = so_far.get("camera.to_world", torch.from_numpy(camera_to_world(scene)).float())
+        inputs = {f"{self._part(one)}.to_world": _put_away(camera) for one in self._candidates()}
+        placed = self.placement(scene, values, so_far)
+        if not placed.away:
+            inputs[f"{self._part(chosen)}.to_world"] = _matrix(camera, placed, values)
+        return inputs
+
+    def measured(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
+        """What is hidden of the object, and what became of the size and the distance that were asked for."""
+        placed = self.placement(scene, values, so_far)
+        hidden: dict[str, Value] = {"hidden": {"value": placed.hidden, "unit": "1"}}
+        if placed.away:
+            return hidden
+        return {
+            **hidden,
+            "true_size": {"value": placed.size, "unit": "object sizes"},
+            "true_distance": {"value": placed.distance, "unit": "object sizes"},
+        }
+
+    # ---- inside -----------------------------------------------------------------------------------------------------
+
+    def _candidates(self) -> tuple[str, ...]:
+        """Every occluder that can be chosen; each is a part of the scene."""
+        if self.chosen["object"] is not None:
+            return (str(self.chosen["object"]),)
+        spec = self.specs.get("which")
+        names = spec.values if isinstance(spec, Choices) else (spec.value if isinstance(spec, Fixed) else MADE[0],)
+        return tuple(dict.fromkeys(str(name) for name in names))
+
+    def _option(self, values: Values) -> str:
+        return self._candidates()[0] if self.chosen["object"] is not None else OPTIONS[int(values["which"])]
+
+    def _part(self, option: str) -> str:
+        """The name of an occluder's part: the instance's, with the option where there are several."""
+        return self.name if len(self._candidates()) == 1 else f"{self.name}-{option}"
+
+    def _asset(self, option: str) -> ObjectAsset:
+        return made(option) if option in MADE else loaded(option)
+
+    def placement(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> Placement:
+        """Work out where the occluder goes; without derivatives.
+
+        Args:
+            scene: the scene.
+            values: the configuration.
+            so_far: where other controls put the camera and the object.
+        """
+        asked = {name: float(value.detach()) for name, value in values.items()}
+        seen = _Seen.of(scene, so_far)
+        mesh = self._asset(self._option(values)).mesh
+        if seen.directions is None or asked["coverage"] <= 0.0:
+            return Placement(np.eye(3), 0.0, asked["size"], asked["distance"] * seen.far, 0.0, True)
+        points = mesh.vertices.astype(np.float64) @ _about_upright(asked["turn"]).T
+        size, distance = _fitting(points, asked["size"], asked["distance"] * seen.far, seen.near)
+        cover = silhouette(_ahead(points, size, distance), mesh.faces)
+        if cover is None:
+            return Placement(np.eye(3), 0.0, size, distance, 0.0, True)
+        return _solved(seen, cover, asked, size, distance)
+
+
+# ---- what the camera sees -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """The object as the camera sees it.
+
+    Attributes:
+        directions: (N, 3) in which it is seen, or None if it is not in the frame.
+        frame: what the picture shows.
+        near: distance of its nearest vertex from the camera.
+        far: distance of the middle of its bounding box.
+    """
+
+    directions: Doubles | None
+    frame: Frame
+    near: float
+    far: float
+
+    @staticmethod
+    def of(scene: SceneDescription, so_far: Mapping[str, Tensor]) -> _Seen:
+        camera = _numpy(so_far, "camera.to_world", camera_to_world(scene))
+        pose = _numpy(so_far, "object.to_world", object_to_world(scene))
+        fov = float(_numpy(so_far, "camera.fov", np.array([scene.number("camera.fov")]))[0])
+        shift = _numpy(so_far, "camera.shift", np.zeros(2))
+        mesh = scene.object.mesh
+        vertices = mesh.vertices.astype(np.float64) + _numpy(so_far, "object.offsets", np.zeros(3))
+        world = vertices @ pose[:3, :3].T + pose[:3, 3]
+        points = _from_camera(world, camera)
+        frame = Frame.of(fov, shift=(float(shift[0]), float(shift[1])))
+        found = silhouette(points, mesh.faces, frame)
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
+        return _Seen(
+            None if found is None else found.directions(),
+            frame,
+            float(np.linalg.norm(points, axis=1).min()),
+            float(np.linalg.norm(middle)),
+        )
+
+
+def _numpy(inputs: Mapping[str, Tensor], name: str, otherwise: Doubles) -> Doubles:
+    return inputs[name].detach().double().numpy() if name in inputs else otherwise
+
+
+def _from_camera(world: Doubles, camera: Doubles) -> Doubles:
+    """World points (N, 3) in camera coordinates: right, up, forward. A sensor's own x axis points to the left."""
+    return np.asarray((world - camera[:3, 3]) @ camera[:3, :3] * (-1.0, 1.0, 1.0))
+
+
+# ---- where the occluder goes ----------------------------------------------------------------------------------------
+
+
+def _solved(seen: _Seen, cover: Silhouette, asked: Mapping[str, float], size: float, distance: float) -> Placement:
+    """Find the angle at which the wanted share is hidden."""
+    assert seen.directions is not None
+    axes = middle_axes(seen.directions)
+    sweep = Sweep(seen.directions, cover, axes, asked["direction"])
+    outside = angle_outside(seen.frame, cover, axes, asked["direction"])
+    angle = sweep.solve(max(asked["coverage"], EASE), outside)
+    if asked["coverage"] < EASE:
+        angle = outside + (angle - outside) * asked["coverage"] / EASE
+    hidden = float(sweep.coverage(np.array([angle]))[0])
+    return Placement(axes, angle, size, distance, hidden, False)
+
+
+def _ahead(points: Doubles, size: float, distance: float) -> Doubles:
+    """Mesh points in camera coordinates when the occluder is straight ahead: its x axis points to the camera."""
+    return np.stack([points[:, 1] * size, points[:, 2] * size, distance - points[:, 0] * size], axis=1)
+
+
+def _fitting(points: Doubles, size: float, distance: float, near: float) -> tuple[float, float]:
+    """Return a size and a distance close to those asked for with which the occluder is between camera and object.
+
+    It keeps `CLEARANCE` from the camera, and no vertex is farther from the camera than the object's nearest one. Where
+    its size leaves no such place, it is made smaller.
+
+    Args:
+        points: (V, 3) of the occluder, one object size large around the origin.
+        size: asked for.
+        distance: asked for.
+        near: distance of the object's nearest vertex.
+    """
+    front, back = float(points[:, 0].max()), float(-points[:, 0].min())
+    aside = float(np.hypot(points[:, 1], points[:, 2]).max())
+    near = max(near, 3.0 * CLEARANCE)
+    for _ in range(200):
+        nearest = CLEARANCE + size * front
+        reach = near * near - (size * aside) ** 2
+        farthest = math.sqrt(reach) - size * back if reach > 0.0 else 0.0
+        if farthest >= nearest:
+            break
+        size *= 0.95
+    return size, min(max(distance, nearest), farthest)
+
+
+def _about_upright(degrees: float) -> Doubles:
+    sine, cosine = math.sin(math.radians(degrees)), math.cos(math.radians(degrees))
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _matrix(camera: Tensor, placed: Placement, values: Values) -> Tensor:
+    """The occluder's pose (4, 4).
+
+    Differentiable in the camera, the direction and the turn at the angle that was found; nothing else has a derivative
+    here, which is why the control is differentiated by differences.
+    """
+    right, up, forward = torch.from_numpy(placed.axes).to(camera)
+    direction = torch.deg2rad(values["direction"])
+    along = torch.cos(direction) * right + torch.sin(direction) * up
+    across = -torch.sin(direction) * right + torch.cos(direction) * up
+    sine, cosine = math.sin(placed.angle), math.cos(placed.angle)
+    ahead = cosine * forward + sine * along
+    along = cosine * along - sine * forward
+    right = torch.cos(direction) * along - torch.sin(direction) * across
+    up = torch.sin(direction) * along + torch.cos(direction) * across
+    turn = torch.deg2rad(values["turn"])
+    x = -torch.cos(turn) * ahead + torch.sin(turn) * right
+    y = torch.sin(turn) * ahead + torch.cos(turn) * right
+    to_world = camera[:3, :3] * torch.tensor([-1.0, 1.0, 1.0]).to(camera)
+    linear = placed.size * to_world @ torch.stack([x, y, up], dim=1)
+    place = camera[:3, 3] + placed.distance * (to_world @ ahead)
+    return _affine(linear, place)
+
+
+def _put_away(camera: Tensor) -> Tensor:
+    """A pose (4, 4) behind the camera, very small."""
+    return _affine(PARKED * torch.eye(3).to(camera), camera[:3, 3] - camera[:3, 2])
+
+
+def _affine(linear: Tensor, place: Tensor) -> Tensor:
+    top = torch.cat([linear, place[:, None]], dim=1)
+    return torch.cat([top, torch.tensor([[0.0, 0.0, 0.0, 1.0]]).to(linear)])

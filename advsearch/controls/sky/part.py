@@ -1,0 +1,184 @@
+"""A clear sky with a sun as an environment map, in torch: a differentiable function of where the sun stands.
+
+The sky dome is Hosek and Wilkie's (2012, An Analytic Model for Full Spectral Sky-Dome Radiance, equation 8), the sun
+theirs of 2013 (Adding a Solar Radiance Function to the Hosek Skylight Model), with the RGB coefficients that Mitsuba
+ships for its `sunsky` plugin. The plugin itself is not used: Mitsuba's samples of an emitter do not carry derivatives,
+so a moving sun has a wrong one, while a map under `environment.data` has a right one and does all that other
+environments do. What differs from the plugin: the sun is wider (`SUN_RADIUS`) with the same irradiance, so that a map
+can hold it; negative radiance is cut off; and below the horizon there is an infinite diffuse ground, not blackness.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch.scene.mitsuba_backend.variant import mitsuba
+
+ROWS, COLUMNS = 256, 512
+"""Size of the map."""
+SUN_RADIUS = math.radians(1.5)
+"""Radius of the sun in the map, radians; half of its light comes from within 0.7 degrees."""
+SUN_APERTURE = math.radians(0.5358 / 2.0)
+"""Radius of the real sun, radians: the one that the coefficients are made for."""
+SUN_OVER_SKY = 467.069280386
+"""Factor from the unit of the sun's coefficients to that of the sky's, as in Mitsuba's plugin."""
+TURBIDITIES = (1.0, 10.0)
+"""What the coefficients cover."""
+NEARLY_NOTHING = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Coefficients:
+    """What the two models interpolate.
+
+    Attributes:
+        shape: (10 turbidities, 2 ground albedos, 6 control points, 3 channels, 9) shape of the dome.
+        level: (10, 2, 6, 3) its mean radiance.
+        sun: (10, 45 pieces, 3 channels, 4 powers of the elevation, 6 powers of the cosine at the limb) its radiance.
+    """
+
+    shape: Tensor
+    level: Tensor
+    sun: Tensor
+
+
+@cache
+def coefficients() -> Coefficients:
+    """Read Mitsuba's tables; once per process."""
+    mi: Any = mitsuba()
+    path = Path(mi.__file__).parent / "data" / "sunsky" / "sunsky_datasets.bin"
+    with contextlib.redirect_stdout(io.StringIO()):  # the reader prints what it loads
+        tables = mi.tensor_io.read(str(path))
+    shape, level, sun = (
+        torch.from_numpy(tables[name]).float() for name in ("sky_params_rgb", "sky_rad_rgb", "sun_rad_rgb")
+    )
+    return Coefficients(shape, level, sun)
+
+
+def direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
+    """Return the unit vector (3,) towards an azimuth and an elevation () in degrees; z is up, azimuth 0 is +x."""
+    phi, theta = torch.deg2rad(azimuth), torch.deg2rad(elevation)
+    return torch.stack([torch.cos(theta) * torch.cos(phi), torch.cos(theta) * torch.sin(phi), torch.sin(theta)])
+
+
+def _at_turbidity(table: Tensor, turbidity: Tensor) -> Tensor:
+    """Interpolate a table (10, ...) between whole turbidities by cubics with a continuous derivative.
+
+    The slope at a whole turbidity is that between its neighbours (Catmull and Rom 1974), one-sided at the ends. The
+    authors interpolate linearly, so that the derivative jumps at whole turbidities, the default of 3 among them.
+    """
+    below = min(8, max(0, int(turbidity.detach()) - 1))
+    t = turbidity - 1.0 - below
+    first, second = table[below], table[below + 1]
+    slopes = [
+        (table[min(9, k + 1)] - table[max(0, k - 1)]) / (min(9, k + 1) - max(0, k - 1)) for k in (below, below + 1)
+    ]
+    straight = torch.lerp(first, second, t)
+    rise = second - first
+    return straight + t * (1.0 - t) * ((1.0 - t) * (slopes[0] - rise) - t * (slopes[1] - rise))
+
+
+def sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
+    """Return the sun's irradiance (3,) on a surface that faces it, in the unit of the sky's radiance times steradian.
+
+    A piece of the model is a cubic in the elevation above the piece's beginning. A term `cos(psi)^j` of the limb's
+    darkening has the mean `2 / (j + 2)` over the disk.
+    """
+    radians = torch.deg2rad(elevation)
+    share = float(radians.detach()) / (math.pi / 2.0)
+    piece = min(44, int(45.0 * max(0.0, share) ** (1.0 / 3.0)))
+    above = radians - (math.pi / 2.0) * (piece / 45.0) ** 3
+    terms = _at_turbidity(coefficients().sun, turbidity)[piece]
+    limb = torch.tensor([2.0 / (power + 2.0) for power in range(6)])
+    powers = torch.stack([above**power for power in range(4)])
+    solid_angle = 2.0 * math.pi * (1.0 - math.cos(SUN_APERTURE))
+    return (torch.einsum("ckj,k,j->c", terms, powers, limb) * solid_angle * SUN_OVER_SKY).clamp_min(0.0)
+
+
+class Sky:
+    """Sky maps over one ground.
+
+    Args:
+        ground: (3,) linear reflectance of the ground, in [0, 1].
+    """
+
+    def __init__(self, ground: Tensor) -> None:
+        self.ground = ground
+        upper = ROWS // 2
+        elevation = 90.0 - 180.0 * torch.arange(upper) / (ROWS - 1)
+        azimuth = 90.0 - 360.0 * (torch.arange(COLUMNS) + 0.5) / COLUMNS
+        rows, columns = torch.meshgrid(elevation, azimuth, indexing="ij")
+        self.directions = direction(rows * 0.0 + columns, rows).permute(1, 2, 0).contiguous()
+        self.cosines = self.directions[..., 2:3].clamp_min(0.0)
+        texel = (math.pi / (ROWS - 1)) * (2.0 * math.pi / COLUMNS)
+        self.solid_angles = torch.cos(torch.deg2rad(rows))[..., None] * texel
+
+    def dome(self, sun: Tensor, elevation: Tensor, turbidity: Tensor) -> Tensor:
+        """Return the radiance (ROWS / 2, COLUMNS, 3) of the sky above the horizon without the sun's disk.
+
+        Args:
+            sun: (3,) unit vector towards it.
+            elevation: () of the sun, degrees, over 0.
+            turbidity: () in `TURBIDITIES`.
+        """
+        a, b, c, d, e, f, g, i, h = self._interpolated(coefficients().shape, elevation, turbidity).unbind(-1)
+        level = self._interpolated(coefficients().level, elevation, turbidity)
+        cosine = (self.directions @ sun)[..., None]
+        angle = angle_between(self.directions, sun)[..., None]
+        horizon = 1.0 + a * torch.exp(b / (self.cosines + 0.01))
+        glow = (1.0 + cosine**2) / (1.0 + h**2 - 2.0 * h * cosine).clamp_min(1e-6).pow(1.5)
+        rest = c + d * torch.exp(e * angle) + f * cosine**2 + g * glow + i * self.cosines.sqrt()
+        return (horizon * rest * level).clamp_min(0.0)
+
+    def _interpolated(self, table: Tensor, elevation: Tensor, turbidity: Tensor) -> Tensor:
+        """Interpolate a table (10, 2, 6, 3, ...): quintic Bezier in the elevation's cube root, linear in the others."""
+        x = (elevation / 90.0).clamp(1e-6, 1.0).pow(1.0 / 3.0)
+        weights = torch.stack([math.comb(5, k) * x**k * (1.0 - x) ** (5 - k) for k in range(6)])
+        curves = torch.einsum("k,akc...->ac...", weights, _at_turbidity(table, turbidity))
+        albedo = self.ground.reshape(3, *[1] * (curves.ndim - 2))
+        return torch.lerp(curves[0], curves[1], albedo)
+
+    def disk(self, sun: Tensor) -> Tensor:
+        """Return the sun's shape (ROWS / 2, COLUMNS, 1): a smooth bump whose integral over solid angle is 1.
+
+        `(1 - r^2)^2` inside the radius: its derivative vanishes where it does, so that an adjoint that samples by
+        radiance sees its whole motion.
+        """
+        distance = (self.directions - sun).square().sum(-1, keepdim=True) / SUN_RADIUS**2
+        bump = (1.0 - distance).clamp_min(0.0).square()
+        return bump / (bump * self.solid_angles).sum().clamp_min(NEARLY_NOTHING)
+
+    def __call__(self, azimuth: Tensor, elevation: Tensor, turbidity: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the map (ROWS, COLUMNS, 3) of linear radiance and its metered irradiance ().
+
+        Args:
+            azimuth: () of the sun, degrees.
+            elevation: () of the sun, degrees, over 0 and at most 90.
+            turbidity: () in `TURBIDITIES`.
+
+        Returns:
+            The map, and the mean channel of the irradiance on a surface that faces the sun.
+        """
+        sun = direction(azimuth, elevation)
+        upper = self.dome(sun, elevation, turbidity) + self.disk(sun) * sun_irradiance(elevation, turbidity)
+        arriving = upper * self.solid_angles
+        on_ground = (arriving * self.cosines).sum((0, 1))
+        lower = (self.ground * on_ground / math.pi).expand(ROWS - ROWS // 2, COLUMNS, 3)
+        facing = (self.directions @ sun).clamp_min(0.0)[..., None]
+        return torch.cat([upper, lower]), (arriving * facing).sum() / 3.0
+
+
+def angle_between(directions: Tensor, towards: Tensor) -> Tensor:
+    """Return the angle (...) in radians between unit vectors (..., 3) and (3,); differentiable at 0 and 180 degrees."""
+    half_sine = ((directions - towards).square().sum(-1) / 4.0 + NEARLY_NOTHING).sqrt()
+    half_cosine = ((directions + towards).square().sum(-1) / 4.0 + NEARLY_NOTHING).sqrt()
+    return 2.0 * torch.atan2(half_sine, half_cosine)

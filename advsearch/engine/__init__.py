@@ -1,0 +1,1 @@
+"""What every question is answered with: problems, stages, replay, sweeps, plans and domains."""

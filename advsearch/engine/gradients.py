@@ -1,0 +1,353 @@
+"""Measures gradient estimators on a scene as it is: error, noise and cost, against differences (DESIGN section 5).
+
+A *probe* is a direction in u along which a derivative is measured: one coordinate, or, for a group of many (texels,
+modes), one direction in all of them. The reference is a central difference of the loss with common random numbers, at
+two step sizes, repeated with other seeds until its own noise is known and small.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.scene.gradients.plan import STEP_RANGE, GradientPlan, GroupPlan
+from advsearch.scene.renderer import Renderer
+
+Loss = Callable[[Tensor], Tensor]
+"""From a picture (H, W, 3) sRGB to a number, by differentiable torch operations."""
+
+SMALL = 0.1
+"""See `scale_of`."""
+COORDINATEWISE = 8
+"""Groups of at most this many coordinates are probed one by one."""
+TOLERANCE = 0.05
+"""Relative error that the mean of an estimator may have beyond the noise."""
+LOUD = 0.2
+"""Noise of one gradient, relative to its size, from which it is called noisy."""
+CONFIDENCE = 2.5
+"""Standard errors within which two means agree."""
+TURNED = 0.0317
+"""Share of a full turn by which periodic coordinates are off their start where gradients are measured."""
+EXPENSIVE = frozenset({"guided", "boundary"})
+"""Estimators that are measured only when asked for."""
+FACTORS = (1.0, 3.0, 9.0, 1.0 / 3.0)
+"""Steps of differences that are tried in turn, as multiples of the plan's. A step that moves an outline by a pixel is
+as wide as a classifier's loss allows; a smooth loss allows more, and noise falls with the step. What moves no outline
+has a share of its range for a step, which may be too wide."""
+
+
+@dataclass(frozen=True, eq=False)
+class Probe:
+    """A direction along which a derivative is measured.
+
+    Attributes:
+        group: the group of coordinates.
+        name: `control.parameter`, with the coordinate's number if the group has several and they are probed singly.
+        direction: (d,) largest element 1; zero outside the group.
+        step: half-width of a difference along the direction.
+    """
+
+    group: GroupPlan
+    name: str
+    direction: Tensor
+    step: float
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A derivative by high-sample central differences.
+
+    Attributes:
+        value: mean over seeds, extrapolated from the two steps to a step of zero (Richardson).
+        noise: its standard error together with a quarter of the steps' disagreement.
+        steps: value at the larger and at the smaller step.
+        factor: the larger step as a multiple of the probe's.
+        renders: primal renders spent.
+    """
+
+    value: float
+    noise: float
+    steps: tuple[float, float]
+    renders: int
+    factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What one estimator says along a probe.
+
+    Attributes:
+        estimator: its name.
+        value: mean over seeds.
+        noise: standard deviation of one estimate.
+        repeats: how many there were.
+        seconds: median time of one gradient of the group.
+        factor: step of its differences as a multiple of the plan's.
+    """
+
+    estimator: str
+    value: float
+    noise: float
+    repeats: int
+    seconds: float
+    factor: float = 1.0
+
+    @property
+    def standard_error(self) -> float:
+        """Of the mean."""
+        return self.noise / math.sqrt(max(1, self.repeats))
+
+
+def smooth_loss(resolution: tuple[int, int], seed: int = 0) -> Loss:
+    """Return a linear loss with smooth weights: a sum of a few waves of the picture's size, other in each channel.
+
+    They fall to zero at the picture's edge (a Hann window). With a hard edge the loss would be as rough as whatever
+    moves across it, a photographed interior above all, and its differences would depend on the step.
+    """
+    generator = torch.Generator().manual_seed(seeds.stream(seed, "smooth loss"))
+    height, width = resolution
+    rows = torch.linspace(-1.0, 1.0, height)[:, None, None]
+    columns = torch.linspace(-1.0, 1.0, width)[None, :, None]
+    weights = torch.zeros(height, width, 3)
+    for _ in range(6):
+        across, down, phase, size = (torch.rand(3, generator=generator) * 2.0 - 1.0 for _ in range(4))
+        weights += size * torch.cos(math.pi * (1.2 * across * columns + 1.2 * down * rows + phase))
+    window = torch.cos(0.5 * math.pi * rows).square() * torch.cos(0.5 * math.pi * columns).square()
+    weights *= window / (height * width)
+
+    def loss(image: Tensor) -> Tensor:
+        return (image * weights).sum()
+
+    return loss
+
+
+def inside(renderer: Renderer, share: float = 0.12) -> Tensor:
+    """Return a point to measure at: the start, but continuous coordinates with a range at least `share` off its ends.
+
+    Periodic ones are turned a little: starts are often symmetric. Groups with a norm ball stay at their start, and so
+    do discrete choices.
+    """
+    u = renderer.start.clone()
+    for group in renderer.plan.groups:
+        if group.valid and group.size <= 64 and not group.periodic:
+            u[group.coordinates] = u[group.coordinates].clamp(share, 1.0 - share)
+        if group.periodic:
+            u[group.coordinates] = (u[group.coordinates] + TURNED).remainder(1.0)
+    return u
+
+
+def probes(renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int) -> list[Probe]:
+    """Return what is worth measuring in a renderer's space: every continuous coordinate, or a direction in many."""
+    found = []
+    for group in renderer.plan.groups:
+        if group.estimator == "none":
+            continue
+        if group.size <= COORDINATEWISE:
+            for number in range(group.size):
+                direction = torch.zeros_like(u)
+                direction[group.begin + number] = 1.0
+                name = group.name if group.size == 1 else f"{group.name}.{number}"
+                found.append(Probe(group, name, direction, group.step))
+        else:
+            found.append(_steep_probe(renderer, loss, u, group, seed, spp))
+    return found
+
+
+def _steep_probe(renderer: Renderer, loss: Loss, u: Tensor, group: GroupPlan, seed: int, spp: int) -> Probe:
+    """One direction in a large group: mostly the estimator's own gradient, so that there is something to see, and a
+    share of random signs, so that what the estimator leaves out shows too."""
+    gradient = estimated(renderer, loss, u, group.estimator, [group.name], seeds.stream(seed, "probe"), spp)
+    generator = torch.Generator().manual_seed(seeds.stream(seed, "probe signs"))
+    part = gradient[group.coordinates]
+    signs = torch.randint(0, 2, part.shape, generator=generator).to(part.dtype) * 2.0 - 1.0
+    direction = torch.zeros_like(u)
+    mixed = part.sign() + 0.5 * signs
+    direction[group.coordinates] = mixed / mixed.abs().max().clamp_min(1e-12)
+    step = group.step if group.size <= 64 else 0.03
+    return Probe(group, group.name, direction, step)
+
+
+def only(plan: GradientPlan, names: Collection[str], estimator: str) -> GradientPlan:
+    """Return the plan with the groups of these names differentiated by an estimator and the others not at all."""
+    groups = tuple(replace(one, estimator=estimator if one.name in names else "none") for one in plan.groups)
+    return replace(plan, groups=groups)
+
+
+def estimated(
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    estimator: str,
+    names: Collection[str],
+    seed: int,
+    spp: int,
+    factor: float = 1.0,
+) -> Tensor:
+    """Return one gradient (d,) of the groups of these names by one estimator, its differences `factor` times as wide
+    as planned; zero elsewhere."""
+    before = renderer.plan
+    renderer.plan = only(before.with_steps(factor), names, estimator)
+    try:
+        return renderer.gradient(loss, u, seed, spp)[1]
+    finally:
+        renderer.plan = before
+
+
+def estimates(
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    estimator: str,
+    along: Sequence[Probe],
+    *,
+    seed: int,
+    spp: int,
+    repeats: int = 6,
+    factor: float = 1.0,
+) -> list[Estimate]:
+    """Measure one estimator of one control's groups along some probes of them; `factor` as in `estimated`."""
+    values: list[list[float]] = [[] for _ in along]
+    seconds = []
+    names = {probe.group.name for probe in along}
+    for number in range(repeats):
+        begun = time.perf_counter()
+        noise = seeds.stream(seed, estimator if factor == 1.0 else f"{estimator} x {factor:g}", number)
+        gradient = estimated(renderer, loss, u, estimator, names, noise, spp, factor)
+        seconds.append(time.perf_counter() - begun)
+        for found, probe in zip(values, along, strict=True):
+            found.append(float(gradient @ probe.direction))
+    typical = statistics.median(seconds)
+    return [
+        Estimate(estimator, statistics.fmean(found), statistics.stdev(found), repeats, typical, factor)
+        for found in values
+    ]
+
+
+def reference(
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    probe: Probe,
+    *,
+    seed: int,
+    spp: int,
+    goal: float = 0.02,
+    repeats: tuple[int, int] = (3, 16),
+    factors: Sequence[float] = (1.0,),
+) -> Reference:
+    """Return the derivative along a probe by central differences at two steps, with its noise.
+
+    Seeds are added until the standard error is below `goal` of the value, between the two numbers of `repeats`. With
+    several `factors`, each gets the smaller number of seeds, both steps so many times wider, until one is sure enough;
+    if none is, the one with the least noise goes on.
+    """
+    before = renderer.renders
+    pairs = {factor: _Pairs(_widened(probe, factor)) for factor in factors}
+    for factor, tried in pairs.items():
+        tried.extend(renderer, loss, u, seed, spp, until=repeats[0])
+        if tried.error <= goal * abs(tried.value):
+            best = factor
+            break
+    else:
+        best = min(pairs, key=lambda factor: pairs[factor].noise)
+        while pairs[best].error > goal * abs(pairs[best].value) and len(pairs[best].wide) < repeats[1]:
+            pairs[best].extend(renderer, loss, u, seed, spp, until=len(pairs[best].wide) + 1)
+    found = pairs[best]
+    return Reference(found.value, found.noise, found.both, renderer.renders - before, best)
+
+
+def _widened(probe: Probe, factor: float) -> Probe:
+    return probe if factor == 1.0 else replace(probe, step=min(STEP_RANGE[1], factor * probe.step))
+
+
+@dataclass
+class _Pairs:
+    """Differences at a probe's step and at half of it, with the same seeds."""
+
+    probe: Probe
+    wide: list[float] = field(default_factory=list)
+    narrow: list[float] = field(default_factory=list)
+
+    def extend(self, renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int, *, until: int) -> None:
+        """Add seeds until there are so many."""
+        for number in range(len(self.wide), until):
+            noise = seeds.stream(seed, "reference", number)
+            self.wide.append(_difference(renderer, loss, u, self.probe, self.probe.step, noise, spp))
+            self.narrow.append(_difference(renderer, loss, u, self.probe, 0.5 * self.probe.step, noise, spp))
+
+    @property
+    def both(self) -> tuple[float, float]:
+        """Mean at the larger and at the smaller step."""
+        return statistics.fmean(self.wide), statistics.fmean(self.narrow)
+
+    @property
+    def _at_zero(self) -> list[float]:
+        """Extrapolated to a step of zero (Richardson)."""
+        return [(4.0 * fine - coarse) / 3.0 for coarse, fine in zip(self.wide, self.narrow, strict=True)]
+
+    @property
+    def value(self) -> float:
+        """Mean of the extrapolated ones."""
+        return statistics.fmean(self._at_zero)
+
+    @property
+    def error(self) -> float:
+        """Standard error of `value`."""
+        return _error(self._at_zero)
+
+    @property
+    def noise(self) -> float:
+        """Standard error together with a quarter of the steps' disagreement."""
+        wide, narrow = self.both
+        return math.hypot(self.error, 0.25 * (wide - narrow))
+
+
+def _error(values: Sequence[float]) -> float:
+    return statistics.stdev(values) / math.sqrt(len(values)) if len(values) > 1 else math.inf
+
+
+def _difference(renderer: Renderer, loss: Loss, u: Tensor, probe: Probe, step: float, seed: int, spp: int) -> float:
+    """The central difference along a probe, one-sided as far as the box asks for it."""
+    move = step * probe.direction
+    if probe.group.periodic:
+        above, below, width = (u + move).remainder(1.0), (u - move).remainder(1.0), 2.0 * step
+    else:
+        above, below = (u + move).clamp(0.0, 1.0), (u - move).clamp(0.0, 1.0)
+        width = 2.0 * step
+        if probe.group.size <= COORDINATEWISE:
+            width = float((above - below) @ probe.direction)
+    with torch.no_grad():
+        return (float(loss(renderer(above, seed, spp))) - float(loss(renderer(below, seed, spp)))) / width
+
+
+def scale_of(against: Reference, beside: Sequence[Reference]) -> float:
+    """Return what errors and noise of a derivative are measured by: its own size, or `SMALL` of the control's largest.
+
+    A derivative that happens to be near zero beside the others of its control has no size of its own to speak of.
+    """
+    return max(abs(against.value), SMALL * max(abs(one.value) for one in beside))
+
+
+def verdict(estimate: Estimate, against: Reference, size: float) -> tuple[str, float]:
+    """Return the status of an estimate, and its error relative to `size` (see `scale_of`).
+
+    - "reference unusable": the reference's own noise exceeds a fifth of the size, and covers the difference;
+    - "biased": the means differ by more than `TOLERANCE` of the reference beyond `CONFIDENCE` standard errors;
+    - "noisy": one gradient scatters by more than `LOUD` of the reference;
+    - "ok": none of these.
+    """
+    difference = abs(estimate.value - against.value)
+    error = difference / size if size > 0.0 else (0.0 if difference == 0.0 else math.inf)
+    doubt = CONFIDENCE * math.hypot(estimate.standard_error, against.noise)
+    if difference <= doubt and against.noise > LOUD * size:
+        return "reference unusable", error
+    if difference > TOLERANCE * size + doubt:
+        return "biased", error
+    return ("noisy" if estimate.noise > LOUD * size else "ok"), error

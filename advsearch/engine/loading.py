@@ -1,0 +1,176 @@
+"""A scene as a person uses it from Python: load it, and ask it for `render(u, seed, spp)`."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import final
+
+from advsearch.controls import Control, Space, gathered, make_control, make_space
+from advsearch.errors import InputError
+from advsearch.scene import settings
+from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
+from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.formation import ImageFormation
+from advsearch.scene.gradients.motion import Motion
+from advsearch.scene.leaving_out import EVERYTHING
+from advsearch.scene.mitsuba_backend.samplers import SAMPLER
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.renderer import Renderer
+
+Controls = str | Sequence[str | Control] | Mapping[str, Mapping[str, object]]
+"""One control or several, by name or instance; a mapping gives each name its settings."""
+
+DEFAULT_RESOLUTION = 128
+
+
+@final
+@dataclass(frozen=True, eq=False, repr=False)
+class Scene:
+    """An object under an environment, with some parameters fixed. Made by `load_scene`.
+
+    Attributes:
+        description: the scene as data.
+    """
+
+    description: SceneDescription
+
+    def renderer(
+        self,
+        controls: Controls,
+        *,
+        resolution: int | tuple[int, int] = DEFAULT_RESOLUTION,
+        denoise: str = "oidn",
+        seed: int = 0,
+        estimators: Mapping[str, str] | None = None,
+        sampler: str = SAMPLER,
+    ) -> Renderer:
+        """Return `render(u, seed, spp)` for the space of these controls.
+
+        Args:
+            controls: what u varies.
+            resolution: side, or (height, width), in pixels.
+            denoise: "oidn" or "none".
+            seed: root of the noise; the `seed` of each call counts on from it.
+            estimators: how derivatives are obtained, by "control.parameter", "control" or "*"; see `advsearch plan`.
+            sampler: "multijitter", or "independent", which has more noise; the first rounds sample counts up to
+                products of two near numbers.
+
+        Raises:
+            InputError: a control is unknown or impossible in this scene, or an argument is out of range.
+        """
+        description = framed(self.description, resolution)
+        space = make_space(as_controls(controls), description)
+        return make_renderer(description, space, resolution, denoise, seed, estimators, sampler=sampler)
+
+    def __repr__(self) -> str:
+        described = self.description
+        object, environment = described.object_spec, described.environment_spec
+        names = sorted(described.given & described.values.keys())
+        fixed = "".join(f", {name}={described.values[name]!r}" for name in names)
+        return f"Scene({object or described.object.name!r}, {environment or described.environment.name!r}{fixed})"
+
+    def with_settings(self, given: Mapping[str, float]) -> Scene:
+        """Return the scene with some of its parameters fixed to other values.
+
+        Raises:
+            InputError: a name is unknown or a value out of range.
+        """
+        settings.resolve(given)
+        own = self.description
+        return Scene(replace(own, values={**own.values, **given}, given=own.given | set(given)))
+
+
+def load_scene(
+    object: str | Path | ObjectAsset,
+    environment: str | Path | EnvironmentAsset | None = None,
+    *,
+    up: str | None = None,
+    settings: Mapping[str, float] | None = None,
+) -> Scene:
+    """Load a scene.
+
+    Args:
+        object: a bundled name ("mug"), a path to an .obj, .ply or .glb file, or an asset.
+        environment: a bundled name, a path to an .hdr or .exr file, an asset; default "studio".
+        up: the up axis of a mesh file, "y" or "z"; by default what its format or else its shape says.
+        settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a picture belongs to none of them
+            but to what makes it: `resolution` of `attack`, `sweep`, `render` and `Scene.renderer`.
+
+    Raises:
+        InputError: a name is unknown, a file cannot be used, or a value is out of range.
+    """
+    return Scene(describe(object, environment, given=settings, up=up))
+
+
+def framed(description: SceneDescription, resolution: int | tuple[int, int]) -> SceneDescription:
+    """Return the scene as it is seen in a picture of this size (side, or height and width)."""
+    height, width = (resolution, resolution) if isinstance(resolution, int) else resolution
+    return replace(description, aspect=width / height)
+
+
+def make_renderer(
+    description: SceneDescription,
+    space: Space,
+    resolution: int | tuple[int, int],
+    denoise: str,
+    seed: int,
+    estimators: Mapping[str, str] | None = None,
+    leave_out: Collection[str] = EVERYTHING,
+    sampler: str = SAMPLER,
+) -> Renderer:
+    """Put a described scene, with what the space's controls need in it, into Mitsuba at one size."""
+    size = (resolution, resolution) if isinstance(resolution, int) else resolution
+    description = space.scene or description
+    formation = ImageFormation(
+        denoiser=denoise,
+        sampler=sampler,
+        exposure=description.number("camera.exposure"),
+        resolution=size,
+        gain=description.gain,
+    )
+    scene = MitsubaScene(description, size, filter=formation.filter, leave_out=leave_out, sampler=sampler)
+    motion = Motion(description, size, scene.assembly)
+    return Renderer(scene, space, formation, seed, motion=motion, estimators=estimators)
+
+
+def settings_of(controls: Controls) -> dict[str, dict[str, object]]:
+    """Return settings by name, as a file holds them, for controls in whatever form they were given.
+
+    Of a control that was given by its name it is what was said about it; of an instance, all of it.
+
+    Raises:
+        InputError: not controls at all, or two of one name.
+    """
+    if isinstance(controls, Mapping):
+        return {name: dict(given or {}) for name, given in controls.items()}
+    several = [part.strip() for part in controls.split(",")] if isinstance(controls, str) else list(controls)
+    as_controls(several)
+    return {
+        one.name if isinstance(one, Control) else one: one.settings() if isinstance(one, Control) else {}
+        for one in several
+        if one
+    }
+
+
+def as_controls(controls: Controls) -> tuple[Control, ...]:
+    """Return control instances for whatever form they were given in.
+
+    Raises:
+        UnknownNameError: a name is not a control.
+        InputError: not controls at all.
+    """
+    if isinstance(controls, str):
+        controls = [part.strip() for part in controls.split(",") if part.strip()]
+    if not isinstance(controls, Mapping):
+        if not all(isinstance(one, (str, Control)) for one in controls):
+            raise InputError(f"controls: expected names or Control instances, got {controls!r}")
+        ready = tuple(one for one in controls if isinstance(one, Control))
+        if ready and len(ready) == len(controls):
+            return ready
+        names = [one for one in controls if isinstance(one, str)]
+        if len(set(names)) != len(names):
+            raise InputError(f"controls: every instance needs a name of its own, got {', '.join(names)}")
+        return ready + as_controls({one: {} for one in names})
+    return tuple(make_control(name, given) for name, given in gathered(controls).items())

@@ -1,0 +1,166 @@
+"""From what a configuration names to things, as every command that loads a scene and a model does it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+from advsearch import threads
+from advsearch.config import SceneConfig
+from advsearch.controls import CONTROLS, Control, names_of
+from advsearch.engine.loading import Controls, as_controls, settings_of
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.models import Model, ModelWarning, load_model
+
+
+def scene_settings(fixed: Mapping[str, Any] | None, exposure: float | None) -> dict[str, Any]:
+    """Return the parameters that a scene is loaded with: those of `set`, and the exposure.
+
+    Raises:
+        InputError: both say what the exposure is.
+    """
+    given = dict(fixed or {})
+    if exposure:
+        if "camera.exposure" in given:
+            raise InputError("`exposure` and `set` camera.exposure say the same thing; leave one of them out")
+        given["camera.exposure"] = exposure
+    return given
+
+
+RUN_SETTINGS = ("epsilon", "norm", "texture_resolution")
+"""Settings of a run that controls take; each control declares which (`Choice.run_setting`)."""
+
+
+def controls_of(
+    controls: Controls, config: SceneConfig, settings: Collection[str] = RUN_SETTINGS
+) -> tuple[Control, ...]:
+    """Return control instances, with the run's settings where they take them and say nothing else themselves.
+
+    Args:
+        controls: in any form; instances stay as they are.
+        config: of the run.
+        settings: those of the run's settings that count.
+
+    Raises:
+        InputError: an instance takes a setting that the run has.
+    """
+    if not isinstance(controls, (str, Mapping)):
+        for one in (one for one in controls if isinstance(one, Control)):
+            for choice in one.choices:
+                if choice.run_setting in settings and getattr(config, choice.run_setting, None) is not None:
+                    raise InputError(
+                        f"{choice.run_setting}: control {one.name} is an instance already; give it its own, as in "
+                        f"{type(one).__name__}({choice.name}=...)"
+                    )
+        if all(isinstance(one, Control) for one in controls):
+            return as_controls(controls)
+    named = settings_of(controls)
+    return as_controls({name: {**_from_run(name, given, config, settings), **given} for name, given in named.items()})
+
+
+def _from_run(asked: str, given: Mapping[str, Any], config: SceneConfig, settings: Collection[str]) -> dict[str, Any]:
+    """What the run's settings say for one control."""
+    kind, name = names_of(asked, given)
+    choices = CONTROLS[kind].choices if kind in CONTROLS else ()
+    said = {one.name: _value(config, one.run_setting, name) for one in choices if one.run_setting in settings}
+    return {choice: value for choice, value in said.items() if value is not None}
+
+
+def _value(config: SceneConfig, setting: str, name: str) -> Any:
+    """The value of a run's setting for one control."""
+    value = getattr(config, setting, None)
+    return value.get(name) if isinstance(value, Mapping) else None if isinstance(value, tuple) else value
+
+
+def takes(asked: str, given: Mapping[str, Any], setting: str) -> bool:
+    """Whether a control takes one of the run's settings; one that is not known counts as one that does."""
+    kind, _ = names_of(asked, given)
+    return kind not in CONTROLS or setting in {choice.run_setting for choice in CONTROLS[kind].choices}
+
+
+def run_settings_for(config: SceneConfig, asked: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the run's settings for a run over one of its controls: None where that does not take them."""
+    _, name = names_of(asked, given)
+    found: dict[str, Any] = {}
+    for setting in RUN_SETTINGS:
+        value = getattr(config, setting, None)
+        if isinstance(value, Mapping):
+            value = {own: number for own, number in value.items() if own == name} or None
+        found[setting] = value if takes(asked, given, setting) else None
+    return found
+
+
+def check_run_settings(config: SceneConfig) -> None:
+    """Refuse a setting of the run that none of its controls takes.
+
+    Raises:
+        UnknownNameError: an epsilon for a control that is not searched.
+        InputError: no control takes it, or not the one that it names.
+    """
+    drawn: Mapping[str, Any] = getattr(config, "over", {})
+    for setting in RUN_SETTINGS:
+        value = getattr(config, setting, None)
+        if value is None:
+            continue
+        asked = config.controls if setting == "epsilon" else {**config.controls, **drawn}
+        if isinstance(value, Mapping):
+            known = {names_of(one, given)[1]: one for one, given in asked.items()}
+            for name in value:
+                if name not in known:
+                    raise UnknownNameError(f"control in `{setting}`", name, known)
+                if not takes(known[name], asked[known[name]], setting):
+                    raise _not_taken(setting, name)
+            continue
+        without = [one for one, given in asked.items() if not takes(one, given, setting)]
+        if without and (isinstance(value, tuple) or len(without) == len(asked)):
+            raise _not_taken(setting, without[0])
+
+
+def _not_taken(setting: str, name: str) -> InputError:
+    if setting == "epsilon":
+        return InputError(
+            f"`epsilon` {name}: the control has ranges and no epsilon; give its ranges, as in "
+            f"`controls` '{name}={{PARAMETER: [LOW, HIGH]}}'"
+        )
+    return InputError(f"{setting}: {name} has none, and no other control is there that has one; leave it out")
+
+
+def load_models(models: Sequence[Any], config: SceneConfig) -> tuple[tuple[Model, ...], list[str]]:
+    """Load models in the threads that are asked for; their warnings become sentences of the run."""
+    threads.configure(1 if config.deterministic else config.threads)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", ModelWarning)
+        loaded = tuple(load_model(one, labels=config.labels) for one in models)
+    said = [str(one.message) for one in caught if issubclass(one.category, ModelWarning)]
+    for one in caught:
+        if not issubclass(one.category, ModelWarning):
+            warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
+    return loaded, said
+
+
+def different(names: Sequence[str], setting: str) -> Sequence[str]:
+    """Return the names.
+
+    Raises:
+        InputError: there are none, or one comes twice.
+    """
+    twice = [name for name in names if names.count(name) > 1]
+    if twice or not names:
+        raise InputError(
+            f"{setting}: expected different names, got {','.join(names)!r}; leave {', '.join(twice[:1])} out"
+        )
+    return names
+
+
+def options_of(arguments: Mapping[str, Any], config: type[SceneConfig], without: Collection[str]) -> dict[str, Any]:
+    """Return the arguments of a Python call that are settings of a configuration; None is one that was not given.
+
+    Args:
+        arguments: by name.
+        config: whose settings.
+        without: names that mean something else in the call than in a file.
+    """
+    names = {"set", *config.model_fields}
+    given = {name: value for name, value in arguments.items() if value is not None}
+    return {name: value for name, value in given.items() if name in names and name not in without}

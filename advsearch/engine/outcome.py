@@ -1,0 +1,351 @@
+"""From what an attack found to its summary (DESIGN section 6), its pictures and its files."""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.attacks import Ending, SearchResult, Trial, Trials, Verification, already_wrong, count_right, typical
+from advsearch.attacks.distribution import Distribution
+from advsearch.attacks.smallest import Bracket
+from advsearch.config import AttackConfig
+from advsearch.engine.memory import ANSWER, MOST_NUMBERS
+from advsearch.engine.problem import Problem
+from advsearch.engine.record import Findings, Recorder, Stages
+from advsearch.errors import InputError
+from advsearch.report.notebook import attack_html
+from advsearch.report.page import write_report
+from advsearch.runs import images, store
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.export import to_pandas
+from advsearch.runs.files import write_bytes
+from advsearch.scene.formation import to_8_bit
+
+PICTURE_SPP = 64
+"""Samples a pixel of the pictures that are kept, unless verification needed more."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class AttackResult:
+    """The answer of an attack.
+
+    Attributes:
+        summary: what `summary.json` holds (DESIGN section 6).
+        run: the run directory, or None if it was not kept.
+        u: (d,) the configuration that was verified; the start where nothing was searched.
+        clean: (H, W, 3) display-referred sRGB in [0, 1], 8-bit values: the clean configuration.
+        adversarial: the same of `u`.
+        artifacts: what the controls hand over of `u`, by name: the texture, say; (h, w, 3) sRGB in [0, 1].
+        search: the search's own log and claim.
+    """
+
+    summary: dict[str, Any]
+    run: Path | None
+    u: Tensor
+    clean: Tensor
+    adversarial: Tensor
+    artifacts: dict[str, Tensor]
+    search: SearchResult | None
+
+    @property
+    def found(self) -> bool:
+        """Whether a verified configuration was found."""
+        return bool(self.summary["ending"] == Ending.FOUND.value)
+
+    def rows(self, kind: str | None = None) -> Iterator[store.Row]:
+        """Yield every evaluated configuration, or those of one kind ("search", "verification", ...), in order.
+
+        Raises:
+            InputError: the run was not kept, so that nothing but the answer is there.
+        """
+        if self.run is None:
+            raise InputError("rows: expected a run that was kept, got none; give the attack a `run` to keep it in")
+        with store.Store(self.run / store.NAME, read_only=True) as results:
+            yield from results.rows(kind)
+
+    def to_pandas(self, kind: str | None = None) -> Any:
+        """Return these rows as a `pandas.DataFrame`; columns as in an export (docs/runs.md).
+
+        Raises:
+            InputError: the run was not kept, or pandas is not installed.
+        """
+        return to_pandas(self.rows(kind))
+
+    def __repr__(self) -> str:
+        summary, run = self.summary, None if self.run is None else str(self.run)
+        rated = summary.get("verified") or {}
+        verified = f", verified {rated['successes']}/{rated['trials']}" if rated else ""
+        controls = ",".join(summary["controls"])
+        return f"AttackResult({summary['object']!r}, {controls!r}, {summary['ending']!r}{verified}, run={run!r})"
+
+    def _repr_html_(self) -> str:
+        pictures = {"clean": self.clean.numpy(), "adversarial": self.adversarial.numpy()}
+        return attack_html(self.summary, pictures)
+
+
+def summarise(
+    config: AttackConfig, problem: Problem, findings: Findings, recorder: Recorder, stages: Stages, said: Sequence[str]
+) -> AttackResult:
+    """Put the result together and, if there is a run directory, write its files."""
+    search = findings.search
+    start = problem.domain.start
+    u = start if search is None else problem.domain.project(search.best_u)
+    spp = max(PICTURE_SPP, findings.sample_count.spp if findings.sample_count else 0)
+    noise = seeds.stream(config.seed, "pictures")
+    stages.progress.stage("making the pictures and the report", hint=f"pictures of {spp} samples a pixel")
+    with torch.no_grad():
+        linear = {
+            "clean": problem.renderer.radiance(problem.whole(start), noise, spp),
+            "adversarial": problem.renderer.radiance(problem.whole(u), noise, spp),
+        }
+    clean, adversarial = (
+        to_8_bit(problem.space.picture(problem.whole(at), problem.renderer.formation.display(radiance)))
+        for at, radiance in zip((start, u), linear.values(), strict=True)
+    )
+    space = problem.searched_space
+    artifacts = space.artifacts(u)
+    answers = _answers(config, problem, findings, clean, adversarial)
+    run = recorder.run
+    costs = _costs(findings, problem, stages)
+    where = {"run": None if run is None else str(run.path)}
+    summary = {"schema": 1, "command": "attack", **where, **answers, **costs, "seed": config.seed}
+    summary |= {"warnings": [*said, *_remarks(findings, problem)], "command_line": config.command_line()}
+    if run is not None:
+        _write_pictures(run, problem, findings, linear, clean, adversarial)
+        _write_artifacts(run, artifacts)
+        for name, data in space.files(u).items():
+            write_bytes(run.path / "artifacts" / name, data)
+        summary["seconds"]["total"] = stages.total
+        if u.numel() <= MOST_NUMBERS:
+            run.store.set_note(ANSWER, json.dumps(u.tolist()))
+        run.write_summary(summary)
+        write_report(run.path)
+        if not findings.interrupted:
+            run.finish()
+    return AttackResult(summary, None if run is None else run.path, u, clean, adversarial, artifacts, search)
+
+
+# ---- the summary ----------------------------------------------------------------------------------------------------
+
+
+def _answers(
+    config: AttackConfig, problem: Problem, findings: Findings, clean: Tensor, adversarial: Tensor
+) -> dict[str, Any]:
+    verification, labels = findings.verification, problem.model.labels
+    clean_trial = typical(findings.clean) if findings.clean else _look(problem, clean)
+    found = typical(verification.adversarial_trials) if verification else _look(problem, adversarial)
+    control = count_right(findings.clean, findings.spp) if findings.clean else None
+    controls = problem.searched_space.controls
+    budgets = [bound.budget for bound in controls]
+    summary: dict[str, Any] = {
+        "object": config.object,
+        "model": problem.model.name,
+        "environment": problem.space.environment or config.environment,
+        "controls": [bound.name for bound in controls],
+        "policy": config.policy_name,
+        "objective": config.objective,
+        "epsilon": budgets[0].epsilon if len(budgets) == 1 else {b.name: b.budget.epsilon for b in controls},
+        "norm": budgets[0].norm if len(budgets) == 1 else {b.name: b.budget.norm for b in controls},
+        "label_set": list(problem.labels.names),
+        "goal": problem.goal.rule,
+        "target": [problem.model.labels[index] for index in problem.goal.targets] or None,
+        "over": [bound.name for bound in problem.space.controls[len(controls) :]],
+        "ending": _ending(findings, problem).value,
+        "image_formation": problem.renderer.formation.summary(),
+        "gradient_plan": problem.plan_summary(problem.plan),
+        "light_path_segments": {
+            "search": problem.search_depth or problem.renderer.scene.max_depth,
+            "verification": problem.renderer.scene.max_depth,
+        },
+        "clean": {
+            **_named(clean_trial, labels),
+            "correct": clean_trial.predicted in problem.labels.indices,
+            "moved": [one.to_dict() for one in problem.space.moved],
+            "control": control.to_control_dict() if control else None,
+        },
+        "adversarial": _named(found, labels) if findings.search else None,
+        "verified": _verified(verification, labels),
+    }
+    if findings.baseline is not None:
+        summary["baseline"] = {
+            "policy": "random",
+            "renders": findings.baseline.renders * problem.draws,
+            "verified": _verified(findings.baseline_verification, labels),
+        }
+    if findings.beaten is not None:
+        summary["answer_from"] = "random"
+        summary["policy_verified"] = _verified(findings.beaten, labels)
+    if findings.average:
+        summary["average"] = _average(findings, problem)
+    if findings.smallest is not None:
+        summary["smallest"] = _smallest(findings.smallest, problem)
+    if findings.search is not None and findings.search.distribution is not None:
+        summary["distribution"] = _distribution(findings.search.distribution, problem)
+    if findings.sample_count is not None:
+        summary["sample_count"] = {"spp": findings.sample_count.spp, "converged": findings.sample_count.converged}
+    if findings.search is not None:
+        summary["claimed"] = {
+            "objective": findings.search.claimed_objective,
+            "re_evaluated": findings.search.best_objective,
+            "success_rate": findings.search.success_rate,
+        }
+        summary["gradients"] = _gradients(findings.search)
+        summary["configuration"] = problem.describe(problem.domain.project(findings.search.best_u))
+    return summary
+
+
+def _gradients(found: SearchResult) -> dict[str, Any]:
+    """What the search saw of its gradients, and what its policy did about them and about steps that failed."""
+    norms = [record.gradient_norm for record in found.history if record.objective == record.objective]
+    return {
+        "count": found.gradients,
+        "cosine_with_the_one_before": statistics.median(found.agreement) if found.agreement else None,
+        "zero": sum(norm == 0.0 for norm in norms),
+        **vars(found.counts),
+    }
+
+
+def _average(findings: Findings, problem: Problem) -> dict[str, Any]:
+    """How often the model is right over configurations drawn from the whole space."""
+    counted = Trials(sum(trial.right for trial in findings.average), len(findings.average), findings.spp)
+    margins = [trial.margin for trial in findings.average]
+    return {
+        "configurations": counted.trials,
+        "correct": counted.successes,
+        "accuracy": counted.rate,
+        "interval": list(counted.interval),
+        "margin": sum(margins) / len(margins),
+        "worst_margin": max(margins),
+    }
+
+
+def _smallest(bracket: Bracket, problem: Problem) -> dict[str, Any]:
+    """The bracket of the smallest epsilon, in the unit of each control."""
+    budgets = {bound.name: float(bound.budget.epsilon or 0.0) for bound in problem.searched_space.controls}
+    flips = bracket.u is not None
+    return {
+        "epsilon": {name: bracket.high * epsilon for name, epsilon in budgets.items()} if flips else None,
+        "not_found_at": {name: bracket.low * epsilon for name, epsilon in budgets.items()} if bracket.low else None,
+        "closed": bracket.closed,
+        "confirmed": bracket.confirmed,
+        "searches": bracket.searches,
+        "checks": bracket.checks,
+    }
+
+
+def _distribution(found: Distribution, problem: Problem) -> dict[str, Any] | None:
+    """Mean and spread of a distribution of configurations, where there are few numbers."""
+    if found.mean.numel() > MOST_NUMBERS:
+        return None
+    return {
+        "mean": problem.describe(problem.domain.project(found.mean)),
+        "deviation": found.deviation.tolist(),
+    }
+
+
+def _ending(findings: Findings, problem: Problem) -> Ending:
+    if findings.interrupted:
+        return Ending.INTERRUPTED
+    if findings.verification is not None:
+        return findings.verification.ending
+    if findings.clean and not problem.goal.minimise and already_wrong(count_right(findings.clean, findings.spp)):
+        return Ending.ALREADY_WRONG
+    return Ending.INTERRUPTED
+
+
+def _look(problem: Problem, picture: Tensor) -> Trial:
+    """What the model says of a finished picture."""
+    with torch.no_grad():
+        probabilities = problem.model(picture)[0].softmax(dim=0)
+    predicted = int(probabilities.argmax())
+    return Trial(float("nan"), predicted, float(probabilities[predicted]))
+
+
+def _named(trial: Trial, labels: Sequence[str]) -> dict[str, Any]:
+    return {"label": labels[trial.predicted], "index": trial.predicted, "probability": trial.probability}
+
+
+def _verified(verification: Verification | None, labels: Sequence[str]) -> dict[str, Any] | None:
+    """Rates and what the model answered in the trials that it got wrong."""
+    if verification is None:
+        return None
+    trials: Trials = verification.adversarial
+    answers = Counter(labels[trial.predicted] for trial in verification.adversarial_trials if trial.wrong)
+    return {**trials.to_dict(), "labels": dict(answers.most_common()), "margin": _mean_margin(verification)}
+
+
+def _mean_margin(verification: Verification) -> float:
+    margins = [trial.margin for trial in verification.adversarial_trials]
+    return sum(margins) / len(margins)
+
+
+def _costs(findings: Findings, problem: Problem, stages: Stages) -> dict[str, Any]:
+    search, baseline = findings.search, findings.baseline
+    return {
+        "renders": {
+            "search": search.renders * problem.draws if search else 0,
+            "gradient": search.gradients if search else 0,
+            "baseline": baseline.renders * problem.draws if baseline else 0,
+            "verification": findings.verification_renders + len(findings.first_look),
+        },
+        "steps": len(search.history) if search else 0,
+        "non_finite": {
+            "objectives": search.non_finite_objectives if search else 0,
+            "gradient_elements": search.non_finite_elements if search else 0,
+        },
+        "seconds": {**stages.seconds, "total": stages.total},
+    }
+
+
+def _remarks(findings: Findings, problem: Problem) -> list[str]:
+    """What a reader has to know beside the numbers."""
+    said = []
+    count = findings.sample_count
+    if count is not None and count.table and not count.converged:
+        said.append(
+            f"The margin still moved with the sample count at {count.spp} samples a pixel, the most that was tried: "
+            "noise may take part in the verdict."
+        )
+    if problem.renderer.non_finite:
+        said.append(f"{problem.renderer.non_finite} values of pictures or gradients were not finite and were set to 0.")
+    return said
+
+
+# ---- the files ------------------------------------------------------------------------------------------------------
+
+
+def _write_pictures(
+    run: RunDirectory,
+    problem: Problem,
+    findings: Findings,
+    linear: dict[str, Tensor],
+    clean: Tensor,
+    adversarial: Tensor,
+) -> None:
+    gain = problem.renderer.formation.gain
+    for name, picture in (("clean", clean), ("adversarial", adversarial)):
+        run.save_image(name, picture)
+        run.save_exr(name, linear[name] * gain)
+    run.save_image("difference", images.difference(clean, adversarial))
+    if findings.verification is not None:
+        for number in range(min(4, len(findings.verification.adversarial_trials))):
+            seed = seeds.stream(problem.seed, "verification", number)
+            run.save_image(f"verification-{number:02d}", problem.picture(findings.verification.u, seed, findings.spp))
+    if findings.frames:
+        run.save_animation("search", [*findings.frames, adversarial.numpy()])
+
+
+def _write_artifacts(run: RunDirectory, artifacts: dict[str, Tensor]) -> None:
+    """Keep what the controls hand over: an 8-bit PNG, and an EXR of the same display-referred values in float32."""
+    for name, picture in artifacts.items():
+        run.save_image(name, picture, folder="artifacts")
+        run.save_exr(name, picture, folder="artifacts")

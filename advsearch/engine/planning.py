@@ -1,0 +1,345 @@
+"""Chooses estimators, steps and sample counts by measurement on the scene and the loss at hand.
+
+Which estimator: the one with the least (squared error) x time, error against differences of the same loss. Which step
+and sample count: the cheapest whose gradient has a cosine of at least `GOAL` with the converged one, of the model's
+own loss (DESIGN 5.2: over poses that loss is rough at the scale of a pixel and sensitive to noise).
+"""
+
+from __future__ import annotations
+
+import itertools
+import statistics
+import time
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.engine.gradients import EXPENSIVE, Loss, estimated, only
+from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, GroupPlan
+from advsearch.scene.renderer import Renderer
+
+GOAL = 0.9
+"""Cosine with the converged gradient that a working gradient should have."""
+FACTORS = (1.0, 3.0, 9.0)
+"""Steps that are tried, as multiples of the plan's; the last only where no other will do:
+it smooths away all but the coarse shape of the loss."""
+COUNTS = (8, 16, 32, 64, 128)
+"""Sample counts that are tried."""
+ADJOINT_RENDERS = 3.0
+"""Renders that take about as long as an adjoint."""
+MANY = 16
+"""Coordinates of one control over which differences are not compared with an adjoint: one by one they take too many
+renders, and the error of random directions is which ones they skip (DESIGN 5.1), so that no number of samples brings
+them to the goal."""
+CONVERGED, AGAIN = 128, 4
+"""Samples a pixel of a gradient that counts as converged, and times as many where these do not agree, or where a
+working gradient has more."""
+WITNESSES = 3
+"""Converged gradients that are taken. Two of a few numbers can agree by luck."""
+TELLS = 0.5
+"""Converged gradients of which two have a smaller cosine than this tell nothing: the cosine of the mean of three with
+the truth is then about sqrt(3 c / (1 + 2 c)) (Spearman and Brown), 0.87 and less. Above it the noise of the converged
+one, which is independent of the working one's, only makes the measured cosine smaller: what is called `ok` is so."""
+
+Status = Literal["ok", "noisy", "reference unusable"]
+
+
+@dataclass(frozen=True)
+class Cosine:
+    """How well a working gradient of the model's loss points the way of the converged one.
+
+    Attributes:
+        control: which control's coordinates.
+        factor: step as a multiple of the plan's.
+        spp: samples a pixel of the working gradient.
+        cosine: mean over seeds; NaN where the converged gradient is zero.
+        converged: smallest cosine of two of the converged gradients, of different seeds.
+        seconds: median time of one working gradient.
+    """
+
+    control: str
+    factor: float
+    spp: int
+    cosine: float
+    converged: float
+    seconds: float
+
+    @property
+    def status(self) -> Status:
+        """Whether it is good enough; "reference unusable" where the converged gradients don't agree well enough to
+        tell."""
+        if not self.converged >= TELLS:
+            return "reference unusable"
+        if self.cosine >= GOAL:
+            return "ok"
+        return "noisy" if self.converged >= GOAL else "reference unusable"
+
+
+def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[GroupPlan, ...], tuple[str, ...]]]:
+    """Return groups of one control with the estimators to compare on them, where there is more than one.
+
+    Args:
+        plan: the plan so far. What was forced is not contested.
+        every: compare all that are valid; otherwise only the adjoints and the first kind of differences, and only where
+            an adjoint is preferred so far: over poses, the model's loss is so rough that none has won.
+    """
+    sets: dict[tuple[str, tuple[str, ...]], list[GroupPlan]] = {}
+    for group in plan.groups:
+        if "forced" in group.reason or not group.valid:
+            continue
+        sets.setdefault((group.control, group.valid), []).append(group)
+    found = []
+    for (_, valid), groups in sets.items():
+        usable = [one for one in valid if one not in EXPENSIVE]
+        by_differences = [one for one in usable if one in BY_DIFFERENCES]
+        size = sum(group.size for group in groups)
+        if size > MANY:
+            by_differences = []
+        adjoints = [one for one in usable if one in BY_ADJOINT]
+        candidates = tuple(adjoints + (by_differences if every else by_differences[:1]))
+        if len(candidates) > 1 and (every or valid[0] in BY_ADJOINT):
+            found.append((tuple(groups), candidates))
+    return found
+
+
+REPEATS = 3
+"""Gradients that are taken of everything that is compared."""
+
+
+def plan_gradients(plan: GradientPlan, *, every: bool = False, repeats: int = REPEATS) -> int:
+    """Return how many gradients `measured_plan` takes."""
+    return repeats * sum(len(candidates) for _, candidates in contested(plan, every=every))
+
+
+def measured_plan(
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    *,
+    seed: int,
+    spp: int,
+    repeats: int = REPEATS,
+    every: bool = False,
+    counted: bool = False,
+    tick: Callable[[], None] = lambda: None,
+) -> GradientPlan:
+    """Return the renderer's plan with every contested choice made by measurement at u.
+
+    Args:
+        renderer: its plan is the one to improve; it is not changed.
+        loss: what will be differentiated.
+        u: (d,) where.
+        seed: root of the noise.
+        spp: samples a pixel.
+        repeats: gradients of each estimator, at least 2.
+        every: see `contested`.
+        counted: take the renders that an estimator needs for its time (an adjoint for `ADJOINT_RENDERS`), so that the
+            choice is the same on a busy machine.
+        tick: called after each gradient.
+    """
+    plan = renderer.plan
+    for groups, candidates in contested(plan, every=every):
+        scores = _scores(renderer, loss, u, groups, candidates, seed, spp, repeats, counted, tick)
+        best = min(scores, key=lambda name: scores[name])
+        others = ", ".join(f"{name} {score / scores[best]:.3g}" for name, score in scores.items() if name != best)
+        time = "renders" if counted else "time"
+        reason = f"least squared error x {time}, measured at {spp} samples (others, as multiples of it: {others})"
+        names = {group.name for group in groups}
+        plan = replace(
+            plan,
+            groups=tuple(
+                replace(one, estimator=best, reason=reason, measured=scores) if one.name in names else one
+                for one in plan.groups
+            ),
+        )
+    return plan
+
+
+def _scores(
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    groups: Sequence[GroupPlan],
+    candidates: Sequence[str],
+    seed: int,
+    spp: int,
+    repeats: int,
+    counted: bool,
+    tick: Callable[[], None],
+) -> dict[str, float]:
+    """Squared error x seconds of each candidate. The reference is the mean of the differences among them, whose own
+    noise is taken off the others' errors. Random directions are no reference: where there are no other differences,
+    each has its own scatter for an error."""
+    names = {group.name for group in groups}
+    gradients: dict[str, Tensor] = {}
+    seconds: dict[str, float] = {}
+    for estimator in candidates:
+        found, times = [], []
+        for number in range(repeats):
+            begun = time.perf_counter()
+            noise = seeds.stream(seed, "plan", number)
+            found.append(estimated(renderer, loss, u, estimator, names, noise, spp))
+            times.append(time.perf_counter() - begun)
+            tick()
+        cost = 1.0 + only(renderer.plan, names, estimator).renders
+        cost += ADJOINT_RENDERS if estimator in BY_ADJOINT else 0.0
+        gradients[estimator], seconds[estimator] = torch.stack(found), cost if counted else statistics.median(times)
+    own = {
+        estimator: float((found - found.mean(dim=0)).square().sum() / max(1, repeats - 1))
+        for estimator, found in gradients.items()
+    }
+    judge = next((one for one in candidates if one in BY_DIFFERENCES - {"simultaneous"}), None)
+    if judge is None:
+        return {estimator: own[estimator] * seconds[estimator] for estimator in gradients}
+    truth = gradients[judge].mean(dim=0)
+    scores = {}
+    for estimator, found_all in gradients.items():
+        error = float((found_all - truth).square().sum(dim=1).mean()) - own[judge] / repeats
+        scores[estimator] = (own[judge] if estimator == judge else max(error, own[estimator])) * seconds[estimator]
+    return scores
+
+
+def cosine_samples(
+    plan: GradientPlan,
+    *,
+    factors: Sequence[float] = FACTORS,
+    counts: Sequence[int] = COUNTS,
+    repeats: int = REPEATS,
+    controls: Collection[str] | None = None,
+) -> int:
+    """Return the samples a pixel that the gradients of `cosines` take in all, at most."""
+    each = repeats * sum(counts) + WITNESSES * (1 + AGAIN) * CONVERGED
+    by_control: dict[str, set[str]] = {}
+    for group in plan.groups:
+        if group.estimator != "none" and (controls is None or group.control in controls):
+            by_control.setdefault(group.control, set()).add(group.estimator)
+    return each * sum(len(factors) if used & BY_DIFFERENCES else 1 for used in by_control.values())
+
+
+def cosines(
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    *,
+    seed: int,
+    factors: Sequence[float] = FACTORS,
+    counts: Sequence[int] = COUNTS,
+    repeats: int = REPEATS,
+    controls: Collection[str] | None = None,
+    tick: Callable[[int], None] = lambda samples: None,
+) -> list[Cosine]:
+    """Measure, control by control, the cosine of working gradients with the converged one at the same step.
+
+    Sample counts are tried in their order until one reaches the goal at a step; then the next step follows. With
+    `controls` only these are measured. `tick` is called after each gradient with the samples a pixel that it took;
+    `cosine_samples` bounds their sum.
+    """
+    base = renderer.plan
+    found: list[Cosine] = []
+    try:
+        for control in dict.fromkeys(group.control for group in base.groups):
+            names = {one.name for one in base.groups if one.control == control and one.estimator != "none"}
+            if not names or (controls is not None and control not in controls):
+                continue
+            by_steps = any(one.estimator in BY_DIFFERENCES for one in base.groups if one.control == control)
+            mine: list[Cosine] = []
+            tried: list[GradientPlan] = []
+            for factor in factors if by_steps else factors[:1]:
+                if factor == FACTORS[-1] and any(row.status == "ok" for row in mine):
+                    break
+                renderer.plan = _silenced(base.with_steps(factor), names)
+                if renderer.plan in tried:  # no step can be wider
+                    continue
+                tried.append(renderer.plan)
+                mine += _cosines_at(renderer, loss, u, control, factor, seed, counts, repeats, tick)
+            found += mine
+    finally:
+        renderer.plan = base
+    return found
+
+
+def _silenced(plan: GradientPlan, names: set[str]) -> GradientPlan:
+    """The plan with all other groups left out."""
+    return replace(
+        plan, groups=tuple(one if one.name in names else replace(one, estimator="none") for one in plan.groups)
+    )
+
+
+def _cosines_at(
+    renderer: Renderer,
+    loss: Loss,
+    u: Tensor,
+    control: str,
+    factor: float,
+    seed: int,
+    counts: Sequence[int],
+    repeats: int,
+    tick: Callable[[int], None],
+) -> list[Cosine]:
+    def converged(spp: int) -> tuple[Tensor, float]:
+        found = []
+        for k in range(WITNESSES):
+            found.append(renderer.gradient(loss, u, seeds.stream(seed, "converged", k), spp)[1])
+            tick(spp)
+        agreements = torch.tensor([_cosine(*pair) for pair in itertools.combinations(found, 2)])
+        return torch.stack(found).mean(dim=0), float(agreements.min())  # NaN if one is
+
+    many = CONVERGED
+    truth, agreement = converged(many)
+    found = []
+    for spp in counts:
+        if many == CONVERGED and (agreement < GOAL or spp > CONVERGED):
+            many = AGAIN * CONVERGED
+            truth, agreement = converged(many)
+        values, times = [], []
+        for number in range(repeats):
+            begun = time.perf_counter()
+            gradient = renderer.gradient(loss, u, seeds.stream(seed, "working", number), spp)[1]
+            times.append(time.perf_counter() - begun)
+            values.append(_cosine(gradient, truth))
+            tick(spp)
+        mean = statistics.fmean(values)
+        found.append(Cosine(control, factor, spp, mean, agreement, statistics.median(times)))
+        if mean >= GOAL:
+            break
+    return found
+
+
+def _cosine(one: Tensor, other: Tensor) -> float:
+    size = float(one.norm() * other.norm())
+    return float(one @ other) / size if size > 0.0 else float("nan")
+
+
+def tuned(plan: GradientPlan, table: Sequence[Cosine]) -> tuple[GradientPlan, int | None]:
+    """Return the plan with each control's step chosen from measured cosines, and the sample count that all then need.
+
+    The cheapest setting that reaches the goal wins; where none does, the one with the greatest cosine, and the reason
+    says so. The sample count is None where nothing was measured.
+    """
+    counts = []
+    for control in dict.fromkeys(row.control for row in table):
+        rows = [row for row in table if row.control == control and row.cosine == row.cosine]
+        if not rows:
+            continue
+        good = [row for row in rows if row.status == "ok"]
+        chosen = min(good, key=lambda row: row.seconds) if good else max(rows, key=lambda row: row.cosine)
+        counts.append(chosen.spp)
+        said = f"cosine {chosen.cosine:.2f} with the converged gradient at {chosen.spp} samples"
+        said += f" and {chosen.factor:g} x the step" + ("" if good else f": {_shortfall(chosen)}")
+        scaled = {one.name: one.step for one in plan.with_steps(chosen.factor).groups}
+        groups = tuple(
+            replace(one, step=scaled[one.name], reason=f"{one.reason}; {said}") if one.control == control else one
+            for one in plan.groups
+        )
+        plan = replace(plan, groups=groups)
+    return plan, max(counts) if counts else None
+
+
+def _shortfall(chosen: Cosine) -> str:
+    if chosen.converged < TELLS:
+        return f"which says little, two converged ones have {chosen.converged:.2f}"
+    return f"below {GOAL:g}, the best that was found"

@@ -1,0 +1,245 @@
+"""What a search works on: a scene, a model, a space and an objective, joined into the calls that `attacks` asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.attacks import Domain, Evaluate, Evaluation, Objective, Trial, margin
+from advsearch.attacks.evaluation import Wanted
+from advsearch.attacks.goal import Goal
+from advsearch.controls import Space
+from advsearch.controls.base import Value
+from advsearch.engine.domains import domain_of
+from advsearch.models import LabelSet, Model
+from advsearch.scene.formation import to_8_bit
+from advsearch.scene.gradients.plan import GradientPlan, GroupPlan
+from advsearch.scene.renderer import Renderer
+
+
+class OnImage(NamedTuple):
+    """Who is told the picture of an evaluation.
+
+    Attributes:
+        wants: whether that of the evaluation with this index is wanted.
+        tell: called with the index and the picture.
+    """
+
+    wants: Callable[[int], bool]
+    tell: Callable[[int, Tensor], None]
+
+
+BY_CHANCE = "forced: it varies by chance, so nobody asks for its derivative"
+
+
+@dataclass
+class Problem:
+    """The joint of rendering, model and search.
+
+    Attributes:
+        renderer: `render(u, seed, spp)` of the whole space.
+        space: the controls behind the whole of u: those that are searched, then those that vary by chance.
+        model: the network under test.
+        labels: the right answers.
+        objective: what is maximised.
+        goal: what counts as success.
+        spp: samples a pixel while searching.
+        seed: root of every stream.
+        searched: how many of the controls are searched; None for all. The others are the conditions: drawn anew from
+            their whole range for every picture.
+        draws: conditions that one evaluation looks at, where there are any; the objective is their mean.
+        search_depth: longest light path in segments of a search's renders; None for the scene's. Verification always
+            renders the scene's.
+        domain: where a search may look: the searched controls.
+        conditions: where the others are drawn from; None where there are none.
+    """
+
+    renderer: Renderer
+    space: Space
+    model: Model
+    labels: LabelSet
+    objective: Objective
+    goal: Goal
+    spp: int
+    seed: int
+    searched: int | None = None
+    draws: int = 1
+    search_depth: int | None = None
+    domain: Domain = field(init=False)
+    conditions: Domain | None = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.plan = self.renderer.plan
+
+    @property
+    def plan(self) -> GradientPlan:
+        """How derivatives are obtained."""
+        return self.renderer.plan
+
+    @plan.setter
+    def plan(self, plan: GradientPlan) -> None:
+        """Take a plan: nothing is computed for the conditions, and the domain's cost follows."""
+        names = {control.name for control in self.space.controls[self.searched :]} if self._over else set()
+        none = {group.name: "none" for group in plan.groups if group.control in names}
+        self.renderer.plan = plan.with_estimator(none, BY_CHANCE)
+        controls = self.space.controls
+        cost = self.renderer.plan.renders
+        self.domain = domain_of(controls[: self.searched], gradient_cost=cost, partial_gradients=True)
+        self.conditions = domain_of(controls[self.searched :]) if self._over else None
+
+    @property
+    def _over(self) -> bool:
+        return self.searched is not None and self.searched < len(self.space.controls)
+
+    @property
+    def searched_space(self) -> Space:
+        """The controls that are searched, as a space of their own: it describes and keeps what was found."""
+        return replace(self.space, controls=self.space.controls[: self.searched])
+
+    # ---- pictures ---------------------------------------------------------------------------------------------------
+
+    def whole(self, u: Tensor, draw: int | None = None) -> Tensor:
+        """Return the configuration of the whole space: u, and the conditions of one draw.
+
+        Args:
+            u: (d,) of the searched controls.
+            draw: seed of the conditions; None for those that leave the scene as it is.
+        """
+        if self.conditions is None:
+            return u
+        if draw is None:
+            return torch.cat([u, self.conditions.start])
+        generator = torch.Generator().manual_seed(seeds.stream(draw, "conditions"))
+        return torch.cat([u, self.conditions.sample(generator)[0]])
+
+    def picture(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True) -> Tensor:
+        """Render a configuration as a file would hold it: (H, W, 3) sRGB in [0, 1], rounded to 8 bits.
+
+        Args:
+            u: (d,) of the searched controls.
+            seed: of the noise, and of the conditions where there are any.
+            spp: samples a pixel.
+            drawn: whether the conditions are drawn; otherwise the scene has those it comes with.
+        """
+        with torch.no_grad():
+            return to_8_bit(self.renderer(self.whole(u, seed if drawn else None), seed=seed, spp=spp))
+
+    def trial(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True) -> Trial:
+        """Render, round to 8 bits, classify: one trial of a verification; arguments as for `picture`."""
+        with torch.no_grad():
+            logits = self.model(self.picture(u, seed, spp, drawn=drawn))
+        probabilities = logits[0].softmax(dim=0)
+        predicted = int(probabilities.argmax())
+        score, right = float(self.goal.score(logits)[0]), bool(self.goal.right(logits)[0])
+        lead = float(margin(logits, logits, self.labels.indices)[0])
+        return Trial(score, predicted, float(probabilities[predicted]), right, lead)
+
+    def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Value]:
+        """Say a configuration of the searched controls in named values with units, under the conditions of a draw.
+
+        Args:
+            u: (d,) of the searched controls.
+            draw: seed of the conditions; None for those that the scene comes with.
+        """
+        return self.space.describe(self.whole(u, draw), self.space.controls[: self.searched])
+
+    def plan_summary(self, plan: GradientPlan) -> dict[str, Any]:
+        """Return what a summary holds of a plan: `GradientPlan.to_dict`, and each step in its parameter's unit."""
+        summary: dict[str, Any] = plan.to_dict()
+        for group, row in zip(plan.groups, summary["groups"], strict=True):
+            row["step_in_unit"], row["unit"] = self._in_unit(group) if group.step_reason else (None, "")
+        return summary
+
+    def _in_unit(self, group: GroupPlan) -> tuple[float | None, str]:
+        """The step of one number in the middle of its range, and its unit; None of what has no number of its own."""
+        u, half = self.whole(self.domain.start).clone(), min(group.step, 0.5)
+        ends = []
+        for side in (0.5 - half, 0.5 + half):
+            u[group.coordinates] = side
+            ends.append(self.space.describe(u).get(group.name))
+        low, high = ends
+        if group.size != 1 or low is None or high is None or not isinstance(low["value"], (int, float)):
+            return None, ""
+        return abs(float(high["value"]) - float(low["value"])) / 2.0, str(low["unit"])
+
+    def conditions_of(self, u: Tensor, draw: int) -> dict[str, Value]:
+        """Say the conditions of a draw in named values with units; empty where there are none."""
+        if self.conditions is None:
+            return {}
+        return self.space.describe(self.whole(u, draw), self.space.controls[self.searched :])
+
+    # ---- evaluations ------------------------------------------------------------------------------------------------
+
+    def evaluator(self, stream: str, on_image: OnImage | None = None) -> Evaluate:
+        """Return the evaluation of configurations whose noise comes from one stream of seeds."""
+
+        def evaluate(u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
+            noise = seeds.stream(self.seed, stream, index)
+            if self.conditions is None:
+                return self._evaluate(u, noise, index, gradient, samples, on_image)
+            draws = [seeds.stream(noise, "draw", number) for number in range(self.draws)]
+            found = [self._evaluate(self.whole(u, d), d, index, gradient, samples, None) for d in draws]
+            if on_image is not None and on_image.wants(index):
+                on_image.tell(index, self.picture(u, noise, self.spp, drawn=False))
+            return _mean(found, u.numel())
+
+        return evaluate
+
+    def _evaluate(
+        self, whole: Tensor, noise: int, index: int, gradient: Wanted, samples: int, on_image: OnImage | None
+    ) -> Evaluation:
+        """One picture of the whole space, classified, with the derivative that is wanted."""
+        before, renders = self.renderer.non_finite, self.renderer.renders
+        seen: list[tuple[Tensor, Tensor]] = []
+
+        def loss(image: Tensor) -> Tensor:
+            value, logits = self._judge(image)
+            seen.append((image.detach(), logits.detach()))
+            return value
+
+        spp, derivative = self.spp * samples, None
+        with self.renderer.scene.shorter(self.search_depth):
+            if gradient:
+                value, derivative = self.renderer.gradient(loss, whole, noise, spp, free=gradient == "free")
+            else:
+                with torch.no_grad():
+                    value = loss(self.renderer(whole, seed=noise, spp=spp))
+        image, logits = seen[0]
+        if on_image is not None and on_image.wants(index):
+            on_image.tell(index, image)
+        return Evaluation(
+            objective=float(value),
+            gradient=derivative,
+            logits=logits[0],
+            success=bool(self.goal.score(logits)[0] > 0.0),
+            non_finite=self.renderer.non_finite - before,
+            cost=(self.renderer.renders - renders) * samples,
+        )
+
+    def _judge(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """The objective of a picture (H, W, 3), and the logits (1, C) behind it."""
+        logits = self.model(image)
+        return self.objective(logits, image[None], self.labels.indices)[0], logits
+
+    def loss(self, image: Tensor) -> Tensor:
+        """The objective of a picture (H, W, 3) sRGB, as a number with a graph."""
+        return self._judge(image)[0]
+
+
+def _mean(found: Sequence[Evaluation], size: int) -> Evaluation:
+    """The mean over conditions. Its cost is counted in evaluations, each of which takes a picture a draw."""
+    count = len(found)
+    gradients = [one.gradient[:size] for one in found if one.gradient is not None]
+    return Evaluation(
+        objective=sum(one.objective for one in found) / count,
+        gradient=torch.stack(gradients).mean(dim=0) if gradients else None,
+        logits=torch.stack([one.logits for one in found]).mean(dim=0),
+        success=sum(one.success for one in found) * 10 >= 9 * count,
+        non_finite=sum(one.non_finite for one in found),
+        cost=max(one.cost for one in found),
+    )

@@ -1,0 +1,214 @@
+"""What an attack knows so far, how long each stage took, and the rows it leaves in the run's store."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.attacks import Evaluation, SampleCount, SearchResult, StepRecord, Trial, Verification, margin
+from advsearch.attacks.smallest import Bracket
+from advsearch.engine.memory import Memory
+from advsearch.engine.problem import Problem
+from advsearch.progress import Progress
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.store import Row
+
+MEASURED = ("centre", "region", "map")
+"""Kinds of trials that seek no answer but see what the model says."""
+
+
+@dataclass
+class Findings:
+    """What is known so far; whatever is still None or empty was not reached.
+
+    Attributes:
+        first_look: a few renders of the clean configuration at the search's sample count.
+        search: what the policy claims.
+        baseline: what the random search claims.
+        sample_count: how the sample count of the verification was chosen.
+        clean: the control group's trials.
+        verification: of the policy's answer.
+        baseline_verification: of the random search's.
+        beaten: verification of the policy's own answer, where the random search's turned out worse for the model and is
+            the run's answer instead.
+        average: trials of configurations drawn from the whole space.
+        smallest: the least epsilon, where it was asked for.
+        frames: pictures of the search as 8-bit values in [0, 1], for the animation.
+        interrupted: somebody pressed Ctrl-C.
+        verification_renders: renders spent on choosing the sample count and on trials.
+    """
+
+    first_look: tuple[Trial, ...] = ()
+    search: SearchResult | None = None
+    baseline: SearchResult | None = None
+    sample_count: SampleCount | None = None
+    clean: tuple[Trial, ...] = ()
+    verification: Verification | None = None
+    baseline_verification: Verification | None = None
+    beaten: Verification | None = None
+    average: tuple[Trial, ...] = ()
+    smallest: Bracket | None = None
+    frames: list[Any] = field(default_factory=list)
+    interrupted: bool = False
+    verification_renders: int = 0
+
+    @property
+    def spp(self) -> int:
+        """Samples a pixel of the verification.
+
+        Raises:
+            RuntimeError: it has not been chosen yet.
+        """
+        if self.sample_count is None:
+            raise RuntimeError("the sample count of the verification has not been chosen yet")
+        return self.sample_count.spp
+
+
+class Stages:
+    """Tells a watcher which stage runs, and keeps the time of each.
+
+    Attributes:
+        progress: the watcher.
+        seconds: time of each stage by name, in seconds.
+        started: when the first began, by `time.perf_counter`.
+    """
+
+    def __init__(self, progress: Progress, started: float | None = None) -> None:
+        self.progress = progress
+        self.started = time.perf_counter() if started is None else started
+        self.seconds: dict[str, float] = {}
+        self._name = ""
+        self._begun = self.started
+
+    def begin(self, name: str, title: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
+        """End the stage before and begin another; a `name` that comes twice adds up. The rest: `Progress.stage`."""
+        self.end()
+        self._name, self._begun = name, time.perf_counter()
+        self.progress.stage(title, total, hint=hint, at_most=at_most)
+
+    def end(self) -> None:
+        """End the stage that runs, if one does."""
+        if self._name:
+            self.seconds[self._name] = self.seconds.get(self._name, 0.0) + time.perf_counter() - self._begun
+            self._name = ""
+
+    @property
+    def total(self) -> float:
+        """Seconds since the first stage began."""
+        return time.perf_counter() - self.started
+
+
+class Recorder:
+    """Writes what is evaluated to the run's store; without a run directory it does nothing.
+
+    Args:
+        run: the open run directory, or None.
+        problem: names labels and describes configurations.
+        memory: what the store has already, which is not written again.
+    """
+
+    def __init__(self, run: RunDirectory | None, problem: Problem, memory: Memory) -> None:
+        self.run = run
+        self._problem = problem
+        self._memory = memory
+        self._renders: dict[str, int] = {}
+
+    def step(self, kind: str, record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
+        """Keep one evaluation of a search."""
+        renders = record.renders - self._renders.get(kind, 0)
+        self._renders[kind] = record.renders
+        if self.run is None or self._memory.holds(kind, record.step):
+            return
+        problem = self._problem
+        probabilities = evaluation.logits.softmax(dim=0)
+        predicted = int(probabilities.argmax())
+        lead = float(margin(evaluation.logits[None], evaluation.logits[None], problem.goal.labels)[0])
+        self.run.record(
+            Row(
+                kind=kind,
+                step=record.step,
+                seed=seeds.stream(problem.seed, kind, record.index),
+                spp=problem.spp * record.samples,
+                objective=record.objective,
+                success=record.success,
+                correct=lead <= 0.0,
+                margin=lead,
+                label=problem.model.labels[predicted],
+                label_index=predicted,
+                probability=float(probabilities[predicted]),
+                values=problem.describe(u),
+                seconds=record.seconds,
+                renders=renders * problem.draws,
+            )
+        )
+
+    def trial(
+        self,
+        kind: str,
+        number: int,
+        spp: int,
+        trial: Trial,
+        seed: int,
+        u: Tensor,
+        *,
+        described: bool = False,
+        drawn: bool = True,
+    ) -> None:
+        """Keep one trial.
+
+        Args:
+            kind: what it is for.
+            number: within its kind.
+            spp: samples a pixel.
+            trial: what came out.
+            seed: of its render.
+            u: (d,) of the searched controls.
+            described: whether to say u, which the trials of one kind may have in common, beside the conditions.
+            drawn: whether it had conditions of its own, where they vary by chance.
+        """
+        if self.run is None or self._memory.holds(kind, number):
+            return
+        labels = self._problem.model.labels
+        told = self._problem.describe(u, seed) if described else {}
+        told = {**told, **(self._problem.conditions_of(u, seed) if drawn else {})}
+        self.run.record(trial_row(kind, number, seed, spp, trial, labels, told, sought=kind not in MEASURED))
+
+
+def trial_row(
+    kind: str,
+    number: int,
+    seed: int,
+    spp: int,
+    trial: Trial,
+    labels: Sequence[str],
+    values: Mapping[str, Any] | None = None,
+    *,
+    sought: bool = True,
+) -> Row:
+    """Return what the store keeps of a trial; arguments as for `Recorder.trial`.
+
+    Args:
+        labels: of the model.
+        values: that describe it.
+        sought: whether a search sought some answer there, so that there is a success.
+    """
+    return Row(
+        kind=kind,
+        step=number,
+        seed=seed,
+        spp=spp,
+        objective=trial.margin,
+        success=trial.wrong if sought else None,
+        correct=trial.right,
+        margin=trial.margin if trial.wrong_lead is None else trial.wrong_lead,
+        label=labels[trial.predicted],
+        label_index=trial.predicted,
+        probability=trial.probability,
+        values=values or {},
+        renders=1,
+    )

@@ -1,0 +1,199 @@
+"""Pictures of a scene before anything is searched, and what the model says of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from advsearch import seeds
+from advsearch.config.rendering import PICTURE_SPP, PICTURES
+from advsearch.controls import Control, compose
+from advsearch.controls.clean import sentences
+from advsearch.engine.loading import Controls, Scene, as_controls, framed, load_scene, make_renderer
+from advsearch.errors import InputError
+from advsearch.models import Model, load_model
+from advsearch.models.model import Answer
+from advsearch.progress import NullProgress, Progress
+from advsearch.report.contact_sheet import contact_sheet
+from advsearch.runs.files import placed_by
+from advsearch.runs.images import write_exr, write_png
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.formation import ImageFormation, to_8_bit
+from advsearch.scene.mitsuba_backend.samplers import SAMPLER
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A scene from one direction.
+
+    Attributes:
+        azimuth: of the camera, degrees.
+        picture: (H, W, 3) display-referred sRGB in [0, 1], rounded to 8 bits: what the model sees.
+        linear: (H, W, 3) linear radiance times the gain, before what controls do to the finished picture.
+        answers: the model's likeliest classes, the first one first.
+    """
+
+    azimuth: float
+    picture: Tensor
+    linear: Tensor
+    answers: tuple[Answer, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """Pictures of a scene. Made by `render`.
+
+    Attributes:
+        scene: what was rendered.
+        model: name of the model that was asked.
+        formation: how the pictures were formed, with size and gain.
+        spp: samples a pixel.
+        views: one, or one for each azimuth.
+        warnings: what was said on the way.
+    """
+
+    scene: SceneDescription
+    model: str
+    formation: ImageFormation
+    spp: int
+    views: tuple[View, ...]
+    warnings: tuple[str, ...] = ()
+
+    def save(self, path: str | Path) -> tuple[int, int]:
+        """Write the picture, whole or not at all; several views become one sheet with the answers under each.
+
+        Args:
+            path: a .png holds what the model sees, an .exr linear radiance times the gain; an older file is replaced.
+
+        Returns:
+            Height and width of what was written, in pixels.
+
+        Raises:
+            InputError: another ending, or an .exr of several views.
+            StorageError: the file could not be written.
+        """
+        file = writable(path, len(self.views))
+        with placed_by("out"):
+            if file.suffix.lower() == ".exr":
+                write_exr(file, self.views[0].linear)
+                return self.formation.resolution
+            sheet = self.sheet() if len(self.views) > 1 else self.views[0].picture.numpy()
+            write_png(file, sheet)
+        return sheet.shape[0], sheet.shape[1]
+
+    def sheet(self) -> Any:
+        """Return all views side by side, (h, w, 3) float32 sRGB in [0, 1], with azimuth and answers under each."""
+        captions = [
+            [f"azimuth {view.azimuth:g}", *(f"{one.probability:.1%} {one.label}" for one in view.answers)]
+            for view in self.views
+        ]
+        return contact_sheet([view.picture.numpy() for view in self.views], captions)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything but the pictures, as JSON values."""
+        return {
+            "object": self.scene.object_spec or self.scene.object.name,
+            "environment": self.scene.environment_spec or self.scene.environment.name,
+            "model": self.model,
+            "spp": self.spp,
+            "image_formation": self.formation.summary(),
+            "gain": self.formation.gain,
+            "up": None if self.scene.object.up is None else asdict(self.scene.object.up),
+            "views": [
+                {"azimuth": view.azimuth, "answers": [asdict(answer) for answer in view.answers]} for view in self.views
+            ],
+            "warnings": list(self.warnings),
+        }
+
+
+def render(
+    scene: Scene | str | Path,
+    model: Model | nn.Module | str | Path = "reference",
+    *,
+    controls: Controls = (),
+    around: int | None = None,
+    resolution: int | tuple[int, int] | None = None,
+    spp: int = PICTURE_SPP,
+    denoise: str = "oidn",
+    sampler: str = SAMPLER,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Rendering:
+    """Render a scene and ask the model what it sees.
+
+    Args:
+        scene: from `load_scene`, or what that takes.
+        model: from `load_model`, or what that takes.
+        controls: what differs from the scene: names, instances, or a mapping from names to settings. A parameter with
+            a range stays where a search would start.
+        around: number of views, from azimuths all around the object; None for one, from the scene's own camera.
+        resolution: side, or (height, width), in pixels; None for what the model takes.
+        spp: samples a pixel.
+        denoise: "oidn" or "none".
+        sampler: "multijitter" or "independent".
+        seed: root of the noise.
+        progress: told how far it is.
+
+    Raises:
+        InputError: a name is unknown, a file cannot be used, a value is out of range, or the scene cannot take a
+            control.
+    """
+    scene = scene if isinstance(scene, Scene) else load_scene(scene)
+    model = model if isinstance(model, Model) else load_model(model)
+    instances = as_controls(controls)
+    if around is not None and any(_turns(one) for one in instances):
+        raise InputError("around: sets camera.azimuth itself, and `controls` fixes it; leave one of them out")
+    size = resolution or (model.input_size[0], model.input_size[1])
+    progress = progress or NullProgress()
+    progress.stage("rendering", around or 1)
+    formation = None
+    views = []
+    for description in _turned(scene.description, around):
+        description = framed(description, size)
+        space = compose(instances, description)
+        renderer = make_renderer(description, space, size, denoise, seed, sampler=sampler)
+        formation = renderer.formation  # the same for all, exposure included
+        with torch.no_grad():
+            radiance = renderer.radiance(space.start, seeds.stream(seed, "pictures"), spp)
+            picture = to_8_bit(space.picture(space.start, formation.display(radiance)))
+        azimuth = description.number("camera.azimuth")
+        views.append(View(azimuth, picture, radiance * formation.gain, model.answers(picture)))
+        progress.advance(1)
+    assert formation is not None
+    own = scene.description
+    warnings = (*own.object.notes, *own.environment.warnings, *sentences(space.moved))
+    shown = replace(own, environment_spec=space.environment or own.environment_spec)
+    return Rendering(shown, model.name, formation, spp, tuple(views), warnings)
+
+
+def writable(path: str | Path, views: int) -> Path:
+    """Return the path of a picture that can be written, as far as its name says."""
+    file = Path(path)
+    suffix = file.suffix.lower()
+    if suffix not in PICTURES:
+        raise InputError(f"out: expected the path of a .png or .exr file, got {str(path)!r}")
+    if suffix == ".exr" and views > 1:
+        raise InputError("out: a sheet of several views has text in it and is a .png; leave `around` out for an .exr")
+    if file.is_dir():
+        raise InputError(f"out: expected the name of a file, got the folder {file}")
+    return file
+
+
+def _turned(description: SceneDescription, around: int | None) -> Iterator[SceneDescription]:
+    """The scene, or the scene from azimuths all around it."""
+    if around is None:
+        yield description
+        return
+    first = description.number("camera.azimuth")
+    for number in range(around):
+        yield description.with_values(camera__azimuth=(first + 360.0 * number / around) % 360.0)
+
+
+def _turns(control: Control) -> bool:
+    """Whether a control says where the camera stands around the object."""
+    return control.kind == "camera" and "azimuth" in control.settings()

@@ -1,0 +1,165 @@
+"""What a sweep is asked for, found and loaded: scenes, models, controls and axes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+from advsearch.config import SweepConfig
+from advsearch.controls import CONTROLS, Control, Space, make_space
+from advsearch.controls.base import Value
+from advsearch.engine.answers import right_answers
+from advsearch.engine.domains import domain_of
+from advsearch.engine.loading import Scene, framed
+from advsearch.engine.sweeps.axes import Axis, on_grid
+from advsearch.engine.sweeps.points import BINS, Drawn, Points
+from advsearch.errors import InputError
+from advsearch.models import LabelSet, Model
+from advsearch.scene.description import ENVIRONMENT
+
+
+@dataclass(frozen=True)
+class Place:
+    """One of the scenes.
+
+    Attributes:
+        object: as it is called.
+        environment: likewise.
+        scene: loaded.
+    """
+
+    object: str
+    environment: str
+    scene: Scene
+
+    @property
+    def values(self) -> dict[str, Value]:
+        """What is stored of it with every configuration."""
+        return {
+            "object": {"value": self.object, "unit": ""},
+            "environment": {"value": self.environment, "unit": ""},
+        }
+
+
+@dataclass(frozen=True)
+class Job:
+    """Everything that was asked for, found and loaded.
+
+    Attributes:
+        config: what was asked for.
+        places: the scenes.
+        models: the networks, loaded.
+        controls: what is drawn by chance.
+        axes: of the grid.
+        samples: draws at each point of the grid.
+        said: warnings on the way.
+    """
+
+    config: SweepConfig
+    places: tuple[Place, ...]
+    models: tuple[Model, ...]
+    controls: tuple[Control, ...]
+    axes: tuple[Axis, ...]
+    samples: int
+    said: tuple[str, ...]
+
+    @cached_property
+    def sizes(self) -> tuple[tuple[int, int], ...]:
+        """(height, width) of the pictures for each model."""
+        return tuple(self.config.resolution or (one.input_size[0], one.input_size[1]) for one in self.models)
+
+    def space(self, place: Place, size: tuple[int, int]) -> Space:
+        """The controls, those of the grid as choices, bound to a scene.
+
+        Raises:
+            InputError: the scene cannot take one of them.
+        """
+        description = framed(place.scene.description, size)
+        controls = on_grid(self.controls, self.axes, description)
+        return make_space(controls, description) if controls else Space((), None)
+
+    def points(self, space: Space) -> Points:
+        """The configurations of a space."""
+        config = self.config
+        return Points(space, domain_of(space.controls), self.axes, self.samples, config.sampler, config.seed)
+
+    def label_set(self, place: Place, model: Model) -> LabelSet:
+        """The right answers: what was said, or else the object's own label.
+
+        Raises:
+            InputError: the model has no such class, or the object has no label.
+        """
+        return right_answers(model, place.scene, place.object, self.config)
+
+
+def check_scenes(places: Sequence[Place], controls: Sequence[Control], axes: Sequence[Axis]) -> None:
+    """Refuse to vary what the scenes were asked to have.
+
+    Raises:
+        InputError: a parameter is fixed and in the grid, or several environments meet a control that chooses one.
+    """
+    given = {name for place in places for name in place.scene.description.given}
+    kinds = {control.name: type(control) for control in controls}
+    settings = {axis: (kinds.get(axis.instance) or CONTROLS[axis.control]).setting(axis.parameter) for axis in axes}
+    for axis, setting in settings.items():
+        if setting in given and setting != ENVIRONMENT:
+            raise InputError(f"`grid` {axis.name}: `set` fixes it already; leave it out of one of the two")
+    environments = list(dict.fromkeys(place.environment for place in places))
+    choosing = [f"`grid` {axis.name}" for axis, setting in settings.items() if setting == ENVIRONMENT]
+    choosing += [
+        f"`controls` {control.name}"
+        for control in controls
+        for parameter in control.parameters
+        if control.setting(parameter) == ENVIRONMENT and parameter.name in control.settings()
+    ]
+    if len(environments) > 1 and choosing:
+        raise InputError(
+            f"`environment={','.join(environments)}` and {choosing[0]} both choose what lights the scene; name all of "
+            "them in one of the two, and leave the other out"
+        )
+
+
+def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
+    """Bind every scene once, so that what is wrong is said before anything is rendered.
+
+    Returns:
+        The points of the first scene, and what the table shows of the draws: shares of the range where scenes, or
+        pictures of different shapes, have different ones.
+
+    Raises:
+        InputError: a scene cannot take a control, or a label does not fit a model.
+    """
+    found = []
+    for place in job.places:
+        spaces = [job.space(place, size) for size in dict.fromkeys(job.sizes)]
+        _check_draws(place, spaces[0])
+        found += [(place, job.points(space)) for space in spaces]
+        for model in job.models:
+            job.label_set(place, model)
+    first = found[0][1]
+    for place, points in found:
+        if points.drawn_numbers != first.drawn_numbers:
+            raise InputError(
+                f"`object` {place.object}: its controls draw other numbers than those of {job.places[0].object}; sweep "
+                "the two by themselves"
+            )
+    drawn = []
+    for versions in zip(*(points.drawn for _, points in found), strict=True):
+        same = all(one.parts == versions[0].parts for one in versions)
+        drawn.append(versions[0] if same else replace(versions[0], unit="of its range", parts=_shares()))
+    return first, tuple(drawn)
+
+
+def _check_draws(place: Place, space: Space) -> None:
+    """Refuse to draw what the scene was asked to have."""
+    for control, group in space.groups:
+        if group.setting in place.scene.description.given - {ENVIRONMENT}:
+            raise InputError(
+                f"`controls` {control.name}: draws {group.name} by chance, and `set` {group.setting} fixes it; "
+                "leave it out of one of the two"
+            )
+
+
+def _shares() -> tuple[list[float], ...]:
+    return tuple([k / BINS, (k + 1) / BINS] for k in range(BINS))

@@ -1,0 +1,349 @@
+"""The loop of a sweep: render, classify, store, count; batch after batch, in a fixed order.
+
+The order is: scenes (object, environment), then the grid with its last axis fastest, then the draws of a point of the
+grid, then the models. Models are shown the same pictures, so that they can be compared, and one is rendered once.
+A batch is stored in one transaction before the next is begun, and begins at a multiple of its size, so that a sweep
+that was stopped goes on bit for bit as one that was not.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from advsearch.attacks import Trial
+from advsearch.attacks.draws import Seeds
+from advsearch.attacks.product import batches
+from advsearch.controls.base import Value
+from advsearch.engine.record import Stages
+from advsearch.engine.samples import search_samples
+from advsearch.engine.sweeps.job import Job, check_all
+from advsearch.engine.sweeps.points import Picks, Points
+from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally
+from advsearch.engine.sweeps.view import View
+from advsearch.engine.sweeps.worst import check_worst, trial_of
+from advsearch.progress import Progress
+from advsearch.report.notebook import sweep_html
+from advsearch.report.studies import sweep_figure
+from advsearch.report.wording import count
+from advsearch.runs import store
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.export import to_pandas
+from advsearch.runs.files import write_bytes
+
+KIND = "sweep"
+"""Rows of the sweep; those of the trials are called "verification"."""
+
+NOT_FINITE = "pictures not finite"
+"""The note under which the store keeps that there were some."""
+
+PICTURE_SPP = 64
+"""Samples a pixel of the picture that is kept, unless verification needed more."""
+
+TELL_SECONDS = 0.1
+"""Least time between two reports of progress."""
+
+READ_AT_ONCE = 256
+"""Pictures whose places are worked out at once when rows are read back."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SweepResult:
+    """The answer of a sweep.
+
+    Attributes:
+        summary: what `summary.json` holds.
+        run: the run directory, or None if it was not kept.
+        in_memory: the rows, where there is no run directory.
+    """
+
+    summary: dict[str, Any]
+    run: Path | None
+    in_memory: tuple[store.Row, ...] = ()
+
+    @property
+    def accuracy(self) -> float | None:
+        """Share of the configurations that the model got right; None where there was none."""
+        accuracy: float | None = self.summary["accuracy"]
+        return accuracy
+
+    def rows(self) -> Iterator[store.Row]:
+        """Yield every configuration with its values and what the model said, in order."""
+        if self.run is None:
+            yield from self.in_memory
+            return
+        with store.Store(self.run / store.NAME, read_only=True) as results:
+            yield from results.rows(KIND)
+
+    def to_pandas(self) -> Any:
+        """Return every configuration as a row of a `pandas.DataFrame`; columns as in an export (docs/runs.md).
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        return to_pandas(self.rows())
+
+    def __repr__(self) -> str:
+        right = f"{self.summary['correct']} of {self.summary['configurations']} right"
+        return f"SweepResult({self.summary['object']!r}, {self.summary['model']!r}, {right}, run={self._place})"
+
+    def _repr_html_(self) -> str:
+        return sweep_html(self.summary)
+
+    @property
+    def _place(self) -> str:
+        return "None" if self.run is None else repr(str(self.run))
+
+
+class Sweep:
+    """One sweep, from its first configuration or from where it was stopped.
+
+    Args:
+        job: what is swept.
+        run: open directory to keep it in, with the rows that are there already; None keeps it in memory.
+        progress: told how far it is.
+    """
+
+    def __init__(self, job: Job, run: RunDirectory | None, progress: Progress) -> None:
+        self.job, self.run, self.stages = job, run, Stages(progress)
+        self.stages.begin("setup", "preparing the scenes for rendering")
+        self.points, self._shown = check_all(job)
+        self.per_scene, self.models = self.points.count, len(job.models)
+        self.total = len(job.places) * self.per_scene * self.models
+        self.samples = search_samples(job.config)
+        self._seeds = Seeds(job.config.seed, KIND)
+        self._kept: list[store.Row] = []
+        self._view: View | None = None
+        self._rendered = 0
+        self._not_finite = run is not None and run.store.note(NOT_FINITE) is not None
+        self._told, self._untold = 0.0, 0
+        objects, environments = (
+            list(dict.fromkeys(getattr(place, name) for place in job.places)) for name in ("object", "environment")
+        )
+        self._outer = [("object", objects), ("environment", environments), ("model", [one.name for one in job.models])]
+        self._places = [(objects.index(one.object), environments.index(one.environment)) for one in job.places]
+
+    def carry_out(self, first: int | None = None) -> SweepResult:
+        """Do what is left and return the answer.
+
+        Args:
+            first: number of the configuration to begin with; None goes on behind the rows that are stored.
+        """
+        tally = self._counted()
+        first = tally.seen if first is None else first
+        ending, worst = FINISHED, None
+        for text in self.job.said:
+            self.stages.progress.message(text)
+        try:
+            self._open(min(first, self.total - 1) // self.models // self.per_scene)
+            hint = f"{self.total} answers, pictures of {count(self.samples, 'sample')} a pixel; `resolution`, `spp`"
+            hint += " or fewer points shorten it"
+            self.stages.begin("sweep", "rendering and classifying", self.total, hint=hint)
+            self.stages.progress.advance(first)
+            self._go_through(first, tally)
+            worst = self._claimed(tally)
+            if worst is not None:
+                worst["verified"] = self._verified(worst)
+        except KeyboardInterrupt:
+            ending = INTERRUPTED
+            if self.run is not None and self.run.store.count(KIND) != tally.seen:
+                tally = self._counted()
+            worst = self._claimed(tally)
+        self.stages.end()
+        return self._finish(tally, ending, worst)
+
+    # ---- the loop ---------------------------------------------------------------------------------------------------
+
+    def _go_through(self, first: int, tally: Tally) -> None:
+        begin_scene, begin = divmod(first // self.models, self.per_scene)
+        for scene in range(begin_scene, len(self.job.places)):
+            view = self._open(scene)
+            for numbers in batches(begin, self.per_scene, self.job.config.batch):
+                self._batch(view, numbers, tally)
+            begin = 0
+
+    def _batch(self, view: View, numbers: range, tally: Tally) -> None:
+        """Render, classify and store neighbouring pictures of a scene, then count them."""
+        begun = time.perf_counter()
+        before = view.number * self.per_scene
+        picks = self.points.picks(numbers.start, len(numbers), before)
+        noise = [self._seeds(before + number) for number in numbers]
+        seen, values = view.look(picks, noise, self.samples)
+        seconds = (time.perf_counter() - begun) / (len(numbers) * self.models)
+        rows = [
+            self._row(before + number, model, noise[k], seen[model][k], values[model][k], seconds)
+            for k, number in enumerate(numbers)
+            for model in range(self.models)
+        ]
+        if self.run is None:
+            self._kept += rows
+        else:
+            self.run.record(*rows)
+        for k in range(len(numbers)):
+            for model in range(self.models):
+                row = rows[k * self.models + model]
+                self._count(tally, view.number, picks, k, model, seen[model][k], str(row.label))
+        self._rendered += len(numbers) * len(view.renderers)
+        if view.not_finite and not self._not_finite:
+            self._not_finite = True
+            if self.run is not None:
+                self.run.store.set_note(NOT_FINITE, "yes")
+        self._tell(len(rows), tally)
+
+    def _row(
+        self, number: int, model: int, seed: int, trial: Trial, values: dict[str, Value], seconds: float
+    ) -> store.Row:
+        network = self.job.models[model]
+        place = self.job.places[number // self.per_scene]
+        lit_by = self.points.lit_by(values)
+        lit: dict[str, Value] = {} if lit_by is None else {"environment": {"value": lit_by, "unit": ""}}
+        known = not math.isnan(trial.margin)
+        return store.Row(
+            kind=KIND,
+            step=number * self.models + model,
+            seed=seed,
+            spp=self.samples,
+            objective=trial.margin if known else None,
+            correct=trial.right,
+            margin=trial.margin if known else None,
+            label=network.labels[trial.predicted],
+            label_index=trial.predicted,
+            probability=trial.probability,
+            values={**place.values, **lit, "model": {"value": network.name, "unit": ""}, **values},
+            seconds=seconds,
+            renders=int(self.job.sizes[model] not in self.job.sizes[:model]),
+        )
+
+    def _tell(self, count: int, tally: Tally) -> None:
+        self._untold += count
+        now = time.monotonic()
+        if now - self._told >= TELL_SECONDS:
+            self.stages.progress.advance(self._untold, accuracy=tally.correct / tally.seen)
+            self._told, self._untold = now, 0
+
+    def _open(self, scene: int) -> View:
+        """The scene with this number; loading it lets the one before go."""
+        if self._view is None or self._view.number != scene:
+            self._view = None
+            self._view = View(self.job, scene)
+        return self._view
+
+    # ---- counting ---------------------------------------------------------------------------------------------------
+
+    def _counted(self) -> Tally:
+        """Counts of the rows that are stored already, read one after the other."""
+        tally = Tally(self._outer, self.job.axes, self._shown)
+        if self.run is None:
+            return tally
+        key, picks = (-1, -1), self.points.picks(0, 0)
+        for row in self.run.store.rows(KIND):
+            number, model = divmod(row.step, self.models)
+            scene, local = divmod(number, self.per_scene)
+            block, place = divmod(local, READ_AT_ONCE)
+            if key != (scene, block):
+                key, begin = (scene, block), block * READ_AT_ONCE
+                size = min(READ_AT_ONCE, self.per_scene - begin)
+                picks = self.points.picks(begin, size, scene * self.per_scene)
+            self._count(tally, scene, picks, place, model, trial_of(row), str(row.label))
+        return tally
+
+    def _count(self, tally: Tally, scene: int, picks: Picks, k: int, model: int, trial: Trial, label: str) -> None:
+        tally.add((picks.number + k) * self.models + model, (*self._places[scene], model), picks, k, trial, label)
+
+    # ---- the worst configuration ------------------------------------------------------------------------------------
+
+    def _claimed(self, tally: Tally) -> dict[str, Any] | None:
+        """What the sweep saw at its worst."""
+        if tally.worst is None:
+            return None
+        index, seen = tally.worst
+        points, picks, model = self._find(index)
+        values = points.values(points.configurations(picks), picks)[0]
+        row = self._row(picks.number, model, self._seeds(picks.number), seen, values, 0.0)
+        claim = {"label": row.label, "index": seen.predicted, "probability": seen.probability, "margin": seen.margin}
+        place, network = self.job.places[picks.number // self.per_scene], self.job.models[model]
+        right = list(self.job.label_set(place, network).names)
+        facts = {"configuration": index, "values": dict(row.values), "seed": row.seed, "label_set": right}
+        return {**facts, "claimed": claim, "verified": None}
+
+    def _verified(self, worst: dict[str, Any]) -> dict[str, Any] | None:
+        """What fresh renders say of it; keeps a picture."""
+        points, picks, model = self._find(worst["configuration"])
+        view = self._open(picks.number // self.per_scene)
+        u = points.configurations(picks)[0]
+        checked = check_worst(view, self.job, model, u, self.run, self.stages)
+        if self.run is not None:
+            spp = max(PICTURE_SPP, checked["spp"] if checked else 0)
+            self.run.save_image("worst", view.picture(model, u, worst["seed"], spp))
+        return checked
+
+    def _find(self, index: int) -> tuple[Points, Picks, int]:
+        """A configuration by its number: its scene's points, its picture, its model."""
+        number, model = divmod(index, self.models)
+        scene, local = divmod(number, self.per_scene)
+        points = self.job.points(self.job.space(self.job.places[scene], self.job.sizes[model]))
+        return points, points.picks(local, 1, scene * self.per_scene), model
+
+    # ---- the answer -------------------------------------------------------------------------------------------------
+
+    def _finish(self, tally: Tally, ending: str, worst: dict[str, Any] | None) -> SweepResult:
+        """Put the summary together and write it."""
+        config, job = self.job.config, self.job
+        seconds = self.stages.seconds
+        view, checked = self._view, (worst or {}).get("verified")
+        swept = seconds.get("sweep", 0.0)
+        summary: dict[str, Any] = {
+            "schema": 1,
+            "command": "sweep",
+            "run": None if self.run is None else str(self.run.path),
+            "object": config.object,
+            "model": ",".join(model.name for model in job.models),
+            "environment": self.points.environment or config.environment,
+            "controls": [control.name for control in job.controls],
+            "ending": ending,
+            "image_formation": next(iter(view.renderers.values())).formation.summary() if view else None,
+            "planned": self.total,
+            **tally.to_dict(),
+            "worst": worst,
+            "grid": {axis.name: len(axis.values) for axis in job.axes},
+            "samples": job.samples,
+            "sampler": config.sampler if job.controls else None,
+            "spp": self.samples,
+            "renders": {
+                "sweep": tally.seen // self.models * len(set(job.sizes)),
+                "verification": checked["renders"] if checked else 0,
+            },
+            "renders_per_second": self._rendered / swept if self._rendered and swept else None,
+            "seconds": {**seconds, "total": self.stages.total},
+            "seed": config.seed,
+            "warnings": [*job.said, *self._remarks(tally, checked)],
+            "command_line": config.command_line(),
+        }
+        if self.run is not None:
+            self.run.write_summary(summary)
+            for suffix, data in sweep_figure(summary).items():
+                write_bytes(self.run.path / "images" / f"sweep.{suffix}", data)
+        return SweepResult(summary, None if self.run is None else self.run.path, tuple(self._kept))
+
+    def _remarks(self, tally: Tally, checked: dict[str, Any] | None) -> list[str]:
+        """What a reader has to know beside the numbers."""
+        said = []
+        if tally.not_finite:
+            said.append(f"{tally.not_finite} answers of the model were not finite; they count as not right.")
+        if self._not_finite:
+            said.append("Some values of pictures were not finite and were set to 0.")
+        if checked and not checked["converged"]:
+            said.append(
+                f"The worst margin still moved with the sample count at {checked['spp']} samples a pixel, the most "
+                "that was tried: noise may take part in it."
+            )
+        return said
+
+
+def carry_out(job: Job, run: RunDirectory | None, progress: Progress, first: int | None = None) -> SweepResult:
+    """Sweep, check the worst configuration and write the summary; see `Sweep`."""
+    return Sweep(job, run, progress).carry_out(first)

@@ -1,0 +1,326 @@
+"""From the number of a picture to its configuration and what is stored of it: arithmetic, nothing is kept.
+
+Within a scene, pictures are numbered along the grid, and the draws of one point of the grid follow each other. Every
+picture of a sweep has a draw of its own, also where the grid is the same, so that pictures are independent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.special import ndtri
+from torch import Tensor
+
+from advsearch.attacks import Block, Domain
+from advsearch.attacks.draws import Draws
+from advsearch.attacks.product import Product
+from advsearch.controls import NumberControl, Parameter, Space
+from advsearch.controls.base import BoundControl, Value
+from advsearch.controls.numbers import BoundNumbers
+from advsearch.controls.values import Choices, Fixed, Range, to_value
+from advsearch.engine.sweeps.axes import Axis
+from advsearch.scene.description import ENVIRONMENT
+
+BINS = 10
+"""Equal parts into which the range of a drawn parameter is cut for the table."""
+
+MOST_QUASI = 64
+"""Numbers of a group up to which Sobol points are used; more (a texture) are drawn pseudo-randomly."""
+
+MOST_BINNED = 4
+"""Numbers of a parameter up to which the table shows them."""
+
+MOST_KEPT = 4096
+"""Descriptions of one control that are kept for points of the grid."""
+
+Doubles = NDArray[np.float64]
+Tell = Callable[[Tensor, "Picks"], list[Mapping[str, Value]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Picks:
+    """Neighbouring pictures of a scene.
+
+    Attributes:
+        number: of the first of them in the whole sweep.
+        digits: of each, its place on every axis of the grid.
+        shares: (n, k) float64 in [0, 1], the coordinates drawn for small parameters; equal parts are equally likely.
+        parts: of each, the part of every drawn number of the table in which it lies.
+    """
+
+    number: int
+    digits: list[tuple[int, ...]]
+    shares: Doubles
+    parts: list[list[int]]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A drawn number, as the table shows it.
+
+    Attributes:
+        name: ``camera.elevation``.
+        unit: of the values.
+        column: of `Picks.shares`.
+        parts: what each part of [0, 1] stands for: a pair of ends, or a value of a list.
+    """
+
+    name: str
+    unit: str
+    column: int
+    parts: tuple[Any, ...]
+
+
+class Points:
+    """The configurations of one scene.
+
+    Args:
+        space: the controls.
+        domain: their budgets; the start is the scene as it is.
+        axes: of the grid, all of them in the space.
+        samples: pictures at each point of the grid.
+        sampler: of the draws.
+        seed: root.
+
+    Attributes:
+        grid: sizes of the axes and the number of points.
+        count: pictures of the scene.
+        drawn: what the table shows of the draws.
+        drawn_numbers: how many numbers a draw has, and which of them the table shows; the same for all scenes.
+    """
+
+    def __init__(
+        self, space: Space, domain: Domain, axes: Sequence[Axis], samples: int, sampler: str, seed: int
+    ) -> None:
+        self.grid = Product(tuple(len(axis.values) for axis in axes))
+        self.samples, self.count = samples, self.grid.count * samples
+        self._space, self._domain, self._axes = space, domain, tuple(axes)
+        self._start = domain.start.numpy().astype(np.float64)
+        self._lower, self._upper = domain.lower.numpy(), domain.upper.numpy()
+        self._places: list[tuple[int, int, int]] = []
+        self._small: list[tuple[Block, slice, slice]] = []
+        self._large: list[tuple[Block, slice, slice]] = []
+        self.drawn = self._lay_out()
+        small, large = (chosen[-1][2].stop if chosen else 0 for chosen in (self._small, self._large))
+        self._columns = [one.column for one in self.drawn]
+        self._sizes = np.array([len(one.parts) for one in self.drawn], dtype=np.int64)
+        self._draws = Draws(small, sampler, seed)
+        self._noise = Draws(large, "random", seed, "large draws")
+        shown = tuple((one.name, one.column, len(one.parts)) for one in self.drawn)
+        self.drawn_numbers = (small, shown)
+        self._tellers = [
+            _teller(
+                space,
+                control,
+                part,
+                [(number, axis) for number, axis in enumerate(axes) if axis.instance == control.name],
+            )
+            for control, part in zip(space.controls, _slices(space), strict=True)
+        ]
+
+    # ---- layout -----------------------------------------------------------------------------------------------------
+
+    def _lay_out(self) -> tuple[Drawn, ...]:
+        """Say of every coordinate of u whether it is an axis of the grid or drawn, and from which columns; return what
+        the table shows."""
+        number_of = {axis.name: number for number, axis in enumerate(self._axes)}
+        shown: list[Drawn] = []
+        for (control, group), (block, part) in zip(self._space.groups, self._domain.parts(), strict=True):
+            name = f"{control.name}.{group.name}"
+            if name in number_of:
+                number = number_of[name]
+                self._places.append((part.start, number, self.grid.sizes[number]))
+                continue
+            into = self._small if block.size <= MOST_QUASI else self._large
+            first = into[-1][2].stop if into else 0
+            columns = slice(first, first + block.size + (block.norm == "l2"))
+            into.append((block, part, columns))
+            if block.size <= MOST_BINNED and block.norm != "l2" and isinstance(control, BoundNumbers):
+                shown += self._shown(control, group.name, block, part, first)
+        return tuple(shown)
+
+    def _shown(self, control: BoundNumbers, name: str, block: Block, part: slice, first: int) -> list[Drawn]:
+        parameter, spec = _spec(control, name)
+        full = f"{control.name}.{name}"
+        if isinstance(spec, Choices):
+            return [Drawn(full, _unit(parameter), first, spec.values)]
+        found = []
+        for number in range(block.size):
+            low, high = (float(ends[part.start + number]) for ends in (self._lower, self._upper))
+            edges = to_value(spec, parameter.log, torch.linspace(low, high, BINS + 1, dtype=torch.float64)).tolist()
+            parts = tuple([edges[k], edges[k + 1]] for k in range(BINS))
+            found.append(Drawn(full + (f".{number}" if parameter.shape else ""), parameter.unit, first + number, parts))
+        return found
+
+    # ---- from numbers to configurations -----------------------------------------------------------------------------
+
+    def picks(self, first: int, count: int, before: int = 0) -> Picks:
+        """Return the pictures from number `first` of the scene on; `before` is how many the scenes before it have."""
+        digits = [self.grid.digits(number // self.samples) for number in range(first, first + count)]
+        shares = self._draws.points(before + first, count)
+        parts = np.minimum((shares[:, self._columns] * self._sizes).astype(np.int64), self._sizes - 1)
+        return Picks(before + first, digits, shares, parts.tolist())
+
+    def configurations(self, picks: Picks) -> Tensor:
+        """Return u of the pictures, (n, d) float32."""
+        u = np.repeat(self._start[None], len(picks.digits), axis=0)
+        for column, number, size in self._places:
+            u[:, column] = [(digits[number] + 0.5) / size for digits in picks.digits]
+        for block, part, columns in self._small:
+            u[:, part] = self._placed(block, part, picks.shares[:, columns])
+        if self._large:
+            noise = self._noise.points(picks.number, len(picks.digits))
+            for block, part, columns in self._large:
+                u[:, part] = self._placed(block, part, noise[:, columns])
+        return torch.from_numpy(np.clip(u.astype(np.float32), self._lower, self._upper))
+
+    def _placed(self, block: Block, part: slice, shares: Doubles) -> Doubles:
+        """Coordinates inside the budget from uniform shares: uniform in the box, or in the ball (Muller 1959)."""
+        if block.options:
+            return np.asarray((np.minimum(np.floor(shares * block.options), block.options - 1) + 0.5) / block.options)
+        if block.norm != "l2" or block.epsilon is None:
+            low, high = self._lower[part].astype(np.float64), self._upper[part].astype(np.float64)
+            return np.asarray(low + (high - low) * shares)
+        direction = ndtri(np.clip(shares[:, :-1], 1e-12, 1.0 - 1e-12))
+        length = block.epsilon * shares[:, -1:] ** (1.0 / block.size)
+        norm = np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-30)
+        return np.asarray(self._start[part] + direction * (length / norm))
+
+    @property
+    def environment(self) -> str | None:
+        """What lights all pictures in the place of the scene's environment; None if that does, or if it varies."""
+        varies = any(group.setting == ENVIRONMENT for _, group in self._space.groups)
+        return None if varies else self._space.environment
+
+    def lit_by(self, values: Mapping[str, Value]) -> str | None:
+        """Return what lights a picture in the place of the scene's environment, by what is stored of it."""
+        return self._space.lit_by(values)
+
+    def values(self, u: Tensor, picks: Picks) -> list[dict[str, Value]]:
+        """Return what is stored of the pictures: parameter to value and unit, as `Space.describe` says it.
+
+        A parameter of the grid has the value that was listed, not what single precision makes of it.
+        """
+        found: list[dict[str, Value]] = [{} for _ in picks.digits]
+        for tell in self._tellers:
+            for into, said in zip(found, tell(u, picks), strict=True):
+                into.update(said)
+        return found
+
+
+# ---- saying what a control does, fast -------------------------------------------------------------------------------
+
+
+def _slices(space: Space) -> list[slice]:
+    found, begin = [], 0
+    for control in space.controls:
+        found.append(slice(begin, begin + len(control.start)))
+        begin = found[-1].stop
+    return found
+
+
+def _unit(parameter: Parameter) -> str:
+    return "name" if parameter.options else parameter.unit
+
+
+def _spec(bound: BoundNumbers, name: str) -> tuple[Parameter, Range | Choices]:
+    """A parameter that is not fixed, and what it is set to."""
+    control = bound.control
+    parameter = next(one for one in control.parameters if one.name == name)
+    spec = control.specs.get(name)
+    if spec is not None and not isinstance(spec, Fixed):
+        return parameter, spec
+    if parameter.options:
+        return parameter, Choices(parameter.options)
+    low, high = control.search_range(bound.scene, parameter) or (parameter.low, parameter.high)
+    return parameter, Range(low, high)
+
+
+def _teller(space: Space, control: BoundControl, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
+    """Return what says the values of one control for many configurations."""
+    if type(control) is BoundNumbers and type(control.control).measured is NumberControl.measured:
+        return _by_column(control, part, axes)
+    if control.refines:
+        return _by_description(lambda u: space.describe(u, (control,)), axes, keep=False)
+    return _by_description(lambda u: control.describe(u[part]), axes, keep=len(axes) == len(control.groups))
+
+
+def _by_column(control: BoundNumbers, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
+    """Values of all configurations at once, parameter by parameter; the same numbers as `describe`."""
+    number_of = {axis.parameter.name: (number, axis) for number, axis in axes}
+    columns: list[Callable[[Tensor, Picks], list[tuple[str, Value]]]] = []
+    begin = part.start
+    for group in control.groups:
+        name = f"{control.name}.{group.name}"
+        if group.name in number_of:
+            number, axis = number_of[group.name]
+            listed: list[Value] = [{"value": value, "unit": axis.unit} for value in axis.values]
+            columns.append(_listed(name, listed, number))
+        else:
+            columns += _drawn(control, group.name, name, begin, group.size)
+        begin += group.size
+
+    def tell(u: Tensor, picks: Picks) -> list[Mapping[str, Value]]:
+        said = [column(u, picks) for column in columns]
+        return [dict(row) for row in zip(*said, strict=True)] if said else [{} for _ in picks.digits]
+
+    return tell
+
+
+def _listed(name: str, listed: list[Value], number: int) -> Callable[[Tensor, Picks], list[tuple[str, Value]]]:
+    """A column of the grid."""
+    pairs = [(name, value) for value in listed]
+    return lambda u, picks: [pairs[digits[number]] for digits in picks.digits]
+
+
+def _drawn(
+    control: BoundNumbers, parameter_name: str, name: str, begin: int, size: int
+) -> list[Callable[[Tensor, Picks], list[tuple[str, Value]]]]:
+    """The columns of a drawn parameter."""
+    parameter, spec = _spec(control, parameter_name)
+    unit = _unit(parameter)
+    if isinstance(spec, Choices):
+        pairs: list[tuple[str, Value]] = [(name, {"value": value, "unit": unit}) for value in spec.values]
+        return [lambda u, picks: [pairs[min(len(pairs) - 1, int(one * len(pairs)))] for one in u[:, begin].tolist()]]
+
+    def column(number: int) -> Callable[[Tensor, Picks], list[tuple[str, Value]]]:
+        full = f"{name}.{number}" if parameter.shape else name
+
+        def tell(u: Tensor, picks: Picks) -> list[tuple[str, Value]]:
+            values = to_value(spec, parameter.log, u[:, begin + number]).tolist()
+            return [(full, {"value": value, "unit": unit}) for value in values]
+
+        return tell
+
+    return [column(number) for number in range(size)]
+
+
+def _by_description(
+    describe: Callable[[Tensor], Mapping[str, Value]], axes: Sequence[tuple[int, Axis]], *, keep: bool
+) -> Tell:
+    """What the control itself says, one configuration after the other.
+
+    Args:
+        describe: from a configuration of the whole space.
+        axes: those of the control, with their numbers.
+        keep: whether these axes are all that the description depends on, so that it can be kept for the next time.
+    """
+    kept: dict[tuple[int, ...], dict[str, Value]] = {}
+
+    def one(u: Tensor, digits: tuple[int, ...]) -> Mapping[str, Value]:
+        key = tuple(digits[number] for number, _ in axes)
+        if keep and key in kept:
+            return kept[key]
+        said: dict[str, Value] = dict(describe(u))
+        for number, axis in axes:
+            said[axis.name] = {"value": axis.values[digits[number]], "unit": axis.unit}
+        if keep and len(kept) < MOST_KEPT:
+            kept[key] = said
+        return said
+
+    return lambda u, picks: [one(row, digits) for row, digits in zip(u, picks.digits, strict=True)]

@@ -1,0 +1,155 @@
+"""Counting what a sweep finds, in memory that does not grow with it, and its summary (DESIGN section 6)."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from advsearch.attacks import Trial, Trials, clopper_pearson
+from advsearch.engine.sweeps.axes import Axis
+from advsearch.engine.sweeps.cells import Cells
+from advsearch.engine.sweeps.points import Drawn, Picks
+
+FINISHED, INTERRUPTED = "finished", "interrupted"
+"""How a sweep ends."""
+
+MOST_ANSWERS = 20
+"""Wrong answers that the summary lists, the most frequent first."""
+
+
+@dataclass
+class Count:
+    """Right answers among configurations, for every value of one axis.
+
+    Attributes:
+        name: of the axis.
+        unit: of its values.
+        values: what each place stands for: a number, a name, or a pair of ends.
+        seen: configurations of each value.
+        correct: those that the model got right.
+    """
+
+    name: str
+    unit: str
+    values: Sequence[Any]
+    seen: list[int] = field(init=False)
+    correct: list[int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.seen, self.correct = [0] * len(self.values), [0] * len(self.values)
+
+    def add(self, place: int, right: bool) -> None:
+        """Count one configuration."""
+        self.seen[place] += 1
+        self.correct[place] += right
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return the table of this axis; values without configurations so far are left out."""
+        return [
+            {"axis": self.name, "unit": self.unit, "value": value, **rate(correct, seen)}
+            for value, seen, correct in zip(self.values, self.seen, self.correct, strict=True)
+            if seen
+        ]
+
+
+def rate(correct: int, seen: int) -> dict[str, Any]:
+    """Return count, accuracy and its 95 % Clopper-Pearson interval; null where nothing was seen."""
+    return {
+        "configurations": seen,
+        "correct": correct,
+        "accuracy": correct / seen if seen else None,
+        "interval": list(clopper_pearson(correct, seen)) if seen else None,
+    }
+
+
+class Tally:
+    """What has been counted so far.
+
+    Args:
+        outer: name and values of the axes outside the scene: object, environment, model.
+        axes: of the grid.
+        drawn: what the table shows of the draws.
+
+    Attributes:
+        seen: configurations.
+        correct: those that the model got right.
+        not_finite: those whose margin was not a number; they count as not right.
+        worst: the number of the configuration with the largest margin, with what was seen there; the first of equals.
+        answers: how often each wrong answer was given.
+    """
+
+    def __init__(
+        self, outer: Sequence[tuple[str, Sequence[str]]], axes: Sequence[Axis], drawn: Sequence[Drawn]
+    ) -> None:
+        self.seen = self.correct = self.not_finite = 0
+        self.worst: tuple[int, Trial] | None = None
+        self.answers: Counter[str] = Counter()
+        self._outer = [Count(name, "", list(dict.fromkeys(values))) for name, values in outer]
+        self._grid = [Count(axis.name, axis.unit, axis.values) for axis in axes]
+        self._drawn = [Count(one.name, one.unit, one.parts) for one in drawn]
+        every = [*self._grid, *reversed(self._outer), *self._drawn]
+        several = [number for number, count in enumerate(every) if len(count.values) > 1]
+        listed = [number for number in several if number < len(every) - len(self._drawn)]
+        self._mapped = listed or several
+        self._cells = Cells([(every[n].name, every[n].unit, every[n].values) for n in self._mapped])
+
+    def add(self, index: int, outer: Sequence[int], picks: Picks, place: int, trial: Trial, label: str) -> None:
+        """Count one configuration.
+
+        Args:
+            index: its number.
+            outer: its places on the outer axes.
+            picks: the pictures it belongs to.
+            place: its place among them.
+            trial: what was seen.
+            label: the answer.
+        """
+        right = trial.right
+        self.seen += 1
+        self.correct += right
+        for count, digit in zip(self._outer, outer, strict=True):
+            count.add(digit, right)
+        for count, digit in zip(self._grid, picks.digits[place], strict=True):
+            count.add(digit, right)
+        for count, part in zip(self._drawn, picks.parts[place], strict=True):
+            count.add(part, right)
+        places = (*picks.digits[place], *reversed(outer), *picks.parts[place])
+        self._cells.add([places[number] for number in self._mapped], trial)
+        if trial.wrong:
+            self.answers[label] += 1
+        if trial.margin != trial.margin:
+            self.not_finite += 1
+        elif self.worst is None or trial.margin > self.worst[1].margin:
+            self.worst = index, trial
+
+    def table(self) -> list[dict[str, Any]]:
+        """Return accuracy by axis and value; axes with a single value are left out."""
+        counts = [*self._outer, *self._grid, *self._drawn]
+        return [row for count in counts if len(count.values) > 1 for row in count.rows()]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the part of the summary that is counted."""
+        return {
+            **rate(self.correct, self.seen),
+            "not_finite": self.not_finite,
+            "answers": dict(sorted(self.answers.most_common(MOST_ANSWERS), key=lambda one: (-one[1], one[0]))),
+            "axes": self.table(),
+            "cells": self._cells.to_dict(),
+        }
+
+
+def verified(
+    trials: Sequence[Trial], labels: Sequence[str], spp: int, *, converged: bool, renders: int
+) -> dict[str, Any]:
+    """Return what fresh renders of the worst configuration say; a success is a wrong answer."""
+    wrong = [trial for trial in trials if trial.wrong]
+    answers = Counter(labels[trial.predicted] for trial in wrong)
+    return {
+        **Trials(len(wrong), len(trials), spp).to_dict(),
+        "labels": dict(answers.most_common()),
+        "margin": sum(trial.margin for trial in trials) / len(trials),
+        "converged": converged,
+        "renders": renders,
+    }

@@ -1,0 +1,102 @@
+"""The independent re-check of the worst configuration of a sweep (DESIGN 4.1): fresh seeds, enough samples, 8 bits.
+
+A sweep has no clean configuration, so there is no control group: a trial counts where the model is wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from torch import Tensor
+
+from advsearch.attacks import Trial, choose_spp, run_trials
+from advsearch.attacks.sample_count import most_samples
+from advsearch.engine.record import Stages, trial_row
+from advsearch.engine.samples import verification_ladder
+from advsearch.engine.sweeps.job import Job
+from advsearch.engine.sweeps.summary import verified
+from advsearch.engine.sweeps.view import View
+from advsearch.runs import store
+from advsearch.runs.directory import RunDirectory
+from advsearch.seeds import stream
+
+KIND, PROBES = "verification", "sample count worst"
+"""Rows of the trials, and of the renders that chose their sample count."""
+
+
+def check_worst(
+    view: View, job: Job, model: int, u: Tensor, run: RunDirectory | None, stages: Stages
+) -> dict[str, Any] | None:
+    """Render a configuration again, and say how often the model is wrong.
+
+    Trials that the run has stored already are not made again.
+
+    Args:
+        view: its scene.
+        job: says how many trials.
+        model: number of the model.
+        u: (d,).
+        run: gets a row for every trial, and has those of a run that was stopped.
+        stages: told how far it is.
+
+    Returns:
+        As `verified` in the summary; None without trials.
+    """
+    config, network = job.config, job.models[model]
+    if config.trials == 0:
+        return None
+    ladder = verification_ladder(config)
+
+    stages.begin(
+        "verification",
+        "finding how many samples the check needs",
+        most_samples(1, ladder),
+        hint="the worst configuration, counted in samples a pixel; `verify_spp=NUMBER` leaves it out",
+        at_most=True,
+    )
+    probe = _after(_stored(run, PROBES), lambda at, seed, spp: view.trial(model, at, seed, spp))
+    known, number = 0 if run is None else run.store.count(PROBES), 0
+
+    def margin_of(spp: int, seed: int) -> float:
+        nonlocal number
+        trial = probe(u, seed, spp)
+        if run is not None and number >= known:
+            run.record(trial_row(PROBES, number, seed, spp, trial, network.labels, sought=False))
+        number += 1
+        stages.progress.advance(spp)
+        return trial.margin
+
+    count = choose_spp({"worst": margin_of}, seed=config.seed, ladder=ladder)
+    hint = f"{config.trials} pictures of {count.spp} samples a pixel; `trials` or `verify_spp` shorten it"
+    stages.begin("verification", "checking the worst configuration with fresh renders", config.trials, hint=hint)
+    stored = _stored(run, KIND)
+
+    def keep(group: str, number: int, trial: Trial) -> None:
+        stages.progress.advance(1)
+        if run is not None and number >= len(stored):
+            seed = stream(config.seed, KIND, number)
+            run.record(trial_row(KIND, number, seed, count.spp, trial, network.labels, sought=False))
+
+    render = _after(stored, lambda at, seed, spp: view.trial(model, at, seed, spp))
+    trials = run_trials(render, u, spp=count.spp, seed=config.seed, trials=config.trials, on_trial=keep)
+    settled = count.converged or len(ladder) == 1
+    renders = count.renders + len(trials)
+    return verified(trials, network.labels, count.spp, converged=settled, renders=renders)
+
+
+def _stored(run: RunDirectory | None, kind: str) -> list[Trial]:
+    return [] if run is None else [trial_of(row) for row in run.store.rows(kind)]
+
+
+def trial_of(row: store.Row) -> Trial:
+    """Return what was seen of a configuration from its row."""
+    seen = math.nan if row.objective is None else row.objective
+    return Trial(seen, row.label_index or 0, math.nan if row.probability is None else row.probability)
+
+
+def _after(stored: Sequence[Trial], render: Callable[[Tensor, int, int], Trial]) -> Callable[[Tensor, int, int], Trial]:
+    """Return the trials that are stored, one after the other, then rendered ones."""
+    left = list(reversed(stored))
+    return lambda u, seed, spp: left.pop() if left else render(u, seed, spp)

@@ -1,0 +1,242 @@
+"""The report of `advsearch precision`: points, slopes, references, warnings and recommendations as plain data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from advsearch.evaluation.precision.fits import (
+    Against,
+    Recommendation,
+    RoundUp,
+    Slope,
+    Theory,
+    confirmed,
+    fit,
+    recommend,
+    warning_of,
+)
+from advsearch.evaluation.precision.image import OIDN
+from advsearch.evaluation.precision.objective import Curve, missing, sooner
+from advsearch.evaluation.precision.points import Point, Reference, Setting
+from advsearch.scene.mitsuba_backend.samplers import next_count
+
+Line = tuple[str, str, str]
+AGAINST: tuple[Against, ...] = ("samples", "seconds")
+FAMILIES = {"raw": "without denoiser", "oidn": "with denoiser", "depth": "by path depth"}
+MEASURES = {"error": "", "margin_error": "margin"}
+
+
+@dataclass
+class Section:
+    """What was measured so far.
+
+    Attributes:
+        sampler: of the run's pixels, which gradients are taken with.
+        points: of each line and measure.
+        theories: of each line.
+        families: of each line of the image: what it is recommended among.
+        again: points of settings that were recommended, from measurements after that.
+        references: as the report holds them.
+        curves: of each policy.
+        start: verified objective before any search.
+        left_out: settings that did not fit into the time.
+        warnings: sentences.
+        interrupted: whether the user stopped it.
+    """
+
+    sampler: str
+    points: dict[tuple[Line, str], list[Point]] = field(default_factory=dict)
+    theories: dict[Line, Theory] = field(default_factory=dict)
+    families: dict[Line, str] = field(default_factory=dict)
+    again: dict[tuple[Line, str], Point] = field(default_factory=dict)
+    references: list[dict[str, Any]] = field(default_factory=list)
+    curves: list[tuple[Setting, Curve]] = field(default_factory=list)
+    start: float = math.nan
+    left_out: tuple[Setting, ...] = ()
+    warnings: list[str] = field(default_factory=list)
+    interrupted: bool = False
+
+    def add(self, line: Line, points: Sequence[Point], theory: Theory) -> None:
+        """Keep the points of one line, all of one measure."""
+        self.points[line, points[0].measure] = sorted(points, key=lambda point: point.setting.spp)
+        self.theories[line] = theory
+
+    def recommended(self, quantity: str, control: str, goal: float) -> Recommendation | None:
+        """Return the setting that reaches a goal soonest, by what was measured so far."""
+        found = (one for one, *what in _recommended(self, goal) if what[:2] == [quantity, control])
+        return next(found, None)
+
+    def refer(
+        self, quantity: str, name: str, control: str, one: Reference, spp: int, margin: Reference | None = None
+    ) -> None:
+        """Keep what a reference is, and how far off it may be."""
+        kept: dict[str, Any] = {"quantity": quantity, "reference": name, "error": one.error}
+        kept |= {"parts": one.parts, "spp": spp * one.parts}
+        if control:
+            kept["control"] = control
+        if margin is not None:
+            kept |= {"margin": float(margin.value[0]), "margin_error": margin.error}
+        self.references.append(kept)
+
+
+def report_of(head: Mapping[str, Any], section: Section, goal: float, seconds: Mapping[str, float]) -> dict[str, Any]:
+    """Return the report: DESIGN section 6, and what else there is to say."""
+    slopes = _slopes(section)
+    for slope in slopes:
+        said = warning_of(slope, section.points[slope.line, slope.measure])
+        section.warnings += [said] if said else []
+    return {
+        **head,
+        "goal": goal,
+        "points": _points(section),
+        "slopes": [_slope(one) for one in slopes],
+        "references": section.references,
+        "recommendations": [_recommendation(*one) for one in _recommended(section, goal)] + _policy(section, goal),
+        "warnings": section.warnings + (["interrupted: only a part was measured"] if section.interrupted else []),
+        "left_out": [_left_out(one) for one in section.left_out],
+        "seconds": dict(seconds),
+        "interrupted": section.interrupted,
+        "figures": [],
+    }
+
+
+def figures_of(report: Mapping[str, Any]) -> dict[str, bytes]:
+    """Return the diagrams as PNG and SVG."""
+    from advsearch.report.diagrams import precision_figures
+
+    return precision_figures(report)
+
+
+# ---- inside ---------------------------------------------------------------------------------------------------------
+
+
+def _slopes(section: Section) -> list[Slope]:
+    found = []
+    for (line, _), points in section.points.items():
+        for against in AGAINST:
+            slope = fit(points, against, section.theories[line])
+            if slope is not None:
+                found.append(slope)
+    return found
+
+
+def _points(section: Section) -> list[dict[str, Any]]:
+    """One entry a setting; the margin's error stands beside the picture's."""
+    found: dict[tuple[Line, int], dict[str, Any]] = {}
+    for (line, measure), points in section.points.items():
+        for point in points:
+            entry = found.setdefault((line, point.setting.spp), _place(point.setting))
+            known, floor = (
+                ("known", "reference_error") if measure == "error" else ("margin_known", "margin_reference_error")
+            )
+            interval = "interval" if measure == "error" else "margin_interval"
+            entry |= {measure: point.error, interval: list(point.interval), known: point.known, floor: point.floor}
+            entry |= {"seconds": point.seconds, "repeats": point.repeats, **point.more}
+            if line in section.families:
+                entry["family"] = section.families[line]
+    return [*found.values(), *_objective_points(section)]
+
+
+def _objective_points(section: Section) -> list[dict[str, Any]]:
+    best = _best(section)
+    found = []
+    for setting, curve in section.curves:
+        shares = missing(curve, best, section.start)
+        for renders, seconds, (low, middle, high), share in zip(
+            curve.renders, curve.seconds, curve.objective, shares, strict=True
+        ):
+            entry = {**_place(setting), "error": share, "objective": middle, "quartiles": [low, high]}
+            found.append({**entry, "renders": renders, "seconds": seconds, "repeats": curve.repeats})
+    return found
+
+
+def _best(section: Section) -> float:
+    """The best median of any policy."""
+    tops = [middle for _, curve in section.curves for _, middle, _ in curve.objective]
+    return max((value for value in tops if math.isfinite(value)), default=math.nan)
+
+
+def _place(setting: Setting) -> dict[str, Any]:
+    place: dict[str, Any] = {"quantity": setting.quantity, "estimator": setting.series, "spp": setting.spp}
+    return place | ({"control": setting.control} if setting.control else {})
+
+
+def _slope(one: Slope) -> dict[str, Any]:
+    quantity, control, series = one.line
+    return {
+        "quantity": quantity,
+        "control": control or None,
+        "estimator": series,
+        "measure": one.measure,
+        "against": one.against,
+        "slope": one.value,
+        "interval": list(one.interval),
+        "offset": one.offset,
+        "points": one.points,
+        "fixed_seconds": one.fixed,
+        "theory": one.theory.slope,
+        "or_steeper": one.theory.at_most,
+        "agrees": one.agrees,
+    }
+
+
+def _recommended(section: Section, goal: float) -> list[tuple[Recommendation | None, str, str, str, str]]:
+    """For each thing that can be asked for: the setting that reaches the goal soonest, or None."""
+    asked: dict[tuple[str, str, str, str], dict[Line, Sequence[Point]]] = {}
+    for (line, measure), points in section.points.items():
+        family = section.families.get(line, "")
+        if measure == "margin_error" and family == "depth":
+            continue
+        asked.setdefault((line[0], line[1], measure, family), {})[line] = points
+    found = []
+    for what, lines in asked.items():
+        round_up = _rounding(section, what[0])
+        one = recommend(lines, goal, round_up)
+        again = None if one is None else section.again.get((one.line, one.measure))
+        if one is not None and again is not None:
+            one = confirmed(one, again, round_up)
+        found.append((one, *what))
+    return found
+
+
+def _rounding(section: Section, quantity: str) -> RoundUp:
+    """A line of the picture is named after its sampler; one of a gradient has that of the run."""
+    return lambda series, samples: next_count(
+        section.sampler if quantity == "gradient" else series.removesuffix(OIDN), samples
+    )
+
+
+def _recommendation(
+    one: Recommendation | None, quantity: str, control: str, measure: str, family: str
+) -> dict[str, Any]:
+    asked = {"quantity": quantity, "control": control or None, "measure": measure, "among": FAMILIES.get(family)}
+    if one is None:
+        return {**asked, "estimator": None}
+    return {
+        **asked,
+        "goal": one.goal,
+        "estimator": one.line[2],
+        "spp": one.spp,
+        "seconds": one.seconds,
+        "error": one.error,
+        "basis": one.basis,
+        **({"repeats": one.repeats} if one.repeats else {}),
+    }
+
+
+def _policy(section: Section, goal: float) -> list[dict[str, Any]]:
+    if not section.curves:
+        return []
+    found = sooner([curve for _, curve in section.curves], goal, _best(section), section.start)
+    asked = {"quantity": "objective", "control": None, "measure": "error", "among": None}
+    if found is None:
+        return [{**asked, "estimator": None}]
+    policy, renders, seconds = found
+    return [{**asked, "goal": goal, "estimator": policy, "renders": renders, "seconds": seconds, "basis": "measured"}]
+
+
+def _left_out(setting: Setting) -> dict[str, Any]:
+    return {**_place(setting), "reason": "did not fit into the time"}

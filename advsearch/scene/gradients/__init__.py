@@ -1,0 +1,1 @@
+"""How pictures are differentiated: the plan, the motion of coordinates, the material form."""

@@ -1,0 +1,86 @@
+"""Mitsuba's dictionary of a described scene: its camera, its environment and the ground; objects come as parts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.parts import PartInput, number, transform
+
+
+def scene_dict(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> dict[str, Any]:
+    """Everything but the object and the parts."""
+    mi = mitsuba()
+    place = mi.ScalarTransform4f
+    number = description.number
+    scene: dict[str, Any] = {
+        "type": "scene",
+        "camera": _camera(description, resolution, filter, sampler),
+        "environment": {
+            "type": "envmap",
+            "bitmap": mi.Bitmap(np.ascontiguousarray(description.environment.radiance, dtype=np.float32)),
+            "scale": 2.0 ** number("environment.exposure"),
+            "to_world": place().rotate([0, 0, 1], number("environment.rotation")).rotate([1, 0, 0], 90),
+        },
+    }
+    if number("ground.size") > 0.0:
+        color = [number(f"ground.{channel}") for channel in ("red", "green", "blue")]
+        reflectance = srgb_to_linear(np.array(color, np.float32)).tolist()
+        scene["ground"] = {
+            "type": "rectangle",
+            "to_world": place().scale(number("ground.size") / 2.0),
+            "bsdf": {
+                "type": "twosided",
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": reflectance}},
+            },
+        }
+    return scene
+
+
+def _camera(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> dict[str, Any]:
+    height, width = resolution
+    camera: dict[str, Any] = {
+        "type": "thinlens" if description.thin_lens else "perspective",
+        "fov": description.number("camera.fov"),
+        "fov_axis": "larger",
+        "near_clip": 0.01,
+        "far_clip": 1e5,
+        "to_world": mitsuba().ScalarTransform4f(camera_to_world(description, width / height)),
+        "film": {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "pixel_format": "rgba" if description.backdrop else "rgb",
+            "component_format": "float32",
+            "rfilter": {"type": filter},
+        },
+        "sampler": {"type": sampler},
+    }
+    if description.thin_lens:
+        camera |= {"aperture_radius": 1e-4, "focus_distance": 1.0}
+    return camera
+
+
+def camera_inputs(resolution: tuple[int, int]) -> tuple[PartInput, ...]:
+    """The camera's inputs. Our field of view is along the larger side, Mitsuba's parameter along the width."""
+    height, width = resolution
+
+    def along_width(value: Any) -> Any:
+        import drjit as dr
+
+        half = dr.deg2rad(value.array) / 2.0
+        return mitsuba().Float(2.0 * dr.rad2deg(dr.atan(dr.tan(half) * min(1.0, width / height))))
+
+    return (
+        PartInput("camera.to_world", "camera.to_world", transform, shape=(4, 4)),
+        PartInput("camera.fov", "camera.x_fov", along_width, shape=(1,)),
+        PartInput("camera.shift_x", "camera.principal_point_offset_x", number, shape=(1,)),
+        PartInput("camera.shift_y", "camera.principal_point_offset_y", number, shape=(1,)),
+        PartInput("camera.aperture", "camera.aperture_radius", number, shape=(1,)),
+        PartInput("camera.focus", "camera.focus_distance", number, shape=(1,)),
+    )

@@ -1,0 +1,292 @@
+"""Find a libLLVM that Dr.Jit can compile its kernels with, before Mitsuba is imported.
+
+Dr.Jit takes whatever ``libLLVM`` the machine offers first. A version that is too old leaves the backend inactive
+(Dr.Jit 1.5 refuses versions below 15) or, worse, aborts the whole process at the first render: on x86 the kernels use
+the ``fminimum`` operation, which LLVM selects from version 17 on. Measured with Dr.Jit 1.5.0 on an AMD EPYC: 13 and
+14 are refused, 15 and 16 abort, 19 and 22 render. So this module looks for the newest file of version 17 or later and
+names it in the variable that Dr.Jit reads, ``DRJIT_LIBLLVM_PATH``.
+
+Only the standard library is imported here: the set-up script runs this file before anything else works
+(``python -m advsearch.scene.mitsuba_backend.llvm`` prints the chosen file).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import functools
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from advsearch.errors import AdvsearchError, EnvironmentSetupError
+
+VARIABLE = "DRJIT_LIBLLVM_PATH"
+MINIMUM = 17
+"""The first major version that renders: see the head of this file."""
+
+_PATTERNS = (
+    "usr/lib/*/libLLVM*.so*",
+    "usr/lib/libLLVM*.so*",
+    "usr/lib/llvm*/lib/libLLVM*.so*",
+    "usr/lib64/libLLVM*.so*",
+    "usr/lib64/llvm*/lib*/libLLVM*.so*",
+    "usr/local/lib/libLLVM*.so*",
+    "opt/homebrew/opt/llvm*/lib/libLLVM*.dylib",
+    "usr/local/opt/llvm*/lib/libLLVM*.dylib",
+    "home/linuxbrew/.linuxbrew/opt/llvm*/lib/libLLVM*.so*",
+    "Program Files/LLVM/bin/LLVM-C.dll",
+)
+"""Where the packages of Debian, Ubuntu, Fedora, Arch, Homebrew and LLVM's own Windows installer put the file."""
+
+_NAME = re.compile(r"libLLVM([-.]\d+(\.\d+)*)?\.(so[^/]*|dylib)|LLVM-C\.dll")
+_NAME_VERSION = re.compile(r"libLLVM(?:\.so\.|[-.])(\d\d(?:\.\d+)*)")
+_FOLDER_VERSION = re.compile(r"llvm[-@]?/?(\d\d(?:\.\d+)*)")
+
+_PROBE = (
+    "import ctypes, sys\n"
+    "v = [ctypes.c_uint() for _ in range(3)]\n"
+    "ctypes.CDLL(sys.argv[1]).LLVMGetVersion(*map(ctypes.byref, v))\n"
+    "print(*(n.value for n in v))\n"
+)
+
+Version = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class LLVM:
+    """A libLLVM that Dr.Jit can use: its file, and its version as numbers, major first."""
+
+    path: Path
+    version: Version
+
+    def __str__(self) -> str:
+        return f"{'.'.join(map(str, self.version))} ({self.path})"
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A file that was found, its version (empty if it could not be told) and why it is refused (empty if it is not)."""
+
+    path: Path
+    version: Version
+    refused: str
+
+    def __str__(self) -> str:
+        version = ".".join(map(str, self.version)) or "version unknown"
+        return f"{self.path} ({version}{': ' + self.refused if self.refused else ''})"
+
+
+def find(root: Path = Path("/"), environ: Mapping[str, str] = os.environ) -> list[Candidate]:
+    """Every libLLVM of this machine, usable ones first, each group newest first; `DRJIT_LIBLLVM_PATH` is not looked at.
+
+    Args:
+        root: the folder taken for the root of the file system (tests give another one).
+        environ: where ``CONDA_PREFIX`` is read from.
+    """
+    found = {path.resolve(): path for path in _files(root, environ)}
+    candidates = [examine(path, name_hint=link) for path, link in found.items()]
+    return sorted(candidates, key=lambda c: (not c.refused, c.version), reverse=True)
+
+
+def examine(path: Path, *, name_hint: Path | None = None) -> Candidate:
+    """Say which version a libLLVM file is, from its name or else by asking it, and whether Dr.Jit can use it.
+
+    Args:
+        path: the file, symbolic links resolved.
+        name_hint: the link through which it was found; its name may hold the version where the file's does not.
+    """
+    if problem := _unreadable(path):
+        return Candidate(path, (), problem)
+    version = version_in(path) or (version_in(name_hint) if name_hint else ()) or _ask(str(path))
+    return Candidate(path, version, refusal(version))
+
+
+def refusal(version: Version) -> str:
+    """Why Dr.Jit cannot use this version of LLVM; empty when it can."""
+    if not version:
+        return "it does not tell its version, so it is older than 16 or not LLVM"
+    if version[0] < 15:
+        return "Dr.Jit refuses versions below 15"
+    if version[0] < MINIMUM:
+        return "it aborts the process at the first render"
+    return ""
+
+
+def version_in(path: Path) -> Version:
+    """The version in a path like ``libLLVM-19.so.1``, ``libLLVM.so.19.1``, ``llvm/19.1.7/lib/libLLVM.dylib``; or ()."""
+    match = _NAME_VERSION.match(path.name) or _FOLDER_VERSION.search(path.parent.as_posix())
+    return tuple(int(part) for part in match[1].split(".")) if match else ()
+
+
+@functools.cache
+def ensure_llvm() -> LLVM:
+    """Choose a libLLVM and name it in ``DRJIT_LIBLLVM_PATH``, which Dr.Jit reads when it is imported.
+
+    A file that the variable names already wins, whatever else there is. Call it before the first import of Mitsuba.
+
+    Raises:
+        EnvironmentSetupError: there is no usable file, or the one that the variable names is not usable; the message
+            lists what was found and the command that installs a good one.
+    """
+    given = os.environ.get(VARIABLE, "")
+    chosen = _given(given) if given else _newest(find())
+    os.environ[VARIABLE] = str(chosen.path)
+    return chosen
+
+
+def install_command(os_release: str | None = None, platform: str = sys.platform) -> str:
+    """The command that installs a good libLLVM on this machine, or one line for each known platform.
+
+    Args:
+        os_release: the text of ``/etc/os-release``; None reads it.
+        platform: as in `sys.platform`.
+    """
+    sudo = "" if hasattr(os, "geteuid") and os.geteuid() == 0 else "sudo "
+    commands = {
+        "Debian, Ubuntu": f"{sudo}apt-get install libllvm19",
+        "Fedora": f"{sudo}dnf install llvm-libs",
+        "Homebrew": "brew install llvm",
+        "conda": "conda install -c conda-forge libllvm19",
+    }
+    if os.environ.get("CONDA_PREFIX"):
+        return commands["conda"]
+    if platform == "darwin":
+        return commands["Homebrew"]
+    release = _read_os_release() if os_release is None else os_release
+    ids = " ".join(re.findall(r'^ID(?:_LIKE)?="?([^"\n]*)', release, re.MULTILINE)).split()
+    if "ubuntu" in ids and re.search(r'^VERSION_ID="?(1\d|2[0-3])\.', release, re.MULTILINE):
+        return commands["conda"]  # its own packages end with LLVM 15
+    for name, known in (("Debian, Ubuntu", {"debian", "ubuntu"}), ("Fedora", {"fedora", "rhel"})):
+        if known & set(ids):
+            return commands[name]
+    return "\n".join(f"  {name}: {command}" for name, command in commands.items())
+
+
+def _given(value: str) -> LLVM:
+    """Check the file (or the bare library name) that the variable names."""
+    path = Path(value)
+    if os.sep in value and not path.is_file():
+        raise EnvironmentSetupError(
+            f"{VARIABLE}: expected a libLLVM file, got {value!r}, which does not exist. "
+            f"Correct it, or unset it to let advsearch look for one."
+        )
+    candidate = examine(path.resolve(), name_hint=path) if os.sep in value else _bare(value)
+    if candidate.refused:
+        raise EnvironmentSetupError(
+            f"{VARIABLE}: expected a libLLVM of version {MINIMUM} or later, got {candidate}. "
+            f"Correct it, or unset it to let advsearch look for one."
+        )
+    return LLVM(path, candidate.version)
+
+
+def _bare(name: str) -> Candidate:
+    """A library name without a folder is looked up by the dynamic loader; only the library itself knows its version."""
+    version = _ask(name)
+    return Candidate(Path(name), version, refusal(version))
+
+
+def _newest(candidates: list[Candidate]) -> LLVM:
+    """The first usable candidate that can be loaded."""
+    refused = [str(c) for c in candidates if c.refused]
+    for candidate in candidates:
+        if candidate.refused:
+            continue
+        try:
+            ctypes.CDLL(str(candidate.path))  # Dr.Jit loads the same file next, so this costs nothing
+        except OSError as error:
+            refused.append(f"{candidate.path} (cannot be loaded: {error})")
+        else:
+            return LLVM(candidate.path, candidate.version)
+    raise EnvironmentSetupError(_missing(refused))
+
+
+def _missing(refused: list[str]) -> str:
+    found = "Found: " + "; ".join(refused) + "." if refused else "Found none."
+    command = install_command()
+    separator = "\n" if "\n" in command else " "
+    return (
+        f"expected a libLLVM of version {MINIMUM} or later, with which Dr.Jit compiles its kernels. {found} "
+        f"Install one with:{separator}{command}{separator}or name a file in {VARIABLE}."
+    )
+
+
+def _files(root: Path, environ: Mapping[str, str]) -> Iterator[Path]:
+    patterns = list(_PATTERNS)
+    for folder in _conda_folders(environ):
+        patterns += [f"{folder}/{name}" for name in ("libLLVM*.so*", "libLLVM*.dylib", "LLVM-C.dll")]
+    for pattern in patterns:
+        yield from (path for path in root.glob(pattern) if _NAME.fullmatch(path.name) and path.is_file())
+    library = ctypes.util.find_library("LLVM") if root == Path("/") else None
+    if library and os.sep in library:
+        yield Path(library)
+
+
+def _conda_folders(environ: Mapping[str, str]) -> list[str]:
+    """The library folders of an active conda environment, relative to the root."""
+    prefix = environ.get("CONDA_PREFIX", "")
+    if not prefix:
+        return []
+    inside = Path(prefix).relative_to(Path(prefix).anchor).as_posix()
+    return [f"{inside}/lib", f"{inside}/Library/bin"]
+
+
+def _unreadable(path: Path) -> str:
+    """Why a file cannot be a library for this interpreter, or ""; only where libraries are ELF files (Linux)."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(20)
+    except OSError as error:
+        return f"it cannot be read: {error.strerror}"
+    own = _own_elf_header()
+    if not own:
+        return ""
+    if head[:4] != b"\x7fELF" or len(head) < 20:
+        return "it is not a shared library"
+    return "" if (head[4:6], head[18:20]) == (own[4:6], own[18:20]) else "it is for another processor"
+
+
+@functools.cache
+def _own_elf_header() -> bytes:
+    """The first bytes of this interpreter's own file: word size, byte order, processor; empty if it is not ELF."""
+    try:
+        with open(sys.executable, "rb") as file:
+            head = file.read(20)
+    except OSError:
+        return b""
+    return head if head[:4] == b"\x7fELF" else b""
+
+
+def _ask(library: str) -> Version:
+    """Load a library in another process, which a bad one may take down, and ask for its version; () if it has none."""
+    command = [sys.executable, "-c", _PROBE, library]
+    try:
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=30, check=True).stdout
+        return tuple(int(part) for part in answer.split())
+    except (OSError, subprocess.SubprocessError, ValueError):
+        return ()
+
+
+def _read_os_release() -> str:
+    try:
+        return Path("/etc/os-release").read_text(encoding="utf-8")
+    except OSError:
+        return ""
+
+
+def main() -> int:
+    """Print the libLLVM that advsearch will use, or why there is none (status 3)."""
+    try:
+        print(ensure_llvm())
+    except AdvsearchError as error:
+        print(f"advsearch: {error}", file=sys.stderr)
+        return 3
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

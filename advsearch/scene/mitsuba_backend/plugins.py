@@ -1,0 +1,70 @@
+"""Mitsuba's mesh and surface plugins from our assets."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.scene.assets import Floats, Material, Mesh
+from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.mitsuba_backend.variant import mitsuba
+
+
+def principled(base_color: Floats, material: Material, extra: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """A two-sided principled BSDF with the base colour as a bilinear texture of linear reflectance.
+
+    Args:
+        base_color: (h, w, 3) display-referred sRGB in [0, 1], row 0 at v = 1.
+        material: the numbers of the surface. A clearcoat of 0 leaves the lobe out.
+        extra: further entries of the plugin's dictionary.
+    """
+    mi = mitsuba()
+    linear = srgb_to_linear(base_color)
+    surface: dict[str, Any] = {
+        "type": "principled",
+        "base_color": {
+            "type": "bitmap",
+            "bitmap": mi.Bitmap(np.ascontiguousarray(linear, dtype=np.float32)),
+            "raw": True,
+            "filter_type": "bilinear",
+        },
+        "roughness": material.roughness,
+        "metallic": material.metallic,
+        "specular": material.specular,
+        **(extra or {}),
+    }
+    if material.clearcoat > 0.0:
+        surface["clearcoat"] = material.clearcoat
+    return {"type": "twosided", "bsdf": surface}
+
+
+def mitsuba_mesh(name: str, mesh: Mesh, to_world: npt.NDArray[np.float64], bsdf: dict[str, Any]) -> Any:
+    """Return a Mitsuba mesh of the given geometry under a pose, with shading normals and texture coordinates.
+
+    Mitsuba's bitmaps have row 0 at v = 0 while ours have it at v = 1, hence the flip.
+    """
+    mi = mitsuba()
+    vertices = mesh.vertices.astype(np.float64) @ to_world[:3, :3].T + to_world[:3, 3]
+    normals = mesh.normals.astype(np.float64) @ np.linalg.inv(to_world[:3, :3])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    uvs = np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1)
+    properties = mi.Properties()
+    properties["bsdf"] = mi.load_dict(bsdf)
+    result = mi.Mesh(
+        name,
+        vertex_count=len(vertices),
+        face_count=len(mesh.faces),
+        has_vertex_normals=True,
+        has_vertex_texcoords=True,
+        props=properties,
+    )
+    parameters = mi.traverse(result)
+    parameters["vertex_positions"] = mi.Float(vertices.astype(np.float32).ravel())
+    parameters["vertex_normals"] = mi.Float(normals.astype(np.float32).ravel())
+    parameters["vertex_texcoords"] = mi.Float(uvs.astype(np.float32).ravel())
+    parameters["faces"] = mi.UInt32(mesh.faces.astype(np.uint32).ravel())
+    parameters.update()
+    return result

@@ -1,0 +1,417 @@
+"""A described scene inside Mitsuba: built once, changed only through named inputs, rendered and differentiated.
+
+Inputs are torch tensors with names of ours (`object.base_color`), so that nothing outside this room knows Mitsuba's
+parameter paths. Every call states all inputs it wants changed; those it does not name have their base values, so that
+no configuration is ever applied on top of another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advsearch.errors import InputError
+from advsearch.scene.assembly import Assembly
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.geometry import object_to_world
+from advsearch.scene.leaving_out import EVERYTHING, IDLE_LOBES, leave_dark_lamps_out
+from advsearch.scene.mitsuba_backend.dictionary import camera_inputs, scene_dict
+from advsearch.scene.mitsuba_backend.population import population
+from advsearch.scene.mitsuba_backend.samplers import SAMPLER, next_count
+from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.parts import MeshPart, PartInput, as_is
+
+MAX_DEPTH = 6
+"""Longest light path in segments: five bounces off surfaces."""
+NO_ROULETTE = 1000
+"""Russian roulette never starts: it adds noise, and paths are short already."""
+
+SHADOW_SPP = 4
+"""Samples a pixel of the material form's shadow term; without it a resting object's gradient has a cosine of 0.66."""
+
+BASE_COLOR = "object.base_color"
+"""Input: (h, w, 3) linear reflectance of the object, row 0 at v = 1 (top of the image)."""
+
+ENVIRONMENT_INPUT = PartInput("environment.padded", "environment.data", as_is, interior=True)
+"""(H, W + 2, 3): Mitsuba keeps a copy of the last column before the first, and of the first after the last."""
+
+
+class MitsubaScene:
+    """Renders one scene at one size.
+
+    Attributes:
+        assembly: turns the inputs of a space into those of this scene.
+        names: every input that can be set.
+        interior: those that the interior adjoint differentiates correctly.
+
+    Args:
+        description: what to build.
+        resolution: (height, width) in pixels.
+        filter: reconstruction filter, "box" or "gaussian".
+        leave_out: names from `advsearch.scene.leaving_out.ITEMS`; less than everything only to measure what it brings.
+        max_depth: longest light path in segments.
+        sampler: Mitsuba's name of the sampler; some round sample counts up, see `scene.samplers`.
+        integrator: Mitsuba's name of the path integrator of primal renders, where there is no medium.
+    """
+
+    def __init__(
+        self,
+        description: SceneDescription,
+        resolution: tuple[int, int],
+        *,
+        filter: str = "box",
+        leave_out: Collection[str] = EVERYTHING,
+        max_depth: int = MAX_DEPTH,
+        sampler: str = SAMPLER,
+        integrator: str = "prb",
+    ) -> None:
+        mi = mitsuba()
+        self._made = (description, filter)
+        self.resolution = resolution
+        self.sampler = sampler
+        self.assembly = Assembly(description)
+        self.max_depth = max_depth
+        self._depth = max_depth
+        self._leave_out = frozenset(leave_out)
+        self._freeze = "tracing" in leave_out and not description.thin_lens  # Dr.Jit cannot record Mitsuba's thin lens
+        self._thin_lens = description.thin_lens
+        self._backdrop = description.backdrop
+        object_part = MeshPart(
+            "object",
+            description.object.mesh,
+            object_to_world(description),
+            description.object.base_color,
+            description.material,
+            {} if "lobes" in leave_out else dict(IDLE_LOBES),
+        )
+        parts = (object_part, *description.parts)
+        self.volumetric = any(part.volumetric for part in parts)
+        plugins = scene_dict(description, resolution, filter, sampler)
+        for part in parts:
+            plugins |= part.plugins()
+            plugins["camera"] |= part.sensor()
+        if "emitters" in leave_out:
+            leave_dark_lamps_out(plugins, parts)
+        self._path: dict[str, Any] = {"type": integrator}
+        for part in parts:
+            self._path |= part.integrator(plugins)
+        self._scene = mi.load_dict(plugins, optimize=False)
+        self._sensor = self._scene.sensors()[0]
+        self._parameters = mi.traverse(self._scene)
+        self._integrators: dict[tuple[str, int], Any] = {}
+        declared = [*camera_inputs(resolution), ENVIRONMENT_INPUT, *(one for part in parts for one in part.inputs())]
+        self._inputs = {one.name: (key, one) for one in declared if (key := _key(self._parameters, one.key))}
+        self.names = frozenset(self._inputs)
+        self.interior = frozenset(name for name, (_, one) in self._inputs.items() if one.interior)
+        self._shapes = frozenset(name for name, (key, _) in self._inputs.items() if _is_of_a_shape(key))
+        self._unsettled: set[str] = set()
+        self._base: dict[str, Any] = {}
+        self._applied: dict[str, Tensor] = {}
+        self._recorded: dict[tuple[str, int, int], Callable[..., Any]] = {}
+        self._recorded_at = (0, 0)
+        population.bury()
+        population.add(self, self._scene, self._integrators, self._parameters)
+        self._every: dict[str, Tensor] = {}
+        if "uploads" not in leave_out:
+            self._every = {name: self.base(name) for name in sorted(self.names)}
+
+    def like(self, **changes: Any) -> MitsubaScene:
+        """Return another scene made as this one was, but with another `max_depth`, `sampler`, `integrator`, or
+        `leave_out`."""
+        description, filter = self._made
+        settings = {"max_depth": self.max_depth, "leave_out": self._leave_out, "sampler": self.sampler, **changes}
+        other = MitsubaScene(description, self.resolution, filter=filter, **settings)
+        for what in ("path", "guides"):
+            other._integrator(what)  # one that comes later makes the recordings of all scenes stale
+        return other
+
+    @property
+    def depth(self) -> int:
+        """Longest light path in segments of the renders now."""
+        return self._depth
+
+    @contextmanager
+    def shorter(self, depth: int | None) -> Iterator[None]:
+        """Render light paths of at most `depth` segments inside the `with`; None changes nothing."""
+        before, self._depth = self._depth, self._depth if depth is None else min(depth, self.max_depth)
+        try:
+            yield
+        finally:
+            self._depth = before
+
+    def base(self, name: str) -> Tensor:
+        """Return the base value of an input, as a fresh torch tensor of the input's shape."""
+        key, one = self._inputs[name]
+        self._apply({})
+        value = _torch(self._parameters[key])
+        return value if one.shape is None else value.reshape(one.shape)
+
+    def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int, *, hide: bool = False) -> Tensor:
+        """Render linear radiance with `spp` independent samples a pixel.
+
+        Args:
+            inputs: what differs from the base values.
+            seed: number of the noise.
+            spp: samples a pixel.
+            hide: leave out what the environment shows directly, for a backdrop.
+
+        Returns:
+            (H, W, 3) float32; (H, W, 4) with the coverage of the scene's surfaces where the scene has a backdrop.
+        """
+        self._apply(inputs)
+        return self._render("hidden" if hide else "path", seed, spp)
+
+    def guides(self, inputs: Mapping[str, Tensor], seed: int, spp: int) -> tuple[Tensor, Tensor]:
+        """Render what guides the denoiser: first-hit albedo and shading normal, each (H, W, 3) float32."""
+        self._apply(inputs)
+        both = self._render("guides", seed, spp)[..., -6:]
+        return both[..., :3].clamp(0.0, 1.0), both[..., 3:6]
+
+    def adjoint(
+        self,
+        inputs: Mapping[str, Tensor],
+        cotangent: Tensor,
+        seed: int,
+        spp: int,
+        *,
+        wrt: Collection[str] | None = None,
+        method: str = "path",
+    ) -> dict[str, Tensor]:
+        """Return the gradient of `sum(cotangent * radiance)` with respect to named inputs.
+
+        Args:
+            inputs: as in `radiance`.
+            cotangent: (H, W, 3) float32.
+            seed: should differ from the primal's, or the gradient of a noisy picture is returned.
+            spp: independent samples a pixel.
+            wrt: the inputs whose gradients are wanted; None means all that are named.
+            method: "path", the interior adjoint (path replay backpropagation, Vicini et al. 2021), unbiased for inputs
+                that do not move silhouettes; "hidden", the same without the visible environment; "boundary", Mitsuba's
+                projective integrator without guiding (Zhang et al. 2023), for vertices too.
+
+        Returns:
+            For each of `wrt` a float32 tensor of the input's shape.
+        """
+        mi = mitsuba()
+        import drjit as dr
+
+        wanted = tuple(inputs if wrt is None else wrt)
+        method, beside = self._general(method, wanted)
+        values = {name: inputs[name] if name in inputs else self.base(name) for name in beside}
+        values |= {name: inputs[name] for name in wanted}
+        spp = next_count(self.sampler, spp)
+        self._apply(inputs)
+        tracked = {name: mi.TensorXf(_contiguous(value)) for name, value in values.items()}
+        try:
+            for name, value in tracked.items():
+                dr.enable_grad(value)
+                self._write(name, value)
+            self._parameters.update()
+            shown = _contiguous(cotangent)
+            if self._backdrop:
+                shown = torch.cat([shown, torch.zeros_like(shown[..., :1])], dim=-1)
+            arriving = mi.TensorXf(shown)
+            with _fewer_warnings():
+                self._integrator(method).render_backward(
+                    self._scene, self._parameters, arriving, sensor=self._sensor, seed=seed, spp=spp
+                )
+            found = {name: _torch(dr.grad(value)).reshape(values[name].shape) for name, value in tracked.items()}
+            return {name: found[name] for name in wanted}
+        finally:
+            for name, value in values.items():
+                self._write(name, mi.TensorXf(_contiguous(value)))
+            self._parameters.update()
+
+    def material_adjoint(
+        self, inputs: Mapping[str, Tensor], cotangent: Tensor, seed: int, spp: int, *, meshes: Collection[str]
+    ) -> dict[str, Tensor]:
+        """Return the gradient with respect to the vertices and normals of some meshes, by the material form.
+
+        Args:
+            inputs: as in `radiance`; has `NAME.vertices` and `NAME.normals` of each mesh.
+            cotangent: (H, W, 3) float32.
+            seed: as in `adjoint`.
+            spp: samples a pixel of the interior term.
+            meshes: names of the meshes.
+        """
+        from advsearch.scene.gradients.material_form import material_adjoint
+
+        self._apply(inputs)
+        names = list(meshes)
+        by_vertices, by_normals = material_adjoint(
+            self._scene,
+            self._sensor,
+            self._parameters,
+            mesh_key=names,
+            vertices=[inputs[f"{name}.vertices"] for name in names],
+            normals=[inputs[f"{name}.normals"] for name in names],
+            cotangent=cotangent,
+            seed=seed,
+            spp=spp,
+            max_depth=self._depth,
+            shadow_spp=SHADOW_SPP,
+        )
+        population.changes += 1  # the first call loads integrators of its own
+        found = {f"{name}.vertices": one for name, one in zip(names, by_vertices, strict=True)}
+        return found | {f"{name}.normals": one for name, one in zip(names, by_normals, strict=True)}
+
+    # ---- inside -----------------------------------------------------------------------------------------------------
+
+    def _general(self, method: str, wanted: Collection[str]) -> tuple[str, list[str]]:
+        """Return the adjoint's method and what to differentiate beside what is wanted, where that is not left out."""
+        beside = set() if "gradients" in self._leave_out else set(self.interior)
+        plain = method == "path" and not self._thin_lens and not self.volumetric
+        if "boundary" not in self._leave_out and plain:  # Mitsuba's projective integrator knows no lens and no medium
+            method = "boundary"
+            beside |= {name for name in self._shapes if name.endswith((".vertices", ".normals"))}
+        return method, sorted(beside - set(wanted))
+
+    def _apply(self, inputs: Mapping[str, Tensor]) -> None:
+        """Set exactly these inputs, everything else at its base value; does nothing for what is set already."""
+        mi = mitsuba()
+
+        unknown = [name for name in inputs if name not in self._inputs]
+        if unknown:
+            raise InputError(f"the scene has no input {', '.join(unknown)}; it has {', '.join(sorted(self._inputs))}")
+        if self._every:
+            inputs = {**self._every, **inputs}
+            self._applied.clear()
+        changed: set[str] = set()
+        for name in [name for name in self._applied if name not in inputs]:
+            self._parameters[self._inputs[name][0]] = type(self._base[name])(self._base[name])
+            del self._applied[name]
+            changed.add(name)
+        for name, tensor in inputs.items():
+            value = _contiguous(tensor)
+            held = self._applied.get(name)
+            if held is not None and held.shape == value.shape and torch.equal(held, value):
+                continue
+            if name not in self._base:
+                own = self._parameters[self._inputs[name][0]]
+                self._base[name] = type(own)(own)
+            self._write(name, mi.TensorXf(value))
+            self._applied[name] = value.clone()
+            changed.add(name)
+        if changed:
+            self._parameters.update()
+        if not changed.isdisjoint(self._shapes):
+            self._unsettled = {"path", "hidden", "guides"}
+            population.changes += 1
+
+    def _write(self, name: str, value: Any) -> None:
+        key, one = self._inputs[name]
+        self._parameters[key] = one.write(value)
+
+    def _integrator(self, method: str) -> Any:
+        """Return the integrator of one method for the paths that are rendered now, made on first use."""
+        key = method, self._depth
+        if key not in self._integrators:
+            mi = mitsuba()
+            path = {"type": "prb", "max_depth": self._depth, "rr_depth": NO_ROULETTE, **self._path}
+            recipes: dict[str, dict[str, Any]] = {
+                "path": path,
+                "hidden": {**path, "hide_emitters": True},
+                "guides": {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"},
+                "boundary": {
+                    "type": "prb_projective",
+                    "max_depth": self._depth,
+                    "rr_depth": NO_ROULETTE,
+                    "guiding": "none",
+                },
+                "guided": {"type": "prb_projective", "max_depth": self._depth, "rr_depth": NO_ROULETTE},
+            }
+            self._integrators[key] = mi.load_dict(recipes[method])
+            population.changes += 1
+        return self._integrators[key]
+
+    def _render(self, what: str, seed: int, spp: int) -> Tensor:
+        mi = mitsuba()
+        import drjit as dr
+
+        def record(scene: Any, sensor: Any, integrator: Any, seed: Any) -> Any:
+            image = integrator.render(scene, sensor=sensor, seed=seed, spp=spp, develop=True, evaluate=False)
+            sensor.sampler().seed(0, 1)  # otherwise the sampler's state keeps the whole render alive
+            return image
+
+        spp = next_count(self.sampler, spp)
+        integrator = self._integrator(what)
+        function = self._function(what, spp, record)
+        return _torch(function(self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)))
+
+    def _function(self, what: str, spp: int, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the recorded function for one job at one sample count, recording it on first use.
+
+        Only primal renders are recorded. Dr.Jit 1.5.0 corrupts memory when it replays some adjoints (a texture of
+        32 x 32 under a film of 32 x 32 pixels, say), and the gain there is small. A recording made before a shape
+        moved renders something else (measured: wrong from the third pose on), so that every move makes all of them
+        stale, and the first render after a move is not recorded: in a search over poses none would be replayed.
+        """
+        import drjit as dr
+
+        population.bury()
+        now = (population.changes, dr.thread_count())  # a recording crashes in another thread pool
+        if self._recorded_at != now:
+            self._recorded.clear()
+            self._recorded_at = now
+        if not self._freeze or what in self._unsettled:
+            self._unsettled.discard(what)
+            return function
+        key = what, spp, self._depth
+        if key not in self._recorded:
+            self._recorded[key] = dr.freeze(function)
+        return self._recorded[key]
+
+
+@contextmanager
+def _fewer_warnings() -> Iterator[None]:
+    """Keep Mitsuba from advising a film that samples beyond its border, at every call."""
+    mi = mitsuba()
+    before = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        mi.set_log_level(before)
+
+
+def _contiguous(tensor: Tensor) -> Tensor:
+    return tensor.detach().to(torch.float32).contiguous()
+
+
+def _torch(value: Any) -> Tensor:
+    """Return a Dr.Jit value as a torch tensor with memory of its own."""
+    mi = mitsuba()
+    if isinstance(value, (mi.Color3f, mi.Point3f)):  # Dr.Jit's own conversion gives a colour six entries
+        return torch.cat([_torch(component) for component in value])
+    value = getattr(value, "matrix", value)
+    if hasattr(value, "torch"):
+        tensor: Tensor = value.torch()
+        return tensor.clone()
+    return torch.tensor(np.array(value, dtype=np.float32))
+
+
+def _is_of_a_shape(key: str) -> bool:
+    """Whether a change of this Mitsuba parameter moves a shape, so that ray tracing is set up anew."""
+    return key.endswith(("vertex_positions", "vertex_normals")) or (
+        key.endswith("to_world") and not key.startswith(("camera", "environment"))
+    )
+
+
+def _key(parameters: Any, pattern: str) -> str | None:
+    """Return the parameter that a pattern with at most one "*" means, or None if the scene has none such.
+
+    Raises:
+        RuntimeError: there are several.
+    """
+    before, star, after = pattern.partition("*")
+    found = [
+        key for key in parameters.keys() if (key.startswith(before) and key.endswith(after) if star else key == pattern)
+    ]
+    if len(found) > 1:
+        raise RuntimeError(f"expected one Mitsuba parameter {pattern}, found {found}")
+    return str(found[0]) if found else None

@@ -1,0 +1,40 @@
+"""The one place that imports Mitsuba: a libLLVM that works, one variant, warnings only, our thread counts."""
+
+from __future__ import annotations
+
+import sys
+from types import ModuleType
+
+from advsearch import threads
+from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
+
+VARIANT = "llvm_ad_rgb"
+
+
+def mitsuba() -> ModuleType:
+    """Mitsuba with the variant ``llvm_ad_rgb`` set. The first call imports it; later ones only look the variant up.
+
+    Raises:
+        EnvironmentSetupError: no libLLVM that Dr.Jit can use; the message holds the command that installs one.
+    """
+    first = "mitsuba" not in sys.modules
+    if first:
+        ensure_llvm()
+    import mitsuba as mi
+
+    if mi.variant() != VARIANT:
+        mi.set_variant(VARIANT)
+        first = True
+    if first:
+        _settle(mi)
+    module: ModuleType = mi
+    return module
+
+
+def _settle(mi: ModuleType) -> None:
+    """Only warnings are logged, and Dr.Jit's pool gets the size that `advsearch.threads` chose."""
+    import drjit as dr
+
+    mi.set_log_level(mi.LogLevel.Warn)
+    dr.set_log_level(dr.LogLevel.Warn)
+    threads.apply_to_drjit()
