@@ -14,10 +14,10 @@ from scipy import stats
 from torch import Tensor
 
 from advsearch.controls import make_space
+from advsearch.controls.corruption import blur as corruption_blur
+from advsearch.controls.corruption import digital as corruption_digital
+from advsearch.controls.corruption import noise as corruption_noise
 from advsearch.controls.corruption.control import NAMES, STEPPED, CorruptionControl, corrupted
-from advsearch.controls.corruption.control import blur as corruption_blur
-from advsearch.controls.corruption.control import digital as corruption_digital
-from advsearch.controls.corruption.control import noise as corruption_noise
 from advsearch.controls.corruption.noise import poisson
 from advsearch.controls.corruption.tools import blurred
 from advsearch.controls.corruption.weather import fractal
