@@ -41,7 +41,7 @@ SWEPT = {
     "contents": "contents.level=0.4,0.9",
     "background": "background.hue=40,200",
     "haze": "haze.density=0.1,0.4",
-    "lens": "lens.opacity=0.3,0.8",
+    "lens": "lens.dots=2",
     "corruption": "corruption.severity=2,4",
 }
 """One small grid of each control, or, for a control without numbers, its settings."""
@@ -49,6 +49,7 @@ FORMS = {
     "texture": "texture={resolution: 4, epsilon: 0.4}",
     "geometry": "geometry={modes: 4, epsilon: 0.1}",
     "patch": "patch={resolution: 4, size: 0.3}",
+    "lens": "lens={dots: 2}",
 }
 """Controls that are attacked in a small form."""
 TIMES = ("second", "time", "date", "start", "started", "created", "rate", "per_second")
