@@ -68,7 +68,8 @@ def commands() -> dict[str, list[str]]:
         found[f"sweep-{control}"] = ["sweep", *axes, "--trials", "6"]
         found[f"attack-{control}"] = ["attack", "--control", name, *few]
     for policy in POLICIES:
-        found[f"policy-{policy}"] = ["attack", "--control", "pose,camera", "--policy", policy, *few]
+        controls = "pose.yaw" if policy == "grid" else "pose,camera"
+        found[f"policy-{policy}"] = ["attack", "--control", controls, "--policy", policy, *few]
     for objective in OBJECTIVES:
         found[f"objective-{objective}"] = ["attack", "--control", "pose", "--objective", objective, *few]
     texture = FORMS["texture"]
