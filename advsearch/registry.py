@@ -5,11 +5,12 @@ A package adds to a registry through an entry point of the registry's group, as 
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cached_property
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -74,9 +75,10 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
         """Import "package.module:Class".
 
         Raises:
-            InputError: it cannot be imported, or is something else.
+            InputError: it cannot be imported, is something else, or must not be imported (`only_named_code`).
         """
         module, _, attribute = name.partition(":")
+        check_import(name)
         try:
             with current_directory_importable():
                 entry: Entry = getattr(import_module(module), attribute)
@@ -106,6 +108,47 @@ class Registry(Mapping[str, Entry], Generic[Entry]):
                 raise InputError(f"{where}: expected {self._expected}; {mend}")
             found[point.name] = entry
         return found
+
+
+_GUARD: ContextVar[tuple[str, frozenset[str]] | None] = ContextVar("guard", default=None)
+"""The file whose settings are carried out, and the code that may be imported for it; None for no such file."""
+
+
+@contextmanager
+def only_named_code(file: str | os.PathLike[str], named: Iterable[str]) -> Iterator[None]:
+    """Import no Python code by its name inside the block but what is named: the settings are somebody's file.
+
+    Args:
+        file: for messages.
+        named: "package.module:attribute", each as it stands in the file.
+    """
+    token = _GUARD.set((os.fspath(file), frozenset(named)))
+    try:
+        yield
+    finally:
+        _GUARD.reset(token)
+
+
+def check_import(name: str) -> None:
+    """Check that "package.module:attribute" may be imported.
+
+    Raises:
+        InputError: a file names it, and nobody else.
+    """
+    guard = _GUARD.get()
+    if guard is None or name in guard[1]:
+        return
+    package = name.partition(":")[0].partition(".")[0]
+    with current_directory_importable():
+        try:
+            found = importlib.util.find_spec(package)
+        except (ImportError, ValueError):
+            found = None
+    where = f" from {found.origin}" if found is not None and found.origin else ""
+    raise InputError(
+        f"{guard[0]}: names {name}, Python code{where} that would be imported and run; read it, and if you trust it, "
+        f"name it yourself with `code={name}`"
+    )
 
 
 @contextmanager

@@ -70,6 +70,43 @@ def test_ctrl_c_leaves_rows_and_resume_ends_with_the_same(
     assert finished(folder) and read_summary(folder)["rows"] == answer["rows"]
 
 
+def test_a_kill_leaves_the_rows_that_were_told(tmp_path: Path, whole: dict[str, Any]) -> None:
+    folder = tmp_path / "run"
+    words = [sys.executable, "-m", "advsearch", *FLAGS.split(), "--threads", "1", "--run", str(folder)]
+    child = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    assert child.stderr is not None
+    for line in child.stderr:
+        if "camera.azimuth by" in line:  # the first row
+            child.kill()
+            break
+    child.communicate(timeout=120)
+    killed = read_summary(folder)
+    assert killed["ending"] == "interrupted" and (killed["measured"], killed["planned"]) == (0, 1)
+    assert 1 <= len(killed["rows"]) < len(whole["rows"]) and values(killed) == values(whole)[: len(killed["rows"])]
+
+
+def test_a_summary_never_forgets_what_an_earlier_one_had(
+    tmp_path: Path, whole: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = [checking.Part(number, CheckConfig(**SMALL), "linear") for number in (1, 2)]
+    told: list[int] = []
+    monkeypatch.setattr(checking, "_parts", lambda *_: both)
+    monkeypatch.setattr(checking, "_linear", lambda *_: iter(whole["rows"]))
+    write = RunDirectory.write_summary
+
+    def written(run: RunDirectory, answer: dict[str, Any]) -> Path:
+        told.append(len(answer["rows"]))
+        return write(run, answer)
+
+    monkeypatch.setattr(RunDirectory, "write_summary", written)
+    config, count = CheckConfig(**SMALL, run=str(tmp_path / "run")), len(whole["rows"])
+    check_from_config(config)
+    assert told == [*range(1, 2 * count + 1), 2 * count]
+    told.clear()
+    check_from_config(config, resumed=tmp_path / "run")
+    assert told == [2 * count]
+
+
 def test_seconds_end_a_check_and_resume_goes_on_for_as_long_again(
     tmp_path: Path, whole: dict[str, Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,8 +11,10 @@ import pytest
 
 import advsearch
 from advsearch.cli.main import main
+from advsearch.config import AttackConfig
 from advsearch.controls import CONTROLS, make_control
 from advsearch.errors import InputError
+from advsearch.runs.directory import RunDirectory
 
 MODULE = '''
 import torch
@@ -49,9 +51,46 @@ def test_the_command_line_and_yaml_take_a_class(capsys: pytest.CaptureFixture[st
     assert main(["sweep", "--object", "mug", "--control", "own_controls:Fade", "--samples", "2", *QUICK]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["controls"] == ["fade"] and found["worst"]["values"]["fade.amount"]["unit"] == "1"
-    assert main(["run", f"{found['run']}/run.yaml", "--quiet", "--json"]) == 0
+    assert main(["run", f"{found['run']}/run.yaml", "--code", "own_controls:Fade", "--quiet", "--json"]) == 0
     again = json.loads(capsys.readouterr().out)
     assert again["worst"]["values"] == found["worst"]["values"] and again["run"] != found["run"]
+
+
+PLANTED = "open('imported', 'w').close()\nraise RuntimeError('planted')"
+
+
+def stopped_run(**settings: object) -> None:
+    """The folder of a run that somebody else has begun, beside Python code that leaves a trace."""
+    Path("planted.py").write_text(PLANTED, encoding="utf-8")
+    config = AttackConfig(object="mug", **{"resolution": 16, **settings})
+    with RunDirectory.create("theirs") as run:
+        run.write_config(config)
+        run.store.append([])
+
+
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        ({"model": "planted:make"}, "planted:make"),
+        ({"model": "planted:make@weights.safetensors"}, "planted:make"),
+        ({"controls": {"planted:Fade": {}}}, "planted:Fade"),
+        ({"controls": {"mine": {"kind": "planted:Fade"}}}, "planted:Fade"),
+        ({"over": {"planted:Fade": {}}}, "planted:Fade"),
+    ],
+)
+@pytest.mark.parametrize("command", ["resume theirs", "run runs/theirs/run.yaml", "region --around theirs"])
+def test_code_that_somebody_elses_file_names_is_not_run(
+    command: str, settings: dict[str, object], name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if "over" in settings and command.startswith("region"):
+        settings = {"controls": settings["over"]}  # nothing varies by chance there
+    stopped_run(**settings)
+    assert main([*command.split(), "--quiet"]) == 2
+    error = capsys.readouterr().err
+    assert f"run.yaml: names {name}, Python code from {Path('planted.py').resolve()} that would be imported" in error
+    assert error.endswith(f"--code {name}\n") and not Path("imported").exists()
+    assert main([*command.split(), "--quiet", "--code", name]) == 2
+    assert Path("imported").exists() and "RuntimeError: planted" in capsys.readouterr().err
 
 
 def test_settings_and_a_name_of_its_own() -> None:

@@ -44,7 +44,7 @@ from advsearch.engine.planning import (
 from advsearch.engine.problem import Problem
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory, default_name
-from advsearch.runs.summary import INTERRUPTED, OUT_OF_TIME
+from advsearch.runs.summary import INTERRUPTED, NAME, OUT_OF_TIME, read_summary
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
 from advsearch.scene.gradients.plan import STEP_RANGE, GroupPlan
 
@@ -112,6 +112,7 @@ def check_from_config(
     with opened as run:
         results, measured, ending = Results(Memory(run), config.seconds), 0, INTERRUPTED
         rows: list[dict[str, Any]] = []
+        told = _told(run)
 
         def summary() -> dict[str, Any]:
             return {
@@ -134,8 +135,9 @@ def check_from_config(
             for part in parts:
                 for row in _rows_of(part, len(parts), results, progress):
                     rows.append(row)
+                    if len(rows) > told:
+                        run.write_summary(summary())  # what a kill leaves
                 measured += 1
-                run.write_summary(summary())
             ending = "done"
         except KeyboardInterrupt:
             pass
@@ -144,6 +146,14 @@ def check_from_config(
         answer = summary()
         run.write_summary(answer)
         return answer
+
+
+def _told(run: RunDirectory) -> int:
+    """How many rows the summary has that an earlier sitting left."""
+    if not (run.path / NAME).is_file():
+        return 0
+    rows = read_summary(run.path).get("rows")
+    return len(rows) if isinstance(rows, list) else 0
 
 
 # ---- what is measured, and what was ---------------------------------------------------------------------------------

@@ -26,8 +26,8 @@ GROUPS = {
     "run": "run",
 }
 
-_NO_SETTINGS = {"case": "--case", "group": "--group"}
-"""Flags of `stability`, which messages name too and which are no setting of a configuration."""
+_NO_SETTINGS = {"case": "--case", "group": "--group", "code": "--code"}
+"""Flags which messages name too and which are no setting of a configuration."""
 
 _LISTS = ("controls", "over", "set_", "estimators", "grid")
 

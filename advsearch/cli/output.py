@@ -19,6 +19,17 @@ def add_flags(parser: argparse.ArgumentParser, *, quiet: bool = False) -> None:
         parser.add_argument("--quiet", action="store_true", help="no progress and no messages on standard error")
 
 
+def add_code_flag(parser: argparse.ArgumentParser) -> None:
+    """Add ``--code``, for commands that carry out the settings of a file."""
+    parser.add_argument(
+        "--code",
+        action="append",
+        default=[],
+        metavar="MODULE:NAME",
+        help="Python code that the file names and that may be imported, as it stands there; may be repeated",
+    )
+
+
 def print_json(value: Any) -> None:
     """Print `value` as JSON on standard output; NaN and infinity become null."""
     from advsearch.runs.summary import plain

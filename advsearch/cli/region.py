@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +36,7 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         allow_abbrev=False,
     )
     add_settings(parser, config=RegionConfig, without=("spp",))  # nothing is searched, so there is no such count
+    output.add_code_flag(parser)
     output.add_flags(parser, quiet=True)
 
 
@@ -42,17 +44,22 @@ def run(args: argparse.Namespace) -> int:
     """Grow the region and print it."""
     from advsearch.cli.flags import config_from
     from advsearch.config import AttackConfig, RegionConfig, SceneConfig
+    from advsearch.registry import only_named_code
     from advsearch.runs.directory import CONFIG, find_run
 
     otherwise: dict[str, Any] = {}
+    guard: AbstractContextManager[None] = nullcontext()
     if "around" in args:
-        theirs = AttackConfig.from_yaml(find_run(args.around) / CONFIG)
+        file = find_run(args.around) / CONFIG
+        theirs = AttackConfig.from_yaml(file)
+        guard = only_named_code(file, [*args.code, getattr(args, "model", "").partition("@")[0]])
         otherwise = {
             name: getattr(theirs, name) for name in SceneConfig.model_fields if name not in ("run", "overwrite")
         }
     elif "object" not in args:
         raise InputError("advsearch region: expected --object NAME, or --around RUN; see advsearch region --help")
-    return carry_out(config_from(args, RegionConfig, **otherwise), as_json=args.json, quiet=args.quiet)
+    with guard:
+        return carry_out(config_from(args, RegionConfig, **otherwise), as_json=args.json, quiet=args.quiet)
 
 
 def carry_out(config: RegionConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:

@@ -20,6 +20,7 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         allow_abbrev=False,
     )
     parser.add_argument("run", metavar="RUN", help="a run's name or folder")
+    output.add_code_flag(parser)
     output.add_flags(parser, quiet=True)
 
 

@@ -31,6 +31,7 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
     parser.add_argument("change", metavar="NAME=VALUE", nargs="*", help="a setting to change: steps=80")
     parser.add_argument("--run", help="where the run is kept: a name (kept in runs/) or the path of a folder")
     parser.add_argument("--overwrite", action="store_true", help="replace a run that is there already")
+    output.add_code_flag(parser)
     output.add_flags(parser, quiet=True)
 
 
@@ -56,16 +57,18 @@ def carry_out(
         command: what the file says it is.
         file: YAML.
         changes: put over it.
-        args: with `json` and `quiet`.
+        args: with `json`, `quiet` and `code`.
         resumed: the folder of the run to go on with, if the file is a run's own.
 
     Raises:
         UnknownNameError: there is no such command.
     """
     from advsearch import config
+    from advsearch.registry import only_named_code
 
     if command not in COMMANDS:
         raise UnknownNameError("command", command, COMMANDS, f"It stands in {file}.")
     described = getattr(config, COMMANDS[command]).from_yaml(file, changes)
     module = importlib.import_module(f"advsearch.cli.{command}")
-    return int(module.carry_out(described, as_json=args.json, quiet=args.quiet, resumed=resumed))
+    with only_named_code(file, args.code):
+        return int(module.carry_out(described, as_json=args.json, quiet=args.quiet, resumed=resumed))

@@ -18,7 +18,7 @@ from advsearch.models.model import Model
 from advsearch.models.preprocessing import PRESETS
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source, load_weights, source_of
-from advsearch.registry import current_directory_importable
+from advsearch.registry import check_import, current_directory_importable
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -43,8 +43,10 @@ def load_callable(spec: str) -> Source | Model:
     Raises:
         ModelError: it cannot be imported, raises, returns something else, or the weights do not fit.
         UnknownNameError: the module has no such attribute; near matches are named.
+        InputError: it must not be imported (`registry.only_named_code`).
     """
     target, weights = split_weights(spec)
+    check_import(target)
     module_name, _, attribute = target.partition(":")
     value: Any = _import_module(module_name, spec)
     for part in attribute.split("."):
