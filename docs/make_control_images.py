@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 SCENES: Mapping[str, tuple[str, str, dict[str, float]]] = {
     "contents": ("mug", "day-room", {"camera.elevation": 45.0}),
-    "sky": ("bowl", "noon", {}),
+    "sky": ("bowl", "studio", {}),
     "background": ("wine-glass", "studio", {}),
     "camera": ("teapot", "day-room", {}),
     "occlusion": ("teapot", "kitchen", {}),
