@@ -194,6 +194,19 @@ def test_it_is_painted_over_what_came_before(scene: SceneDescription) -> None:
     torch.testing.assert_close(found[share == 0.0], red[0, 0].expand(int((share == 0.0).sum()), 3))
 
 
+@pytest.mark.parametrize("turn", [1, -1])
+def test_a_patch_lies_on_any_material(scene: SceneDescription, turn: int) -> None:
+    """In whatever order the two are asked for."""
+    controls = [make_control("material", {"which": "wood"}), make_control("patch", {"pixels": 1.0, "size": [0.2, 0.3]})]
+    space = make_space(controls[::turn], scene)
+    color = space.inputs(space.start)[BASE_COLOR]
+    wood = make_control("material", {"which": "wood"}).bind(scene)
+    alone = wood.inputs(wood.start)[BASE_COLOR]
+    changed = (color - alone).abs().amax(dim=-1) > 1e-3
+    assert 0.005 < float(changed.float().mean()) < 0.5
+    assert float(color.amin(dim=-1).max()) > 0.99 > float(alone.amin(dim=-1).max())
+
+
 def test_two_patches_and_a_texture_compose(scene: SceneDescription) -> None:
     controls = [
         PatchControl("left", azimuth=20, size=0.2),

@@ -16,7 +16,7 @@ from advsearch.attacks import make_policy
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig, GapConfig, RenderConfig, SweepConfig
-from advsearch.controls import CONTROLS
+from advsearch.controls import CONTROLS, make_control
 from advsearch.controls.patch.control import PatchControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
@@ -138,6 +138,14 @@ def _seen(config: AttackConfig, seen: list[Any]) -> None:
         ),
         ("patch", {"texture_resolution": 8}, "--texture-resolution: patch has none"),
         ("texture,pose", {"epsilon": "pose=1"}, "--epsilon pose: the control has ranges and no epsilon"),
+        (
+            "environment",
+            {"epsilon": 0.1},
+            "--epsilon environment: the control has ranges and no epsilon; give its ranges, as in --control "
+            "'environment={PARAMETER: [LOW, HIGH]}', or search harmonics with it",
+        ),
+        ("texture,environment", {"epsilon": "environment=1"}, "--epsilon environment: the control has ranges"),
+        ("environment.rotation", {"epsilon": 0.1}, "--epsilon environment: the control has ranges"),
         ("texture,pose", {"epsilon": (0.1, 0.2)}, "--epsilon pose: the control has ranges and no epsilon"),
     ],
 )
@@ -145,6 +153,34 @@ def test_a_setting_that_no_control_takes_is_refused(controls: str, options: dict
     with pytest.raises(InputError) as error:
         check_run_settings(AttackConfig(object="mug", controls=controls, **options))
     assert with_flags(str(error.value)).startswith(message)
+
+
+@pytest.mark.parametrize(
+    "controls",
+    [
+        ["environment.harmonics"],
+        ["environment.harmonics", "environment.rotation"],
+        {"environment": {"harmonics": [-1, 1]}},
+    ],
+)
+def test_an_environment_takes_an_epsilon_for_its_harmonics(controls: Any) -> None:
+    named = controls if isinstance(controls, dict) else {name: {} for name in controls}
+    config = AttackConfig(object="mug", controls=named, epsilon=0.07)
+    check_run_settings(config)
+    (control,) = controls_of(named, config)
+    assert control.settings()["epsilon"] == 0.07
+
+
+def test_an_environment_without_harmonics_refuses_an_epsilon_of_its_own() -> None:
+    with pytest.raises(InputError, match=r"environment\.epsilon: the radius of the ball of harmonics, which are not"):
+        make_control("environment", {"epsilon": 0.3})
+
+
+def test_an_epsilon_that_another_control_takes_leaves_an_environment_as_it_is() -> None:
+    config = AttackConfig(object="mug", controls="texture,environment", epsilon=0.07)
+    check_run_settings(config)
+    texture, environment = controls_of("texture,environment", config)
+    assert texture.settings()["epsilon"] == 0.07 and "epsilon" not in environment.settings()
 
 
 def test_an_epsilon_for_a_control_that_is_not_there_is_refused() -> None:

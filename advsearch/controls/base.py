@@ -74,12 +74,15 @@ class Choice:
         description: one sentence.
         run_setting: the setting of a whole run that says it for all controls ("epsilon"), unless the control itself
             says something else; empty if there is none.
+        bounds: the parameter that it says something about, which is not searched unless asked for; empty if it counts
+            always. Where that parameter is not given, the control does not take the setting.
     """
 
     name: str
     default: float | str | None
     description: str
     run_setting: str = ""
+    bounds: str = ""
 
 
 @dataclass(frozen=True)
@@ -140,6 +143,8 @@ class BoundControl(ABC):
         moved: values of the clean scene that the start has not, because the control leaves them out.
         refines: the scene inputs that this control takes from the ones before it, and may change (a patch on a
             texture).
+        on_top: what it refines lies over what all other controls make of it, whatever the order in which they were
+            asked for (a patch on any material).
     """
 
     name: str
@@ -147,6 +152,7 @@ class BoundControl(ABC):
     groups: tuple[Group, ...]
     moved: tuple[Moved, ...] = ()
     refines: frozenset[str] = frozenset()
+    on_top: bool = False
 
     @property
     def budget(self) -> Budget:

@@ -84,13 +84,20 @@ class EnvironmentControl(NumberControl):
         ),
     )
     choices: ClassVar[tuple[Choice, ...]] = (
-        Choice("epsilon", 0.5, "Radius of the ball of `harmonics`: L2 norm of all coefficients.", "epsilon"),
+        Choice(
+            "epsilon", 0.5, "Radius of the ball of `harmonics`: L2 norm of all coefficients.", "epsilon", "harmonics"
+        ),
     )
 
     def check_choices(self) -> None:
         given = self.chosen["epsilon"]
         if not is_number(given) or not 0.0 < given <= 100.0:
             raise InputError(f"{self.name}.epsilon: expected a number over 0 and at most 100, got {given!r}")
+        if "epsilon" in self._given and "harmonics" not in self._given:
+            raise InputError(
+                f"{self.name}.epsilon: the radius of the ball of harmonics, which are not there; leave it out, or give "
+                f"harmonics a range too, as in {self.name}={{harmonics: [-1, 1], epsilon: {given}}}"
+            )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """An environment that is fixed is the scene's."""

@@ -76,7 +76,8 @@ class Space:
     def inputs(self, u: Tensor) -> dict[str, Tensor]:
         """Map u to scene inputs, by differentiable torch operations.
 
-        Controls that refine what others set come last, whatever the order in which they were asked for.
+        Controls that refine what others set come later, and those that lie on top last, whatever the order in which
+        they were asked for.
 
         Raises:
             InputError: two controls set one input.
@@ -87,8 +88,8 @@ class Space:
         return merged
 
     def _in_turn(self, u: Tensor) -> Sequence[tuple[BoundControl, Tensor]]:
-        """Controls with their slices of u, those last that refine what others set."""
-        return sorted(self.slices(u), key=lambda one: bool(one[0].refines))
+        """Controls with their slices of u: those later that refine what others set, and last those that lie on top."""
+        return sorted(self.slices(u), key=lambda one: (bool(one[0].refines), one[0].on_top))
 
     def _among_others(self, u: Tensor) -> dict[BoundControl, tuple[Tensor, Mapping[str, Tensor]]]:
         """Each control's slice of u and the inputs of the controls before it, for those that take any."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from advsearch import threads
 from advsearch.config import SceneConfig
-from advsearch.controls import CONTROLS, Control, names_of
+from advsearch.controls import CONTROLS, Choice, Control, gathered, names_of
 from advsearch.engine.loading import Controls, as_controls, settings_of
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model, ModelWarning, load_model
@@ -47,7 +47,7 @@ def controls_of(
     """
     if not isinstance(controls, (str, Mapping)):
         for one in (one for one in controls if isinstance(one, Control)):
-            for choice in one.choices:
+            for choice in _counting(type(one), one.settings()):
                 if choice.run_setting in settings and getattr(config, choice.run_setting, None) is not None:
                     raise InputError(
                         f"{choice.run_setting}: control {one.name} is an instance already; give it its own, as in "
@@ -61,8 +61,8 @@ def controls_of(
 
 def _from_run(asked: str, given: Mapping[str, Any], config: SceneConfig, settings: Collection[str]) -> dict[str, Any]:
     """What the run's settings say for one control."""
-    kind, name = names_of(asked, given)
-    choices = CONTROLS[kind].choices if kind in CONTROLS else ()
+    _, name = names_of(asked, given)
+    choices = _choices(asked, given)
     said = {one.name: _value(config, one.run_setting, name) for one in choices if one.run_setting in settings}
     return {choice: value for choice, value in said.items() if value is not None}
 
@@ -76,7 +76,19 @@ def _value(config: SceneConfig, setting: str, name: str) -> Any:
 def takes(asked: str, given: Mapping[str, Any], setting: str) -> bool:
     """Whether a control takes one of the run's settings; one that is not known counts as one that does."""
     kind, _ = names_of(asked, given)
-    return kind not in CONTROLS or setting in {choice.run_setting for choice in CONTROLS[kind].choices}
+    return kind not in CONTROLS or setting in {choice.run_setting for choice in _choices(asked, given)}
+
+
+def _choices(asked: str, given: Mapping[str, Any]) -> list[Choice]:
+    """The choices of a control, as it is asked for, that count."""
+    ((name, settings),) = gathered({asked: given}).items()
+    kind, _ = names_of(name, settings)
+    return _counting(CONTROLS[kind], settings) if kind in CONTROLS else []
+
+
+def _counting(kind: type[Control], given: Mapping[str, object]) -> list[Choice]:
+    """The choices that count beside the parameters that are given."""
+    return [choice for choice in kind.choices if not choice.bounds or given.get(choice.bounds) is not None]
 
 
 def run_settings_for(config: SceneConfig, asked: str, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -103,27 +115,34 @@ def check_run_settings(config: SceneConfig) -> None:
         value = getattr(config, setting, None)
         if value is None:
             continue
-        asked = config.controls if setting == "epsilon" else {**config.controls, **drawn}
+        asked = gathered(config.controls if setting == "epsilon" else {**config.controls, **drawn})
         if isinstance(value, Mapping):
             known = {names_of(one, given)[1]: one for one, given in asked.items()}
             for name in value:
                 if name not in known:
                     raise UnknownNameError(f"control in `{setting}`", name, known)
                 if not takes(known[name], asked[known[name]], setting):
-                    raise _not_taken(setting, name)
+                    raise _not_taken(setting, name, names_of(known[name], asked[known[name]])[0])
             continue
         without = [one for one, given in asked.items() if not takes(one, given, setting)]
         if without and (isinstance(value, tuple) or len(without) == len(asked)):
-            raise _not_taken(setting, without[0])
+            raise _not_taken(setting, without[0], names_of(without[0], asked[without[0]])[0])
 
 
-def _not_taken(setting: str, name: str) -> InputError:
+def _not_taken(setting: str, name: str, kind: str) -> InputError:
     if setting == "epsilon":
         return InputError(
             f"`epsilon` {name}: the control has ranges and no epsilon; give its ranges, as in "
-            f"`controls` '{name}={{PARAMETER: [LOW, HIGH]}}'"
+            f"`controls` '{name}={{PARAMETER: [LOW, HIGH]}}'{_bounded(kind)}"
         )
     return InputError(f"{setting}: {name} has none, and no other control is there that has one; leave it out")
+
+
+def _bounded(kind: str) -> str:
+    """What a control would take an epsilon for, in words; nothing if there is no such thing."""
+    choices = CONTROLS[kind].choices if kind in CONTROLS else ()
+    bounded = [choice.bounds for choice in choices if choice.run_setting == "epsilon" and choice.bounds]
+    return f", or search {bounded[0]} with it" if bounded else ""
 
 
 def load_models(models: Sequence[Any], config: SceneConfig) -> tuple[tuple[Model, ...], list[str]]:

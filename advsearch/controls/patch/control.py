@@ -285,6 +285,7 @@ class BoundPatch(BoundControl):
     """
 
     refines: frozenset[str] = frozenset({BASE_COLOR})
+    on_top = True
 
     def __init__(
         self,
