@@ -1,4 +1,4 @@
-"""Independent random streams, all derived from one root seed (DESIGN 4.3).
+"""Independent random streams, all derived from one root seed (docs/design.md, "Seeds").
 
 A stream is named, so that the primal, gradient, search, baseline and verification seeds of a run never meet, whatever
 their number. `numpy.random.SeedSequence` does the mixing.

@@ -3,9 +3,9 @@
     python benchmarks/golden.py keep FOLDER [--only texture]      before a change
     python benchmarks/golden.py compare FOLDER [--only texture]   after it
 
-Every control is swept and attacked, every policy and objective searches, and each question about a space is asked once, on the
-bundled mug at 48 x 48 pixels with 2 samples, deterministic. The exported rows and the numbers of each summary are
-compared; only seconds, dates and paths are left out. The exit status is 3 if anything differs. Rows are of one
+Every control is swept and attacked, every policy and objective searches, and each question about a space is asked once,
+on the bundled mug at 48 x 48 pixels with 2 samples, deterministic. The exported rows and the numbers of each summary
+are compared; only seconds, dates and paths are left out. The exit status is 3 if anything differs. Rows are of one
 processor and one libLLVM: another machine's need not equal them.
 """
 

@@ -2,11 +2,11 @@
 
     python benchmarks/rotation.py [--environments studio kitchen noon FILE] [--size 96] [--seconds 600]
 
-Mitsuba's own derivative of an environment's turn has the wrong sign (DESIGN 5). The plan takes central differences of
-1.8 degrees, or the adjoint of texels that are resampled along the azimuth. Here the loss is linear and smooth, the
-object is the mug. Both are held against differences at the step and at half of it, with the same seeds, extrapolated
-to a step of zero. Seeds are added until the standard error of the bias of what the plan takes is under 1 %, or the time
-is over. The exit status is 3 if that bias is over 2 % (`ASKED`), or cannot be told.
+Mitsuba's own derivative of an environment's turn has the wrong sign (docs/gradients.md). The plan takes central
+differences of 1.8 degrees, or the adjoint of texels that are resampled along the azimuth. Here the loss is linear and
+smooth, the object is the mug. Both are held against differences at the step and at half of it, with the same seeds,
+extrapolated to a step of zero. Seeds are added until the standard error of the bias of what the plan takes is under
+1 %, or the time is over. The exit status is 3 if that bias is over 2 % (`ASKED`), or cannot be told.
 """
 
 from __future__ import annotations

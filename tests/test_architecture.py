@@ -60,7 +60,7 @@ RULES = {
     "cli": Rule(None),
     "": Rule({"api", "engine", "models"}, set()),
 }
-"""DESIGN, section 2. The empty name is `advsearch/__init__.py`."""
+"""As in docs/design.md, "Rooms, and who may know whom". The empty name is `advsearch/__init__.py`."""
 
 DISTRIBUTIONS = {"PIL": "pillow", "yaml": "PyYAML", "mitsuba_oidn": "mitsuba-oidn"}
 """Where a package is installed under another name than it is imported."""
@@ -163,7 +163,7 @@ def test_the_reader_of_imports_sees_all_of_them(tmp_path: Path, module: str, sou
 
 
 def test_the_design_in_one_glance() -> None:
-    """The rules above are the ones of DESIGN section 2: bottom never reaches top, and the command line is the roof."""
+    """As in docs/design.md, "Rooms, and who may know whom": bottom never reaches top, the command line is the roof."""
     assert not any("cli" in (rule.rooms or ()) for rule in RULES.values())
     for name in ("attacks", "models"):
         assert not RENDERER & (RULES[name].packages or RENDERER) and RULES[name].rooms == set()

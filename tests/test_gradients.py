@@ -220,7 +220,7 @@ def test_a_texture_beside_a_pose_is_differentiated_once_and_nothing_geometric_fo
 
 
 def test_turning_an_environment_has_the_right_sign_and_size() -> None:
-    """Mitsuba's own derivative of `to_world` has the wrong sign (DESIGN section 5); texels have the right one."""
+    """Mitsuba's own derivative of `to_world` has the wrong sign (docs/gradients.md); texels have the right one."""
     render = renderer(["environment.rotation"])
     loss, u = smooth_loss((SIZE, SIZE)), inside(render)
     names = [render.plan.groups[0].name]

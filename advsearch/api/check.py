@@ -81,9 +81,9 @@ def check(
         progress: told how far it is.
 
     Returns:
-        One row for each parameter, estimator and loss, as DESIGN section 6 lists them. For the model's loss the
-        estimator, the step and the samples are those that reach the goal soonest, and rows with `WHOLE` for their
-        parameter have the cosine of a control's working gradients with the converged one.
+        One row for each parameter, estimator and loss, as docs/gradients.md, "What check says" lists them. For the
+        model's loss the estimator, the step and the samples are those that reach the goal soonest, and rows with
+        `WHOLE` for their parameter have the cosine of a control's working gradients with the converged one.
     """
     results = Results(Memory(None))
     parts = _parts(config, losses, everything)

@@ -54,7 +54,7 @@ def precision(config: PrecisionConfig, *, progress: Progress | None = None) -> d
         progress: told how far it is.
 
     Returns:
-        The report (DESIGN section 6), with the paths of its figures.
+        The report (docs/precision.md, "JSON"), with the paths of its figures.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.

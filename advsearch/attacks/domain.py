@@ -1,4 +1,4 @@
-"""Where a search may look: a start, norm budgets around it, and bounds. All in the unit box (DESIGN 4.5)."""
+"""Where a search may look: a start, norm budgets around it, and bounds. All in the unit box."""
 
 from __future__ import annotations
 

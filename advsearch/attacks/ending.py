@@ -8,7 +8,7 @@ from enum import Enum
 class Ending(Enum):
     """Why a search or a run stopped. The value is what JSON holds; `explanation` is one sentence for a person.
 
-    A search ends with a claim at most; `FOUND` in a run's summary is only ever written after `verify` (DESIGN 4.1).
+    A search ends with a claim at most; only `verify` makes it `FOUND` (docs/design.md, "Verification").
     """
 
     FOUND = "found"

@@ -1,4 +1,4 @@
-"""What a search is for: which answers of the model count as success. Not what it maximises (DESIGN 4.2)."""
+"""What a search is for: which answers of the model count as success. Not what it maximises (docs/objectives.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a search maximises; what counts as success is another thing (`advsearch.attacks.goal`, DESIGN 4.2).
+"""What a search maximises; what counts as success is another thing (`advsearch.attacks.goal`, docs/objectives.md).
 
 An objective is a callable `(logits, images, labels) -> values`, the larger the nearer to what the search is after:
 

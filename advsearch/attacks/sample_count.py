@@ -1,4 +1,6 @@
-"""How many samples per pixel a verification needs: enough that noise no longer moves the verdict (DESIGN 5.2).
+"""How many samples per pixel a verification needs until noise no longer moves the verdict.
+
+The rule: docs/design.md, "Verification".
 
 Monte Carlo noise takes part of the margin away, and less of it the more samples there are. So the margin *drifts*
 with the sample count, and a verification in the middle of that drift credits the scene with what the noise did.

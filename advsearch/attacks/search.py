@@ -70,7 +70,7 @@ OnStep = Callable[[StepRecord, Tensor, Evaluation], None]
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """What a search claims. Only `verify` turns a claim into a finding (DESIGN 4.1).
+    """What a search claims. Only `verify` turns a claim into a finding (docs/design.md, "Verification").
 
     Attributes:
         best_u: (d,) float32, the answer; the start if nothing could be evaluated.
@@ -134,10 +134,10 @@ def search(
     """Run one policy on one domain and return the worst configuration it found.
 
     1. Until `steps` renders are spent: the policy proposes; the proposal is checked against the domain; it is evaluated
-       with the seed index of its step (a new one every time, DESIGN 4.4); the policy is told. An evaluation costs one
-       render, and a gradient by differences `Domain.gradient_cost` more, all times the `samples` of the proposal. What
-       cannot be paid is not asked for (`affordable`): no more samples than there are renders left, and no gradient
-       after which none would be left to use it, so never in the last evaluation.
+       with the seed index of its step (a new one every time, docs/design.md, "The search"); the policy is told. An
+       evaluation costs one render, and a gradient by differences `Domain.gradient_cost` more, all times the `samples`
+       of the proposal. What cannot be paid is not asked for (`affordable`): no more samples than there are renders
+       left, and no gradient after which none would be left to use it, so never in the last evaluation.
     2. The `candidates` best distinct configurations are each evaluated `repeats` times more, with new seed indices
        that are the same for all, without gradient. The best by these renders is the answer (see `candidates`). With
        `candidates=0`, for an objective without noise, the raw best is the answer. Those that are not clearly worse

@@ -69,7 +69,7 @@ class Trials:
         return clopper_pearson(self.successes, self.trials)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the form of `verified` in summary.json (DESIGN 6)."""
+        """Return the form of `verified` in summary.json (docs/design.md, "summary.json")."""
         return {
             "successes": self.successes,
             "trials": self.trials,

@@ -1,4 +1,4 @@
-"""The independent re-check of a search's answer (DESIGN 4.1 and 5.2). The rule for a verdict is stated here only.
+"""The independent re-check of a search's answer (docs/design.md, "Verification"). A verdict's rule stands here only.
 
 Every trial renders a configuration with a seed nobody has used, at a sample count shown to be high enough, with the
 pixels rounded to 8 bits, and classifies it. The clean configuration goes through exactly the same trials as a control

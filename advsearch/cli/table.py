@@ -15,7 +15,7 @@ def answer(summary: Summary) -> str:
     """Return the verdict, the rates, the cost and the place of the pictures.
 
     Args:
-        summary: as in `summary.json` (DESIGN 6); what is missing is left out.
+        summary: as in `summary.json` (docs/design.md, "summary.json"); what is missing is left out.
     """
     found = (_clean(summary), _adversarial(summary), _random(summary), _average(summary))
     rates = [row for row in found if row]

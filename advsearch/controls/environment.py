@@ -1,7 +1,7 @@
 """The `environment` control: which map lights the scene, how it is turned, how bright it is, and its colour.
 
 Mitsuba's own derivative of an environment's rotation has the wrong sign: the sampling of the light is detached from it
-(DESIGN section 5). Here the map itself is resampled along its columns by torch, and the adjoint differentiates its
+(docs/gradients.md). Here the map itself is resampled along its columns by torch, and the adjoint differentiates its
 texels, which is right:
 
     map(rotation)[column c] = (1 - f) base[c + k] + f base[c + k + 1],    rotation / 360 * columns = k + f

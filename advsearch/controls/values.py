@@ -2,8 +2,8 @@
 
     pose: {yaw: [0, 360], pitch: 10, scale: {choices: [0.8, 1.0, 1.2]}}
 
-The same form in Python, YAML and on the command line (DESIGN section 7). Two numbers in a list are a range; three or
-more, or names, are a choice.
+The same form in Python, YAML and on the command line (docs/controls/README.md). Two numbers in a list are a range;
+three or more, or names, are a choice.
 """
 
 from __future__ import annotations

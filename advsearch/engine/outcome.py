@@ -1,4 +1,4 @@
-"""From what an attack found to its summary (DESIGN section 6), its pictures and its files."""
+"""From what an attack found to its summary, its pictures and its files."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class AttackResult:
     """The answer of an attack.
 
     Attributes:
-        summary: what `summary.json` holds (DESIGN section 6).
+        summary: what `summary.json` holds (docs/design.md, "summary.json").
         run: the run directory, or None if it was not kept.
         u: (d,) the configuration that was verified; the start where nothing was searched.
         clean: (H, W, 3) display-referred sRGB in [0, 1], 8-bit values: the clean configuration.

@@ -2,7 +2,8 @@
 
 Which estimator: the one with the least (squared error) x time, error against differences of the same loss. Which step
 and sample count: the cheapest whose gradient has a cosine of at least `GOAL` with the converged one, of the model's
-own loss (DESIGN 5.2: over poses that loss is rough at the scale of a pixel and sensitive to noise).
+own loss (docs/gradients.md, "The model's own loss": over poses that loss is rough at the scale of a pixel and sensitive
+to noise).
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ ADJOINT_RENDERS = 3.0
 """Renders that take about as long as an adjoint."""
 MANY = 16
 """Coordinates of one control over which differences are not compared with an adjoint: one by one they take too many
-renders, and the error of random directions is which ones they skip (DESIGN 5.1), so that no number of samples brings
-them to the goal."""
+renders, and the error of random directions is which ones they skip, so that no number of samples brings them to the
+goal."""
 CONVERGED, AGAIN = 128, 4
 """Samples a pixel of a gradient that counts as converged, and times as many where these do not agree, or where a
 working gradient has more."""

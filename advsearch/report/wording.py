@@ -1,4 +1,4 @@
-"""The sentences and numbers of a summary (DESIGN 6) in plain words, for the final table and the report alike."""
+"""A summary (docs/design.md, "summary.json") in plain words, for the final table and the report alike."""
 
 from __future__ import annotations
 

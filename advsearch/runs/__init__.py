@@ -1,4 +1,4 @@
-"""What a run leaves behind (DESIGN 6): its directory, results, pictures and summary.
+"""What a run leaves behind (docs/runs.md): its directory, results, pictures and summary.
 
 The names that others rely on, in a run directory:
 

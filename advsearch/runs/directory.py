@@ -1,4 +1,4 @@
-"""The run directory: all that a run leaves behind (DESIGN 6), made, locked and filled here."""
+"""The run directory: all that a run leaves behind (docs/runs.md), made, locked and filled here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`summary.json`: the answer of a run as plain JSON (DESIGN 6)."""
+"""`summary.json`: the answer of a run as plain JSON (docs/design.md, "summary.json")."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _ORDER = (
     "seconds",
     "seed",
 )
-"""The fields of DESIGN 6 in its order; others follow in the order in which they were given."""
+"""The fields of docs/design.md, "summary.json" in their order; others follow in the order in which they were given."""
 
 
 def goes_on(answer: Mapping[str, Any]) -> bool:
@@ -79,7 +79,7 @@ def plain(value: Any) -> Any:
 
 
 def to_json(summary: Mapping[str, Any]) -> str:
-    """Return the summary as text: ``schema`` first, then the fields in the order of DESIGN 6, then all others."""
+    """Return the summary as text: ``schema`` first, then the fields in the order above, then all others."""
     given = {"schema": SCHEMA, **summary}
     names = [name for name in _ORDER if name in given] + [name for name in given if name not in _ORDER]
     return json.dumps({name: plain(given[name]) for name in names}, indent=2, allow_nan=False, ensure_ascii=False)

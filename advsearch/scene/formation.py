@@ -2,8 +2,8 @@
 
     display = sRGB(clip(gain * denoised(radiance), 0, 1))          (IEC 61966-2-1 transfer)
 
-It is part of a run, named and stored, and the same in search and verification (DESIGN 5.2). Verification then rounds to
-8 bits, as a file would.
+It is part of a run, named and stored, and the same in search and verification (docs/design.md, "Image formation").
+Verification then rounds to 8 bits, as a file would.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""The function in the middle: `render(u, seed, spp)`, differentiable in ordinary torch autograd (DESIGN section 1).
+"""The function in the middle: `render(u, seed, spp)`, differentiable in ordinary torch autograd.
+
+See docs/design.md, "One function in the middle".
 
     u in [0, 1]^d --space--> scene inputs --assembly, Mitsuba--> radiance --image formation--> (H, W, 3) sRGB in [0, 1]
 
@@ -253,7 +255,7 @@ class Renderer:
         return wanted
 
     def _finite(self, values: Tensor) -> Tensor:
-        """Replace NaN and infinite entries by zero and count them (DESIGN 4.9)."""
+        """Replace NaN and infinite entries by zero and count them."""
         if bool(torch.isfinite(values.sum())):
             return values
         finite = torch.isfinite(values)

@@ -1,4 +1,4 @@
-"""Random search: the baseline that every worst-case claim is measured against (DESIGN 4.2)."""
+"""Random search: the baseline that every worst-case claim is measured against (docs/design.md, "The search")."""
 
 from __future__ import annotations
 

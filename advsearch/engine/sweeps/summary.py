@@ -1,4 +1,4 @@
-"""Counting what a sweep finds, in memory that does not grow with it, and its summary (DESIGN section 6)."""
+"""Counting what a sweep finds, in memory that does not grow, and its summary (docs/sweeps.md, "What it says")."""
 
 from __future__ import annotations
 

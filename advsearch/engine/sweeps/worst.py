@@ -1,6 +1,7 @@
-"""The independent re-check of the worst configuration of a sweep (DESIGN 4.1): fresh seeds, enough samples, 8 bits.
+"""The independent re-check of the worst configuration of a sweep: fresh seeds, enough samples, 8 bits.
 
-A sweep has no clean configuration, so there is no control group: a trial counts where the model is wrong.
+Its place in the answer: docs/sweeps.md, "What it says". A sweep has no clean configuration, so there is no control
+group: a trial counts where the model is wrong.
 """
 
 from __future__ import annotations

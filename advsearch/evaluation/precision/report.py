@@ -83,7 +83,7 @@ class Section:
 
 
 def report_of(head: Mapping[str, Any], section: Section, goal: float, seconds: Mapping[str, float]) -> dict[str, Any]:
-    """Return the report: DESIGN section 6, and what else there is to say."""
+    """Return the report (docs/precision.md, "JSON")."""
     slopes = _slopes(section)
     for slope in slopes:
         said = warning_of(slope, section.points[slope.line, slope.measure])

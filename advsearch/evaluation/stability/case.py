@@ -131,7 +131,7 @@ class Row:
         return str(deciding[0]) if deciding else ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the row as DESIGN section 6 lists it, and more."""
+        """Return the row (docs/stability.md, "What a row says")."""
         found = self.findings
         return {
             "case": self.case.name,

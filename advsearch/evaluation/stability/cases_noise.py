@@ -186,7 +186,8 @@ def one_sample() -> Findings:
 def heavy_render(count: int = SAMPLES) -> Findings:
     """Gradients of a shift at 4 samples a pixel: how heavy their tails are, and what each estimator makes of them.
 
-    "boundary" is the estimator with the heavy tail (DESIGN 5.1), which no plan takes by itself; "secant" the plan's.
+    "boundary" is the estimator with the heavy tail (docs/stability.md, "Heavy tails"), which no plan takes by itself;
+    "secant" the plan's.
     """
     renderer = small("mug", {"pose": {"x": [-0.3, 0.3]}})
     renderer.formation = replace(renderer.formation, transfer="linear")

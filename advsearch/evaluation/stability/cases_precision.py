@@ -35,7 +35,7 @@ BITS = 1e-5
 MOVES = 40
 """Pictures of a moved mesh that are compared: that their last bits differ is a matter of chance."""
 LOGITS = 1e-3
-"""Difference in logits that single precision may make: a thousandth of what noise moves a margin by (DESIGN 5.2)."""
+"""Difference in logits that single precision may make: a thousandth of what noise moves a margin by."""
 BISECTIONS = 24
 TEXTURE: Controls = {"texture": {"resolution": 16}}
 SHIFT: Controls = {"pose": {"x": [-0.3, 0.3]}}

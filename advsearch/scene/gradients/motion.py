@@ -1,7 +1,8 @@
 """How fast each coordinate of u moves points in the picture, and the width of a difference that follows from it.
 
 A smooth loss is best differenced over about one pixel of motion of the fastest outline, never over a fixed length in
-the world (DESIGN 5.1): narrower and noise wins, wider and the loss bends. For a classifier's see `plan.SEARCH_STEP`.
+the world (docs/gradients.md, "The estimators"): narrower and noise wins, wider and the loss bends. For a classifier's
+see `plan.SEARCH_STEP`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The gradient plan: how the derivative of every coordinate of u is obtained (DESIGN section 5).
+"""The gradient plan: how the derivative of every coordinate of u is obtained (docs/gradients.md).
 
 A control's groups of coordinates declare which estimators are valid for them. Where only one is, the plan takes it;
-where several are, it takes the first, until a measurement on the actual scene (`advsearch.evaluation.measurement`)
+where several are, it takes the first, until a measurement on the actual scene (`advsearch.engine.planning`)
 says which has the least variance x time. Any of them can be forced by name.
 """
 
@@ -43,7 +43,7 @@ DIRECTIONS = 4
 DEFAULT_STEP, TURN_STEP = 0.05, 0.005
 """Half of a difference's width in u, for coordinates that move nothing in the picture: of a range, of a full turn."""
 DEFAULT_PIXELS = 1.0
-"""How far the fastest point of an outline moves over half a difference, in pixels (DESIGN 5.1)."""
+"""Pixels by which the fastest point of an outline moves in half a difference (docs/gradients.md, "The estimators")."""
 STEP_RANGE = (1e-6, 0.15)
 """Smallest and largest step in u."""
 SEARCH_STEP = 0.03
