@@ -18,6 +18,9 @@ from advsearch.errors import FileFormatError, InputError
 FACTOR = "ADVSEARCH_LIMITS"
 """Environment variable with a number that all limits on the size of input are multiplied by."""
 
+Json = dict[str, Any]
+"""What a file or a store holds as a JSON object, before a type has taken it, or once it has been written out."""
+
 DEPTH = 100
 """Deepest nesting of JSON, in lists and objects."""
 

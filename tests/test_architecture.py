@@ -53,8 +53,10 @@ RULES = {
     "models": Rule(set(), {"torch", "numpy", "safetensors"}),
     "attacks": Rule(set(), {"torch", "numpy", "scipy", "cma"}),
     "engine": Rule({"scene", "bundled", "controls", "models", "attacks", "runs", "report", "config", "settings"}),
-    "evaluation": Rule({"scene", "bundled", "controls", "models", "attacks", "engine", "report"}),
-    "runs": Rule({"config", "settings"}, {"numpy", "pydantic", "imageio", "OpenEXR", "PIL", "pyarrow"}),
+    "evaluation": Rule({"scene", "bundled", "controls", "models", "attacks", "engine", "runs", "report"}),
+    "runs": Rule(
+        {"config", "settings"}, {"numpy", "pydantic", "typing_extensions", "imageio", "OpenEXR", "PIL", "pyarrow"}
+    ),
     "report": Rule({"runs", "config", "settings"}, {"numpy", "PIL", "matplotlib"}, HEAVY),
     "api": Rule(None),
     "cli": Rule(None),

@@ -133,10 +133,10 @@ def test_a_step_is_one_that_a_search_can_follow_and_never_under_a_pixel() -> Non
 def test_a_plan_says_its_steps_in_the_parameters_unit_and_why() -> None:
     config = AttackConfig(object="mug", controls={"camera": {"azimuth": [0, 360]}}, resolution=(32, 32))
     problem, _ = problem_from_config(config)
-    (found,) = problem.plan_summary(problem.plan)["groups"]
-    assert found["step"] == SEARCH_STEP and found["unit"] == "degrees"
-    assert found["step_in_unit"] == pytest.approx(0.03 * 360.0, abs=0.01)
-    assert "so that a search can follow" in found["step_reason"]
+    (found,) = problem.plan_summary(problem.plan).groups
+    assert found.step == SEARCH_STEP and found.unit == "degrees"
+    assert found.step_in_unit == pytest.approx(0.03 * 360.0, abs=0.01)
+    assert "so that a search can follow" in found.step_reason
 
 
 @pytest.mark.slow

@@ -161,12 +161,12 @@ def test_the_plan_shows_what_is_left_out(specialise: bool) -> None:
     )
     found = plan(config)
     said = text(found)
-    assert found["specialised"] is specialise
+    assert found.specialised is specialise
     if specialise:
-        assert {row["item"] for row in found["gains"]} >= {*ITEMS, ALL}
-        assert found["bounces"]["reason"] in said and "texels of texture" in said
+        assert {row.item for row in found.gains or ()} >= {*ITEMS, ALL}
+        assert found.bounces is not None and found.bounces.reason in said and "texels of texture" in said
     else:
-        assert "gains" not in found and "nothing (--no-specialise)" in said
+        assert found.gains is None and "nothing (--no-specialise)" in said
 
 
 def test_every_input_of_a_light_has_a_base_value() -> None:

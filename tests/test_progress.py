@@ -206,15 +206,15 @@ def test_a_plan_counts_what_it_says() -> None:
     progress = Recorded()
     whole = plan(PLANNED, progress=progress)
     progress.check()
-    assert whole["ending"] == "done" and whole["not_measured"] == [] and whole["gains"]
-    assert sum("cosine" in text for text in progress.messages) == len(whole["cosines"])
+    assert whole.ending == "done" and whole.not_measured == [] and whole.gains
+    assert sum("cosine" in text for text in progress.messages) == len(whole.cosines)
     assert plan_text(whole).startswith("How a search gets the derivative of each parameter")
 
 
 def test_a_plan_says_what_it_did_not_measure(monkeypatch: pytest.MonkeyPatch) -> None:
     cut = plan(PLANNED.model_copy(update={"seconds": 1e-9}))
-    assert cut["ending"] == "out of time" and not cut["cosines"] and "gains" not in cut
-    assert cut["not_measured"][1:] == ["what can be left out", "environment with denoiser none"]
+    assert cut.ending == "out of time" and not cut.cosines and cut.gains is None
+    assert cut.not_measured[1:] == ["what can be left out", "environment with denoiser none"]
     assert "not measured, the time was up:\n  step and samples of environment" in plan_text(cut)
 
     def stopped(*_: Any, **__: Any) -> None:
@@ -227,9 +227,13 @@ def test_a_plan_says_what_it_did_not_measure(monkeypatch: pytest.MonkeyPatch) ->
     progress = Recorded()
     half = plan(PLANNED, progress=progress)
     progress.check()
-    assert half["ending"] == "interrupted" and half["cosines"] and half["not_measured"] == cut["not_measured"][1:]
+    assert half.ending == "interrupted" and half.cosines and half.not_measured == cut.not_measured[1:]
     assert "not measured, it was stopped" in plan_text(half)
-    assert half["denoise"] == {"asked": "oidn", "advised": "oidn", "reason": "the other one was not measured"}
+    assert half.denoise.to_dict() == {
+        "asked": "oidn",
+        "advised": "oidn",
+        "reason": "the other one was not measured",
+    }
 
 
 # ---- what is stored is not rendered again ---------------------------------------------------------------------------

@@ -34,8 +34,9 @@ from advsearch.runs.export import FORMATS, export
 from advsearch.runs.files import PART, replacing, write_bytes, write_text
 from advsearch.runs.listing import finished, listed
 from advsearch.runs.lock import RunLock
+from advsearch.runs.results.base import plain
 from advsearch.runs.store import MIGRATIONS, Row, Store
-from advsearch.runs.summary import plain, read_summary, to_json
+from advsearch.runs.summary import read_summary, to_json
 
 WRITER = """
 import sys

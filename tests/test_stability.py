@@ -19,7 +19,7 @@ from advsearch.evaluation.stability.case import holds
 from advsearch.evaluation.stability.cases_noise import clipped_mean, median_of_means
 from advsearch.evaluation.stability.scene import sphere
 from advsearch.evaluation.stability.search import Toy, condition_number, hessian, numbers, quadratic
-from advsearch.evaluation.stability.suite import CASES, FELL_SHORT, GROUPS, OK, Case, Check, Findings, chosen, run_case
+from advsearch.evaluation.stability.suite import CASES, FELL_SHORT, GROUPS, OK, Case, Check, Outcome, chosen, run_case
 
 WANTED = {
     "radiometric": (
@@ -131,18 +131,18 @@ def test_a_check_says_what_it_wanted(check: Check, ok: bool, text: str) -> None:
     assert check.ok is ok and str(check) == text
 
 
-def made(findings: Findings | Exception, name: str = "made") -> Case:
-    def find() -> Findings:
-        if isinstance(findings, Exception):
-            raise findings
-        return findings
+def made(outcome: Outcome | Exception, name: str = "made") -> Case:
+    def find() -> Outcome:
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
 
     return Case(name, "noise", "", "It holds.", "a rule", find, "pose")
 
 
 def test_a_row_has_what_the_design_lists() -> None:
-    findings = Findings((Check("a", 1.0, most=2.0), Check("b", 5.0, most=2.0)), True, 0.25, "stalled", {"c": 3.0})
-    row = run_case(made(findings)).to_dict()
+    outcome = Outcome((Check("a", 1.0, most=2.0), Check("b", 5.0, most=2.0)), True, 0.25, "stalled", {"c": 3.0})
+    row = run_case(made(outcome)).to_dict()
     wanted = {"case": "made", "control": "pose", "finite": True, "relative_error": 0.25, "ending": "stalled"}
     assert {**row, **wanted} == row
     assert (row["status"], row["rule"], row["decides"]) == (FELL_SHORT, "a rule", "b: 5 (expected at most 2)")
@@ -150,7 +150,7 @@ def test_a_row_has_what_the_design_lists() -> None:
 
 
 def test_what_is_not_finite_falls_short_whatever_the_checks_say() -> None:
-    row = run_case(made(Findings((Check("a", 1.0, most=2.0),), finite=False)))
+    row = run_case(made(Outcome((Check("a", 1.0, most=2.0),), finite=False)))
     assert (row.status, row.decides) == (FELL_SHORT, "NaN or infinite values")
 
 
@@ -160,7 +160,7 @@ def test_what_is_not_finite_falls_short_whatever_the_checks_say() -> None:
 )
 def test_an_exception_is_a_finding(error: Exception, ending: str, text: str) -> None:
     row = run_case(made(error))
-    assert row.status == FELL_SHORT and row.findings.ending == ending and text in row.decides
+    assert row.status == FELL_SHORT and row.ending == ending and text in row.decides
 
 
 # ---- the command ----------------------------------------------------------------------------------------------------
@@ -168,8 +168,8 @@ def test_an_exception_is_a_finding(error: Exception, ending: str, text: str) -> 
 
 @pytest.fixture
 def two_cases(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    good = made(Findings((Check("a", 1.0, most=2.0),), relative_error=0.02, ending="found"), "good")
-    bad = replace(made(Findings((Check("a", 3.0, most=2.0),)), "bad"), group="stiff")
+    good = made(Outcome((Check("a", 1.0, most=2.0),), relative_error=0.02, ending="found"), "good")
+    bad = replace(made(Outcome((Check("a", 3.0, most=2.0),)), "bad"), group="stiff")
     monkeypatch.setattr(suite, "CASES", (good, bad))
     yield
 
@@ -211,7 +211,7 @@ def test_seconds_and_ctrl_c_end_the_suite_and_say_what_was_not_run(
     assert main(["stability", "--seconds", "1e-9", "--quiet"]) == 0
     assert "not run: bad; --case NAME runs one" in capsys.readouterr().out
 
-    def interrupted() -> Findings:
+    def interrupted() -> Outcome:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(suite, "CASES", (suite.CASES[0], replace(suite.CASES[1], find=interrupted)))

@@ -42,9 +42,11 @@ from advsearch.engine.planning import (
     tuned,
 )
 from advsearch.engine.problem import Problem
+from advsearch.files import Json
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory, default_name
-from advsearch.runs.summary import INTERRUPTED, NAME, OUT_OF_TIME, read_summary
+from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME
+from advsearch.runs.summary import NAME, read_summary
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
 from advsearch.scene.gradients.plan import STEP_RANGE, GroupPlan
 
@@ -309,7 +311,7 @@ def _model(part: Part, title: str, results: Results, progress: Progress) -> Iter
     renderer, u = problem.renderer, inside(problem.renderer)
     counts = tuple(count for count in (*COUNTS, MOST) if count >= problem.spp) or (problem.spp,)
 
-    def measured() -> dict[str, object]:
+    def measured() -> Json:
         progress.stage(f"{title}: comparing ways to differentiate", plan_gradients(renderer.plan))
         seed, tick = seeds.stream(config.seed, "measure"), lambda: progress.advance(1)
         return measured_plan(renderer, problem.loss, u, seed=seed, spp=problem.spp, counted=True, tick=tick).to_dict()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
 
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
@@ -17,20 +16,25 @@ from advsearch.engine.problem import Problem
 from advsearch.evaluation.leaving_out import measured_gains, most_gradients, resolved_texels, rows_of
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.wording import count
-from advsearch.runs.summary import INTERRUPTED, OUT_OF_TIME
+from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME, Formation
+from advsearch.runs.results.plan import (
+    CosineRow,
+    DenoiserAdvice,
+    EstimatorLimit,
+    GainRow,
+    PathLength,
+    PlanResult,
+    TexelRow,
+)
 from advsearch.scene.gradients.plan import BY_DIFFERENCES, GradientPlan
 
 
-def plan(config: AttackConfig, *, progress: Progress | None = None) -> dict[str, Any]:
+def plan(config: AttackConfig, *, progress: Progress | None = None) -> PlanResult:
     """Choose how every derivative is obtained and what is left out, by measurement, and say why.
 
     Args:
         config: scene, model, controls; after its `seconds` nothing more is measured.
         progress: told how far it is.
-
-    Returns:
-        The plan with its reasons, the cosines that chose steps and samples, the limits of the estimators, and what is
-        left out with its gain and the proof that it is safe; in `not_measured` what the time did not suffice for.
     """
     progress, begun = progress or NullProgress(), time.monotonic()
     progress.stage(LOADING)
@@ -49,25 +53,27 @@ def plan(config: AttackConfig, *, progress: Progress | None = None) -> dict[str,
         ending = INTERRUPTED
     tables, (chosen, spp) = work.tables, work.chosen
     used = {group.estimator for group in chosen.groups}
-    return {
-        "schema": 1,
-        "command": "plan",
-        "object": config.object,
-        "environment": problem.space.environment or config.environment,
-        "controls": list(config.controls),
-        "model": problem.model.name,
-        "ending": ending,
-        "not_measured": [what for what, _ in left],
-        "image_formation": problem.renderer.formation.summary(),
-        **problem.plan_summary(chosen),
-        "spp": spp,
-        "cosines": [{"denoise": name, **vars(row)} for name, rows in tables.items() for row in rows],
-        "denoise": quieter(tables, config.denoise),
-        "left_out": _left_out(problem, used) if config.specialise else [],
-        "specialised": config.specialise,
-        **work.dropped,
-        "limits": _limits() if "material" in used else [],
-    }
+    gradient = problem.plan_summary(chosen)
+    return PlanResult(
+        object=config.object,
+        environment=problem.space.environment or config.environment,
+        controls=list(config.controls),
+        model=problem.model.name,
+        ending=ending,
+        not_measured=[what for what, _ in left],
+        image_formation=Formation.of(problem.renderer.formation),
+        renders_per_gradient=gradient.renders_per_gradient,
+        spp=spp,
+        groups=gradient.groups,
+        cosines=[CosineRow(denoise=name, **vars(row)) for name, rows in tables.items() for row in rows],
+        denoise=quieter(tables, config.denoise),
+        left_out=_left_out(problem, used) if config.specialise else [],
+        specialised=config.specialise,
+        gains=work.gains,
+        bounces=work.bounces,
+        texels=work.texels,
+        limits=_limits() if "material" in used else [],
+    )
 
 
 class _Measurements:
@@ -80,7 +86,7 @@ class _Measurements:
 
     Attributes:
         tables: denoiser to the cosines so far.
-        dropped: see `leaving_out`; empty before.
+        gains, bounces, texels: what leaving things out brings; None before it was measured.
     """
 
     def __init__(self, problem: Problem, config: AttackConfig, progress: Progress) -> None:
@@ -88,7 +94,9 @@ class _Measurements:
         self._other = "none" if config.denoise == "oidn" else "oidn"
         self._theirs: Problem | None = None
         self.tables: dict[str, list[Cosine]] = {config.denoise: [], self._other: []}
-        self.dropped: dict[str, Any] = {}
+        self.gains: list[GainRow] | None = None
+        self.bounces: PathLength | None = None
+        self.texels: list[TexelRow] | None = None
 
     @property
     def chosen(self) -> tuple[GradientPlan, int]:
@@ -151,17 +159,18 @@ class _Measurements:
         before = self._problem.renderer.plan
         self._problem.renderer.plan, _ = self.chosen
         try:
-            self.dropped = leaving_out(self._problem, self._config, self._progress)
+            self.gains, self.bounces, self.texels = leaving_out(self._problem, self._config, self._progress)
         finally:
             self._problem.renderer.plan = before
 
 
-def leaving_out(problem: Problem, config: AttackConfig, progress: Progress) -> dict[str, Any]:
+def leaving_out(
+    problem: Problem, config: AttackConfig, progress: Progress
+) -> tuple[list[GainRow], PathLength, list[TexelRow]]:
     """Measure what leaving things out of a search's renders brings, and prove it safe.
 
     Returns:
-        "gains": a row for each item and one for all; "bounces": the path length and why; "texels": what is searched
-        beyond what a pixel shows.
+        A row for each item and one for all; the path length and why; what is searched beyond what a pixel shows.
     """
     renderer, seed = problem.renderer, seeds.stream(config.seed, "leaving out")
     u = inside(renderer)
@@ -174,14 +183,11 @@ def leaving_out(problem: Problem, config: AttackConfig, progress: Progress) -> d
     bounces = bounces_of(problem, config.seed, tick=tick)
     progress.stage("measuring what leaving things out saves", most_gradients(), hint=hint, at_most=True)
     gains = measured_gains(renderer, problem.loss, u, seed=seed, spp=problem.spp, depth=bounces.depth, tick=tick)
-    return {
-        "gains": rows_of(gains),
-        "bounces": {**vars(bounces), "cuts": [vars(cut) for cut in bounces.cuts], "reason": bounces.reason},
-        "texels": [vars(one) for one in resolved_texels(renderer, u, seed=seed)],
-    }
+    texels = [TexelRow.of(one) for one in resolved_texels(renderer, u, seed=seed)]
+    return rows_of(gains), PathLength.of(bounces), texels
 
 
-def quieter(tables: Mapping[str, Sequence[Cosine]], asked: str) -> dict[str, str]:
+def quieter(tables: Mapping[str, Sequence[Cosine]], asked: str) -> DenoiserAdvice:
     """Say which denoiser makes the better gradients: the one that reaches the goal in all controls in less time.
 
     A denoiser is part of the image formation, the same in search and verification, so that this is advice: another one
@@ -202,7 +208,7 @@ def quieter(tables: Mapping[str, Sequence[Cosine]], asked: str) -> dict[str, str
 
     measured = [name for name in tables if tables[name]]
     if len(measured) == 1 and len(tables) > 1:
-        return {"asked": asked, "advised": asked, "reason": "the other one was not measured"}
+        return DenoiserAdvice(asked=asked, advised=asked, reason="the other one was not measured")
     advised = min(measured, key=rank) if measured else asked
     reached = bool(measured) and not rank(advised)[0]
     why = (
@@ -212,14 +218,14 @@ def quieter(tables: Mapping[str, Sequence[Cosine]], asked: str) -> dict[str, str
         if measured
         else "nothing was measured"
     )
-    return {"asked": asked, "advised": advised, "reason": why}
+    return DenoiserAdvice(asked=asked, advised=advised, reason=why)
 
 
-def _limits() -> list[Any]:
+def _limits() -> list[EstimatorLimit]:
     """What the material form does not cover, as it states itself."""
     from advsearch.scene.gradients.material_form import LIMITS
 
-    return [vars(limit) if hasattr(limit, "__dict__") else str(limit) for limit in LIMITS]
+    return [EstimatorLimit.of(limit) for limit in LIMITS]
 
 
 def _left_out(problem: Problem, used: set[str]) -> list[str]:

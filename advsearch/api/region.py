@@ -23,8 +23,8 @@ from advsearch.progress import NullProgress, Progress
 from advsearch.report.studies import map_figure
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
+from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.store import NAME, Store
-from advsearch.runs.summary import INTERRUPTED
 from advsearch.settings import split_names
 
 MOST = 8

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from advsearch.config import RenderConfig
 from advsearch.engine.loading import load_scene
@@ -13,10 +12,11 @@ from advsearch.engine.rendering import render as render
 from advsearch.engine.rendering import writable
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
+from advsearch.runs.results.render import RenderResult
 
 
-def render_from_config(config: RenderConfig, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Render what a configuration describes, write the file, and return what is known about it as JSON values.
+def render_from_config(config: RenderConfig, *, progress: Progress | None = None) -> RenderResult:
+    """Render what a configuration describes, write the file, and return what is known about it.
 
     Raises:
         InputError: as for `render`, or the file would replace one that is read.
@@ -48,6 +48,4 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
     warnings = [*found.warnings, *said]
     for text in warnings:
         progress.message(text)
-    size = found.save(out)
-    written = {"out": str(out), "size": list(size)}
-    return {"schema": 1, "command": "render", **written, **found.to_dict(), "warnings": warnings}
+    return found.result(out, found.save(out), warnings)

@@ -103,7 +103,7 @@ def fell_short(rows: Sequence[Mapping[str, Any]]) -> bool:
 
 def answer(summary: Mapping[str, Any]) -> str:
     """Return what the table shows and how to read it, the table, and where the run is."""
-    from advsearch.runs.summary import OUT_OF_TIME
+    from advsearch.runs.results.base import OUT_OF_TIME
 
     rows, left = summary["rows"], summary["planned"] - summary["measured"]
     parts = [READING, table(rows)] if rows else []

@@ -9,7 +9,10 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from advsearch.runs.results.base import Result
 
 
 def add_flags(parser: argparse.ArgumentParser, *, quiet: bool = False) -> None:
@@ -32,7 +35,7 @@ def add_code_flag(parser: argparse.ArgumentParser) -> None:
 
 def print_json(value: Any) -> None:
     """Print `value` as JSON on standard output; NaN and infinity become null."""
-    from advsearch.runs.summary import plain
+    from advsearch.runs.results.base import plain
 
     text = json.dumps(plain(value), indent=2, allow_nan=False, ensure_ascii=False)
     print("".join(sign if sign.isprintable() or sign == "\n" else _json_escape(sign) for sign in text))
@@ -43,7 +46,7 @@ def _json_escape(sign: str) -> str:
     return "\\u007f" if sign == "\x7f" else json.dumps(sign)[1:-1]
 
 
-def finish(summary: Mapping[str, Any], answer: Callable[[Any], str], *, as_json: bool) -> int:
+def finish(summary: Result | Mapping[str, Any], answer: Callable[[Any], str], *, as_json: bool) -> int:
     """Print the last word of a command, and return its exit status.
 
     Args:
@@ -57,14 +60,18 @@ def finish(summary: Mapping[str, Any], answer: Callable[[Any], str], *, as_json:
         print_json(summary)
     else:
         print(answer(summary) + go_on_text(summary))
-    return INTERRUPTED if summary.get("ending") == "interrupted" else OK
+    ending = summary.get("ending") if isinstance(summary, Mapping) else getattr(summary, "ending", None)
+    return INTERRUPTED if ending == "interrupted" else OK
 
 
-def go_on_text(summary: Mapping[str, Any]) -> str:
+def go_on_text(summary: Result | Mapping[str, Any]) -> str:
     """Return how to go on with a run that was stopped; nothing of one that was not, or that is kept nowhere."""
     from advsearch.runs.directory import shown
     from advsearch.runs.summary import goes_on
 
+    if not isinstance(summary, Mapping):
+        run = getattr(summary, "run", None)
+        return f"\n\nGo on with: advsearch resume {shown(run)}" if summary.goes_on and run else ""
     return (
         f"\n\nGo on with: advsearch resume {shown(summary['run'])}" if goes_on(summary) and summary.get("run") else ""
     )

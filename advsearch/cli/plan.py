@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
 from advsearch.cli.check import FIELDS, GROUPS
+
+if TYPE_CHECKING:
+    from advsearch.runs.results.plan import GroupDerivative, PlanResult
 
 HELP = "show how a search gets its derivatives and what it leaves out, measured on its scene, and why"
 
@@ -51,44 +53,42 @@ def run(args: argparse.Namespace) -> int:
     return output.finish(chosen, text, as_json=args.json)
 
 
-def _step(group: Mapping[str, Any]) -> str:
+def _step(group: GroupDerivative) -> str:
     """The step of a difference in u, and in the parameter's unit where it has one."""
-    if not group["step_reason"]:
+    if not group.step_reason:
         return ""
-    own = "" if group["step_in_unit"] is None else f" ({group['step_in_unit']:.3g} {group['unit']})"
-    return f"{group['step']:.3g}{own}"
+    own = "" if group.step_in_unit is None else f" ({group.step_in_unit:.3g} {group.unit})"
+    return f"{group.step:.3g}{own}"
 
 
-def _steps(chosen: Mapping[str, Any]) -> list[str]:
+def _steps(chosen: PlanResult) -> list[str]:
     """Why the steps are as wide as they are, each reason once with its parameters."""
     reasons: dict[str, list[str]] = {}
-    for group in chosen["groups"]:
-        if group["step_reason"]:
-            reasons.setdefault(group["step_reason"], []).append(f"{group['control']}.{group['parameter']}")
+    for group in chosen.groups:
+        if group.step_reason:
+            reasons.setdefault(group.step_reason, []).append(group.name)
     return [f"step of {', '.join(names)}: {reason}" for reason, names in reasons.items()]
 
 
-def text(chosen: dict[str, Any]) -> str:
+def text(chosen: PlanResult) -> str:
     """Return a plan as text."""
-    from advsearch.runs.summary import OUT_OF_TIME
+    from advsearch.runs.results.base import OUT_OF_TIME
 
     rows = [["parameter", "numbers", "estimator", "step", "why"]]
-    for group in chosen["groups"]:
+    for group in chosen.groups:
         step = _step(group)
-        rows.append(
-            [f"{group['control']}.{group['parameter']}", str(group["size"]), group["estimator"], step, group["reason"]]
-        )
+        rows.append([group.name, str(group.size), group.estimator, step, group.reason])
     lines = [
         READING,
         "",
         output.columns(rows),
         "",
-        f"renders for one gradient beside the picture itself: {chosen['renders_per_gradient']}",
-        f"samples a pixel: {chosen['spp']}",
+        f"renders for one gradient beside the picture itself: {chosen.renders_per_gradient}",
+        f"samples a pixel: {chosen.spp}",
         *_steps(chosen),
         *_left_out(chosen),
     ]
-    if chosen["cosines"]:
+    if chosen.cosines:
         heads = [
             "control",
             "denoiser",
@@ -100,56 +100,56 @@ def text(chosen: dict[str, Any]) -> str:
         ]
         body = [
             [
-                row["control"],
-                row["denoise"],
-                f"x {row['factor']:.3g}",
-                str(row["spp"]),
-                f"{row['cosine']:.3f}",
-                f"{row['converged']:.3f}",
-                f"{row['seconds']:.2f}",
+                row.control,
+                row.denoise,
+                f"x {row.factor:.3g}",
+                str(row.spp),
+                f"{row.cosine:.3f}",
+                f"{row.converged:.3f}",
+                f"{row.seconds:.2f}",
             ]
-            for row in chosen["cosines"]
+            for row in chosen.cosines
         ]
         lines += ["", output.columns([heads, *body])]
-        denoise = chosen["denoise"]
+        denoise = chosen.denoise
         lines += [
             "",
-            f"denoiser asked for: {denoise['asked']}; better gradients: {denoise['advised']} ({denoise['reason']})",
+            f"denoiser asked for: {denoise.asked}; better gradients: {denoise.advised} ({denoise.reason})",
         ]
-    if chosen["not_measured"]:
-        why = "the time was up" if chosen["ending"] == OUT_OF_TIME else "it was stopped"
-        lines += ["", f"not measured, {why}:", *(f"  {what}" for what in chosen["not_measured"])]
-    if chosen["limits"]:
-        lines += ["", "limits of the material form:", *(f"  {limit}" for limit in chosen["limits"])]
+    if chosen.not_measured:
+        why = "the time was up" if chosen.ending == OUT_OF_TIME else "it was stopped"
+        lines += ["", f"not measured, {why}:", *(f"  {what}" for what in chosen.not_measured)]
+    if chosen.limits:
+        lines += ["", "limits of the material form:", *(f"  {limit.what}" for limit in chosen.limits)]
     return "\n".join(lines)
 
 
-def _left_out(chosen: dict[str, Any]) -> list[str]:
+def _left_out(chosen: PlanResult) -> list[str]:
     """Lines on what the search doesn't compute: sentences, then what was measured."""
-    if not chosen["specialised"]:
+    if not chosen.specialised:
         return ["left out: nothing (--no-specialise)"]
-    if "gains" not in chosen:
-        return ["not needed:", *(f"  {sentence}" for sentence in chosen["left_out"])]
+    if chosen.gains is None or chosen.bounces is None:
+        return ["not needed:", *(f"  {sentence}" for sentence in chosen.left_out)]
     rows = [["left out", "a gradient with it takes", "picture differs", "gradient differs"]]
-    for row in chosen["gains"]:
-        agrees = [_agreement(row[name]) for name in ("picture_difference", "gradient_difference")]
-        rows.append([row["what"], f"x {row['gain']:.2f}", *agrees])
-    bounces = chosen["bounces"]
+    for row in chosen.gains:
+        agrees = _agreement(row.picture_difference), _agreement(row.gradient_difference)
+        rows.append([row.what, f"x {row.gain:.2f}", *agrees])
+    bounces = chosen.bounces
     return [
         "not needed:",
-        *(f"  {sentence}" for sentence in chosen["left_out"]),
+        *(f"  {sentence}" for sentence in chosen.left_out),
         "",
         output.columns(rows),
         "",
-        f"longest light path of the search: {bounces['depth']} segments of {bounces['full']}: {bounces['reason']}",
+        f"longest light path of the search: {bounces.depth} segments of {bounces.full}: {bounces.reason}",
         *(
-            f"texels of {one['control']}: {one['seen']} are seen in {one['pixels']} pixels; "
+            f"texels of {one.control}: {one.seen} are seen in {one.pixels} pixels; "
             + (
-                f"--texture-resolution {one['enough']} would resolve as much"
-                if one["enough"] < one["side"]
-                else f"{one['side']} a side is what the pixels resolve"
+                f"--texture-resolution {one.enough} would resolve as much"
+                if one.enough < one.side
+                else f"{one.side} a side is what the pixels resolve"
             )
-            for one in chosen["texels"]
+            for one in chosen.texels or ()
         ),
     ]
 

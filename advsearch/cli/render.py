@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
+
+if TYPE_CHECKING:
+    from advsearch.runs.results.render import ClassAnswer, RenderResult
 
 HELP = "render a picture of a scene, and say what the model sees in it"
 GROUPS = ("scene", "model", "picture")
@@ -51,19 +53,18 @@ def run(args: argparse.Namespace) -> int:
     return output.finish(found, text, as_json=args.json)
 
 
-def text(found: Mapping[str, Any]) -> str:
+def text(found: RenderResult) -> str:
     """Return what was written, and the model's answers view by view."""
-    height, width = found["size"]
-    views = found["views"]
-    lines = [f"{found['out']}: {width} x {height} pixels", ""]
-    if len(views) == 1:
-        rows = [[one["label"], _percent(one)] for one in views[0]["answers"]]
-        return "\n".join([*lines, f"Model {found['model']} sees", output.columns(rows)])
-    rows = [["azimuth", f"model {found['model']} sees"]]
-    for view in views:
-        rows.append([f"{view['azimuth']:g}", ", ".join(f"{one['label']} {_percent(one)}" for one in view["answers"])])
+    height, width = found.size
+    lines = [f"{found.out}: {width} x {height} pixels", ""]
+    if len(found.views) == 1:
+        rows = [[one.label, _percent(one)] for one in found.views[0].answers]
+        return "\n".join([*lines, f"Model {found.model} sees", output.columns(rows)])
+    rows = [["azimuth", f"model {found.model} sees"]]
+    for view in found.views:
+        rows.append([f"{view.azimuth:g}", ", ".join(f"{one.label} {_percent(one)}" for one in view.answers)])
     return "\n".join([*lines, output.columns(rows)])
 
 
-def _percent(answer: Mapping[str, Any]) -> str:
-    return f"{100 * answer['probability']:.1f} %"
+def _percent(answer: ClassAnswer) -> str:
+    return f"{100 * answer.probability:.1f} %"

@@ -142,7 +142,7 @@ def facts(parameter: Any) -> dict[str, Any]:
     Args:
         parameter: a dataclass or a mapping.
     """
-    from advsearch.runs.summary import plain
+    from advsearch.runs.results.base import plain
 
     return dict(plain(parameter))
 

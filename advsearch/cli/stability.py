@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
@@ -13,10 +13,10 @@ from advsearch.errors import InputError
 
 if TYPE_CHECKING:
     from advsearch.evaluation.stability.case import Case
-    from advsearch.evaluation.stability.suite import Row
+    from advsearch.runs.results.stability import StabilityResult
 
 HELP = "check numerical stability on stiff and extreme cases"
-EXIT_FELL_SHORT, INTERRUPTED = 3, 130
+EXIT_FELL_SHORT = 3
 
 _EXAMPLES = """examples:
   advsearch stability
@@ -50,31 +50,26 @@ def run(args: argparse.Namespace) -> int:
     from advsearch.cli.progress import at_work
 
     with at_work(as_json=args.json, quiet=args.quiet) as progress:
-        from advsearch.evaluation.stability.suite import OK, chosen, run_cases
+        from advsearch.api.stability import stability
+        from advsearch.evaluation.stability.suite import OK, chosen
 
         cases = chosen(args.case, args.group)
-        rows, stopped = ([], False) if args.list else _rows(run_cases(cases, progress, seconds=args.seconds))
+        if not args.list:
+            result = stability(cases, seconds=args.seconds, progress=progress)
     if args.list:
-        listed = [{"case": one.name, "group": one.group, "control": one.control, "holds": one.holds} for one in cases]
-        if args.json:
-            output.print_json({"schema": 1, "command": "stability", "cases": listed})
-        else:
-            print(
-                output.columns(
-                    [["group", "case", "what must hold"]]
-                    + [[one["group"], one["case"], one["holds"]] for one in listed]
-                )
-            )
-        return 0
-    if args.json:
-        left = [one.name for one in cases[len(rows) :]]
-        done = [row.to_dict() for row in rows]
-        output.print_json({"schema": 1, "command": "stability", "rows": done, "not_run": left})
+        return _print_cases(cases, as_json=args.json)
+    status = output.finish(result, table, as_json=args.json)
+    return status or (0 if all(row.status == OK for row in result.rows) else EXIT_FELL_SHORT)
+
+
+def _print_cases(cases: Sequence[Case], *, as_json: bool) -> int:
+    listed = [{"case": one.name, "group": one.group, "control": one.control, "holds": one.holds} for one in cases]
+    if as_json:
+        output.print_json({"schema": 1, "command": "stability", "cases": listed})
     else:
-        print(table(rows, cases[len(rows) :]))
-    if stopped:
-        return INTERRUPTED
-    return 0 if all(row.status == OK for row in rows) else EXIT_FELL_SHORT
+        rows = [[one.group, one.name, one.holds] for one in cases]
+        print(output.columns([["group", "case", "what must hold"], *rows]))
+    return 0
 
 
 def _seconds(text: str) -> float:
@@ -88,30 +83,20 @@ def _seconds(text: str) -> float:
     return seconds
 
 
-def _rows(running: Iterable[Row]) -> tuple[list[Row], bool]:
-    """The rows of cases as far as they were run, and whether they were stopped."""
-    rows: list[Row] = []
-    try:
-        for row in running:
-            rows.append(row)
-    except KeyboardInterrupt:
-        return rows, True
-    return rows, False
-
-
-def table(rows: Sequence[Row], left: Sequence[Case] = ()) -> str:
+def table(result: StabilityResult) -> str:
     """Return the rows as text: a table, what was measured, the number that decides where a case fell short, and what
     was not run."""
     from advsearch.evaluation.stability.suite import OK
 
+    rows, left = result.rows, result.not_run
     heads = ["group", "case", "finite", "error", "ending", "seconds", "status"]
     body = [
         [
-            row.case.group,
-            row.case.name,
-            "yes" if row.findings.finite else "NO",
-            "" if row.findings.relative_error is None else f"{100.0 * row.findings.relative_error:.2g} %",
-            textwrap.shorten(row.findings.ending, 30, placeholder=" ..."),
+            row.group,
+            row.case,
+            "yes" if row.finite else "NO",
+            "" if row.relative_error is None else f"{100.0 * row.relative_error:.2g} %",
+            textwrap.shorten(row.ending, 30, placeholder=" ..."),
             f"{row.seconds:.1f}",
             row.status,
         ]
@@ -119,17 +104,17 @@ def table(rows: Sequence[Row], left: Sequence[Case] = ()) -> str:
     ]
     parts = [output.columns([heads, *body])]
     conditions = [
-        f"  {row.case.name}: {name} {value:.3g}"
+        f"  {row.case}: {name} {value:.3g}"
         for row in rows
-        for name, value in row.findings.measured.items()
+        for name, value in row.measured.items()
         if name.startswith("condition number")
     ]
     if conditions:
         parts.append("condition numbers:\n" + "\n".join(conditions))
     short = [row for row in rows if row.status != OK]
-    parts += [f"{row.case.name} fell short: {row.decides}\n  expected: {row.case.holds}" for row in short]
+    parts += [f"{row.case} fell short: {row.decides}\n  expected: {row.holds}" for row in short]
     if left:
-        parts.append("not run: " + ", ".join(case.name for case in left) + "; --case NAME runs one")
+        parts.append("not run: " + ", ".join(left) + "; --case NAME runs one")
     total = sum(row.seconds for row in rows)
     parts.append(f"{len(rows) - len(short)} of {len(rows)} cases hold, in {total:.0f} seconds")
     return "\n\n".join(parts)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +17,7 @@ from advsearch.controls import Space
 from advsearch.controls.base import Value
 from advsearch.engine.domains import domain_of
 from advsearch.models import LabelSet, Model
+from advsearch.runs.results.plan import PlannedGradient
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.gradients.plan import GradientPlan, GroupPlan
 from advsearch.scene.renderer import Renderer
@@ -148,12 +149,12 @@ class Problem:
         """
         return self.space.describe(self.whole(u, draw), self.space.controls[: self.searched])
 
-    def plan_summary(self, plan: GradientPlan) -> dict[str, Any]:
-        """Return what a summary holds of a plan: `GradientPlan.to_dict`, and each step in its parameter's unit."""
-        summary: dict[str, Any] = plan.to_dict()
-        for group, row in zip(plan.groups, summary["groups"], strict=True):
+    def plan_summary(self, plan: GradientPlan) -> PlannedGradient:
+        """Return what a result holds of a plan: what is stored of it, and each step in its parameter's unit."""
+        stored = plan.to_dict()
+        for group, row in zip(plan.groups, stored["groups"], strict=True):
             row["step_in_unit"], row["unit"] = self._in_unit(group) if group.step_reason else (None, "")
-        return summary
+        return PlannedGradient.of(stored)
 
     def _in_unit(self, group: GroupPlan) -> tuple[float | None, str]:
         """The step of one number in the middle of its range, and its unit; None of what has no number of its own."""

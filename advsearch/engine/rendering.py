@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,8 @@ from advsearch.progress import NullProgress, Progress
 from advsearch.report.contact_sheet import contact_sheet
 from advsearch.runs.files import placed_by
 from advsearch.runs.images import write_exr, write_png
+from advsearch.runs.results.base import Formation
+from advsearch.runs.results.render import MeshUp, RenderResult, ViewAnswers
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import ImageFormation, to_8_bit
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER
@@ -94,21 +96,27 @@ class Rendering:
         ]
         return contact_sheet([view.picture.numpy() for view in self.views], captions)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything but the pictures, as JSON values."""
-        return {
-            "object": self.scene.object_spec or self.scene.object.name,
-            "environment": self.scene.environment_spec or self.scene.environment.name,
-            "model": self.model,
-            "spp": self.spp,
-            "image_formation": self.formation.summary(),
-            "gain": self.formation.gain,
-            "up": None if self.scene.object.up is None else asdict(self.scene.object.up),
-            "views": [
-                {"azimuth": view.azimuth, "answers": [asdict(answer) for answer in view.answers]} for view in self.views
-            ],
-            "warnings": list(self.warnings),
-        }
+    def result(self, out: Path, size: tuple[int, int], warnings: Sequence[str]) -> RenderResult:
+        """Return everything but the pictures.
+
+        Args:
+            out: the file that was written.
+            size: its height and width in pixels.
+            warnings: all that were said.
+        """
+        return RenderResult(
+            out=str(out),
+            size=size,
+            object=self.scene.object_spec or self.scene.object.name,
+            environment=self.scene.environment_spec or self.scene.environment.name,
+            model=self.model,
+            spp=self.spp,
+            image_formation=Formation.of(self.formation),
+            gain=self.formation.gain,
+            up=None if self.scene.object.up is None else MeshUp.of(self.scene.object.up),
+            views=[ViewAnswers.of(view) for view in self.views],
+            warnings=list(warnings),
+        )
 
 
 def render(

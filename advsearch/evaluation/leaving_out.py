@@ -19,6 +19,7 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.engine.gradients import Loss
+from advsearch.runs.results.plan import GainRow
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
@@ -120,11 +121,17 @@ def measured_gains(
     return rows
 
 
-def rows_of(gains: Sequence[Gain]) -> list[dict[str, object]]:
+def rows_of(gains: Sequence[Gain]) -> list[GainRow]:
     """Return rows for a file or a table."""
     return [
-        {"item": one.item, "what": WHAT[one.item], "gain": one.gain}
-        | {"picture_difference": one.picture, "gradient_difference": one.gradient, "seconds": one.seconds}
+        GainRow(
+            item=one.item,
+            what=WHAT[one.item],
+            gain=one.gain,
+            picture_difference=one.picture,
+            gradient_difference=one.gradient,
+            seconds=one.seconds,
+        )
         for one in gains
     ]
 

@@ -24,7 +24,7 @@ from typing import Any, final, get_args, get_type_hints
 from advsearch.errors import FileFormatError
 from advsearch.files import open_regular, parse_json
 from advsearch.runs.files import storage_errors
-from advsearch.runs.summary import plain
+from advsearch.runs.results.base import plain
 
 NAME = "results.sqlite"
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-import enum
 import json
-import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,13 +11,9 @@ from typing import Any
 from advsearch.errors import FileFormatError
 from advsearch.files import parse_json, read_text
 from advsearch.runs.files import write_text
+from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME, SCHEMA, plain
 
 NAME = "summary.json"
-
-INTERRUPTED, OUT_OF_TIME = "interrupted", "out of time"
-"""Endings of a run that can go on."""
-
-SCHEMA = 1
 
 LARGEST = 64 << 20
 """Most bytes of a summary."""
@@ -51,31 +44,6 @@ _ORDER = (
 def goes_on(answer: Mapping[str, Any]) -> bool:
     """Whether a run with this summary was stopped before its end, so that it can be resumed."""
     return answer.get("ending") in (INTERRUPTED, OUT_OF_TIME)
-
-
-def plain(value: Any) -> Any:
-    """Return `value` made of what JSON has: numbers of numpy and torch become Python's, NaN and infinity become None.
-
-    Raises:
-        TypeError: there is something in it that has no JSON form.
-    """
-    if isinstance(value, enum.Enum):
-        return plain(value.value)
-    if value is None or isinstance(value, (str, bool, int)):
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, Mapping):
-        return {str(name): plain(inner) for name, inner in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(inner) for inner in value]
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {one.name: plain(getattr(value, one.name)) for one in dataclasses.fields(value)}
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    raise TypeError(f"expected something that JSON can hold, got {type(value).__name__}")
 
 
 def to_json(summary: Mapping[str, Any]) -> str:

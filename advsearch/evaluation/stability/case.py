@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 GROUPS: Mapping[str, str] = {
     "radiometric": "light that is very strong, absent or impossible, and pictures at the ends of their range",
@@ -57,7 +56,7 @@ def holds(what: str, truth: bool) -> Check:
 
 
 @dataclass(frozen=True)
-class Findings:
+class Outcome:
     """What a case found.
 
     Attributes:
@@ -75,6 +74,20 @@ class Findings:
     ending: str = ""
     measured: Mapping[str, float] = field(default_factory=dict)
     rule: str = ""
+
+    @property
+    def status(self) -> str:
+        """`OK` where everything was finite and every check holds."""
+        return OK if self.finite and all(check.ok for check in self.checks) else FELL_SHORT
+
+    @property
+    def decides(self) -> str:
+        """The number that decides: of the first check that fails, else of the last one."""
+        bad = [check for check in self.checks if not check.ok]
+        if not self.finite and not bad:
+            return "NaN or infinite values"
+        deciding = bad or list(self.checks[-1:])
+        return str(deciding[0]) if deciding else ""
 
 
 @dataclass(frozen=True)
@@ -97,57 +110,6 @@ class Case:
     what: str
     holds: str
     rule: str
-    find: Callable[[], Findings]
+    find: Callable[[], Outcome]
     control: str = ""
     cheap: bool = True
-
-
-@dataclass(frozen=True)
-class Row:
-    """A case and what it found.
-
-    Attributes:
-        case: which.
-        findings: what.
-        seconds: what it took.
-    """
-
-    case: Case
-    findings: Findings
-    seconds: float
-
-    @property
-    def status(self) -> str:
-        """`OK` where everything was finite and every check holds."""
-        return OK if self.findings.finite and all(check.ok for check in self.findings.checks) else FELL_SHORT
-
-    @property
-    def decides(self) -> str:
-        """The number that decides: of the first check that fails, else of the last one."""
-        bad = [check for check in self.findings.checks if not check.ok]
-        if not self.findings.finite and not bad:
-            return "NaN or infinite values"
-        deciding = bad or list(self.findings.checks[-1:])
-        return str(deciding[0]) if deciding else ""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the row (docs/stability.md, "What a row says")."""
-        found = self.findings
-        return {
-            "case": self.case.name,
-            "group": self.case.group,
-            "control": self.case.control,
-            "finite": found.finite,
-            "relative_error": found.relative_error,
-            "ending": found.ending,
-            "rule": found.rule or self.case.rule,
-            "status": self.status,
-            "decides": self.decides,
-            "holds": self.case.holds,
-            "checks": [
-                {"what": one.what, "value": one.value, "least": one.least, "most": one.most, "ok": one.ok}
-                for one in found.checks
-            ],
-            "measured": dict(found.measured),
-            "seconds": self.seconds,
-        }

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from advsearch.engine.gradients import smooth_loss
-from advsearch.evaluation.stability.case import Case, Check, Findings, holds
+from advsearch.evaluation.stability.case import Case, Check, Outcome, holds
 from advsearch.evaluation.stability.scene import (
     BARE,
     SPP,
@@ -39,12 +39,12 @@ SAME_PICTURE = 2e-3
 FAR = 1e4
 
 
-def mesh(made: Mesh) -> Findings:
+def mesh(made: Mesh) -> Outcome:
     """A mesh of our own, seen from the front: painted and shifted."""
     return examine(small(thing(made), PAINTED, settings=FRONT)).findings()
 
 
-def degenerate() -> Findings:
+def degenerate() -> Outcome:
     """A square with faces that have no area: a repeated corner, three points on a line, one point three times."""
     line = [[0.0, 0.0, 0.5], [0.0, 0.1, 0.5], [0.0, 0.2, 0.5]]
     faces = [*HALVES, [0, 0, 1], [4, 5, 6], [4, 4, 4]]
@@ -60,28 +60,28 @@ def degenerate() -> Findings:
         Check("faces left after the import", float(len(asset.mesh.faces)), 2.0, 2.0),
         holds("the import says what it removed", any("without area" in note for note in asset.warnings)),
     )
-    return Findings((*found.checks, *more), found.finite, found.relative_error, found.ending, found.measured)
+    return Outcome((*found.checks, *more), found.finite, found.relative_error, found.ending, found.measured)
 
 
-def sliver() -> Findings:
+def sliver() -> Outcome:
     """A square with a triangle across it that is a million times as long as wide."""
     return mesh(mesh_of([*QUAD, [0.0, -0.5, 0.5], [0.0, 0.5, 0.5], [0.0, 0.5, 0.5 + 1e-6]], [*HALVES, [4, 5, 6]]))
 
 
-def coincident() -> Findings:
+def coincident() -> Outcome:
     """Two squares in one place: which is hit is chance, but not what the picture is."""
     twice = _mesh(QUAD + QUAD, [*HALVES, [4, 5, 6], [4, 6, 7]])
     found = mesh(twice)
     same = Check("mean difference from one square", _difference(twice, _mesh(QUAD, HALVES)), most=SAME_PICTURE)
-    return Findings((*found.checks, same), found.finite, found.relative_error, found.ending, found.measured)
+    return Outcome((*found.checks, same), found.finite, found.relative_error, found.ending, found.measured)
 
 
-def one_triangle() -> Findings:
+def one_triangle() -> Outcome:
     """A mesh of one triangle."""
     return mesh(_mesh([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 1.0]], [[0, 1, 2]]))
 
 
-def million() -> Findings:
+def million() -> Outcome:
     """A sphere of a million triangles: painted, and moved once each way."""
     fine = sphere(501, 1000)
     found = examine(small(thing(fine), {"texture": {"resolution": 8}}), evaluations=2)
@@ -96,14 +96,14 @@ def million() -> Findings:
     )
 
 
-def sized(scale: float) -> Findings:
+def sized(scale: float) -> Outcome:
     """The object 100 times smaller or larger: a speck, or a wall around the camera."""
     low, high = (scale, 2.0 * scale) if scale < 1.0 else (scale / 2.0, scale)
     renderer = small("mug", {"pose": {"scale": [low, high]}})
     return examine(renderer, torch.tensor([0.0 if scale < 1.0 else 1.0]), compare=False).findings()
 
 
-def file_units(scale: float, shift: float = 0.0) -> Findings:
+def file_units(scale: float, shift: float = 0.0) -> Outcome:
     """A file in other units, or far from its origin, is the same object."""
     points = np.array([[x, y, z] for x in (-0.3, 0.3) for y in (-0.5, 0.5) for z in (0.0, 1.0)])
     corners = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]]
@@ -120,7 +120,7 @@ def file_units(scale: float, shift: float = 0.0) -> Findings:
     return found.findings(Check("mean difference from the same box at home", apart, most=SAME_PICTURE))
 
 
-def far_away() -> Findings:
+def far_away() -> Outcome:
     """The object 10,000 sizes away: gone from the picture, and so is its derivative."""
     renderer = small("mug", {"pose": {"y": [9e3, FAR]}})
     found = examine(renderer, torch.tensor([1.0]))
@@ -132,13 +132,13 @@ def far_away() -> Findings:
     )
 
 
-def view(controls: Controls, u: Sequence[float], *, black: bool = True, compare: bool = True) -> Findings:
+def view(controls: Controls, u: Sequence[float], *, black: bool = True, compare: bool = True) -> Outcome:
     """The mug, in black on a bare sky where only its outline is to move, seen in some extreme way."""
     renderer = small(dark() if black else "mug", controls, settings=BARE if black else None)
     return examine(renderer, torch.tensor(u, dtype=torch.float32), compare=compare).findings()
 
 
-def gimbal() -> Findings:
+def gimbal() -> Outcome:
     """At a pitch of 90 degrees yaw and roll turn about one axis: angles lock, the rotation vector does not."""
     angles = {"pose": {"yaw": [-90.0, 90.0], "pitch": [45.0, 135.0], "roll": [-90.0, 90.0], "on_ground": "no"}}
     locked = small(dark(), angles, settings=BARE)
@@ -156,7 +156,7 @@ def gimbal() -> Findings:
     )
 
 
-def full_turn(controls: Controls) -> Findings:
+def full_turn(controls: Controls) -> Outcome:
     """0 and 360 degrees are one place: one picture, one gradient, and a step across the seam goes on."""
     renderer = small("mug", controls)
     zero, one = torch.zeros_like(renderer.start), torch.ones_like(renderer.start)

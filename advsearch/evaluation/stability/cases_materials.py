@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from advsearch.engine.gradients import smooth_loss
-from advsearch.evaluation.stability.case import Case, Check, Findings, holds
+from advsearch.evaluation.stability.case import Case, Check, Outcome, holds
 from advsearch.evaluation.stability.scene import ERROR, REFERENCE_SPP, SPP, Controls, examine, small
 from advsearch.scene import library
 from advsearch.scene.description import describe
@@ -42,13 +42,13 @@ class GlassBall(Part):
         return ()
 
 
-def surface(searched: dict[str, list[float]], **values: float) -> Findings:
+def surface(searched: dict[str, list[float]], **values: float) -> Outcome:
     """A surface with some numbers at the ends of their range, and the derivative by some of them there."""
     settings = {f"material.{name}": value for name, value in values.items()}
     return examine(small("mug", {"material": searched}, settings=settings)).findings()
 
 
-def clear_glass() -> Findings:
+def clear_glass() -> Outcome:
     """The object behind a ball of clear glass: light bends twice, and a texel still has its gradient."""
     camera = camera_to_world(describe("mug"))
     x, y, z = (float(one) for one in camera[:3, 3] * 0.6 + np.array([0.0, 0.0, 0.2]))
@@ -60,7 +60,7 @@ def clear_glass() -> Findings:
     return examine(glass).findings(Check("mean change of the picture by the glass", moved, least=0.01))
 
 
-def texels_at_the_ends() -> Findings:
+def texels_at_the_ends() -> Outcome:
     """A texture of texels that are exactly 0 and exactly 1: the gradient is there, and the search moves inwards."""
     checks = np.indices((8, 8)).sum(axis=0) % 2
     texels = np.repeat(checks[:, :, None], 3, axis=2).astype(np.float32)

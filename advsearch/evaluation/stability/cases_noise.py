@@ -23,7 +23,7 @@ from torch import Tensor
 
 from advsearch.attacks import Block, Domain, make_policy, search
 from advsearch.engine.gradients import probes, reference, smooth_loss
-from advsearch.evaluation.stability.case import Case, Check, Findings, holds
+from advsearch.evaluation.stability.case import Case, Check, Outcome, holds
 from advsearch.evaluation.stability.scene import REFERENCE_SPP, Controls, compared, examine, small
 from advsearch.evaluation.stability.search import Toy
 
@@ -83,7 +83,7 @@ def _noise(kind: str, shape: tuple[int, ...], generator: torch.Generator) -> Ten
     return signs * (uniform.pow(-1.0 / TAIL) - 1.0) / 0.59
 
 
-def estimators(kind: str) -> Findings:
+def estimators(kind: str) -> Outcome:
     """Bias and typical error of each estimator, from 24 samples of a gradient whose mean is known."""
     truth = torch.tensor([1.0, 0.5, -0.25, 0.1]).double()
     generator = torch.Generator().manual_seed(0)
@@ -104,14 +104,14 @@ def estimators(kind: str) -> Findings:
     if kind == "symmetric":  # a skewed distribution has a bias whatever is done; it is printed
         checks.append(Check("median of means: bias", measured["median of means: bias"], most=0.02))
         checks.append(Check("normalisation: cosine of its mean with the truth", cosine, least=0.99))
-    return Findings(
+    return Outcome(
         tuple(checks),
         relative_error=measured["median of means: bias"],
         measured=measured,
     )
 
 
-def heavy_search(kind: str) -> Findings:
+def heavy_search(kind: str) -> Outcome:
     """Searches with noisy gradients, the noise in the median twice as large as the gradient.
 
     Args:
@@ -129,7 +129,7 @@ def heavy_search(kind: str) -> Findings:
         measured[f"{name}: share with gaussian noise"] = usual
         checks.append(Check(f"{name}: share with gaussian noise over that with tails", usual / share, most=RATIO))
     error = 1.0 - min(value for key, value in measured.items() if key.endswith("optimum"))
-    return Findings(tuple(checks), relative_error=error, measured=measured)
+    return Outcome(tuple(checks), relative_error=error, measured=measured)
 
 
 def _share_of_optimum(name: str, kind: str, seeds: int = 9) -> float:
@@ -166,7 +166,7 @@ def _disturbance(kind: str, index: int, size: int, generator: torch.Generator) -
     return normal * float(_noise("symmetric", (1,), generator).abs()) if kind == "lengths" else normal
 
 
-def one_sample() -> Findings:
+def one_sample() -> Outcome:
     """One sample a pixel: the mean of many gradients is that of a quiet one, and the denoiser takes such a picture."""
     controls: Controls = {
         "texture": {"resolution": 8},
@@ -183,7 +183,7 @@ def one_sample() -> Findings:
     return findings
 
 
-def heavy_render(count: int = SAMPLES) -> Findings:
+def heavy_render(count: int = SAMPLES) -> Outcome:
     """Gradients of a shift at 4 samples a pixel: how heavy their tails are, and what each estimator makes of them.
 
     "boundary" is the estimator with the heavy tail (docs/stability.md, "Heavy tails"), which no plan takes by itself;
@@ -221,7 +221,7 @@ def heavy_render(count: int = SAMPLES) -> Findings:
         ),
         holds("the plan takes secant", plan.groups[0].estimator == "secant"),
     ]
-    return Findings(tuple(checks), bad["secant"] == 0, off, measured=measured)
+    return Outcome(tuple(checks), bad["secant"] == 0, off, measured=measured)
 
 
 _RULE = (

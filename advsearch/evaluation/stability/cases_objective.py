@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from advsearch.attacks import POLICIES, Ending, Trial, make_policy, search, verify
 from advsearch.attacks.goal import Goal
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
-from advsearch.evaluation.stability.case import Case, Check, Findings, holds
+from advsearch.evaluation.stability.case import Case, Check, Outcome, holds
 from advsearch.evaluation.stability.search import Toy, numbers, quadratic
 from advsearch.models.model import Model
 from advsearch.models.preprocessing import Preprocessing
@@ -39,7 +39,7 @@ def _differentiated(logits: Tensor, objective: Any, dtype: torch.dtype) -> tuple
     return float(value.detach()), slope[0]
 
 
-def logits_like(rows: list[list[float]], *, same: float = 1e-5) -> Findings:
+def logits_like(rows: list[list[float]], *, same: float = 1e-5) -> Outcome:
     """Every objective of logits, in single against double precision."""
     worst, finite, lost = 0.0, True, 0
     for row in rows:
@@ -54,7 +54,7 @@ def logits_like(rows: list[list[float]], *, same: float = 1e-5) -> Findings:
                 float((slope - wanted).abs().max() / wanted.abs().max().clamp(min=1e-12)),
             )
             worst = max(worst, *error)
-    return Findings(
+    return Outcome(
         (
             Check("objectives without a gradient", float(lost), 0.0, 0.0),
             Check("error against double", worst, most=same),
@@ -65,14 +65,14 @@ def logits_like(rows: list[list[float]], *, same: float = 1e-5) -> Findings:
     )
 
 
-def ties() -> Findings:
+def ties() -> Outcome:
     """The largest logits are equal: the gradient is shared, and a tie is no success."""
     rows = [[1.0, 1.0, 0.0, -1.0], [2.0, 2.0, 2.0, 2.0], [0.0, 3.0, 3.0, 3.0]]
     found = logits_like(rows)
     goal = Goal(LABELS)
     tied = torch.tensor(rows[:2])
     _, slope = _differentiated(torch.tensor([rows[2]]), FORMS["margin"], torch.float32)
-    return Findings(
+    return Outcome(
         (
             *found.checks,
             holds("a tie is no success", not bool((goal.score(tied) > 0.0).any())),
@@ -96,7 +96,7 @@ class _Certain(nn.Module):
         return torch.stack([light, 0.5 - light, torch.zeros_like(light)], dim=1).mul(self.sharpness).softmax(dim=1)
 
 
-def certain() -> Findings:
+def certain() -> Outcome:
     """A model that answers with probabilities of exactly 0 and 1: finite, and its flatness is named."""
     model = Model(_Certain(1e4), "certain", ("a", "b", "c"), Preprocessing((8, 8)), probabilities=True)
     image = torch.full((8, 8, 3), 0.9, requires_grad=True)
@@ -111,7 +111,7 @@ def certain() -> Findings:
 
     flat = search(Toy(light, numbers([0.9])), numbers([0.9]), make_policy("pgd"), steps=STEPS, seed=0, candidates=0)
     found = logits_like([[200.0, -200.0, 0.0, -300.0], [-200.0, 200.0, 0.0, -300.0]])
-    return Findings(
+    return Outcome(
         (
             *found.checks,
             holds("the model's probabilities are exactly 0 and 1", set(probabilities.flatten().tolist()) == {0.0, 1.0}),
@@ -128,7 +128,7 @@ def _left(ending: Ending, u: Tensor) -> bool:
     return ending is Ending.STALLED or float((u - 0.9).abs().max()) > 0.1
 
 
-def nan_at(steps: frozenset[int], *, ends: bool) -> Findings:
+def nan_at(steps: frozenset[int], *, ends: bool) -> Outcome:
     """The model answers NaN at some steps; every policy has to go on, or to give up where it is three in a row."""
     broken, endings, finite = [], set(), True
     for name in POLICIES:
@@ -141,7 +141,7 @@ def nan_at(steps: frozenset[int], *, ends: bool) -> Findings:
         right = result.non_finite_objectives == seen and (result.ending is Ending.NON_FINITE) == ends
         if not right:
             broken.append(name)
-    return Findings(
+    return Outcome(
         (
             Check("policies that went wrong" + (": " + ", ".join(broken) if broken else ""), len(broken), 0.0, 0.0),
             holds("every answer is finite", finite),
@@ -151,7 +151,7 @@ def nan_at(steps: frozenset[int], *, ends: bool) -> Findings:
     )
 
 
-def constant() -> Findings:
+def constant() -> Outcome:
     """A model whose answer never changes: nothing is found, and who follows gradients says that there are none."""
     wrong, endings = [], set()
     for name in POLICIES:
@@ -162,10 +162,10 @@ def constant() -> Findings:
         if result.success_rate > 0.0 or (name in ("pgd", "adam") and result.ending is not Ending.STALLED):
             wrong.append(name)
     label = "policies that went wrong" + (": " + ", ".join(wrong) if wrong else "")
-    return Findings((Check(label, float(len(wrong)), 0.0, 0.0),), ending=", ".join(sorted(endings)))
+    return Outcome((Check(label, float(len(wrong)), 0.0, 0.0),), ending=", ".join(sorted(endings)))
 
 
-def chance(rate: float, runs: int = 100) -> Findings:
+def chance(rate: float, runs: int = 100) -> Outcome:
     """A model that answers at random, wrong with some probability: a search always claims something; nothing holds."""
     found = claimed = 0
     domain = numbers([0.5, 0.5])
@@ -187,7 +187,7 @@ def chance(rate: float, runs: int = 100) -> Findings:
         claimed += result.ending is Ending.FOUND
         ending = verify(trial, domain, result.best_u, spp=1, seed=run, claim=result.ending).ending
         found += ending is Ending.FOUND
-    return Findings(
+    return Outcome(
         (Check(f"findings in {runs} runs", float(found), 0.0, 0.0),),
         ending="not verified, or already wrong",
         measured={"claims of the search": float(claimed)},

@@ -22,7 +22,7 @@ from advsearch.attacks import Block, Domain, make_policy, search
 from advsearch.attacks.policies.base import one_thread
 from advsearch.attacks.projections import project_l2_box
 from advsearch.engine.gradients import smooth_loss
-from advsearch.evaluation.stability.case import Case, Check, Findings, holds
+from advsearch.evaluation.stability.case import Case, Check, Outcome, holds
 from advsearch.evaluation.stability.scene import SIZE, Controls, small
 from advsearch.evaluation.stability.search import Toy
 from advsearch.models import load_model
@@ -41,7 +41,7 @@ TEXTURE: Controls = {"texture": {"resolution": 16}}
 SHIFT: Controls = {"pose": {"x": [-0.3, 0.3]}}
 
 
-def verdicts() -> Findings:
+def verdicts() -> Outcome:
     """The reference model in single and in double precision, on pictures on its own decision boundaries.
 
     Between two pictures with different answers the boundary is found by bisection in single precision; there the two
@@ -79,7 +79,7 @@ def verdicts() -> Findings:
         wrong = single.argmax(dim=1) != double.argmax(dim=1)
         flips += int(wrong.sum())
         farthest = max(farthest, float(((top[:, 0] - top[:, 1]) * wrong).max()))
-    return Findings(
+    return Outcome(
         (
             Check("boundaries that were found", float(pairs), least=2.0),
             Check("largest margin at which the answers differ, logits", farthest, most=LOGITS),
@@ -90,7 +90,7 @@ def verdicts() -> Findings:
     )
 
 
-def picture_bytes() -> Findings:
+def picture_bytes() -> Outcome:
     """The tone curve and the rounding to 8 bits in single and in double precision, and what that does to the model."""
     model = load_model("reference")
     radiance = 1.2 * torch.rand(*model.input_size, 3, generator=torch.Generator().manual_seed(1))
@@ -99,7 +99,7 @@ def picture_bytes() -> Findings:
     with torch.no_grad():
         apart = float((model(single) - model(double.float())).abs().max())
     other = float((off > 0.0).double().mean())
-    return Findings(
+    return Outcome(
         (
             Check("largest difference in 8-bit levels", float(off.max()), most=1.0),
             Check("share of bytes that differ", other, most=1e-4),
@@ -109,7 +109,7 @@ def picture_bytes() -> Findings:
     )
 
 
-def large_ball(size: int = 1_000_000) -> Findings:
+def large_ball(size: int = 1_000_000) -> Outcome:
     """The projection of a million numbers onto an L2 ball, its norm in double precision."""
     generator = torch.Generator().manual_seed(0)
     start = torch.rand(size, generator=generator)
@@ -117,7 +117,7 @@ def large_ball(size: int = 1_000_000) -> Findings:
     domain = Domain(start, (Block(size, "l2", radius),))
     projected = project_l2_box(start + torch.randn(size, generator=generator), start, radius, 0.0, 1.0)
     norm = float((projected.double() - start.double()).norm())
-    return Findings(
+    return Outcome(
         (
             Check("norm over the radius, in double precision", norm / radius, most=1.0 + 1e-5),
             Check("excess that the domain sees", domain.violation(projected), most=2e-6),
@@ -126,7 +126,7 @@ def large_ball(size: int = 1_000_000) -> Findings:
     )
 
 
-def many_steps(name: str) -> Findings:
+def many_steps(name: str) -> Outcome:
     """A search of 10,000 steps: it never leaves its budget, accumulates nothing that is wrong, and seeds never meet."""
     target = torch.full((52,), 0.8).double()
     domain = Domain(
@@ -151,7 +151,7 @@ def many_steps(name: str) -> Findings:
     )
     gap = float(value(best.double())) - result.best_objective
     late, early = times[-1] - times[-LONG // 5], times[LONG // 5] - begun
-    return Findings(
+    return Outcome(
         (
             Check("evaluations", float(len(result.history)), LONG, LONG),
             Check("distance outside the budget", domain.violation(result.best_u), most=2e-6),
@@ -165,7 +165,7 @@ def many_steps(name: str) -> Findings:
     )
 
 
-def accumulation() -> Findings:
+def accumulation() -> Outcome:
     """10,000 small steps of an angle around its circle, in single against double precision, and 10,000 seeds."""
     domain = Domain(torch.zeros(1), (Block(1, periodic=True, name="angle"),))
     u, exact, step = torch.zeros(1), 0.0, 0.000_731
@@ -175,7 +175,7 @@ def accumulation() -> Findings:
     drift = abs(float(u) - exact)
     drift = min(drift, 1.0 - drift)
     different = len({seeds.stream(0, "search", index) for index in range(LONG)})
-    return Findings(
+    return Outcome(
         (
             Check("drift of the angle, in turns", drift, most=1e-3),
             Check("different seeds of 10,000 steps", float(different), least=LONG - 1),
@@ -203,7 +203,7 @@ def rendered(path: str, count: int) -> None:
     np.savez(path, **arrays)
 
 
-def one_and_two_threads() -> Findings:
+def one_and_two_threads() -> Outcome:
     """Pictures, pictures of a moved mesh and an adjoint: twice with one thread and once with two, in processes each.
 
     With two threads the last bits of the pictures of a moved mesh differ now and then, from one process to the next
@@ -215,13 +215,13 @@ def one_and_two_threads() -> Findings:
             path = str(Path(folder) / f"{number}.npz")
             status, said = _in_a_process(f"from {__name__} import rendered; rendered({path!r}, {count})")
             if status:
-                return Findings((Check(f"exit status with {count} threads ({said})", float(status), 0.0, 0.0),))
+                return Outcome((Check(f"exit status with {count} threads ({said})", float(status), 0.0, 0.0),))
             with np.load(path) as arrays:
                 found.append(dict(arrays))
     one, again, two = found
     moved = float(np.abs(one["moved"] - two["moved"]).max())
     error = float(np.abs(one["adjoint"] - two["adjoint"]).max() / np.abs(one["adjoint"]).max())
-    return Findings(
+    return Outcome(
         (
             *(holds(f"{name}: the same bits with 1 thread each time", _equal(one[name], again[name])) for name in one),
             holds("adjoint: the same bits each time with 1 thread", _equal(one["adjoint"], one["again"])),
@@ -249,10 +249,10 @@ def changed_threads(counts: Sequence[int] = (2, 1, 2, 1, 2, 1)) -> None:
             renderer(renderer.start, 0, 8)
 
 
-def threads_under_a_scene() -> Findings:
+def threads_under_a_scene() -> Outcome:
     """A scene that lives while the number of threads is changed, as a deterministic second search does."""
     status, said = _in_a_process(f"from {__name__} import changed_threads; changed_threads()")
-    return Findings(
+    return Outcome(
         (Check("exit status of the process" + (f" ({said})" if said else ""), float(status), 0.0, 0.0),),
         ending="survived" if status == 0 else "crashed",
     )

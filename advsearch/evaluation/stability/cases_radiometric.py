@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advsearch.attacks import PGD, Adam, Auto, Policy, search
 from advsearch.errors import InputError
-from advsearch.evaluation.stability.case import Case, Check, Findings, holds
+from advsearch.evaluation.stability.case import Case, Check, Outcome, holds
 from advsearch.evaluation.stability.scene import Controls, Evaluator, domain_of, examine, small
 from advsearch.scene.assets import EnvironmentAsset, Floats
 from advsearch.scene.environments import import_environment
@@ -37,7 +37,7 @@ def _map(value: float, texel: float | None = None) -> EnvironmentAsset:
     return EnvironmentAsset("made", _radiance(value, texel))
 
 
-def bright_texel() -> Findings:
+def bright_texel() -> Outcome:
     """A sky of 0.3 with one texel of 100,000, raw and denoised."""
     flash = _map(0.3, BRIGHT)
     seen = examine(
@@ -51,7 +51,7 @@ def bright_texel() -> Findings:
     )
 
 
-def black_environment() -> Findings:
+def black_environment() -> Outcome:
     """Nothing shines: the picture is black, no texel matters, and the search has to say that it is stuck."""
     seen = examine(
         small("mug", {"texture": {"resolution": 8}}, environment=_map(0.0)), compare=False, evaluations=PLATEAU_STEPS
@@ -63,14 +63,14 @@ def black_environment() -> Findings:
     )
 
 
-def lamp_in_the_dark() -> Findings:
+def lamp_in_the_dark() -> Outcome:
     """A black environment and a lamp: the lamp has to be able to light the scene."""
     controls = {"light": {"type": "point", "power": [0.0, 20.0], "x": 1.0, "y": 1.0, "z": 2.0}}
     seen = examine(small("mug", controls, environment=_map(0.0)), torch.tensor([0.5]))
     return seen.findings(Check("mean of the picture", seen.mean, least=0.01))
 
 
-def refused(value: float, *, as_file: bool) -> Findings:
+def refused(value: float, *, as_file: bool) -> Outcome:
     """A texel that is no light, in a file or in an array, has to be refused in a sentence."""
     radiance = _radiance(0.3, value)
     try:
@@ -86,11 +86,11 @@ def refused(value: float, *, as_file: bool) -> Findings:
                 rendered(rendered.start, seed=0, spp=1)
     except InputError as error:
         said = "texels" in str(error) and "\n" not in str(error)
-        return Findings((holds("refused in a sentence that counts the texels", said),), ending="refused")
-    return Findings((holds("refused", False),), ending="rendered all the same")
+        return Outcome((holds("refused in a sentence that counts the texels", said),), ending="refused")
+    return Outcome((holds("refused", False),), ending="rendered all the same")
 
 
-def exposure(control: str, stops: float) -> Findings:
+def exposure(control: str, stops: float) -> Outcome:
     """A picture ten stops over or under."""
     low, high = sorted((stops, stops - np.sign(stops)))
     share = 1.0 if stops > 0.0 else 0.0
@@ -101,7 +101,7 @@ def exposure(control: str, stops: float) -> Findings:
     return examine(renderer, u).findings()
 
 
-def plateau(low: float, high: float) -> Findings:
+def plateau(low: float, high: float) -> Outcome:
     """Start where the picture is white and nothing has a gradient; the way out is an exposure further down.
 
     Args:
@@ -123,7 +123,7 @@ def plateau(low: float, high: float) -> Findings:
     first = Evaluator(renderer, darkness, 2)(start, index=0, gradient=True)
     assert first.gradient is not None
     slope = float(first.gradient.abs().max())
-    return Findings(
+    return Outcome(
         (Check("gradient at the start", slope, 0.0, 0.0), *checks),
         ending=", ".join(endings),
         measured={"evaluations without a gradient": float(flat)},

@@ -17,7 +17,7 @@ from advsearch.attacks import PGD, Policy, SearchResult, make_policy, search
 from advsearch.controls.base import Parameter
 from advsearch.controls.values import Range, read, to_unit, to_value
 from advsearch.engine.gradients import smooth_loss
-from advsearch.evaluation.stability.case import Case, Check, Findings
+from advsearch.evaluation.stability.case import Case, Check, Outcome
 from advsearch.evaluation.stability.scene import SHARPNESS, Controls, Evaluator, domain_of, examine, small
 from advsearch.evaluation.stability.search import Toy, Value, condition_number, hessian, numbers, quadratic, valley
 from advsearch.scene.renderer import Renderer
@@ -47,7 +47,7 @@ def path(toy: Toy, policy: Policy[Any], *, steps: int = STEPS, seed: int = 0) ->
 # ---- units ----------------------------------------------------------------------------------------------------------
 
 
-def rescaled_units() -> Findings:
+def rescaled_units() -> Outcome:
     """A lamp and a rotation, in watts and degrees or in milliwatts and radians: the same search.
 
     The ranges are read and mapped as those of any control are.
@@ -61,7 +61,7 @@ def rescaled_units() -> Findings:
             paths.append(seen)
             endings.add(result.ending.value)
         worst = max(worst, *(float((one - paths[0]).abs().max()) for one in paths[1:]))
-    return Findings(
+    return Outcome(
         (Check("largest distance of two trajectories in u", worst, most=SAME),), True, worst, ", ".join(sorted(endings))
     )
 
@@ -85,7 +85,7 @@ def _lamp_and_rotation(watt: float, degree: float) -> Toy:
     return Toy(value, numbers(start))
 
 
-def objective_units() -> Findings:
+def objective_units() -> Outcome:
     """The same objective times a millionth and a million: the same search."""
     worst = 0.0
     for name in ("pgd", "adam", "cmaes", "nes", "auto"):
@@ -94,13 +94,13 @@ def objective_units() -> Findings:
             toy = Toy(quadratic([0.7, 0.4], [1.0, 30.0]), numbers([0.1, 0.9]), scale=scale)
             paths.append(path(toy, make_policy(name), steps=60)[1])
         worst = max(worst, *(float((one - paths[0]).abs().max()) for one in paths[1:]))
-    return Findings((Check("largest distance of two trajectories in u", worst, most=SAME),), True, worst)
+    return Outcome((Check("largest distance of two trajectories in u", worst, most=SAME),), True, worst)
 
 
 # ---- curvatures -----------------------------------------------------------------------------------------------------
 
 
-def curvatures(ratio: float = RATIO) -> Findings:
+def curvatures(ratio: float = RATIO) -> Outcome:
     """Two numbers whose curvatures differ by a million: evaluations until both are at the peak, against equal ones."""
     checks, measured, start, peak = [], {}, [0.15, 0.9], [0.63, 0.37]
     for name in FOLLOWERS:
@@ -118,7 +118,7 @@ def curvatures(ratio: float = RATIO) -> Findings:
     found = condition_number(second)
     measured["condition number"] = found
     checks.append(Check("estimated condition number over the true one", found / ratio, 0.95, 1.05))
-    return Findings(tuple(checks), True, abs(found / ratio - 1.0), measured=measured)
+    return Outcome(tuple(checks), True, abs(found / ratio - 1.0), measured=measured)
 
 
 def _until_there(name: str, value: Value, start: list[float], peak: list[float], scale: float = 1.0) -> float:
@@ -139,7 +139,7 @@ def _until_there(name: str, value: Value, start: list[float], peak: list[float],
     return sum(counts) / len(counts)
 
 
-def scaled_block() -> Findings:
+def scaled_block() -> Outcome:
     """The gradient of one number times a million or a millionth, the objective as it is: the rate has to stay.
 
     So it is where one control's derivative comes in other units than another's.
@@ -152,13 +152,13 @@ def scaled_block() -> Findings:
             measured[f"{name}: evaluations at x {scale:g}"] = counts[scale]
         worst = max(counts.values()) / counts[1.0]
         checks.append(Check(f"{name}: evaluations over those of the unscaled gradient", worst, most=SLOWER))
-    return Findings(tuple(checks), measured=measured)
+    return Outcome(tuple(checks), measured=measured)
 
 
 # ---- valleys and boxes ----------------------------------------------------------------------------------------------
 
 
-def curved_valley(steps: int = 400) -> Findings:
+def curved_valley(steps: int = 400) -> Outcome:
     """Rosenbrock's valley: what policies have left to its peak after 400 renders, beside random search.
 
     PGD steps by signs in numbers that are blocks of their own, so it has to go round the bend in small steps: it gets
@@ -183,10 +183,10 @@ def curved_valley(steps: int = 400) -> Findings:
     best = min(measured[f"{name}: median gap"] for name in ("auto", "cmaes"))
     checks.append(Check("smallest gap of auto and cmaes", best, most=1e-3))
     checks.append(Check("condition number over 2508", measured["condition number"] / 2508.0, 0.9, 1.1))
-    return Findings(tuple(checks), measured=measured)
+    return Outcome(tuple(checks), measured=measured)
 
 
-def wide_box(width: float = 1e-3) -> Findings:
+def wide_box(width: float = 1e-3) -> Outcome:
     """A box a thousand times as wide as the objective's own scale in one number, and just right in the other."""
     peak, start = [0.63, 0.3712], [0.2, 0.9]
 
@@ -205,10 +205,10 @@ def wide_box(width: float = 1e-3) -> Findings:
         checks.append(
             Check(f"{name}: distance to the peak in its widths", measured[f"{name}: median distance"] / width, most=3.0)
         )
-    return Findings(tuple(checks), measured=measured)
+    return Outcome(tuple(checks), measured=measured)
 
 
-def wide_range() -> Findings:
+def wide_range() -> Outcome:
     """A shift searched over 20,000 object sizes: its derivative has to be that of a sensible range."""
     wide, narrow = (small("mug", {"pose": {"x": [-reach, reach]}}) for reach in (1e4, 0.3))
     loss = smooth_loss(wide.formation.resolution)
@@ -228,7 +228,7 @@ def wide_range() -> Findings:
 # ---- a scene --------------------------------------------------------------------------------------------------------
 
 
-def light_rotation_texel() -> Findings:
+def light_rotation_texel() -> Outcome:
     """A lamp's power beside a rotation beside texels, rendered: how stiff it is, and whether each of them moves."""
     controls: Controls = {
         "light": {"type": "point", "power": [0.0, 12.0], "x": 1.0, "y": -1.0, "z": 2.0},

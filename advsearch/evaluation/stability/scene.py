@@ -17,7 +17,7 @@ from advsearch.attacks.evaluation import Wanted
 from advsearch.controls import Space, make_control, make_space
 from advsearch.engine import domains
 from advsearch.engine.gradients import Loss, Probe, estimates, probes, reference, scale_of, smooth_loss, verdict
-from advsearch.evaluation.stability.case import Check, Findings, holds
+from advsearch.evaluation.stability.case import Check, Outcome, holds
 from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, Material, Mesh, ObjectAsset
 from advsearch.scene.description import describe
@@ -171,7 +171,7 @@ class Examined:
     mean: float
     result: SearchResult
 
-    def findings(self, *more: Check, rule: str = "") -> Findings:
+    def findings(self, *more: Check, rule: str = "") -> Outcome:
         """Return the findings: the checks that every scene has, and more."""
         checks = [
             holds("the picture is in [0, 1]", self.inside),
@@ -186,7 +186,7 @@ class Examined:
             checks.append(Check(f"gradient error beyond the noise, {worst.name}", worst.excess, most=ERROR))
             error = worst.error
         measured = {"mean": self.mean, "largest gradient": self.gradient}
-        return Findings((*checks, *more), self.finite, error, self.result.ending.value, measured, rule)
+        return Outcome((*checks, *more), self.finite, error, self.result.ending.value, measured, rule)
 
 
 def dark(name: str = "mug") -> ObjectAsset:

@@ -19,8 +19,9 @@ from advsearch.evaluation.stability import (
     cases_radiometric,
     cases_stiff,
 )
-from advsearch.evaluation.stability.case import FELL_SHORT, GROUPS, OK, Case, Check, Findings, Row
+from advsearch.evaluation.stability.case import FELL_SHORT, GROUPS, OK, Case, Check, Outcome
 from advsearch.progress import NullProgress, Progress
+from advsearch.runs.results.stability import CaseRow, CheckRow
 
 CASES: tuple[Case, ...] = (
     *cases_radiometric.CASES,
@@ -52,22 +53,36 @@ def chosen(names: Sequence[str] = (), groups: Sequence[str] = ()) -> tuple[Case,
     return tuple(case for case in CASES if case.name in names or case.group in groups)
 
 
-def run_case(case: Case) -> Row:
+def run_case(case: Case) -> CaseRow:
     """Run one case. An exception is a finding like any other: the case falls short, and the exception says why."""
     begun = time.perf_counter()
     try:
-        findings = case.find()
+        outcome = case.find()
     except AdvsearchError as error:
-        findings = Findings((Check(f"refused: {error}", 1.0, 0.0, 0.0),), ending="refused")
+        outcome = Outcome((Check(f"refused: {error}", 1.0, 0.0, 0.0),), ending="refused")
     except Exception as error:
         what = f"raised {type(error).__name__}: {error}"
-        findings = Findings((Check(what, 1.0, 0.0, 0.0),), finite=False, ending="raised")
-    return Row(case, findings, time.perf_counter() - begun)
+        outcome = Outcome((Check(what, 1.0, 0.0, 0.0),), finite=False, ending="raised")
+    return CaseRow(
+        case=case.name,
+        group=case.group,
+        control=case.control,
+        finite=outcome.finite,
+        relative_error=outcome.relative_error,
+        ending=outcome.ending,
+        rule=outcome.rule or case.rule,
+        status=outcome.status,
+        decides=outcome.decides,
+        holds=case.holds,
+        checks=[CheckRow.of(one) for one in outcome.checks],
+        measured=dict(outcome.measured),
+        seconds=time.perf_counter() - begun,
+    )
 
 
 def run_cases(
     cases: Sequence[Case] = CASES, progress: Progress | None = None, *, seconds: float | None = None
-) -> Iterator[Row]:
+) -> Iterator[CaseRow]:
     """Run cases one after the other and yield each row as it is done; after so many seconds none is begun any more."""
     progress, begun = progress or NullProgress(), time.perf_counter()
     hint = "`case` and `group` pick some, `seconds` stops before the next one"
@@ -81,4 +96,4 @@ def run_cases(
         yield row
 
 
-__all__ = ["CASES", "FELL_SHORT", "GROUPS", "OK", "Case", "Check", "Findings", "Row", "chosen", "run_case", "run_cases"]
+__all__ = ["CASES", "FELL_SHORT", "GROUPS", "OK", "Case", "Check", "Outcome", "chosen", "run_case", "run_cases"]

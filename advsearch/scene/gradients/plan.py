@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.files import Json
 
 ESTIMATORS: Mapping[str, str] = {
     "adjoint": "interior adjoint (path replay); right for what moves no outline: textures, colours, lights' power",
@@ -160,7 +160,7 @@ class GradientPlan:
         """Return the plan with steps over which outlines move by a pixel: for smooth losses, which bend over more."""
         return replace(self, groups=tuple(replace(one, step=one.pixel) for one in self.groups))
 
-    def restored(self, stored: Mapping[str, Any]) -> GradientPlan:
+    def restored(self, stored: Json) -> GradientPlan:
         """Return the plan with the choices that `to_dict` has stored of a plan for the same space."""
         chosen = {f"{one['control']}.{one['parameter']}": one for one in stored["groups"]}
         groups = tuple(
@@ -175,7 +175,7 @@ class GradientPlan:
         )
         return replace(self, groups=groups, spp=stored["spp"])
 
-    def to_dict(self) -> dict[str, object]:
+    def to_dict(self) -> Json:
         """Return what a run stores of the plan."""
         return {
             "renders_per_gradient": self.renders,

@@ -1,0 +1,101 @@
+"""What every result is made of: named fields, checked when they are put in, written as JSON and read back."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+from advsearch.files import Json
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+SCHEMA = 1
+
+INTERRUPTED, OUT_OF_TIME = "interrupted", "out of time"
+"""Endings of a run that can go on."""
+
+Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
+"""A number that may be NaN or infinite: null in JSON, which is read as NaN."""
+
+Interval = tuple[Number, Number]
+"""Both ends of a 95 % interval."""
+
+
+class Fields(BaseModel):
+    """Named fields of a result.
+
+    A field without a default is always there, if need be as null. One with a default is left out where it has it: it
+    belongs to what was not asked for. Fields that a file has and the class has not are passed over.
+    """
+
+    model_config = ConfigDict(frozen=True, from_attributes=True)
+
+    @classmethod
+    def of(cls, source: object) -> Self:
+        """Return the fields with the values that the attributes, or the keys, of something have."""
+        return cls.model_validate(source)
+
+    def to_dict(self) -> Json:
+        """Return the fields as JSON values; NaN and infinity are None."""
+        values: Json = plain(self.model_dump(exclude_defaults=True))
+        return values
+
+
+class Result(Fields):
+    """The answer of a command."""
+
+    command: ClassVar[str]
+
+    def to_dict(self) -> Json:
+        """Return `schema`, `command` and the fields as JSON values; NaN and infinity are None."""
+        return {"schema": SCHEMA, "command": self.command, **super().to_dict()}
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether it was stopped before its end, so that a run can be resumed."""
+        return getattr(self, "ending", None) in (INTERRUPTED, OUT_OF_TIME)
+
+
+class Formation(Fields):
+    """How radiance became pictures."""
+
+    denoiser: str
+    filter: str = Field(description="reconstruction filter of pixels")
+    sampler: str = Field(description="sampler of pixels")
+    exposure: float = Field(description="stops over the metered one")
+    resolution: tuple[int, int] = Field(description="[height, width], pixels")
+    gain: float = Field(description="from radiance to display-linear values")
+
+
+def plain(value: Any) -> Any:
+    """Return `value` made of what JSON has: numbers of numpy and torch become Python's, NaN and infinity become None.
+
+    Raises:
+        TypeError: there is something in it that has no JSON form.
+    """
+    if isinstance(value, enum.Enum):
+        return plain(value.value)
+    if value is None or isinstance(value, (str, bool, int)):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Fields):
+        return value.to_dict()
+    if isinstance(value, Mapping):
+        return {str(name): plain(inner) for name, inner in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(inner) for inner in value]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {one.name: plain(getattr(value, one.name)) for one in dataclasses.fields(value)}
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    raise TypeError(f"expected something that JSON can hold, got {type(value).__name__}")

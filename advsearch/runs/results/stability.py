@@ -1,0 +1,47 @@
+"""The result of `stability`."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from pydantic import Field
+
+from advsearch.runs.results.base import Fields, Number, Result
+
+
+class CheckRow(Fields):
+    """One number that decides, and the range that it has to be in."""
+
+    what: str
+    value: Number
+    least: Number
+    most: Number
+    ok: bool
+
+
+class CaseRow(Fields):
+    """One case of the suite and what it showed."""
+
+    case: str
+    group: str
+    control: str = Field(description="the controls that it moves")
+    finite: bool = Field(description="every picture and gradient was finite, and none had to be made so")
+    relative_error: Number | None = Field(description="of a gradient against its reference; null where there is none")
+    ending: str = Field(description="of the case's search; `refused` where its input was")
+    rule: str = Field(description="what handles the case")
+    status: str = Field(description="`ok` or `fell short`")
+    decides: str = Field(description="the number that decides")
+    holds: str = Field(description="what must hold")
+    checks: list[CheckRow]
+    measured: dict[str, Number]
+    seconds: float
+
+
+class StabilityResult(Result):
+    """Extreme cases, and whether each of them holds."""
+
+    command: ClassVar[str] = "stability"
+
+    rows: list[CaseRow]
+    not_run: list[str] = Field(description="cases that were not begun")
+    ending: str
