@@ -20,6 +20,7 @@ import pytest
 from rich.console import Console
 from rich.progress import Progress as Bars
 from rich.progress import TextColumn
+from samples import region
 from test_report import AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, changed, make_run
 
 import advsearch
@@ -377,12 +378,6 @@ GAP: dict[str, Any] = {
          "worst": {"successes": 20, "trials": 20}, "ending": "found", "margin": 3.25},
     ],
 }  # fmt: skip
-REGION: dict[str, Any] = {
-    "schema": 1, "command": "region", "run": "runs/mug-pose-002", "object": "mug", "controls": ["pose"],
-    "ending": "done", "verdict": "wrong", "same": 200, "samples": 200, "interval": [0.982, 1.0], "volume": 0.12,
-    "box": [{"name": "pose.yaw", "unit": "degrees", "low": 10.0, "high": 55.5, "centre": 30.0}],
-    "renders": {"verification": 300}, "seconds": {"total": 9.0},
-}  # fmt: skip
 SWEEP: dict[str, Any] = {
     "schema": 1, "command": "sweep", "run": "runs/mug-sweep-001", "configurations": 8, "planned": 8, "correct": 6,
     "ending": "finished", "axes": [], "renders": {"sweep": 8}, "seconds": {"total": 9.0}, **RATE,
@@ -444,7 +439,7 @@ def test_region_builds_its_configuration_and_prints_the_box(
     api: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     given: list[Any] = []
-    api(region_from_config=lambda config, progress, resumed: given.append(config) or REGION)
+    api(region_from_config=lambda config, progress, resumed: given.append(config) or region())
     argv = "region --object mug --control pose.yaw,pose.pitch --vary pose.yaw,pose.pitch --map 24 --samples 50 --quiet"
     assert main(argv.split()) == 0
     assert given == [
@@ -473,7 +468,7 @@ def test_region_takes_scene_and_controls_from_the_run_that_it_goes_around(
     with RunDirectory.create_for(theirs):
         pass
     given: list[Any] = []
-    api(region_from_config=lambda config, progress, resumed: given.append(config) or REGION)
+    api(region_from_config=lambda config, progress, resumed: given.append(config) or region())
     assert main("region --around first --vary pose.yaw --seed 9 --quiet".split()) == 0
     (config,) = given
     assert (config.object, config.controls, config.spp) == ("bowl", {"pose": {"yaw": [0, 90]}}, 4)
@@ -516,7 +511,7 @@ def test_run_does_what_the_command_of_a_file_says(
     path = tmp_path / "run.yaml"
     path.write_text(config.to_yaml())
     given: list[Any] = []
-    summaries = {"curve_from_config": CURVE, "gap_from_config": GAP, "region_from_config": REGION}
+    summaries = {"curve_from_config": CURVE, "gap_from_config": GAP, "region_from_config": region()}
     answer = summaries.get(called) or Result(SWEEP if called == "sweep_from_config" else SUMMARY)
     api(**{called: lambda config, **named: given.append(config) or answer})
     assert main(["run", str(path), "seed=8", "--quiet"]) == 0
@@ -552,7 +547,7 @@ def test_resume_goes_on_with_what_was_stopped(api: Callable[..., None], runs: Pa
     with RunDirectory.create_for(config) as run:
         run.record(Row("search", 0))
     resumed: list[Path] = []
-    summaries = {"curve_from_config": CURVE, "gap_from_config": GAP, "region_from_config": REGION}
+    summaries = {"curve_from_config": CURVE, "gap_from_config": GAP, "region_from_config": region()}
     answer = summaries.get(called) or Result(SWEEP if called == "resume_sweep" else SUMMARY)
 
     def goes_on(first: Any, *, progress: Progress, resumed: Path | None = None) -> Any:
@@ -766,13 +761,13 @@ def test_show_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     [
         (GAP, "  object   control   right on average"),
         (CURVE, "  object   clean right   ending"),
-        (REGION, "The model is wrong in 200 of 200 fresh samples of this box"),
+        (region(), "The model is wrong in 200 of 200 fresh samples of this box"),
         (SWEEP, "The model is right in 6 of 8 configurations"),
     ],
     ids=["gap", "curve", "region", "sweep"],
 )
 def test_show_prints_what_the_command_printed(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], summary: dict[str, Any], first: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], summary: Any, first: str
 ) -> None:
     with RunDirectory.create(tmp_path / "run") as run:
         run.write_summary(summary)

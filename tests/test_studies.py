@@ -21,6 +21,7 @@ from advsearch.config import AttackConfig, GapConfig, RegionConfig
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed
+from advsearch.runs.summary import read_result
 
 FLIPS = {"mug": 0.02, "bowl": 0.1, "vase": 0.0, "pan": 9.0}
 """The epsilon at which each object flips; 0: it is wrong already."""
@@ -134,18 +135,18 @@ def test_a_region_is_told_in_the_units_of_its_parameters(tmp_path: Path) -> None
         vary="pose.yaw,camera.elevation", samples=8, map=2, verify_spp=2, run=str(tmp_path / "run"),
     )  # fmt: skip
     try:
-        summary = mapping.region_from_config(config)
+        result = mapping.region_from_config(config)
     except InputError as error:  # sixteen pixels may leave the verdict to the noise, which is said
         assert "depends on the noise" in str(error)
         return
-    yaw, elevation = summary["box"]
-    assert (yaw["name"], yaw["unit"]) == ("pose.yaw", "degrees") and 10 <= yaw["low"] <= yaw["centre"] <= yaw[
-        "high"
-    ] <= 50
-    assert elevation["unit"] == "degrees" and 0.0 <= summary["volume"] <= 1.0
-    assert summary["same"] <= summary["samples"] == 8 and len(summary["map"]["margins"]) == 2
+    assert result.box and result.map and result.volume is not None and result.same is not None
+    yaw, elevation = result.box
+    assert (yaw.name, yaw.unit) == ("pose.yaw", "degrees") and 10 <= yaw.low <= yaw.centre <= yaw.high <= 50
+    assert elevation.unit == "degrees" and 0.0 <= result.volume <= 1.0
+    assert result.same <= result.samples == 8 and len(result.map.margins) == 2
     assert (tmp_path / "run" / "images" / "map.png").is_file()
-    assert "fresh samples of this box" in region_text(summary)
+    assert "fresh samples of this box" in region_text(result)
+    assert read_result(tmp_path / "run").to_dict() == result.to_dict()
 
 
 def test_a_region_that_is_interrupted_says_how_to_go_on(

@@ -11,6 +11,7 @@ from advsearch.api.region import region_from_config
 from advsearch.config import GapConfig, RegionConfig
 from advsearch.engine.naming import options_of
 from advsearch.progress import Progress
+from advsearch.runs.results.region import RegionResult
 
 Named = str | Sequence[str] | Mapping[str, Mapping[str, Any] | None]
 """Controls by name; a mapping gives each name its settings."""
@@ -98,18 +99,12 @@ def region(
     map: int = 0,
     verify_spp: int | None = None,
     progress: Progress | None = None,
-) -> Mapping[str, Any]:
+) -> RegionResult:
     """Grow the box around a configuration in which the verdict stays what it is (docs/questions.md).
 
     The arguments are the settings of `advsearch region` by the same names. The run is kept, in `run` or under runs/.
 
-    Returns:
-        What `summary.json` holds: `verdict`, `box`, `same`, `volume`, and `map` where one was asked for.
-
     Raises:
         InputError: anything that the caller can put right.
     """
-    found: Mapping[str, Any] = region_from_config(
-        RegionConfig(**options_of(locals(), RegionConfig, ())), progress=progress
-    )
-    return found
+    return region_from_config(RegionConfig(**options_of(locals(), RegionConfig, ())), progress=progress)

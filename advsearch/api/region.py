@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,13 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.stages import Attack
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.files import Json
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.studies import map_figure
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.base import INTERRUPTED
+from advsearch.runs.results.base import INTERRUPTED, CleanScene, Formation, MovedValue
+from advsearch.runs.results.region import AxisRange, BoxSide, MarginMap, RegionResult
 from advsearch.runs.store import NAME, Store
 from advsearch.settings import split_names
 
@@ -47,13 +50,10 @@ class Varied:
     places: Tensor
 
 
-def region_from_config(config: RegionConfig, *, progress: Progress | None = None, resumed: Path | None = None) -> Any:
+def region_from_config(
+    config: RegionConfig, *, progress: Progress | None = None, resumed: Path | None = None
+) -> RegionResult:
     """Grow the region that a configuration describes and keep it in a run directory.
-
-    Returns:
-        What `summary.json` holds: `verdict` at the centre; `box`, the range of each parameter with its unit;
-        `same`, how many fresh samples of the box had that verdict, with the 95 % interval of its share; `volume`, the
-        share of the whole space; `map`, if one was asked for. None of these where `ending` is "interrupted".
 
     Raises:
         InputError: the verdict at the centre depends on the noise, the parameters do not fit, and what a scene raises.
@@ -77,29 +77,27 @@ def region_from_config(config: RegionConfig, *, progress: Progress | None = None
         except KeyboardInterrupt:
             found, ending = {}, INTERRUPTED
         stages.end()
-        answer = {
-            "schema": 1,
-            "command": "region",
-            "run": str(run.path),
-            "object": config.object,
-            "environment": problem.space.environment or config.environment,
-            "model": problem.model.name,
-            "controls": [bound.name for bound in problem.space.controls],
-            "ending": ending,
+        result = RegionResult(
+            run=str(run.path),
+            object=config.object,
+            environment=problem.space.environment or config.environment,
+            model=problem.model.name,
+            controls=[bound.name for bound in problem.space.controls],
+            ending=ending,
             **found,
-            "image_formation": problem.renderer.formation.summary(),
-            "clean": {"moved": [one.to_dict() for one in problem.space.moved]},
-            "warnings": said,
-            "renders": {"verification": attack.findings.verification_renders},
-            "seconds": {**stages.seconds, "total": stages.total},
-            "seed": config.seed,
-            "command_line": config.command_line(),
-        }
-        run.write_summary(answer)
-        return answer
+            image_formation=Formation.of(problem.renderer.formation),
+            clean=CleanScene(moved=[MovedValue.of(one) for one in problem.space.moved]),
+            warnings=said,
+            renders={"verification": attack.findings.verification_renders},
+            seconds={**stages.seconds, "total": stages.total},
+            seed=config.seed,
+            command_line=config.command_line(),
+        )
+        run.write_summary(result)
+        return result
 
 
-def _found(attack: Attack, config: RegionConfig, varied: Varied, centre: Tensor, run: RunDirectory) -> dict[str, Any]:
+def _found(attack: Attack, config: RegionConfig, varied: Varied, centre: Tensor, run: RunDirectory) -> Json:
     """Look at the centre, grow the box, check it, and draw the map if one was asked for."""
     problem, stages = attack.problem, attack.stages
     attack.choose_spp({"centre": centre})
@@ -140,14 +138,14 @@ def _found(attack: Attack, config: RegionConfig, varied: Varied, centre: Tensor,
         "same": found.same,
         "samples": found.samples,
         "rate": found.same / found.samples,
-        "interval": list(found.interval),
+        "interval": found.interval,
         "volume": found.volume,
         "spp": spp,
-        **({"map": _map(attack, config.map, at, varied, box, run)} if config.map else {}),
+        "map": _map(attack, config.map, at, box, run) if config.map else None,
     }
 
 
-def _budget(around: str) -> dict[str, Any]:
+def _budget(around: str) -> Json:
     """How far a run's controls may go, so that its answer lies within."""
     theirs = AttackConfig.from_yaml(find_run(around) / CONFIG)
     return {"epsilon": theirs.epsilon, "norm": theirs.norm}
@@ -211,7 +209,7 @@ def _verdict(attack: Attack, centre: Tensor) -> bool:
     return wrong >= needed
 
 
-def _box(problem: Problem, found: Region, at: Any, varied: Varied) -> list[dict[str, Any]]:
+def _box(problem: Problem, found: Region, at: Any, varied: Varied) -> list[BoxSide]:
     """The range of every parameter of the box in its unit."""
     ends = [problem.describe(at(values)) for values in (found.low, found.high, found.centre)]
     rows = []
@@ -222,11 +220,11 @@ def _box(problem: Problem, found: Region, at: Any, varied: Varied) -> list[dict[
             place = varied.names.index(name)
             sides = (found.low, found.high, found.centre)
             low, high, centre = (float(side[place]) for side in sides)
-            rows.append({"name": name, "unit": "of the range", "low": low, "high": high, "centre": centre})
+            rows.append(BoxSide(name=name, unit="of the range", low=low, high=high, centre=centre))
             continue
         low, high, centre = (_number(end[known], number if known == stem else "") for end in ends)
         unit = str(ends[0][known].get("unit", ""))
-        rows.append({"name": name, "unit": unit, "low": low, "high": high, "centre": centre})
+        rows.append(BoxSide(name=name, unit=unit, low=low, high=high, centre=centre))
     return rows
 
 
@@ -235,7 +233,7 @@ def _number(told: Any, number: str) -> float:
     return float(value[int(number)] if number else value)
 
 
-def _map(attack: Attack, side: int, at: Any, varied: Varied, box: Any, run: RunDirectory) -> dict[str, Any]:
+def _map(attack: Attack, side: int, at: Any, box: Sequence[BoxSide], run: RunDirectory) -> MarginMap:
     """The margin on a grid over two parameters, as numbers and as a picture."""
     hint = f"{side * side} pictures of {attack.findings.spp} samples a pixel; `map` or `verify_spp` shorten it"
     attack.stages.begin("map", "drawing the map", side * side, hint=hint)
@@ -249,10 +247,11 @@ def _map(attack: Attack, side: int, at: Any, varied: Varied, box: Any, run: RunD
     margins = [[margin(row, column) for column in range(len(steps))] for row in range(len(steps))]
     ends = [attack.problem.describe(at(torch.full((2,), end))) for end in (0.0, 1.0)]
     axes = []
-    for one in box:
-        known = one["name"] in ends[0]
-        low, high = (_number(end[one["name"]], "") for end in ends) if known else (0.0, 1.0)
-        axes.append({"name": one["name"], "unit": one["unit"], "low": low, "high": high})
-    for suffix, data in map_figure(margins, axes, box).items():
+    for side_of in box:
+        known = side_of.name in ends[0]
+        low, high = (_number(end[side_of.name], "") for end in ends) if known else (0.0, 1.0)
+        axes.append(AxisRange(name=side_of.name, unit=side_of.unit, low=low, high=high))
+    drawn = MarginMap(axes=(axes[0], axes[1]), margins=margins)
+    for suffix, data in map_figure(drawn, box).items():
         write_bytes(run.path / "images" / f"map.{suffix}", data)
-    return {"axes": axes, "margins": margins}
+    return drawn

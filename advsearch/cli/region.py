@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
 from advsearch.errors import InputError
+from advsearch.files import Json
 
 if TYPE_CHECKING:
     from advsearch.config import RegionConfig
+    from advsearch.runs.results.region import RegionResult
 
 HELP = "grow a box around a configuration in which the model's verdict stays the same"
 
@@ -47,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     from advsearch.registry import only_named_code
     from advsearch.runs.directory import CONFIG, find_run
 
-    otherwise: dict[str, Any] = {}
+    otherwise: Json = {}
     guard: AbstractContextManager[None] = nullcontext()
     if "around" in args:
         file = find_run(args.around) / CONFIG
@@ -69,30 +70,26 @@ def carry_out(config: RegionConfig, *, as_json: bool, quiet: bool, resumed: Path
     with at_work(as_json=as_json, quiet=quiet) as progress:
         from advsearch.api.region import region_from_config
 
-        summary = region_from_config(config, progress=progress, resumed=resumed)
-    return output.finish(summary, answer, as_json=as_json)
+        result = region_from_config(config, progress=progress, resumed=resumed)
+    return output.finish(result, answer, as_json=as_json)
 
 
-def answer(summary: Mapping[str, Any]) -> str:
+def answer(result: RegionResult) -> str:
     """Return the box and what is known of it."""
     from advsearch.report import wording
 
     cost = [
-        ["renders", str(summary["renders"]["verification"])],
-        ["time", wording.seconds_text(summary["seconds"]["total"])],
-        ["run", str(summary["run"])],
+        ["renders", str(result.renders["verification"])],
+        ["time", wording.seconds_text(result.seconds["total"])],
+        ["run", str(result.run)],
     ]
-    if "box" not in summary:
+    if result.box is None or result.interval is None:
         return "Stopped before the box was known.\n\n" + output.columns(cost)
-    low = 100.0 * summary["interval"][0]
     said = (
-        f"The model is {summary['verdict']} in {summary['same']} of {summary['samples']} fresh samples of this box: "
-        f"with 95 % confidence in at least {low:.1f} % of it."
+        f"The model is {result.verdict} in {result.same} of {result.samples} fresh samples of this box: "
+        f"with 95 % confidence in at least {100.0 * result.interval[0]:.1f} % of it."
     )
     rows = [["parameter", "from", "to", "centre", "unit"]]
-    rows += [
-        [one["name"], f"{one['low']:.4g}", f"{one['high']:.4g}", f"{one['centre']:.4g}", one["unit"]]
-        for one in summary["box"]
-    ]
-    facts = [["share of the space", wording.percent(summary["volume"])], *cost]
+    rows += [[one.name, f"{one.low:.4g}", f"{one.high:.4g}", f"{one.centre:.4g}", one.unit] for one in result.box]
+    facts = [["share of the space", wording.percent(result.volume)], *cost]
     return "\n\n".join([said, output.columns(rows), output.columns(facts)])

@@ -43,7 +43,8 @@ def show_run(name: str, as_json: bool) -> int:
 
     from advsearch.runs.directory import find_run
     from advsearch.runs.listing import described
-    from advsearch.runs.summary import NAME, of_a_file, read_summary
+    from advsearch.runs.results import KEPT
+    from advsearch.runs.summary import NAME, of_a_file, read_result, read_summary
 
     path = find_run(name)
     if not (path / NAME).is_file():
@@ -60,6 +61,9 @@ def show_run(name: str, as_json: bool) -> int:
     answer = importlib.import_module(tables.get(str(kind), "advsearch.cli.table")).answer
     if as_json:
         output.print_json(summary)
+    elif str(kind) in KEPT:
+        result = read_result(path)
+        print(answer(result) + output.go_on_text(result))
     else:
         with of_a_file(path / NAME):
             text = answer(summary) + output.go_on_text(summary)

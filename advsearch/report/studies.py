@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from advsearch.report.diagrams import STYLE
+from advsearch.runs.results.region import BoxSide, MarginMap
 
 BLUE, RED, GREY = "#1d5fd0", "#b3261e", "#5c606a"
 
@@ -62,28 +63,20 @@ def gap_figure(answer: Mapping[str, Any]) -> Figures:
     return _figure(draw, (6.4, 1.6 + 0.36 * len(rows)))
 
 
-def map_figure(
-    margins: Sequence[Sequence[float]], axes_of: Sequence[Mapping[str, Any]], box: Sequence[Mapping[str, Any]]
-) -> Figures:
-    """Draw a map of the margin over two parameters, with the line at which the verdict changes, and the box.
-
-    Args:
-        margins: rows of the second parameter, from its lowest value.
-        axes_of: name, unit, low and high of the first and the second parameter.
-        box: low, high and centre of both.
-    """
+def map_figure(drawn: MarginMap, box: Sequence[BoxSide]) -> Figures:
+    """Draw a map of the margin over two parameters, with the line at which the verdict changes, and the box."""
 
     def draw(axes: Any) -> None:
-        first, second = axes_of
-        extent = (first["low"], first["high"], second["low"], second["high"])
-        _heat(axes, margins, extent, MARGIN, _name(first["name"], first), _name(second["name"], second))
+        (first, second), margins = drawn.axes, drawn.margins
+        extent = (first.low, first.high, second.low, second.high)
+        _heat(axes, margins, extent, MARGIN, _name(first.name, first.unit), _name(second.name, second.unit))
         if min(map(min, margins)) < 0.0 < max(map(max, margins)):
             axes.contour(margins, levels=[0.0], extent=extent, colors="black", linewidths=1.0)
         across, up = box
-        corners_x = [across["low"], across["high"], across["high"], across["low"], across["low"]]
-        corners_y = [up["low"], up["low"], up["high"], up["high"], up["low"]]
+        corners_x = [across.low, across.high, across.high, across.low, across.low]
+        corners_y = [up.low, up.low, up.high, up.high, up.low]
         axes.plot(corners_x, corners_y, color="black", linestyle="--", label="region")
-        axes.plot(across["centre"], up["centre"], "k+", label="centre")
+        axes.plot(across.centre, up.centre, "k+", label="centre")
         axes.legend(loc="upper right", frameon=True)
 
     return _figure(draw, (6.0, 4.6))
@@ -109,7 +102,7 @@ def _cells(axes: Any, answer: Mapping[str, Any], cells: Mapping[str, Any]) -> No
     first, second = cells["axes"]
     seen, correct, margin = cells["configurations"], cells["correct"], cells["margin"]
     extent = (-0.5, len(first["values"]) - 0.5, -0.5, len(second["values"]) - 0.5)
-    labels = _name(first["axis"], first), _name(second["axis"], second)
+    labels = _name(first["axis"], first["unit"]), _name(second["axis"], second["unit"])
     if max(map(max, seen)) > 1:
         pairs = [zip(*rows, strict=True) for rows in zip(correct, seen, strict=True)]
         values = [[right / count if count else math.nan for right, count in row] for row in pairs]
@@ -131,7 +124,7 @@ def _along(axes: Any, answer: Mapping[str, Any], rows: Sequence[Mapping[str, Any
     axes.vlines(at, low, high, color=BLUE, alpha=0.35, linewidth=5, label="95 % interval")
     axes.plot(at, accuracy, "o", color=BLUE, label="accuracy")
     axes.set_xticks(*_ticks([row["value"] for row in rows]), rotation=45 if _long([r["value"] for r in rows]) else 0)
-    axes.set(xlabel=_name(rows[0]["axis"], rows[0]), ylabel="accuracy", ylim=(-0.03, 1.03))
+    axes.set(xlabel=_name(rows[0]["axis"], rows[0]["unit"]), ylabel="accuracy", ylim=(-0.03, 1.03))
     axes.margins(x=0.08)
     axes.set_title(f"{answer['object']}, {answer['model']}")
     axes.grid(True, axis="y")
@@ -162,8 +155,8 @@ def _heat(
     axes.figure.colorbar(shown, ax=axes, label=meaning)
 
 
-def _name(name: str, axis: Mapping[str, Any]) -> str:
-    return f"{name} [{axis['unit']}]" if axis["unit"] not in ("", "name") else name
+def _name(name: str, unit: str) -> str:
+    return f"{name} [{unit}]" if unit not in ("", "name") else name
 
 
 def _ticks(values: Sequence[Any]) -> tuple[list[int], list[str]]:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
     from advsearch.config import SceneConfig
+    from advsearch.runs.results.base import Result
 
 HOME = Path("runs")
 """Where runs live that are called by name, in the current directory."""
@@ -239,7 +240,7 @@ class RunDirectory:
         """Return `files.replacing` of a file of this run: ``with run.replacing("artifacts/mesh.obj") as path: ...``."""
         return replacing(self.path / name)
 
-    def write_summary(self, answer: Mapping[str, Any]) -> Path:
+    def write_summary(self, answer: Result | Mapping[str, Any]) -> Path:
         """Write `summary.json` and return its path; numbers of numpy and torch are converted, NaN becomes null.
 
         Raises:

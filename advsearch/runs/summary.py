@@ -8,10 +8,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from advsearch.errors import FileFormatError
 from advsearch.files import parse_json, read_text
 from advsearch.runs.files import write_text
-from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME, SCHEMA, plain
+from advsearch.runs.results import KEPT
+from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME, SCHEMA, Result, plain
 
 NAME = "summary.json"
 
@@ -53,13 +56,36 @@ def to_json(summary: Mapping[str, Any]) -> str:
     return json.dumps({name: plain(given[name]) for name in names}, indent=2, allow_nan=False, ensure_ascii=False)
 
 
-def write_summary(folder: Path, summary: Mapping[str, Any]) -> Path:
+def write_summary(folder: Path, summary: Result | Mapping[str, Any]) -> Path:
     """Write ``summary.json`` into the run directory, whole or not at all, and return its path.
 
     Raises:
         StorageError: it could not be written.
     """
-    return write_text(folder / NAME, to_json(summary) + "\n")
+    values = summary if isinstance(summary, Mapping) else summary.to_dict()
+    return write_text(folder / NAME, to_json(values) + "\n")
+
+
+def read_result(folder: Path) -> Result:
+    """Return the result of the run in `folder`.
+
+    Raises:
+        FileFormatError: there is none (the run did not end yet), or it is not one of this version.
+    """
+    values = read_summary(folder)
+    kind = KEPT.get(str(values.get("command")))
+    if kind is None:
+        raise _no_summary(folder, f"one of the command {values.get('command')!r}")
+    try:
+        return kind.of(values)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"[:120]
+        raise _no_summary(folder, f"one with a part that is missing or of another type ({what})") from None
+
+
+def _no_summary(folder: Path, got: str) -> FileFormatError:
+    return FileFormatError(f"{folder / NAME}: expected the summary of a run, got {got}")
 
 
 @contextmanager

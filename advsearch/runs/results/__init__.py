@@ -1,1 +1,9 @@
 """What each command answers: one model a command, which table, page, JSON and docs read."""
+
+from __future__ import annotations
+
+from advsearch.runs.results.base import Result
+from advsearch.runs.results.region import RegionResult
+
+KEPT: dict[str, type[Result]] = {one.command: one for one in (RegionResult,)}
+"""The results that a run keeps in `summary.json`, by command."""

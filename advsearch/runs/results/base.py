@@ -63,6 +63,41 @@ class Result(Fields):
         return getattr(self, "ending", None) in (INTERRUPTED, OUT_OF_TIME)
 
 
+class RunResult(Result):
+    """The answer of a command that keeps a run."""
+
+    run: str | None = Field(description="the folder; null if nothing was kept")
+    environment: str
+    controls: list[str]
+    ending: str = Field(description="how it ended")
+    seconds: dict[str, Number] = Field(description="by part of the work, and in `total`")
+    seed: int
+    command_line: str = Field(description="that asks the same again")
+
+    def to_dict(self) -> Json:
+        """Return the fields as JSON values, what a reader looks for first in front."""
+        values = super().to_dict()
+        for name in ("warnings", "seconds", "seed", "command_line"):
+            if name in values:
+                values[name] = values.pop(name)
+        return values
+
+
+class MovedValue(Fields):
+    """A value of the scene that a control leaves out, so that the clean scene has another."""
+
+    parameter: str
+    unit: str
+    scene: float | str = Field(description="the value of the scene as it was described")
+    used: float | str = Field(description="the value that the clean scene has instead")
+
+
+class CleanScene(Fields):
+    """The scene that a search starts from."""
+
+    moved: list[MovedValue] = Field(description="the values that had to move")
+
+
 class Formation(Fields):
     """How radiance became pictures."""
 

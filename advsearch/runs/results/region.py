@@ -1,0 +1,53 @@
+"""The result of `region`."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from pydantic import Field
+
+from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, Number, RunResult
+
+
+class AxisRange(Fields):
+    """One parameter and the range of it that is shown."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+
+class BoxSide(AxisRange):
+    """One parameter and the range of it in which the verdict stays."""
+
+    centre: float = Field(description="the value that the box grew around")
+
+
+class MarginMap(Fields):
+    """The margin on a grid over two parameters."""
+
+    axes: tuple[AxisRange, AxisRange]
+    margins: list[list[Number]] = Field(description="logits, in rows of the second parameter from its lowest value")
+
+
+class RegionResult(RunResult):
+    """The box around a configuration in which the verdict stays; only what is known of it if it was interrupted."""
+
+    command: ClassVar[str] = "region"
+
+    object: str
+    model: str
+    verdict: str | None = Field(None, description="`right` or `wrong`, at the centre")
+    box: list[BoxSide] | None = Field(None, description="a row for each parameter, with the range of its values")
+    same: int | None = Field(None, description="fresh samples of the box that had that verdict")
+    samples: int | None = Field(None, description="all fresh samples of it")
+    rate: float | None = Field(None, description="the share of those that had it")
+    interval: Interval | None = Field(None, description="of that share")
+    volume: float | None = Field(None, description="share of the ranges that the box takes up")
+    spp: int | None = Field(None, description="samples a pixel")
+    map: MarginMap | None = Field(None, description="the margin over two parameters; only with `--map`")
+    image_formation: Formation
+    clean: CleanScene
+    warnings: list[str]
+    renders: dict[str, int] = Field(description="of the `verification`: everything")
