@@ -29,8 +29,8 @@ from advsearch.evaluation.precision.image import (  # noqa: E402
     PictureBench,
     variants,
 )
-from advsearch.evaluation.precision.points import Sample, Setting, point_of  # noqa: E402
-from advsearch.evaluation.precision.rounds import Budget  # noqa: E402
+from advsearch.evaluation.precision.points import MeasuredSetting, Sample, point_of  # noqa: E402
+from advsearch.evaluation.precision.rounds import TimeBudget  # noqa: E402
 
 SCENES = ("bowl/kitchen", "bottle/noon", "ball/studio")
 CONTROL = "environment"
@@ -70,48 +70,46 @@ def one(scene: str, args: argparse.Namespace) -> bool:
         )
         report = precision(config)
     kept = True
-    for found in report["recommendations"]:
-        if found["estimator"] is None or found["measure"] == "margin_error" or found["among"] == "by path depth":
+    for found in report.recommendations:
+        if found.estimator is None or found.measure == "margin_error" or found.among == "by path depth":
             continue
         error, known = measured(config, found)
-        ratio = error / found["error"]
+        ratio = error / found.error
         good = not known or 1.0 / FACTOR <= ratio <= FACTOR
         kept = kept and good
         said = "" if good else "   FALLS SHORT"
         said += "" if known else "   (the reference cannot tell)"
         print(
-            f"  {scene:14s}  {found['quantity']:9s}  {found['estimator']:25s}  {found['spp']:7d}   "
-            f"{found['error']:8.3f}   {error:8.3f}   {ratio:5.2f}{said}",
+            f"  {scene:14s}  {found.quantity:9s}  {found.estimator:25s}  {found.spp:7d}   "
+            f"{found.error:8.3f}   {error:8.3f}   {ratio:5.2f}{said}",
             flush=True,
         )
-    for slope in report["slopes"]:
-        if slope["estimator"] == "independent" and slope["measure"] == "error" and slope["against"] == "samples":
-            good = abs(slope["slope"] + 0.5) <= SLOPE
+    for slope in report.slopes:
+        if slope.estimator == "independent" and slope.measure == "error" and slope.against == "samples":
+            good = abs(slope.slope + 0.5) <= SLOPE
             kept = kept and good
-            print(
-                f"  {scene:14s}  slope of independent sampling {slope['slope']:.2f}{'' if good else '   FALLS SHORT'}"
-            )
+            print(f"  {scene:14s}  slope of independent sampling {slope.slope:.2f}{'' if good else '   FALLS SHORT'}")
     return kept
 
 
 def measured(config: PrecisionConfig, found: dict[str, Any]) -> tuple[float, bool]:
     """The error of a recommended setting with other seeds, and whether the new reference can tell it."""
     problem, _ = problem_from_config(config.as_attack())
-    renderer, budget = problem.renderer, Budget(config.seconds / 3.0)
-    setting = Setting(found["quantity"], found["estimator"], found["spp"], 1.0, found["control"] or "")
+    renderer, budget = problem.renderer, TimeBudget(config.seconds / 3.0)
+    setting = MeasuredSetting(found.quantity, found.estimator, found.spp, 1.0, found.control or "")
     bench: Any
-    if found["quantity"] == "image":
+    if found.quantity == "image":
         samplers = [name for name in ("independent", "multijitter", "stratified", "orthogonal", "ldsampler")]
         chosen = [
             one
             for one in variants(samplers, (), renderer.scene.max_depth, volumetric=renderer.scene.volumetric)
-            if one.series in (found["estimator"], REFERENCE_SAMPLER, f"{REFERENCE_SAMPLER} + oidn")
+            if one.series in (found.estimator, REFERENCE_SAMPLER, f"{REFERENCE_SAMPLER} + oidn")
         ]
         bench = PictureBench(renderer, problem.whole(problem.domain.start), lambda picture: 1.0, chosen)
     else:
         renderer = renderer.like(denoiser="none", transfer="linear")
         exact = renderer.like(renderer.scene.like(sampler=REFERENCE_SAMPLER))
-        part = next(one for one in parts_of(renderer.plan.groups, linear=True) if one.name == found["control"])
+        part = next(one for one in parts_of(renderer.plan.groups, linear=True) if one.name == found.control)
         loss = smooth_loss(renderer.formation.resolution, config.seed)
         bench = GradientBench(renderer, loss, inside(renderer), part, exact)
     bench.refer(budget, SEED, lambda: None)

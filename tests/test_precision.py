@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from advsearch.cli.main import main
+from advsearch.cli.precision import answer as precision_text
 from advsearch.config import PrecisionConfig
 from advsearch.errors import InputError
 from advsearch.evaluation.precision.fits import (
@@ -30,13 +31,13 @@ from advsearch.evaluation.precision.fits import (
 from advsearch.evaluation.precision.gradient import parts_of
 from advsearch.evaluation.precision.image import COUNTS, variants
 from advsearch.evaluation.precision.machine import machine
-from advsearch.evaluation.precision.objective import Curve, Mark, curve_of, marks_at, missing, sooner
+from advsearch.evaluation.precision.objective import Mark, PolicyCurve, curve_of, marks_at, missing, sooner
 from advsearch.evaluation.precision.points import (
     WARM_UP,
+    MeasuredSetting,
     Point,
-    Reference,
+    ReferenceValue,
     Sample,
-    Setting,
     point_of,
     quartiles,
     reference_of,
@@ -44,8 +45,9 @@ from advsearch.evaluation.precision.points import (
     typical_seconds,
 )
 from advsearch.evaluation.precision.report import Section, _rounding
-from advsearch.evaluation.precision.rounds import LEAST, Budget, gather, in_rounds, part_samples
+from advsearch.evaluation.precision.rounds import LEAST, TimeBudget, gather, in_rounds, part_samples
 from advsearch.report.diagrams import precision_figures
+from advsearch.runs.results.precision import PrecisionResult
 from advsearch.scene.gradients.plan import GroupPlan
 from advsearch.scene.mitsuba_backend.samplers import next_count
 
@@ -73,12 +75,17 @@ def noisy(count: int, seed: int, bias: float = 0.0, power: float = -0.5) -> np.n
     return TRUTH * (1.0 + bias) + count**power * generator.standard_normal(SIZE)
 
 
-def setting(count: int, series: str = "independent", cost: float | None = None) -> Setting:
-    return Setting("image", series, count, float(count) if cost is None else cost)
+def setting(count: int, series: str = "independent", cost: float | None = None) -> MeasuredSetting:
+    return MeasuredSetting("image", series, count, float(count) if cost is None else cost)
 
 
 def measured(
-    reference: Reference, *, bias: float = 0.0, power: float = -0.5, fixed: float = 0.0, series: str = "independent"
+    reference: ReferenceValue,
+    *,
+    bias: float = 0.0,
+    power: float = -0.5,
+    fixed: float = 0.0,
+    series: str = "independent",
 ) -> list[Point]:
     """Points of synthetic noise; a sample takes a millisecond."""
     points = []
@@ -89,12 +96,12 @@ def measured(
     return points
 
 
-def exact() -> Reference:
+def exact() -> ReferenceValue:
     """A reference whose own error is far below everything measured."""
     return reference_of([noisy(10**8, seed) for seed in (1, 2)])
 
 
-def rough(samples: int) -> Reference:
+def rough(samples: int) -> ReferenceValue:
     """A reference from four parts that are not much better than what is measured."""
     return reference_of([noisy(samples, seed) for seed in range(4)])
 
@@ -310,11 +317,11 @@ def test_the_cheapest_that_is_good_enough_is_taken_as_it_is() -> None:
 # ---- rounds and budgets ---------------------------------------------------------------------------------------------
 
 
-def timed(clock: Clock, rate: float = 1e-3, cold: float = 0.0) -> Callable[[Setting, int], tuple[int, float]]:
+def timed(clock: Clock, rate: float = 1e-3, cold: float = 0.0) -> Callable[[MeasuredSetting, int], tuple[int, float]]:
     """Takes `rate` seconds for each unit of cost, and `cold` more at the first call of a setting."""
-    seen: set[Setting] = set()
+    seen: set[MeasuredSetting] = set()
 
-    def measure(one: Setting, seed: int) -> tuple[int, float]:
+    def measure(one: MeasuredSetting, seed: int) -> tuple[int, float]:
         seconds = rate * one.cost + (0.0 if one in seen else cold)
         seen.add(one)
         clock.now += seconds
@@ -329,7 +336,7 @@ def test_rounds_are_interleaved_cheapest_first_with_a_seed_each() -> None:
     found = in_rounds(
         settings,
         timed(clock),
-        Budget(100.0, clock),
+        TimeBudget(100.0, clock),
         rounds=3,
         seed=0,
         warm_up=0,
@@ -346,7 +353,7 @@ def test_rounds_are_interleaved_cheapest_first_with_a_seed_each() -> None:
 def test_a_budget_is_kept_and_what_was_left_out_is_said(seconds: float, cold: float) -> None:
     clock = Clock()
     settings = [setting(count, series) for series in ("a", "b", "c") for count in COUNTS_TRIED]
-    found = in_rounds(settings, timed(clock, cold=cold), Budget(seconds, clock), rounds=50, seed=0)
+    found = in_rounds(settings, timed(clock, cold=cold), TimeBudget(seconds, clock), rounds=50, seed=0)
     assert clock.now <= seconds + 3 * cold
     assert set(found.left_out) | set(found.results) == set(settings)
     assert not found.complete
@@ -357,7 +364,7 @@ def test_a_budget_is_kept_and_what_was_left_out_is_said(seconds: float, cold: fl
 
 def test_a_part_of_a_budget_is_a_budget() -> None:
     clock = Clock()
-    whole = Budget(10.0, clock)
+    whole = TimeBudget(10.0, clock)
     clock.now = 2.0
     part = whole.share(0.25)
     assert (whole.left, part.left) == (8.0, 2.0)
@@ -372,10 +379,10 @@ def test_a_reference_has_two_parts_whatever_they_take_and_stops_in_time() -> Non
         clock.now += 1.0
         return np.array([float(seed)])
 
-    assert len(gather(part, Budget(0.1, clock), seed=0)) == 2
-    found = gather(part, Budget(5.5, clock), seed=0)
+    assert len(gather(part, TimeBudget(0.1, clock), seed=0)) == 2
+    found = gather(part, TimeBudget(5.5, clock), seed=0)
     assert len(found) == 5 and len({float(one[0]) for one in found}) == 5
-    assert len(gather(part, Budget(1e9, clock), seed=0, most=7)) == 7
+    assert len(gather(part, TimeBudget(1e9, clock), seed=0, most=7)) == 7
 
 
 def test_samples_of_a_part_fit_into_the_time() -> None:
@@ -446,8 +453,8 @@ def test_a_curve_is_medians_and_quartiles_at_common_marks() -> None:
 
 
 def test_the_policy_that_gets_there_sooner() -> None:
-    quick = Curve("quick", (1, 2), (1.0, 2.0), ((0.0, 0.0, 0.0), (8.0, 9.0, 9.5)), 5)
-    slow = Curve("slow", (1, 2), (1.0, 4.0), ((0.0, 0.0, 0.0), (9.0, 10.0, 10.0)), 5)
+    quick = PolicyCurve("quick", (1, 2), (1.0, 2.0), ((0.0, 0.0, 0.0), (8.0, 9.0, 9.5)), 5)
+    slow = PolicyCurve("slow", (1, 2), (1.0, 4.0), ((0.0, 0.0, 0.0), (9.0, 10.0, 10.0)), 5)
     assert missing(quick, best=10.0, start=0.0) == (1.0, 0.1)
     assert sooner([quick, slow], 0.2, best=10.0, start=0.0) == ("quick", 2, 2.0)
     assert sooner([quick, slow], 0.05, best=10.0, start=0.0) == ("slow", 2, 4.0)
@@ -486,8 +493,8 @@ def test_settings_go_through_yaml_and_the_command_line(tmp_path: Path) -> None:
 def test_the_machine_is_named(tmp_path: Path) -> None:
     info = tmp_path / "cpuinfo"
     info.write_text("processor : 0\nmodel name : An  Example CPU\n", encoding="utf-8")
-    assert machine(info)["cpu"] == "An Example CPU"
-    assert machine(tmp_path / "none")["cpu"] and int(str(machine()["cores"])) >= 1
+    assert machine(info).cpu == "An Example CPU"
+    assert machine(tmp_path / "none").cpu and machine().cores >= 1
 
 
 def test_a_tiny_scene_from_end_to_end(
@@ -510,6 +517,7 @@ def test_a_tiny_scene_from_end_to_end(
     independent = slopes.get(("image", "independent", "error", "samples"))
     if independent is not None:  # a slow machine measures too few points
         assert independent["slope"] == pytest.approx(-0.5, abs=0.15)
+    assert precision_text(PrecisionResult.of(report)).count("figure: ") == 2
     run = Path(report["run"])
     assert run.parent == Path("runs") and (run / "run.yaml").is_file() and (run / "summary.json").is_file()
     assert [Path(path).suffix for path in report["figures"]] == [".png", ".svg"]
@@ -518,4 +526,4 @@ def test_a_tiny_scene_from_end_to_end(
 
 
 def test_a_report_without_points_has_no_figure() -> None:
-    assert precision_figures({"points": [], "slopes": []}) == {}
+    assert precision_figures(PrecisionResult.model_construct(points=[], slopes=[])) == {}

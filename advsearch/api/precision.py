@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,23 +14,27 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
-from advsearch.attacks import make_policy
+from advsearch.attacks import Policy, make_policy
 from advsearch.config import PrecisionConfig
 from advsearch.engine.gradients import Loss, inside, smooth_loss
 from advsearch.engine.planning import measured_plan, plan_gradients
 from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
 from advsearch.evaluation.precision.fits import UNKNOWN, Theory
-from advsearch.evaluation.precision.gradient import GradientBench, Part, parts_of, theory_of
+from advsearch.evaluation.precision.gradient import GradientBench, GradientPart, parts_of, theory_of
 from advsearch.evaluation.precision.image import REFERENCE_SAMPLER, PictureBench, variants
 from advsearch.evaluation.precision.machine import machine
 from advsearch.evaluation.precision.objective import ObjectiveBench, curve_of
-from advsearch.evaluation.precision.points import Point, Sample, Setting, point_of
-from advsearch.evaluation.precision.report import Section, figures_of, report_of
-from advsearch.evaluation.precision.rounds import Budget, Rounds, in_rounds
+from advsearch.evaluation.precision.points import MeasuredSetting, Point, Sample, point_of
+from advsearch.evaluation.precision.report import Section, report_of
+from advsearch.evaluation.precision.rounds import Rounds, TimeBudget, in_rounds
+from advsearch.files import Json
 from advsearch.progress import NullProgress, Progress
+from advsearch.report.diagrams import precision_figures
 from advsearch.runs.directory import RunDirectory, check_free, default_name
 from advsearch.runs.files import write_bytes, write_text
+from advsearch.runs.results.base import Formation
+from advsearch.runs.results.precision import PrecisionResult
 from advsearch.runs.summary import to_json
 from advsearch.settings import split_names
 
@@ -46,15 +50,12 @@ VERIFY_SPP, VERIFY_RENDERS = 64, 4
 NUMBERS, FIGURE = "precision.json", "precision"
 
 
-def precision(config: PrecisionConfig, *, progress: Progress | None = None) -> dict[str, Any]:
+def precision(config: PrecisionConfig, *, progress: Progress | None = None) -> PrecisionResult:
     """Measure error against run time and write figures and numbers.
 
     Args:
         config: scene, model, controls, what to measure and for how long.
         progress: told how far it is.
-
-    Returns:
-        The report (docs/precision.md, "JSON"), with the paths of its figures.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
@@ -68,14 +69,14 @@ def precision(config: PrecisionConfig, *, progress: Progress | None = None) -> d
     problem, said = problem_from_config(config.as_attack())
     for text in said:
         progress.message(text)
-    job = _Job(config, problem, progress, Budget(config.seconds))
+    job = _Measurement(config, problem, progress, TimeBudget(config.seconds))
     setup = time.perf_counter() - begun
     wanted = [name for name in ("image", "gradient", "objective") if name in split_names(config.quantities)]
     if "gradient" in wanted and not any(group.valid for group in problem.renderer.plan.groups):
         raise InputError(
             f"`controls` {','.join(config.controls)}: has no derivative; leave gradient out of `quantities`"
         )
-    measure: dict[str, Callable[[Budget], None]] = {
+    measure: dict[str, Callable[[TimeBudget], None]] = {
         "image": job.image,
         "gradient": job.gradient,
         "objective": lambda share: job.objective(share, policies),
@@ -91,13 +92,13 @@ def precision(config: PrecisionConfig, *, progress: Progress | None = None) -> d
 
 
 @dataclass
-class _Job:
+class _Measurement:
     """What is measured, quantity by quantity, and what came out so far."""
 
     config: PrecisionConfig
     problem: Problem
     progress: Progress
-    budget: Budget
+    budget: TimeBudget
     section: Section = field(init=False)
 
     def __post_init__(self) -> None:
@@ -108,7 +109,7 @@ class _Job:
         """Root of the measurements' seeds."""
         return seeds.stream(self.config.seed, "precision")
 
-    def image(self, budget: Budget) -> None:
+    def image(self, budget: TimeBudget) -> None:
         """The picture and the model's margin."""
         renderer, problem = self.problem.renderer, self.problem
         depths = [int(part) for part in split_names(self.config.depths)]
@@ -133,7 +134,7 @@ class _Job:
             self._take(found, measure, bench.floor, lambda series: theories[series])
         self.section.families |= {("image", "", series): family for series, family in families.items()}
 
-    def gradient(self, budget: Budget) -> None:
+    def gradient(self, budget: TimeBudget) -> None:
         """Every control's gradient."""
         config, problem, renderer = self.config, self.problem, self.problem.renderer
         loss: Loss = problem.loss
@@ -148,7 +149,7 @@ class _Job:
             bench = GradientBench(renderer, loss, u, part, exact)
             self._one_gradient(bench, part, budget.share(1.0 / (len(parts) - number)))
 
-    def _one_gradient(self, bench: GradientBench, part: Part, budget: Budget) -> None:
+    def _one_gradient(self, bench: GradientBench, part: GradientPart, budget: TimeBudget) -> None:
         share = budget.share(REFERENCE_SHARE)
         bench.refer(share, self.seed, self._timed(f"gradient of {part.name}: references", share))
         if bench.reference is None:
@@ -162,7 +163,7 @@ class _Job:
         self._take(found, "error", bench.floor, lambda series: theory_of(series, sampler) if linear else UNKNOWN)
         self._confirm(bench, part, budget)
 
-    def _confirm(self, bench: GradientBench, part: Part, budget: Budget) -> None:
+    def _confirm(self, bench: GradientBench, part: GradientPart, budget: TimeBudget) -> None:
         """Measure the setting that is recommended so far again, with seeds of its own."""
         one = self.section.recommended("gradient", part.name, self.config.error)
         if one is None:
@@ -183,7 +184,7 @@ class _Job:
             floor = bench.floor(setting, "error")
             self.section.again[one.line, "error"] = point_of(setting, samples, "error", floor)
 
-    def objective(self, budget: Budget, policies: dict[str, Any]) -> None:
+    def objective(self, budget: TimeBudget, policies: Mapping[str, Policy[Any]]) -> None:
         """The best verified objective of each policy."""
         problem, config = self.problem, self.config
         if any(policy.uses_gradient for policy in policies.values()):
@@ -228,7 +229,9 @@ class _Job:
 
     # ---- inside -----------------------------------------------------------------------------------------------------
 
-    def _rounds(self, name: str, settings: Sequence[Setting], measure: Any, budget: Budget) -> Rounds[dict[str, float]]:
+    def _rounds(
+        self, name: str, settings: Sequence[MeasuredSetting], measure: Any, budget: TimeBudget
+    ) -> Rounds[dict[str, float]]:
         tick = self._timed(f"{name}: measuring every setting in rounds", budget)
         found: Rounds[dict[str, float]] = in_rounds(
             settings,
@@ -245,7 +248,7 @@ class _Job:
         self,
         found: Rounds[dict[str, float]],
         measure: str,
-        floor: Callable[[Setting, str], float],
+        floor: Callable[[MeasuredSetting, str], float],
         theory: Callable[[str], Theory],
     ) -> None:
         """Make points of what was measured."""
@@ -257,7 +260,7 @@ class _Job:
         for line, points in lines.items():
             self.section.add(line, points, theory(line[2]))
 
-    def _timed(self, name: str, budget: Budget) -> Callable[..., None]:
+    def _timed(self, name: str, budget: TimeBudget) -> Callable[..., None]:
         """Begin a stage that ends with a budget of seconds, and return what tells how many have passed."""
         total, done = math.ceil(budget.left), 0
         self.progress.stage(name, total, hint="counted in seconds; `seconds` sets them", at_most=True)
@@ -271,16 +274,15 @@ class _Job:
         return tick
 
 
-def _head(config: PrecisionConfig, problem: Problem) -> dict[str, Any]:
+def _head(config: PrecisionConfig, problem: Problem) -> Json:
+    """What was asked for, and on what it was measured."""
     return {
-        "schema": 1,
-        "command": "precision",
         "run": None,
         "object": config.object,
         "model": problem.model.name,
         "environment": problem.space.environment or config.environment,
         "controls": list(config.controls),
-        "image_formation": problem.renderer.formation.summary(),
+        "image_formation": Formation.of(problem.renderer.formation),
         "depth": problem.renderer.scene.max_depth,
         "loss": config.loss,
         "objective": config.objective,
@@ -290,23 +292,23 @@ def _head(config: PrecisionConfig, problem: Problem) -> dict[str, Any]:
     }
 
 
-def _kept(config: PrecisionConfig, report: dict[str, Any]) -> dict[str, Any]:
+def _kept(config: PrecisionConfig, report: PrecisionResult) -> PrecisionResult:
     """Write the figures and the numbers into `--out` or a run directory, and return the report with their paths."""
     if config.out is not None:
         folder = Path(config.out).expanduser()
-        report["figures"] = _write(folder, report)
+        report = report.model_copy(update={"figures": _write(folder, report)})
         write_text(folder / NUMBERS, to_json(report) + "\n")
         return report
     default = default_name(config.object, ("precision",))
     with RunDirectory.create(config.run, overwrite=config.overwrite, default=default) as kept:
         kept.write_config(config)
-        report["run"] = str(kept.path)
-        report["figures"] = _write(kept.path / "images", report)
+        figures = _write(kept.path / "images", report)
+        report = report.model_copy(update={"run": str(kept.path), "figures": figures})
         kept.write_summary(report)
     return report
 
 
-def _write(folder: Path, report: dict[str, Any]) -> list[str]:
+def _write(folder: Path, report: PrecisionResult) -> list[str]:
     folder.mkdir(parents=True, exist_ok=True)
-    figures = figures_of(report)
+    figures = precision_figures(report)
     return [str(write_bytes(folder / f"{FIGURE}.{kind}", data)) for kind, data in figures.items()]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
-Points = Sequence[Mapping[str, Any]]
+    from advsearch.runs.results.precision import PrecisionPoint, PrecisionResult
+
+Points = Sequence["PrecisionPoint"]
 
 COLORS = ("#1d5fd0", "#b4540a", "#1f7a45", "#7a3fa8", "#b3261e", "#4a7d8c", "#8a6d00", "#5c606a", "#c2488f")
 MARKERS = "osD^vP*X<"
@@ -42,7 +44,7 @@ PANEL = (5.6, 3.9)
 PERCENT = 100.0
 
 
-def precision_figures(report: Mapping[str, Any]) -> dict[str, bytes]:
+def precision_figures(report: PrecisionResult) -> dict[str, bytes]:
     """Return the diagrams of a report as files.
 
     Args:
@@ -69,27 +71,27 @@ def precision_figures(report: Mapping[str, Any]) -> dict[str, bytes]:
         return {kind: _rendered(figure, kind) for kind in ("png", "svg")}
 
 
-def _panels(report: Mapping[str, Any]) -> list[tuple[str, str, Points]]:
+def _panels(report: PrecisionResult) -> list[tuple[str, str, Points]]:
     """Title, what the vertical axis shows, and points of each diagram."""
-    image = [one for one in report["points"] if one["quantity"] == "image"]
+    image = [one for one in report.points if one.quantity == "image"]
     found: list[tuple[str, str, Points]] = []
     for family, title in (("raw", "picture: samplers, denoiser"), ("depth", "picture: path depth")):
-        shown = [one for one in image if (one["family"] == "depth") == (family == "depth")]
+        shown = [one for one in image if (one.family == "depth") == (family == "depth")]
         found += [(title, "error", shown)] if shown else []
-    margin = [one for one in image if one["family"] != "depth"]
+    margin = [one for one in image if one.family != "depth"]
     found += [("margin of the model", "margin_error", margin)] if margin else []
-    gradient = [one for one in report["points"] if one["quantity"] == "gradient"]
-    for control in dict.fromkeys(one["control"] for one in gradient):
-        found.append((f"gradient: {control}", "error", [one for one in gradient if one["control"] == control]))
-    objective = [one for one in report["points"] if one["quantity"] == "objective"]
+    gradient = [one for one in report.points if one.quantity == "gradient"]
+    for control in dict.fromkeys(one.control for one in gradient):
+        found.append((f"gradient: {control}", "error", [one for one in gradient if one.control == control]))
+    objective = [one for one in report.points if one.quantity == "objective"]
     return found + ([("best verified objective", "objective", objective)] if objective else [])
 
 
-def _errors(axes: Axes, points: Points, measure: str, report: Mapping[str, Any]) -> None:
+def _errors(axes: Axes, points: Points, measure: str, report: PrecisionResult) -> None:
     """Error against seconds, one line for each estimator."""
-    usable = [one for one in points if one[measure] is not None and 0.0 < one[measure] < math.inf]
-    for number, name in enumerate(dict.fromkeys(one["estimator"] for one in usable)):
-        line = sorted((one for one in usable if one["estimator"] == name), key=lambda one: one["spp"])
+    usable = [one for one in points if 0.0 < one.error_by(measure).value < math.inf]
+    for number, name in enumerate(dict.fromkeys(one.estimator for one in usable)):
+        line = sorted((one for one in usable if one.estimator == name), key=lambda one: one.spp)
         _line(axes, line, measure, number, _named(name, points, measure, report))
     axes.set_xscale("log")
     axes.set_yscale("log")
@@ -97,7 +99,7 @@ def _errors(axes: Axes, points: Points, measure: str, report: Mapping[str, Any])
         _theory(axes, usable, measure)
         _plain_axis(axes.xaxis)
         _plain_axis(axes.yaxis)
-    goal = report["goal"] * PERCENT
+    goal = report.goal * PERCENT
     low, high = axes.get_ylim()
     if low < goal < high:
         axes.axhline(goal, color="#1c1d20", linewidth=0.8, linestyle=":")
@@ -112,15 +114,14 @@ def _errors(axes: Axes, points: Points, measure: str, report: Mapping[str, Any])
 
 
 def _line(axes: Axes, line: Points, measure: str, number: int, label: str) -> None:
-    known_by = "known" if measure == "error" else "margin_known"
-    interval = "interval" if measure == "error" else "margin_interval"
+    found = [one.error_by(measure) for one in line]
     color, marker = COLORS[number % len(COLORS)], MARKERS[number % len(MARKERS)]
-    seconds = [one["seconds"] for one in line]
-    errors = [PERCENT * one[measure] for one in line]
+    seconds = [one.seconds for one in line]
+    errors = [PERCENT * error.value for error in found]
     axes.plot(seconds, errors, color=color, linewidth=1.0, alpha=0.55)
-    for one, x, y in zip(line, seconds, errors, strict=True):
-        if one[known_by]:
-            low, high = (PERCENT * value if value is not None else math.nan for value in one[interval])
+    for error, x, y in zip(found, seconds, errors, strict=True):
+        if error.known:
+            low, high = (PERCENT * value for value in error.interval)
             if low == low and high < 4.0 * y:
                 axes.plot([x, x], [low, high], color=color, linewidth=0.8, alpha=0.6)
             axes.plot([x], [y], marker=marker, markersize=5, color=color)
@@ -135,27 +136,27 @@ def _line(axes: Axes, line: Points, measure: str, number: int, label: str) -> No
     axes.plot([], [], marker=marker, markersize=5, color=color, linewidth=1.0, label=label)
 
 
-def _named(name: str, points: Points, measure: str, report: Mapping[str, Any]) -> str:
+def _named(name: str, points: Points, measure: str, report: PrecisionResult) -> str:
     """An estimator with the slope of its line against samples, and theory where it disagrees with that."""
-    control = points[0].get("control")
-    for one in report["slopes"]:
-        same = one["estimator"] == name and one["control"] == control and one["quantity"] == points[0]["quantity"]
-        if same and one["measure"] == measure and one["against"] == "samples":
-            doubt = f" (not {_minus(one['theory'])})" if one["agrees"] is False else ""
-            return f"{name}  {_minus(one['slope'])}{doubt}"
+    control = points[0].control
+    for one in report.slopes:
+        same = one.estimator == name and one.control == control and one.quantity == points[0].quantity
+        if same and one.measure == measure and one.against == "samples":
+            doubt = f" (not {_minus(one.theory)})" if one.agrees is False else ""
+            return f"{name}  {_minus(one.slope)}{doubt}"
     return name
 
 
-def _minus(value: float) -> str:
-    return f"{value:.2f}".replace("-", "\N{MINUS SIGN}")
+def _minus(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}".replace("-", "\N{MINUS SIGN}")
 
 
 def _theory(axes: Axes, points: Points, measure: str) -> None:
     """A dashed line of slope -1/2 under the points."""
-    low, high = min(one["seconds"] for one in points), max(one["seconds"] for one in points)
+    low, high = min(one.seconds for one in points), max(one.seconds for one in points)
     if high < 1.5 * low:
         return
-    at = PERCENT * min(one[measure] * math.sqrt(one["seconds"]) for one in points) * 0.8
+    at = PERCENT * min(one.error_by(measure).value * math.sqrt(one.seconds) for one in points) * 0.8
     axes.plot([low, high], [at / math.sqrt(low), at / math.sqrt(high)], color="#5c606a", linewidth=1.0, linestyle="--")
     middle = math.sqrt(low * high)
     axes.annotate(
@@ -184,20 +185,21 @@ def _plain_axis(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _gains(axes: Axes, points: Points, kind: str, report: Mapping[str, Any]) -> None:
+def _gains(axes: Axes, points: Points, kind: str, report: PrecisionResult) -> None:
     """Objective against seconds, median and quartiles, one line for each policy."""
-    for number, name in enumerate(dict.fromkeys(one["estimator"] for one in points)):
-        line = sorted((one for one in points if one["estimator"] == name), key=lambda one: one["renders"])
+    for number, name in enumerate(dict.fromkeys(one.estimator for one in points)):
+        line = sorted((one for one in points if one.estimator == name), key=lambda one: one.renders or 0)
         color = COLORS[number % len(COLORS)]
-        seconds = [one["seconds"] for one in line]
-        low, high = ([one["quartiles"][side] for one in line] for side in (0, 1))
+        seconds = [one.seconds for one in line]
+        low, high = ([one.quartiles[side] for one in line if one.quartiles] for side in (0, 1))
         axes.fill_between(seconds, low, high, color=color, alpha=0.15, linewidth=0)
         marker = MARKERS[number % len(MARKERS)]
-        label = f"{name}, {line[-1]['repeats']} searches"
-        axes.plot(seconds, [one["objective"] for one in line], marker=marker, markersize=4.5, color=color, label=label)
+        label = f"{name}, {line[-1].repeats} searches"
+        gains = [math.nan if one.objective is None else one.objective for one in line]
+        axes.plot(seconds, gains, marker=marker, markersize=4.5, color=color, label=label)
         axes.annotate(
-            f"{line[-1]['renders']} renders",
-            (seconds[-1], line[-1]["objective"]),
+            f"{line[-1].renders} renders",
+            (seconds[-1], gains[-1]),
             fontsize=7.5,
             color=color,
             xytext=(4, 0),
@@ -207,19 +209,19 @@ def _gains(axes: Axes, points: Points, kind: str, report: Mapping[str, Any]) -> 
     axes.set_xscale("log")
     _plain_axis(axes.xaxis)
     axes.set_xlabel("seconds of search")
-    axes.set_ylabel(f"{report['objective']}, verified")
+    axes.set_ylabel(f"{report.objective}, verified")
     axes.grid(True, which="major")
     axes.legend(loc="upper left")
 
 
-def _explain(figure: Figure, report: Mapping[str, Any]) -> None:
+def _explain(figure: Figure, report: PrecisionResult) -> None:
     """Title, the machine, and how to read it."""
-    machine, formation = report["machine"], report["image_formation"]
-    height, width = formation["resolution"]
-    threads = ", ".join(f"{count} {name} thread" + "s" * (count != 1) for name, count in machine["threads"].items())
-    what = f"{report['object']} in {report['environment']}, {report['model']}, {width} x {height} pixels"
+    machine, formation = report.machine, report.image_formation
+    height, width = formation.resolution
+    threads = ", ".join(f"{count} {name} thread" + "s" * (count != 1) for name, count in machine.threads.items())
+    what = f"{report.object} in {report.environment}, {report.model}, {width} x {height} pixels"
     figure.suptitle(what, fontsize=11, fontweight="bold", x=0.01, ha="left")
-    place = f"{machine['cpu']}, {machine['cores']} cores, {threads}; seconds are medians of interleaved repeats."
+    place = f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are medians of interleaved repeats."
     key = "Filled: known, with its 95 % interval. Open, with an arrow: at most this, the reference is no better."
     figure.supxlabel(f"{place}\n{key}", fontsize=8, color="#5c606a", x=0.01, ha="left")
 

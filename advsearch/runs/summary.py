@@ -49,8 +49,10 @@ def goes_on(answer: Mapping[str, Any]) -> bool:
     return answer.get("ending") in (INTERRUPTED, OUT_OF_TIME)
 
 
-def to_json(summary: Mapping[str, Any]) -> str:
+def to_json(summary: Result | Mapping[str, Any]) -> str:
     """Return the summary as text: ``schema`` first, then the fields in the order above, then all others."""
+    if not isinstance(summary, Mapping):
+        return json.dumps(summary.to_dict(), indent=2, allow_nan=False, ensure_ascii=False)
     given = {"schema": SCHEMA, **summary}
     names = [name for name in _ORDER if name in given] + [name for name in given if name not in _ORDER]
     return json.dumps({name: plain(given[name]) for name in names}, indent=2, allow_nan=False, ensure_ascii=False)
@@ -62,8 +64,7 @@ def write_summary(folder: Path, summary: Result | Mapping[str, Any]) -> Path:
     Raises:
         StorageError: it could not be written.
     """
-    values = summary if isinstance(summary, Mapping) else summary.to_dict()
-    return write_text(folder / NAME, to_json(values) + "\n")
+    return write_text(folder / NAME, to_json(summary) + "\n")
 
 
 def read_result(folder: Path) -> Result:

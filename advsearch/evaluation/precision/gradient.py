@@ -13,8 +13,8 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.engine.gradients import EXPENSIVE, Loss, Probe, estimated, reference
 from advsearch.evaluation.precision.fits import INDEPENDENT, STRATIFIED, UNKNOWN, Theory
-from advsearch.evaluation.precision.points import Array, Reference, Setting, reference_of
-from advsearch.evaluation.precision.rounds import Budget, gather, part_samples
+from advsearch.evaluation.precision.points import Array, MeasuredSetting, ReferenceValue, reference_of
+from advsearch.evaluation.precision.rounds import TimeBudget, gather, part_samples
 from advsearch.scene.gradients.plan import BY_ADJOINT, DIRECTIONS, GroupPlan
 from advsearch.scene.renderer import Renderer
 
@@ -30,7 +30,7 @@ AGREE = 0.05
 
 
 @dataclass(frozen=True)
-class Part:
+class GradientPart:
     """Coordinates of one control whose gradient one call of an estimator answers.
 
     Attributes:
@@ -58,7 +58,7 @@ class Part:
         return _array(torch.cat([gradient[group.coordinates] for group in self.groups]))
 
 
-def parts_of(groups: Sequence[GroupPlan], *, linear: bool) -> list[Part]:
+def parts_of(groups: Sequence[GroupPlan], *, linear: bool) -> list[GradientPart]:
     """Return the parts of a space with the estimators that are valid for them.
 
     Args:
@@ -77,7 +77,9 @@ def parts_of(groups: Sequence[GroupPlan], *, linear: bool) -> list[Part]:
             names = f"{members[0].parameter},... ({len(members)})"
         usable = [one for one in valid if one not in EXPENSIVE and not (linear and one == "secant")]
         usable += [one for one in ("forward",) if "differences" in usable and one not in usable]
-        found.append(Part(f"{control}.{names}" if control in several else control, tuple(members), tuple(usable)))
+        found.append(
+            GradientPart(f"{control}.{names}" if control in several else control, tuple(members), tuple(usable))
+        )
     return found
 
 
@@ -103,23 +105,25 @@ class GradientBench:
         exact: renders the same with a better sampler, for references; None takes the renderer itself.
     """
 
-    def __init__(self, renderer: Renderer, loss: Loss, u: Tensor, part: Part, exact: Renderer | None = None) -> None:
+    def __init__(
+        self, renderer: Renderer, loss: Loss, u: Tensor, part: GradientPart, exact: Renderer | None = None
+    ) -> None:
         self._renderer, self._loss, self._u, self.part = renderer, loss, u, part
         self._exact = exact or renderer
-        self.reference: Reference | None = None
+        self.reference: ReferenceValue | None = None
         self.part_spp = 0
         self.by = ""
 
     @property
-    def settings(self) -> list[Setting]:
+    def settings(self) -> list[MeasuredSetting]:
         """Everything to measure."""
         return [
-            Setting("gradient", one, count, count * self._cost(one), self.part.name)
+            MeasuredSetting("gradient", one, count, count * self._cost(one), self.part.name)
             for one in self.part.estimators
             for count in COUNTS
         ]
 
-    def refer(self, budget: Budget, seed: int, on_done: Callable[[], None]) -> None:
+    def refer(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> None:
         """Find the reference: differences at two steps where the coordinates are few, else the mean of an adjoint."""
         few = self.part.size <= BY_COORDINATE
         adjoints = [one for one in self.part.estimators if one in BY_ADJOINT]
@@ -129,7 +133,7 @@ class GradientBench:
         else:
             self._by_estimator(budget, seed, on_done)
 
-    def measure(self, setting: Setting, seed: int) -> tuple[dict[str, float], float]:
+    def measure(self, setting: MeasuredSetting, seed: int) -> tuple[dict[str, float], float]:
         """Take one gradient and return its error and cosine, and the seconds, the picture itself included."""
         begun = time.perf_counter()
         found = self._estimated(self._renderer, setting.series, seed, setting.spp)
@@ -137,11 +141,11 @@ class GradientBench:
         assert self.reference is not None
         return {"error": self.reference.relative_error(found), "cosine": self.reference.cosine(found)}, seconds
 
-    def floor(self, setting: Setting, measure: str) -> float:
+    def floor(self, setting: MeasuredSetting, measure: str) -> float:
         """The reference's own relative error."""
         return 0.0 if self.reference is None else self.reference.error
 
-    def bias(self, budget: Budget, seed: int) -> str | None:
+    def bias(self, budget: TimeBudget, seed: int) -> str | None:
         """Check a reference by an adjoint against differences along one direction; a sentence if it is biased."""
         if self.by == "differences" or self.reference is None or budget.left <= 0.0:
             return None
@@ -170,7 +174,7 @@ class GradientBench:
         gradient = estimated(renderer, self._loss, self._u, estimator, self.part.names, seed, spp)
         return self.part.of(gradient)
 
-    def _by_differences(self, budget: Budget, seed: int, on_done: Callable[[], None]) -> None:
+    def _by_differences(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> None:
         along = [_coordinate(self._u, group, number) for group in self.part.groups for number in range(group.size)]
         rate = self._rate(lambda spp: self._difference(along[0], seed, spp)) * len(along)
         self.part_spp = part_samples(rate, budget.left, parts=3, counts=(16, 64, 256))
@@ -190,7 +194,7 @@ class GradientBench:
         one = reference(self._exact, self._loss, self._u, probe, seed=seed, spp=spp, repeats=(1, 1))
         return one.value, one.steps[0] - one.steps[1]
 
-    def _by_estimator(self, budget: Budget, seed: int, on_done: Callable[[], None]) -> None:
+    def _by_estimator(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> None:
         by = self.by if self.by != "differences" else self.part.estimators[0]
         self.by = by
         rate = self._rate(lambda spp: self._estimated(self._exact, by, seed, spp))

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from advsearch.evaluation.precision.fits import INDEPENDENT, STRATIFIED, UNKNOWN, Theory
-from advsearch.evaluation.precision.points import Array, Reference, Setting, reference_through
-from advsearch.evaluation.precision.rounds import Budget, gather, part_samples
+from advsearch.evaluation.precision.points import Array, MeasuredSetting, ReferenceValue, reference_through
+from advsearch.evaluation.precision.rounds import TimeBudget, gather, part_samples
 from advsearch.scene.renderer import Renderer
 
 Margin = Callable[[Tensor], float]
@@ -103,27 +103,27 @@ class PictureBench:
         self._scenes: dict[tuple[str, int, str], Any] = {}
         self.renderers = {one.series: self._as(one) for one in chosen}
         self._size = (*renderer.formation.resolution, 3)
-        self.pictures: dict[str, Reference] = {}
-        self.margins: dict[str, Reference] = {}
+        self.pictures: dict[str, ReferenceValue] = {}
+        self.margins: dict[str, ReferenceValue] = {}
         self.part_spp: dict[str, int] = {}
 
     @property
-    def settings(self) -> list[Setting]:
+    def settings(self) -> list[MeasuredSetting]:
         """Everything to measure."""
         return [
-            Setting("image", one.series, count, count * one.weight)
+            MeasuredSetting("image", one.series, count, count * one.weight)
             for one in self.variants.values()
             for count in one.counts
         ]
 
-    def refer(self, budget: Budget, seed: int, on_done: Callable[[], None]) -> None:
+    def refer(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> None:
         """Render the references, one for each family, in shares of a budget."""
         families = [one for one in ("raw", "depth", "oidn") if any(v.family == one for v in self.variants.values())]
         for number, family in enumerate(families):
             share = budget.share(1.0 / (len(families) - number))
             self._refer(family, self._truth(family), share, seed, on_done)
 
-    def measure(self, setting: Setting, seed: int) -> tuple[dict[str, float], float]:
+    def measure(self, setting: MeasuredSetting, seed: int) -> tuple[dict[str, float], float]:
         """Render one setting and return its errors, and the seconds that rendering and denoising took."""
         variant = self.variants[setting.series]
         begun = time.perf_counter()
@@ -136,7 +136,7 @@ class PictureBench:
         numbers["margin_error"] = self.margins[variant.family].relative_error(seen)
         return numbers, seconds
 
-    def floor(self, setting: Setting, measure: str) -> float:
+    def floor(self, setting: MeasuredSetting, measure: str) -> float:
         """The reference's own relative error for a setting."""
         family = self.variants[setting.series].family
         if measure == "margin_error":
@@ -151,7 +151,9 @@ class PictureBench:
         denoiser = "oidn" if family == "oidn" else "none"
         return self._as(Variant(family, family, REFERENCE_SAMPLER, denoiser, max(depths)))
 
-    def _refer(self, family: str, renderer: Renderer, budget: Budget, seed: int, on_done: Callable[[], None]) -> None:
+    def _refer(
+        self, family: str, renderer: Renderer, budget: TimeBudget, seed: int, on_done: Callable[[], None]
+    ) -> None:
         pilot = 16
         for number in range(3):
             begun = time.perf_counter()

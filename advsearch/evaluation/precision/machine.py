@@ -7,23 +7,24 @@ import sys
 from pathlib import Path
 
 from advsearch import threads
+from advsearch.runs.results.precision import Machine
 
 _CPU_INFO = Path("/proc/cpuinfo")
 
 
-def machine(cpu_info: Path = _CPU_INFO) -> dict[str, object]:
+def machine(cpu_info: Path = _CPU_INFO) -> Machine:
     """Return what a time has to be read with: the processor, its cores, and the threads in use.
 
     Args:
         cpu_info: Linux's description of the processor.
     """
-    return {
-        "cpu": _cpu_name(cpu_info),
-        "cores": threads.cores(),
-        "threads": _threads(),
-        "system": f"{platform.system()} {platform.machine()}",
-        "python": platform.python_version(),
-    }
+    return Machine(
+        cpu=_cpu_name(cpu_info),
+        cores=threads.cores(),
+        threads=_threads(),
+        system=f"{platform.system()} {platform.machine()}",
+        python=platform.python_version(),
+    )
 
 
 def _cpu_name(cpu_info: Path) -> str:

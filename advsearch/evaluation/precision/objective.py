@@ -11,8 +11,8 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.attacks import Domain, Evaluate, Evaluation, Policy, StepRecord, search
-from advsearch.evaluation.precision.points import Setting, quartiles
-from advsearch.evaluation.precision.rounds import Budget
+from advsearch.evaluation.precision.points import MeasuredSetting, quartiles
+from advsearch.evaluation.precision.rounds import TimeBudget
 
 EvaluatorOf = Callable[[str], Evaluate]
 """From the name of a stream of seeds to an evaluation whose noise comes from it."""
@@ -36,7 +36,7 @@ class Mark:
 
 
 @dataclass(frozen=True)
-class Curve:
+class PolicyCurve:
     """How a policy does, over seeds.
 
     Attributes:
@@ -78,16 +78,16 @@ class ObjectiveBench:
         policies: Mapping[str, Policy[Any]],
         steps: int,
         verified: Verified,
-        budget: Budget,
+        budget: TimeBudget,
     ) -> None:
         self._evaluator, self._domain, self._policies = evaluator, domain, policies
         self._steps, self._verified, self._budget = steps, verified, budget
 
-    def settings(self, spp: int) -> list[Setting]:
+    def settings(self, spp: int) -> list[MeasuredSetting]:
         """One setting a policy."""
-        return [Setting("objective", name, spp, 1.0) for name in self._policies]
+        return [MeasuredSetting("objective", name, spp, 1.0) for name in self._policies]
 
-    def measure(self, setting: Setting, seed: int) -> tuple[list[Mark], float]:
+    def measure(self, setting: MeasuredSetting, seed: int) -> tuple[list[Mark], float]:
         """Run one search; its marks, verified, and the seconds of search and verification together."""
         begun = time.perf_counter()
         held = self._search(setting.series, seed)
@@ -132,11 +132,11 @@ class ObjectiveBench:
         return held
 
 
-def curve_of(policy: str, searches: Sequence[Sequence[Mark]]) -> Curve:
+def curve_of(policy: str, searches: Sequence[Sequence[Mark]]) -> PolicyCurve:
     """Return medians and quartiles over searches, at the marks that all of them have reached."""
     common = min((len(marks) for marks in searches), default=0)
     columns = [[marks[number] for marks in searches] for number in range(common)]
-    return Curve(
+    return PolicyCurve(
         policy,
         tuple(column[0].renders for column in columns),
         tuple(quartiles([mark.seconds for mark in column])[1] for column in columns),
@@ -145,7 +145,7 @@ def curve_of(policy: str, searches: Sequence[Sequence[Mark]]) -> Curve:
     )
 
 
-def missing(curve: Curve, best: float, start: float) -> tuple[float, ...]:
+def missing(curve: PolicyCurve, best: float, start: float) -> tuple[float, ...]:
     """Return the share of the possible gain that a policy's median misses at each mark.
 
     Args:
@@ -157,7 +157,7 @@ def missing(curve: Curve, best: float, start: float) -> tuple[float, ...]:
     return tuple(0.0 if gain <= 0.0 else max(0.0, (best - middle) / gain) for _, middle, _ in curve.objective)
 
 
-def sooner(curves: Sequence[Curve], goal: float, best: float, start: float) -> tuple[str, int, float] | None:
+def sooner(curves: Sequence[PolicyCurve], goal: float, best: float, start: float) -> tuple[str, int, float] | None:
     """Return the policy whose median reaches a share of the possible gain in the least time: its name, renders and
     seconds; None where none does."""
     reached = [

@@ -27,7 +27,7 @@ may record them again, and so may the first one after other scenes were rendered
 
 
 @dataclass(frozen=True)
-class Setting:
+class MeasuredSetting:
     """One way to compute a quantity.
 
     Attributes:
@@ -80,7 +80,7 @@ class Point:
         more: means of the other numbers.
     """
 
-    setting: Setting
+    setting: MeasuredSetting
     measure: str
     error: float
     interval: tuple[float, float]
@@ -92,7 +92,7 @@ class Point:
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class ReferenceValue:
     """A value that stands for the truth, and how far off it may be.
 
     Attributes:
@@ -117,7 +117,7 @@ class Reference:
         return float(value @ self.value) / size if size > 0.0 else math.nan
 
 
-def reference_of(parts: Sequence[Array], bias: float = 0.0) -> Reference:
+def reference_of(parts: Sequence[Array], bias: float = 0.0) -> ReferenceValue:
     """Return the mean of independent parts with the standard error that their scatter implies.
 
         error^2 = sum_k |part_k - mean|^2 / (K (K - 1)),      for two halves: |half_1 - half_2| / 2
@@ -132,10 +132,10 @@ def reference_of(parts: Sequence[Array], bias: float = 0.0) -> Reference:
     scatter = sum(float(np.sum((part - mean) ** 2)) for part in parts)
     error = math.hypot(math.sqrt(scatter / (len(parts) * (len(parts) - 1))), bias)
     size = float(np.linalg.norm(mean))
-    return Reference(mean, _ratio(error, size), size, len(parts))
+    return ReferenceValue(mean, _ratio(error, size), size, len(parts))
 
 
-def reference_through(function: Callable[[Array], Array], parts: Sequence[Array]) -> Reference:
+def reference_through(function: Callable[[Array], Array], parts: Sequence[Array]) -> ReferenceValue:
     """Return a function of the mean of independent parts, with its error by the jackknife (Efron 1982, chapter 3).
 
     For what is no mean itself, such as a picture after its tone curve or a model's margin on it. The error holds the
@@ -155,10 +155,10 @@ def reference_through(function: Callable[[Array], Array], parts: Sequence[Array]
     bias = (count - 1) * float(np.linalg.norm(middle - value)) if count > 2 else 0.0
     bias = max(0.0, bias - math.sqrt(scatter))  # the estimate of the bias scatters as much as the value does
     size = float(np.linalg.norm(value))
-    return Reference(value, _ratio(math.hypot(math.sqrt(scatter), bias), size), size, count)
+    return ReferenceValue(value, _ratio(math.hypot(math.sqrt(scatter), bias), size), size, count)
 
 
-def point_of(setting: Setting, samples: Sequence[Sample], measure: str = "error", floor: float = 0.0) -> Point:
+def point_of(setting: MeasuredSetting, samples: Sequence[Sample], measure: str = "error", floor: float = 0.0) -> Point:
     """Return what samples of a setting say about one error, given the reference's own.
 
     The samples' noise and the reference's are independent, so their squares add: error^2 = mean of squares - floor^2.

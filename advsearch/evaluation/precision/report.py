@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from advsearch.evaluation.precision.fits import (
     Against,
@@ -19,8 +18,17 @@ from advsearch.evaluation.precision.fits import (
     warning_of,
 )
 from advsearch.evaluation.precision.image import OIDN
-from advsearch.evaluation.precision.objective import Curve, missing, sooner
-from advsearch.evaluation.precision.points import Point, Reference, Setting
+from advsearch.evaluation.precision.objective import PolicyCurve, missing, sooner
+from advsearch.evaluation.precision.points import MeasuredSetting, Point, ReferenceValue
+from advsearch.files import Json
+from advsearch.runs.results.precision import (
+    NotMeasured,
+    PrecisionPoint,
+    PrecisionReference,
+    PrecisionResult,
+    PrecisionSlope,
+    Recommended,
+)
 from advsearch.scene.mitsuba_backend.samplers import next_count
 
 Line = tuple[str, str, str]
@@ -52,10 +60,10 @@ class Section:
     theories: dict[Line, Theory] = field(default_factory=dict)
     families: dict[Line, str] = field(default_factory=dict)
     again: dict[tuple[Line, str], Point] = field(default_factory=dict)
-    references: list[dict[str, Any]] = field(default_factory=list)
-    curves: list[tuple[Setting, Curve]] = field(default_factory=list)
+    references: list[PrecisionReference] = field(default_factory=list)
+    curves: list[tuple[MeasuredSetting, PolicyCurve]] = field(default_factory=list)
     start: float = math.nan
-    left_out: tuple[Setting, ...] = ()
+    left_out: tuple[MeasuredSetting, ...] = ()
     warnings: list[str] = field(default_factory=list)
     interrupted: bool = False
 
@@ -70,44 +78,48 @@ class Section:
         return next(found, None)
 
     def refer(
-        self, quantity: str, name: str, control: str, one: Reference, spp: int, margin: Reference | None = None
+        self,
+        quantity: str,
+        name: str,
+        control: str,
+        one: ReferenceValue,
+        spp: int,
+        margin: ReferenceValue | None = None,
     ) -> None:
         """Keep what a reference is, and how far off it may be."""
-        kept: dict[str, Any] = {"quantity": quantity, "reference": name, "error": one.error}
-        kept |= {"parts": one.parts, "spp": spp * one.parts}
-        if control:
-            kept["control"] = control
-        if margin is not None:
-            kept |= {"margin": float(margin.value[0]), "margin_error": margin.error}
-        self.references.append(kept)
+        self.references.append(
+            PrecisionReference(
+                quantity=quantity,
+                reference=name,
+                error=one.error,
+                parts=one.parts,
+                spp=spp * one.parts,
+                control=control or None,
+                margin=None if margin is None else float(margin.value[0]),
+                margin_error=None if margin is None else margin.error,
+            )
+        )
 
 
-def report_of(head: Mapping[str, Any], section: Section, goal: float, seconds: Mapping[str, float]) -> dict[str, Any]:
-    """Return the report (docs/precision.md, "JSON")."""
+def report_of(head: Json, section: Section, goal: float, seconds: Mapping[str, float]) -> PrecisionResult:
+    """Return the report: what was asked for (`head`), what was measured and what follows from it; no figures yet."""
     slopes = _slopes(section)
     for slope in slopes:
         said = warning_of(slope, section.points[slope.line, slope.measure])
         section.warnings += [said] if said else []
-    return {
+    return PrecisionResult(
         **head,
-        "goal": goal,
-        "points": _points(section),
-        "slopes": [_slope(one) for one in slopes],
-        "references": section.references,
-        "recommendations": [_recommendation(*one) for one in _recommended(section, goal)] + _policy(section, goal),
-        "warnings": section.warnings + (["interrupted: only a part was measured"] if section.interrupted else []),
-        "left_out": [_left_out(one) for one in section.left_out],
-        "seconds": dict(seconds),
-        "interrupted": section.interrupted,
-        "figures": [],
-    }
-
-
-def figures_of(report: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return the diagrams as PNG and SVG."""
-    from advsearch.report.diagrams import precision_figures
-
-    return precision_figures(report)
+        goal=goal,
+        points=_points(section),
+        slopes=[_slope(one) for one in slopes],
+        references=section.references,
+        recommendations=[_recommendation(*one) for one in _recommended(section, goal)] + _policy(section, goal),
+        warnings=section.warnings + (["interrupted: only a part was measured"] if section.interrupted else []),
+        left_out=[NotMeasured(**_place(one), reason="did not fit into the time") for one in section.left_out],
+        seconds=dict(seconds),
+        interrupted=section.interrupted,
+        figures=[],
+    )
 
 
 # ---- inside ---------------------------------------------------------------------------------------------------------
@@ -123,24 +135,22 @@ def _slopes(section: Section) -> list[Slope]:
     return found
 
 
-def _points(section: Section) -> list[dict[str, Any]]:
+def _points(section: Section) -> list[PrecisionPoint]:
     """One entry a setting; the margin's error stands beside the picture's."""
-    found: dict[tuple[Line, int], dict[str, Any]] = {}
+    found: dict[tuple[Line, int], Json] = {}
     for (line, measure), points in section.points.items():
         for point in points:
             entry = found.setdefault((line, point.setting.spp), _place(point.setting))
-            known, floor = (
-                ("known", "reference_error") if measure == "error" else ("margin_known", "margin_reference_error")
-            )
-            interval = "interval" if measure == "error" else "margin_interval"
-            entry |= {measure: point.error, interval: list(point.interval), known: point.known, floor: point.floor}
+            own = measure.removesuffix("error")  # "margin_", or nothing
+            entry |= {measure: point.error, f"{own}interval": point.interval, f"{own}known": point.known}
+            entry[f"{own}reference_error"] = point.floor
             entry |= {"seconds": point.seconds, "repeats": point.repeats, **point.more}
             if line in section.families:
                 entry["family"] = section.families[line]
-    return [*found.values(), *_objective_points(section)]
+    return [*map(PrecisionPoint.of, found.values()), *_objective_points(section)]
 
 
-def _objective_points(section: Section) -> list[dict[str, Any]]:
+def _objective_points(section: Section) -> list[PrecisionPoint]:
     best = _best(section)
     found = []
     for setting, curve in section.curves:
@@ -148,8 +158,8 @@ def _objective_points(section: Section) -> list[dict[str, Any]]:
         for renders, seconds, (low, middle, high), share in zip(
             curve.renders, curve.seconds, curve.objective, shares, strict=True
         ):
-            entry = {**_place(setting), "error": share, "objective": middle, "quartiles": [low, high]}
-            found.append({**entry, "renders": renders, "seconds": seconds, "repeats": curve.repeats})
+            place = {**_place(setting), "renders": renders, "seconds": seconds, "repeats": curve.repeats}
+            found.append(PrecisionPoint(**place, error=share, objective=middle, quartiles=(low, high)))
     return found
 
 
@@ -159,28 +169,28 @@ def _best(section: Section) -> float:
     return max((value for value in tops if math.isfinite(value)), default=math.nan)
 
 
-def _place(setting: Setting) -> dict[str, Any]:
-    place: dict[str, Any] = {"quantity": setting.quantity, "estimator": setting.series, "spp": setting.spp}
-    return place | ({"control": setting.control} if setting.control else {})
+def _place(setting: MeasuredSetting) -> Json:
+    place = {"quantity": setting.quantity, "estimator": setting.series, "spp": setting.spp}
+    return {**place, "control": setting.control or None}
 
 
-def _slope(one: Slope) -> dict[str, Any]:
+def _slope(one: Slope) -> PrecisionSlope:
     quantity, control, series = one.line
-    return {
-        "quantity": quantity,
-        "control": control or None,
-        "estimator": series,
-        "measure": one.measure,
-        "against": one.against,
-        "slope": one.value,
-        "interval": list(one.interval),
-        "offset": one.offset,
-        "points": one.points,
-        "fixed_seconds": one.fixed,
-        "theory": one.theory.slope,
-        "or_steeper": one.theory.at_most,
-        "agrees": one.agrees,
-    }
+    return PrecisionSlope(
+        quantity=quantity,
+        control=control or None,
+        estimator=series,
+        measure=one.measure,
+        against=one.against,
+        slope=one.value,
+        interval=one.interval,
+        offset=one.offset,
+        points=one.points,
+        fixed_seconds=one.fixed,
+        theory=one.theory.slope,
+        or_steeper=one.theory.at_most,
+        agrees=one.agrees,
+    )
 
 
 def _recommended(section: Section, goal: float) -> list[tuple[Recommendation | None, str, str, str, str]]:
@@ -209,34 +219,37 @@ def _rounding(section: Section, quantity: str) -> RoundUp:
     )
 
 
-def _recommendation(
-    one: Recommendation | None, quantity: str, control: str, measure: str, family: str
-) -> dict[str, Any]:
-    asked = {"quantity": quantity, "control": control or None, "measure": measure, "among": FAMILIES.get(family)}
-    if one is None:
-        return {**asked, "estimator": None}
-    return {
-        **asked,
-        "goal": one.goal,
-        "estimator": one.line[2],
-        "spp": one.spp,
-        "seconds": one.seconds,
-        "error": one.error,
-        "basis": one.basis,
-        **({"repeats": one.repeats} if one.repeats else {}),
-    }
+def _recommendation(one: Recommendation | None, quantity: str, control: str, measure: str, family: str) -> Recommended:
+    return Recommended(
+        quantity=quantity,
+        control=control or None,
+        measure=measure,
+        among=FAMILIES.get(family),
+        estimator=None if one is None else one.line[2],
+        goal=None if one is None else one.goal,
+        spp=None if one is None else one.spp,
+        seconds=None if one is None else one.seconds,
+        error=None if one is None else one.error,
+        basis=None if one is None else one.basis,
+        repeats=None if one is None else one.repeats or None,
+    )
 
 
-def _policy(section: Section, goal: float) -> list[dict[str, Any]]:
+def _policy(section: Section, goal: float) -> list[Recommended]:
     if not section.curves:
         return []
     found = sooner([curve for _, curve in section.curves], goal, _best(section), section.start)
-    asked = {"quantity": "objective", "control": None, "measure": "error", "among": None}
-    if found is None:
-        return [{**asked, "estimator": None}]
-    policy, renders, seconds = found
-    return [{**asked, "goal": goal, "estimator": policy, "renders": renders, "seconds": seconds, "basis": "measured"}]
-
-
-def _left_out(setting: Setting) -> dict[str, Any]:
-    return {**_place(setting), "reason": "did not fit into the time"}
+    policy, renders, seconds = found or (None, None, None)
+    return [
+        Recommended(
+            quantity="objective",
+            control=None,
+            measure="error",
+            among=None,
+            estimator=policy,
+            goal=goal if found else None,
+            renders=renders,
+            seconds=seconds,
+            basis="measured" if found else None,
+        )
+    ]

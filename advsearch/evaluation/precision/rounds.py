@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 from advsearch import seeds
-from advsearch.evaluation.precision.points import Array, Setting
+from advsearch.evaluation.precision.points import Array, MeasuredSetting
 
 Result = TypeVar("Result")
-Measure = Callable[[Setting, int], tuple[Result, float]]
+Measure = Callable[[MeasuredSetting, int], tuple[Result, float]]
 """From a setting and a seed to what came out and the seconds it took."""
 
 LEAST = 5
@@ -27,7 +27,7 @@ MOST_PARTS = 64
 """Independent parts of a reference, at most."""
 
 
-class Budget:
+class TimeBudget:
     """Seconds that may be spent.
 
     Args:
@@ -44,9 +44,9 @@ class Budget:
         """Seconds left, not below 0."""
         return max(0.0, self._end - self._clock())
 
-    def share(self, part: float) -> Budget:
+    def share(self, part: float) -> TimeBudget:
         """Return a budget of a part, in [0, 1], of what is left."""
-        return Budget(part * self.left, self._clock)
+        return TimeBudget(part * self.left, self._clock)
 
 
 @dataclass
@@ -59,21 +59,21 @@ class Rounds(Generic[Result]):
         complete: whether every setting had all its rounds.
     """
 
-    results: dict[Setting, list[tuple[Result, float]]] = field(default_factory=dict)
-    left_out: tuple[Setting, ...] = ()
+    results: dict[MeasuredSetting, list[tuple[Result, float]]] = field(default_factory=dict)
+    left_out: tuple[MeasuredSetting, ...] = ()
     complete: bool = True
 
 
 def in_rounds(
-    settings: Iterable[Setting],
+    settings: Iterable[MeasuredSetting],
     measure: Measure[Result],
-    budget: Budget,
+    budget: TimeBudget,
     *,
     rounds: int,
     seed: int,
     least: int = LEAST,
     warm_up: int = 1,
-    on_done: Callable[[Setting], None] | None = None,
+    on_done: Callable[[MeasuredSetting], None] | None = None,
 ) -> Rounds[Result]:
     """Measure settings in rounds until the rounds are done or the budget is used up.
 
@@ -94,7 +94,7 @@ def in_rounds(
     found: Rounds[Result] = Rounds()
     forecast = Forecast(found.results, cold=warm_up + 1 if warm_up else 0)
 
-    def call(setting: Setting) -> None:
+    def call(setting: MeasuredSetting) -> None:
         taken = found.results.setdefault(setting, [])
         name = f"precision {'/'.join(setting.line)}/{setting.spp}"
         taken.append(measure(setting, seeds.stream(seed, name, len(taken))))
@@ -129,10 +129,10 @@ class Forecast(Generic[Result]):
         cold: first calls of a setting that take longer, and say little about the next.
     """
 
-    def __init__(self, results: dict[Setting, list[tuple[Result, float]]], cold: int) -> None:
+    def __init__(self, results: dict[MeasuredSetting, list[tuple[Result, float]]], cold: int) -> None:
         self._results, self._cold = results, cold
 
-    def seconds(self, setting: Setting) -> float:
+    def seconds(self, setting: MeasuredSetting) -> float:
         """A call but the first: as the setting's own, else in proportion to its line's dearest setting, else at the
         highest rate of any line; 0 where nothing is known."""
         if setting in self._results:
@@ -159,14 +159,14 @@ class Forecast(Generic[Result]):
         needs = [max(0, least - len(taken)) * self._warm(one) for one, taken in self._results.items()]
         return sum(need for need in needs if need <= CLAIM * left)
 
-    def _warm(self, setting: Setting) -> float:
+    def _warm(self, setting: MeasuredSetting) -> float:
         taken = [seconds for _, seconds in self._results[setting]]
         return statistics.median((taken[self._cold :] or taken[-1:])[-3:])
 
 
 def gather(
     part: Callable[[int], Array],
-    budget: Budget,
+    budget: TimeBudget,
     *,
     seed: int,
     name: str = "reference",

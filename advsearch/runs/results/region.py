@@ -38,15 +38,15 @@ class RegionResult(RunResult):
 
     object: str
     model: str
-    verdict: str | None = Field(None, description="`right` or `wrong`, at the centre")
-    box: list[BoxSide] | None = Field(None, description="a row for each parameter, with the range of its values")
-    same: int | None = Field(None, description="fresh samples of the box that had that verdict")
-    samples: int | None = Field(None, description="all fresh samples of it")
-    rate: float | None = Field(None, description="the share of those that had it")
-    interval: Interval | None = Field(None, description="of that share")
-    volume: float | None = Field(None, description="share of the ranges that the box takes up")
-    spp: int | None = Field(None, description="samples a pixel")
-    map: MarginMap | None = Field(None, description="the margin over two parameters; only with `--map`")
+    verdict: str | None = Field(default=None, description="`right` or `wrong`, at the centre")
+    box: list[BoxSide] | None = Field(default=None, description="for each parameter, the range of its values")
+    same: int | None = Field(default=None, description="fresh samples of the box that had that verdict")
+    samples: int | None = Field(default=None, description="all fresh samples of it")
+    rate: float | None = Field(default=None, description="the share of those that had it")
+    interval: Interval | None = Field(default=None, description="of that share")
+    volume: float | None = Field(default=None, description="share of the ranges that the box takes up")
+    spp: int | None = Field(default=None, description="samples a pixel")
+    map: MarginMap | None = Field(default=None, description="the margin over two parameters; only with `--map`")
     image_formation: Formation
     clean: CleanScene
     warnings: list[str]
