@@ -12,6 +12,7 @@ import torch
 import advsearch
 from advsearch.api.sweep import sweep_from_config
 from advsearch.cli.flags import with_flags
+from advsearch.cli.main import main
 from advsearch.config import SweepConfig
 from advsearch.controls import Space, make_control, make_space
 from advsearch.controls.clean import sentences
@@ -19,7 +20,7 @@ from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.scene.assets import EnvironmentAsset
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.description import DEFAULT_ENVIRONMENT, SceneDescription, describe
 
 AZIMUTH = {"camera.azimuth": 130.0}
 
@@ -30,7 +31,7 @@ def space_of(scene: SceneDescription, **controls: dict[str, Any]) -> Space:
 
 # ---- what was asked for is kept -------------------------------------------------------------------------------------
 
-REFUSED: dict[str, tuple[dict[str, float], str, dict[str, Any], str]] = {
+REFUSED: dict[str, tuple[dict[str, float], str | None, dict[str, Any], str]] = {
     "a range": (
         {"camera.elevation": 80.0},
         "studio",
@@ -53,9 +54,15 @@ REFUSED: dict[str, tuple[dict[str, float], str, dict[str, Any], str]] = {
         {"environment": {"which": ["noon", "kitchen"]}},
         "--environment loft and --control environment contradict each other: environment.which is one of noon, kitchen",
     ),
+    "the default environment": (
+        {},
+        "studio",
+        {"environment": {"which": ["noon", "kitchen"]}},
+        "--environment studio and --control environment contradict each other: environment.which is one of noon",
+    ),
     "an environment": ({}, "loft", {"environment": {"which": "noon", "rotation": [0, 90]}}, "--environment loft and"),
     "a sky": ({}, "loft", {"sky": {}}, "--environment loft and --control sky contradict each other"),
-    "a turned sky": ({"environment.rotation": 90.0}, "studio", {"sky": {}}, "--set environment.rotation=90 and"),
+    "a turned sky": ({"environment.rotation": 90.0}, None, {"sky": {}}, "--set environment.rotation=90 and"),
     "a hidden ground": ({"ground.size": 5.0}, "studio", {"background": {}}, "--set ground.size=5 and --control"),
     "the surface of a named material": (
         {"material.roughness": 0.9},
@@ -101,6 +108,20 @@ def test_a_control_that_agrees_starts_at_what_was_asked_for(
     for name, value in space.describe(space.start).items():
         if name in given and isinstance(value["value"], float):
             assert (value["value"] - given[name]) % 360.0 == pytest.approx(0.0, abs=1e-4)
+
+
+def test_the_default_environment_is_asked_for_only_where_it_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    words = ["sweep", "--object", "mug", "--control", "environment={which: [noon, kitchen]}", "--run", str(run)]
+    more = "--samples 2 --resolution 16 --spp 1 --trials 0 --quiet".split()
+    assert main([*words, *more, "--environment", "studio"]) == 2
+    assert "error: --environment studio and --control environment contradict each other" in capsys.readouterr().err
+    assert main([*words, *more]) == 0
+    (run / "summary.json").unlink()  # as if it had been stopped
+    assert main(["resume", str(run), "--quiet"]) == 0
+    assert SweepConfig(object="mug").lit_by == DEFAULT_ENVIRONMENT
 
 
 # ---- what nobody asked for moves, and that is said ------------------------------------------------------------------

@@ -370,7 +370,7 @@ def check_names(config: SceneConfig) -> None:
     check_run_settings(config)
     controls_of(config.controls, config)
     resolve(config.set_)  # type: ignore[arg-type]
-    lights = config.environments if isinstance(config, SweepConfig) else (config.environment,)
+    lights = config.environments if isinstance(config, SweepConfig) else (config.lit_by,)
     for name in config.objects:
         assert name in library.list_objects() or Path(name).suffix in objects.SUFFIXES
         needs_label = not isinstance(config, RenderConfig) and name not in library.list_objects()

@@ -122,7 +122,7 @@ def check_from_config(
                 "command": "check",
                 "run": str(run.path),
                 "object": ",".join(dict.fromkeys(part.config.object for part in parts)),
-                "environment": ",".join(dict.fromkeys(part.config.environment for part in parts)),
+                "environment": ",".join(dict.fromkeys(part.config.lit_by for part in parts)),
                 "controls": list(dict.fromkeys(name for part in parts for name in part.config.controls)),
                 "ending": ending,
                 "measured": measured,
@@ -250,7 +250,7 @@ def _configurations(config: AttackConfig, everything: bool) -> Iterator[AttackCo
                 continue  # a sky takes the place of the environment
             update: dict[str, Any] = {
                 "object": object,
-                "environment": environment,
+                "environment": None if environment == DEFAULT_ENVIRONMENT else environment,
                 "controls": {control: {}},
                 "label": None,
                 **run_settings_for(config, control, {}),
@@ -265,7 +265,7 @@ def _rows_of(part: Part, parts: int, results: Results, progress: Progress) -> It
         yield from stored
         return
     config = part.config
-    what = f"{config.object} in {config.environment}, {' and '.join(config.controls)}"
+    what = f"{config.object} in {config.lit_by}, {' and '.join(config.controls)}"
     title = f"{what} ({part.number} of {parts})" if parts > 1 else what
     progress.stage(f"loading {title}")
     rows = []
@@ -463,4 +463,4 @@ def _sets(found: Sequence[Probe]) -> list[list[Probe]]:
 
 
 def _place(part: Part) -> dict[str, Any]:
-    return {"object": part.config.object, "environment": part.config.environment, "loss": part.loss}
+    return {"object": part.config.object, "environment": part.config.lit_by, "loss": part.loss}

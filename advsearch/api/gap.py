@@ -76,7 +76,7 @@ def _study(config: Any, body: Callable[[Any, _Parts], Summary], progress: Progre
             "run": str(run.path),
             "objects": list(config.objects),
             "controls": list(config.controls),
-            "environment": config.environment,
+            "environment": config.lit_by,
             "model": config.model,
             "policy": config.policy_name,
             **body(config, parts),

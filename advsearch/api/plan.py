@@ -56,7 +56,7 @@ def plan(config: AttackConfig, *, progress: Progress | None = None) -> PlanResul
     gradient = problem.plan_summary(chosen)
     return PlanResult(
         object=config.object,
-        environment=problem.space.environment or config.environment,
+        environment=problem.space.environment or config.lit_by,
         controls=list(config.controls),
         model=problem.model.name,
         ending=ending,

@@ -280,7 +280,7 @@ def _head(config: PrecisionConfig, problem: Problem) -> Json:
         "run": None,
         "object": config.object,
         "model": problem.model.name,
-        "environment": problem.space.environment or config.environment,
+        "environment": problem.space.environment or config.lit_by,
         "controls": list(config.controls),
         "image_formation": Formation.of(problem.renderer.formation),
         "depth": problem.renderer.scene.max_depth,

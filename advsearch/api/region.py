@@ -80,7 +80,7 @@ def region_from_config(
         result = RegionResult(
             run=str(run.path),
             object=config.object,
-            environment=problem.space.environment or config.environment,
+            environment=problem.space.environment or config.lit_by,
             model=problem.model.name,
             controls=[bound.name for bound in problem.space.controls],
             ending=ending,

@@ -201,8 +201,9 @@ def _places(config: SweepConfig) -> tuple[Place, ...]:
     lights = {environments[0]: firsts[objects[0]].description.environment}
     for name in environments[1:]:
         lights[name] = load_scene(firsts[objects[0]].description.object, name).description.environment
+    asked = {light: lights[light] if config.environment else None for light in environments}
     return tuple(
-        Place(name, light, load_scene(firsts[name].description.object, lights[light], settings=given))
+        Place(name, light, load_scene(firsts[name].description.object, asked[light], settings=given))
         for name in objects
         for light in environments
     )

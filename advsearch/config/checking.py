@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from advsearch.config.attack import AttackConfig
 from advsearch.settings import Clash, setting
 
-OF_ALL = {"object": "mug", "environment": "studio", "controls": {"texture": {}}, "set_": {}}
+OF_ALL: dict[str, Any] = {"object": "mug", "environment": None, "controls": {"texture": {}}, "set_": {}}
 """What is as it is unless it is given, and has to be left so with `all`."""
 
 

@@ -11,6 +11,9 @@ from pydantic import field_validator, model_validator
 from advsearch.errors import InputError
 from advsearch.settings import Clash, Config, check_once, number_or_text, setting, split_names
 
+DEFAULT_ENVIRONMENT = "studio"
+"""What lights a scene of which nothing is said: `scene.description.DEFAULT_ENVIRONMENT`, which a test holds this to."""
+
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
 
@@ -47,7 +50,13 @@ class SceneConfig(Config):
         "what the model should recognise",
         "the name of an object or a .obj, .ply, .glb, .gltf or .stl file",
     )
-    environment: str = setting("studio", "scene", "what lights it", "the name of an environment or a .hdr or .exr file")
+    environment: str | None = setting(
+        None,
+        "scene",
+        "what lights it",
+        "the name of an environment or a .hdr or .exr file",
+        otherwise=DEFAULT_ENVIRONMENT,
+    )
     up: Literal["y", "z"] | None = setting(
         None,
         "scene",
@@ -149,10 +158,15 @@ class SceneConfig(Config):
     def _one_of_each(self) -> SceneConfig:
         """Refuse several objects, environments or models where one is looked at."""
         for name in ("object", "environment", "model"):
-            names = split_names(getattr(self, name))
+            names = split_names(getattr(self, name) or "")
             if len(names) > 1 and name not in self.several:
                 raise one_only(name, names)
         return self
+
+    @property
+    def lit_by(self) -> str:
+        """The environment by name: the default one where none was asked for."""
+        return self.environment or DEFAULT_ENVIRONMENT
 
     @property
     def search_spp(self) -> int:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import field_validator
 
 from advsearch.config.attack import FEWEST_TRIALS
-from advsearch.config.scene import SceneConfig
+from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.settings import Clash, number_or_text, setting, split_names
 
 
@@ -35,11 +35,12 @@ class SweepConfig(SceneConfig):
         "what the model should recognise; several separated by commas",
         "names of objects or .obj, .ply, .glb, .gltf or .stl files",
     )
-    environment: str = setting(
-        "studio",
+    environment: str | None = setting(
+        None,
         "scene",
         "what lights it; several separated by commas",
         "names of environments or .hdr or .exr files",
+        otherwise=DEFAULT_ENVIRONMENT,
     )
     model: str = setting(
         "reference",
@@ -119,7 +120,7 @@ class SweepConfig(SceneConfig):
     @property
     def environments(self) -> tuple[str, ...]:
         """The environments by name."""
-        return split_names(self.environment)
+        return split_names(self.lit_by)
 
     @property
     def models(self) -> tuple[str, ...]:

@@ -149,7 +149,7 @@ def _answers(
     summary: dict[str, Any] = {
         "object": config.object,
         "model": problem.model.name,
-        "environment": problem.space.environment or config.environment,
+        "environment": problem.space.environment or config.lit_by,
         "controls": [bound.name for bound in controls],
         "policy": config.policy_name,
         "objective": config.objective,

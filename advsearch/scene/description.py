@@ -42,7 +42,7 @@ class SceneDescription:
         object_spec: how the object was asked for: a bundled name, a path, or an asset's own name.
         environment_spec: how the environment was asked for, likewise.
         up: the up axis that was given for a mesh file, or None.
-        given: what was asked for: names of settings, and "environment" where it is not the default one.
+        given: what was asked for: names of settings, and "environment".
         parts: what controls have put into the scene beside the object, the environment and the ground.
         thin_lens: the camera has an aperture and a focus distance.
         backdrop: the environment may be hidden behind a plain colour (`backdrop.color`).
@@ -134,7 +134,7 @@ def describe(
     scene = SceneDescription(
         _object(object_spec, up), _environment(lit_by), values, _spec(object_spec), _spec(lit_by), up
     )
-    asked = () if scene.bundled_environment == DEFAULT_ENVIRONMENT else (ENVIRONMENT,)
+    asked = () if environment_spec is None else (ENVIRONMENT,)
     return replace(scene, given=frozenset((*(given or {}), *asked)))
 
 

@@ -302,7 +302,7 @@ class Sweep:
             "run": None if self.run is None else str(self.run.path),
             "object": config.object,
             "model": ",".join(model.name for model in job.models),
-            "environment": self.points.environment or config.environment,
+            "environment": self.points.environment or config.lit_by,
             "controls": [control.name for control in job.controls],
             "ending": ending,
             "image_formation": next(iter(view.renderers.values())).formation.summary() if view else None,
