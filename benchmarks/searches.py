@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Measure and print; returns the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--object", default="mug")
-    parser.add_argument("--environment", default="studio")
+    parser.add_argument("--environment")
     parser.add_argument("--model", default="reference")
     parser.add_argument("--labels")
     parser.add_argument("--label")

@@ -41,9 +41,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-SCENES: Mapping[str, tuple[str, str, dict[str, float]]] = {
+SCENES: Mapping[str, tuple[str, str | None, dict[str, float]]] = {
     "contents": ("mug", "day-room", {"camera.elevation": 45.0}),
-    "sky": ("bowl", "studio", {}),
+    "sky": ("bowl", None, {}),
     "background": ("wine-glass", "studio", {}),
     "camera": ("teapot", "day-room", {}),
     "occlusion": ("teapot", "kitchen", {}),
@@ -67,7 +67,7 @@ CONTROLS: Mapping[str, Mapping[str, Any]] = {
 
 def row(name: str, size: int) -> Image.Image:
     """Return the pictures of one control side by side."""
-    spec, environment, given = SCENES.get(name, ("mug", "studio", {}))
+    spec, environment, given = SCENES.get(name, ("mug", None, {}))
     scene = load_scene(spec, environment, settings=given)
     controls = dict(CONTROLS.get(name, {name: {}}))
     space = make_space(as_controls(controls), scene.description)
