@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,45 +16,10 @@ import numpy.typing as npt
 from advsearch.bundled.environments import ENVIRONMENTS
 from advsearch.bundled.objects import OBJECTS
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
-from advsearch.scene.color import linear_to_srgb, srgb_to_linear
+from advsearch.scene.color import linear_to_srgb
 
 Floats = npt.NDArray[np.float32]
 VARIANTS = 3
-
-
-def _texture(mi: Any, display: Floats) -> dict[str, Any]:
-    """A bitmap texture; Mitsuba puts row 0 at v = 0, so the image is turned upside down."""
-    return {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.ascontiguousarray(srgb_to_linear(display)[::-1]))}
-
-
-def _mesh(mi: Any, asset: ObjectAsset) -> Any:
-    props = mi.Properties()
-    props["material"] = mi.load_dict(
-        {
-            "type": "principled",
-            "base_color": _texture(mi, asset.base_color),
-            "roughness": asset.material.roughness,
-            "metallic": asset.material.metallic,
-            "specular": asset.material.specular,
-            "clearcoat": asset.material.clearcoat,
-        }
-    )
-    source = asset.mesh
-    mesh = mi.Mesh(
-        asset.name,
-        len(source.vertices),
-        len(source.faces),
-        props=props,
-        has_vertex_normals=True,
-        has_vertex_texcoords=True,
-    )
-    params = mi.traverse(mesh)
-    params["vertex_positions"] = source.vertices.ravel()
-    params["vertex_normals"] = source.normals.ravel()
-    params["vertex_texcoords"] = source.uvs.ravel()
-    params["faces"] = source.faces.ravel()
-    params.update()
-    return mesh
 
 
 def picture(
@@ -68,13 +32,13 @@ def picture(
     zoom: float = 1.0,
 ) -> Floats:
     """Render an object on a brown ground plane; (size, size, 3) display-referred sRGB. Angles in degrees."""
-    import mitsuba as mi
     import torch
 
     from advsearch.scene.mitsuba_backend.denoise import Denoiser
+    from advsearch.scene.mitsuba_backend.meshes import mitsuba_mesh, principled
+    from advsearch.scene.mitsuba_backend.variant import mitsuba
 
-    if mi.variant() is None:
-        mi.set_variant("llvm_ad_rgb")
+    mi = mitsuba()
     transform = mi.ScalarTransform4f
     low, high = asset.mesh.vertices.min(axis=0), asset.mesh.vertices.max(axis=0)
     middle = (low + high) / 2
@@ -107,7 +71,7 @@ def picture(
                 "to_world": transform().scale([1.5, 1.5, 1]),
                 "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.13, 0.08]}},
             },
-            "object": _mesh(mi, asset),
+            "object": mitsuba_mesh(asset.name, asset.mesh, np.eye(4), principled(asset.base_color, asset.material)),
         }
     )
     layers = torch.from_numpy(np.array(mi.render(scene, spp=spp, seed=1), dtype=np.float32))

@@ -164,6 +164,23 @@ def test_the_reader_of_imports_sees_all_of_them(tmp_path: Path, module: str, sou
     assert imports(module, path) == expected
 
 
+def test_only_the_backend_speaks_mitsuba() -> None:
+    """And the probe of `advsearch doctor`, and two scripts that draw what is bundled; a mesh's names stand once."""
+    backend = "advsearch.scene.mitsuba_backend"
+    variant = f"{backend}.variant"
+    users: dict[str, set[str]] = {}
+    for module, path in python_files():
+        if not module.startswith(backend):
+            for name in imports(module, path):
+                if name == variant or name.split(".")[0] in RENDERER:
+                    users.setdefault(name, set()).add(module)
+    probe = "advsearch.cli.doctor_probe"
+    scripts = {"advsearch.bundled.contact_sheet", "advsearch.bundled.environments.skies"}
+    assert users == {"drjit": {probe}, "mitsuba_oidn": {probe}, variant: {probe, *scripts}}
+    for name, only in (("vertex_positions", f"{backend}.meshes"), ("llvm_ad_rgb", variant)):
+        assert [module for module, path in python_files() if name in path.read_text(encoding="utf-8")] == [only]
+
+
 def test_the_design_in_one_glance() -> None:
     """As in docs/design.md, "Rooms, and who may know whom": bottom never reaches top, the command line is the roof."""
     assert not any("cli" in (rule.rooms or ()) for rule in RULES.values())

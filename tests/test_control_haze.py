@@ -11,13 +11,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.controls.haze.control import LEAST_RADIUS, THIN_HAZE, HazeControl
-from advsearch.controls.haze.part import HazePart
+from advsearch.controls.haze import LEAST_RADIUS, THIN_HAZE, HazeControl
 from advsearch.errors import InputError
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.parts import HazePart
 
 SIDE = 32
 WHITE = [1.0, 1.0, 1.0]

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.controls.light.control import LIT_POWER, LightControl, metered_irradiance
+from advsearch.controls.light import LIT_POWER, LightControl, metered_irradiance
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import SceneDescription, describe

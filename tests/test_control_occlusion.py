@@ -19,6 +19,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.library import list_objects
+from advsearch.scene.mitsuba_backend.parts import translation
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.silhouettes import Frame, Sweep, middle_axes, pixels_in, silhouette
@@ -115,7 +116,7 @@ def test_primary_rays_find_the_same_share(scene: SceneDescription, which: str) -
 def met(part: MeshPart, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
     """Which rays (N, 3) from a point meet a mesh, by Mitsuba."""
     mi = mitsuba()
-    scene = mi.load_dict({"type": "scene", **part.plugins()})
+    scene = mi.load_dict({"type": "scene", **translation(part).plugins})
     towards = mi.Vector3f(*(mi.Float(one.astype(np.float32)) for one in rays.T))
     return np.array(scene.ray_test(mi.Ray3f(mi.Point3f(*origin.tolist()), towards)))
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.sky.control import METERED_IRRADIANCE, SkyControl
-from advsearch.controls.sky.part import COLUMNS, ROWS, SUN_APERTURE, Sky, angle_between, direction, sun_irradiance
+from advsearch.controls.sky.dome import COLUMNS, ROWS, SUN_APERTURE, Sky, angle_between, direction, sun_irradiance
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.exposure import irradiance

@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.scene.gradients.material_form import LIMITS, material_adjoint
 from advsearch.scene.library import load_environment, load_object
+from advsearch.scene.mitsuba_backend.material_form.adjoint import LIMITS, material_adjoint
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 
 SIZE = 48

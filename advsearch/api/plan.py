@@ -223,7 +223,7 @@ def quieter(tables: Mapping[str, Sequence[Cosine]], asked: str) -> DenoiserAdvic
 
 def _limits() -> list[EstimatorLimit]:
     """What the material form does not cover, as it states itself."""
-    from advsearch.scene.gradients.material_form import LIMITS
+    from advsearch.scene.mitsuba_backend.material_form.adjoint import LIMITS
 
     return [EstimatorLimit.of(limit) for limit in LIMITS]
 

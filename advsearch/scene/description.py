@@ -18,7 +18,7 @@ from advsearch.errors import InputError
 from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.parts import Part
+from advsearch.scene.parts import ScenePart
 
 Doubles = npt.NDArray[np.float64]
 
@@ -56,12 +56,12 @@ class SceneDescription:
     environment_spec: str = ""
     up: str | None = None
     given: frozenset[str] = frozenset()
-    parts: tuple[Part, ...] = ()
+    parts: tuple[ScenePart, ...] = ()
     thin_lens: bool = False
     backdrop: bool = False
     aspect: float = 1.0
 
-    def with_part(self, part: Part) -> SceneDescription:
+    def with_part(self, part: ScenePart) -> SceneDescription:
         """Return the scene with one more part.
 
         Raises:

@@ -8,10 +8,7 @@ measured bound, and the verification renders all of them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, MutableMapping, Sequence
-from typing import Any
-
-from advsearch.scene.parts import Part
+from collections.abc import Mapping
 
 ITEMS: Mapping[str, str] = {
     "tracing": "tracing a render anew: it is recorded once and replayed, until a shape moves",
@@ -27,23 +24,3 @@ EVERYTHING = frozenset(ITEMS)
 """Leave out all that can be."""
 NOTHING: frozenset[str] = frozenset()
 """Leave out nothing: what a program has to do that knows neither scene nor search."""
-
-_ABSENT = {"type": "uniform", "value": 0.0}
-IDLE_LOBES: Mapping[str, Any] = {name: _ABSENT for name in ("clearcoat", "sheen")}
-"""Entries of the principled surface that give it lobes of strength 0."""
-
-
-def leave_dark_lamps_out(plugins: MutableMapping[str, Any], parts: Sequence[Part]) -> None:
-    """Take no samples towards lamps that emit nothing.
-
-    A path that arrives at one by chance still counts, with all of the weight, so that nothing is biased should it be
-    lit after all.
-
-    Args:
-        plugins: Mitsuba's dictionary of the scene; changed.
-        parts: of the scene.
-    """
-    for part in parts:
-        if part.dark:
-            plugin = plugins[part.name]
-            plugin.get("emitter", plugin)["sampling_weight"] = 0.0

@@ -1,129 +1,35 @@
-"""What controls may put into a scene beside the object and its environment: meshes, lights, a medium.
+"""What controls may put into a scene beside the object and its environment, as data: meshes, lamps, haze.
 
-A part says which Mitsuba plugins it adds and which scene inputs they take. An input is a torch tensor under a name of
-ours; `MitsubaScene` writes it into Mitsuba's parameters, and reads its gradient back where the adjoint is valid.
+A part says what it is and which scene inputs it takes, torch tensors under names of ours; `mitsuba_backend` translates
+it. A part of another kind is a subclass, with a translation registered in `mitsuba_backend.parts.translation`.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from advsearch.scene.assets import Floats, Material, Mesh
 
-Write = Callable[[Any], Any]
-"""From a Dr.Jit `TensorXf` (perhaps with gradients enabled) to the type that the Mitsuba parameter takes."""
 
-
-def as_is(value: Any) -> Any:
-    """Textures, grids: Mitsuba takes the tensor itself."""
-    return value
-
-
-def flat(value: Any) -> Any:
-    """Vertex buffers: Mitsuba takes a flat array."""
-    return value.array
-
-
-def number(value: Any) -> Any:
-    """A single number."""
-    from advsearch.scene.mitsuba_backend.variant import mitsuba
-
-    return mitsuba().Float(value.array)
-
-
-def color(value: Any) -> Any:
-    """Three numbers: an RGB colour."""
-    from advsearch.scene.mitsuba_backend.variant import mitsuba
-
-    mi = mitsuba()
-    import drjit as dr
-
-    return mi.Color3f(*(dr.gather(mi.Float, value.array, mi.UInt32(channel)) for channel in range(3)))
-
-
-def point(value: Any) -> Any:
-    """Three numbers: a place."""
-    from advsearch.scene.mitsuba_backend.variant import mitsuba
-
-    mi = mitsuba()
-    import drjit as dr
-
-    return mi.Point3f(*(dr.gather(mi.Float, value.array, mi.UInt32(axis)) for axis in range(3)))
-
-
-def transform(value: Any) -> Any:
-    """A 4 x 4 matrix, row by row."""
-    from advsearch.scene.mitsuba_backend.variant import mitsuba
-
-    mi = mitsuba()
-    import drjit as dr
-
-    rows = [[dr.gather(mi.Float, value.array, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(4)]
-    return mi.Transform4f(mi.Matrix4f(rows))
-
-
-@dataclass(frozen=True)
-class PartInput:
-    """One input of a part.
-
-    Attributes:
-        name: the input's name, e.g. "key.position".
-        key: Mitsuba's parameter path, or its beginning and end with one "*" between for an unknown middle.
-        write: converts the tensor.
-        interior: the interior adjoint (`prb`) differentiates it correctly.
-        shape: of the tensor; None takes it from Mitsuba's own value.
-    """
-
-    name: str
-    key: str
-    write: Write = as_is
-    interior: bool = False
-    shape: tuple[int, ...] | None = None
-
-
-class Part(ABC):
+@dataclass(frozen=True, eq=False)
+class ScenePart:
     """Something in a scene.
 
     Attributes:
-        name: unique in the scene; begins the names of its inputs and plugins.
+        name: unique in the scene; begins the names of its inputs.
         volumetric: needs an integrator that handles media.
-        dark: is a lamp that emits nothing, whatever its inputs are.
     """
 
     name: str
-    volumetric: bool = False
-    dark: bool = False
-
-    @abstractmethod
-    def plugins(self) -> dict[str, Any]:
-        """Return entries of Mitsuba's scene dictionary (plugin dictionaries or objects) by name. A name that the
-        scene has already ("environment") is replaced."""
-
-    @abstractmethod
-    def inputs(self) -> tuple[PartInput, ...]:
-        """Return what may be set; the base value of each is whatever `plugins` made."""
-
-    def sensor(self) -> dict[str, Any]:
-        """Return entries to add to the sensor's dictionary (the medium that the camera is in)."""
-        return {}
-
-    def integrator(self, plugins: Mapping[str, Any]) -> dict[str, Any]:
-        """Return entries that replace those of the path integrator's dictionary (another type, for a medium).
-
-        Args:
-            plugins: the scene's dictionary, complete.
-        """
-        return {}
+    volumetric: ClassVar[bool] = False
 
 
 @dataclass(frozen=True, eq=False)
-class MeshPart(Part):
+class MeshPart(ScenePart):
     """A mesh with a principled surface and a base-colour texture.
 
     Takes `NAME.vertices` and `NAME.normals` (V, 3) in world space, `NAME.base_color` (h, w, 3) linear reflectance with
@@ -136,31 +42,59 @@ class MeshPart(Part):
         to_world: (4, 4) its base pose.
         base_color: (h, w, 3) float32 display-referred sRGB.
         material: the rest of the surface.
-        extra: further entries of the principled plugin's dictionary (e.g. {"spec_trans": 0.9}).
     """
 
-    name: str
     mesh: Mesh
     to_world: npt.NDArray[np.float64]
     base_color: Floats
     material: Material = field(default_factory=Material)
-    extra: dict[str, Any] = field(default_factory=dict)
 
-    def plugins(self) -> dict[str, Any]:
-        from advsearch.scene.mitsuba_backend.plugins import mitsuba_mesh, principled
 
-        surface = principled(self.base_color, self.material, self.extra)
-        return {self.name: mitsuba_mesh(self.name, self.mesh, self.to_world, surface)}
+@dataclass(frozen=True, eq=False)
+class PointLamp(ScenePart):
+    """A point that shines equally in all directions; the camera does not see it.
 
-    def inputs(self) -> tuple[PartInput, ...]:
-        name, count = self.name, len(self.mesh.vertices)
-        found = [
-            PartInput(f"{name}.vertices", f"{name}.vertex_positions", flat, shape=(count, 3)),
-            PartInput(f"{name}.normals", f"{name}.vertex_normals", flat, shape=(count, 3)),
-            PartInput(f"{name}.base_color", f"{name}.*.base_color.data", interior=True),
-            PartInput(f"{name}.roughness", f"{name}.*.roughness.value", number, True, (1,)),
-            PartInput(f"{name}.metallic", f"{name}.*.metallic.value", number, True, (1,)),
-            PartInput(f"{name}.specular", f"{name}.*.specular", number, True, (1,)),
-            PartInput(f"{name}.clearcoat", f"{name}.*.clearcoat.value", number, True, (1,)),
-        ]
-        return tuple(found)
+    Takes `NAME.position` (3,) in object sizes and `NAME.intensity` (3,) linear radiant intensity. The interior adjoint
+    is right for the intensity; for a position Mitsuba raises.
+
+    Attributes:
+        name: of the lamp.
+        dark: its intensity is 0 whatever happens.
+    """
+
+    dark: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class BallLamp(ScenePart):
+    """A ball that shines outwards with the same radiance everywhere; the camera sees it where it is in view.
+
+    A ball needs no orientation, and the cone under which it is seen is sampled: as quiet as a disk, and simpler. Light
+    of others passes through it, so that a lamp of power 0 changes nothing, wherever it stands.
+
+    Takes `NAME.ball` (4, 4), the pose of the unit ball (a shift and one scale for all axes), and `NAME.radiance` (3,)
+    linear radiance. The interior adjoint is right for the radiance; for the pose it is silently 0.
+
+    Attributes:
+        name: of the lamp.
+        dark: its radiance is 0 whatever happens.
+    """
+
+    dark: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class HazePart(ScenePart):
+    """One grey medium in a ball around the origin that camera and object stand in; it scatters evenly in all
+    directions.
+
+    Takes `NAME.density` (1,), the extinction per object size, and `NAME.albedo` (3,), the share of the light that is
+    scattered and not absorbed.
+
+    Attributes:
+        name: of the haze.
+        radius: of the ball that it fills, object sizes.
+    """
+
+    radius: float
+    volumetric: ClassVar[bool] = True

@@ -95,10 +95,9 @@ def _bake(azimuth: float, elevation: float) -> tuple[Array, Array]:
         root of the elevation (denser near the horizon), column 0 at azimuth 0; and the (3,) irradiance of the sun
         across its beam.
     """
-    import mitsuba as mi
+    from advsearch.scene.mitsuba_backend.variant import mitsuba
 
-    if mi.variant() is None:
-        mi.set_variant("llvm_ad_rgb")
+    mi = mitsuba()
     sun = _towards(azimuth, elevation)
     spec = {"type": "sunsky", "turbidity": TURBIDITY, "sun_direction": [float(c) for c in sun]}
     a = 2 * np.pi * np.arange(COLUMNS) / COLUMNS

@@ -1,6 +1,6 @@
 """The `sky` control: a clear sky with a sun instead of the environment; where the sun stands and how hazy the air is.
 
-The map is `part`'s (Hosek and Wilkie 2012, 2013). The same sun is hundreds of times darker at the
+The map is `dome`'s (Hosek and Wilkie 2012, 2013). The same sun is hundreds of times darker at the
 horizon than at noon, so exposure matters. By default every configuration is metered, as an automatic camera would: the
 sky is scaled so that a surface facing the sun receives the same irradiance `M` always,
 
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from advsearch.controls.base import Choice, Parameter
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.sky.part import TURBIDITIES, Sky
+from advsearch.controls.sky.dome import TURBIDITIES, Sky
 from advsearch.errors import InputError
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import SceneDescription

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 from statistics import fmean
-from typing import Any
 
 import numpy as np
 import torch
@@ -16,12 +15,13 @@ from advsearch.evaluation.stability.scene import ERROR, REFERENCE_SPP, SPP, Cont
 from advsearch.scene import library
 from advsearch.scene.description import describe
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.parts import Part, PartInput
+from advsearch.scene.mitsuba_backend.parts import Translation, translation
+from advsearch.scene.parts import ScenePart
 from advsearch.scene.renderer import Renderer
 
 
 @dataclass(frozen=True, eq=False)
-class GlassBall(Part):
+class GlassBall(ScenePart):
     """A ball of clear glass; nothing of it varies.
 
     Attributes:
@@ -30,16 +30,15 @@ class GlassBall(Part):
         radius: in object sizes.
     """
 
-    name: str
     place: tuple[float, float, float]
     radius: float
 
-    def plugins(self) -> dict[str, Any]:
-        surface = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
-        return {self.name: {"type": "sphere", "center": list(self.place), "radius": self.radius, "bsdf": surface}}
 
-    def inputs(self) -> tuple[PartInput, ...]:
-        return ()
+@translation.register
+def _glass(part: GlassBall) -> Translation:
+    surface = {"type": "dielectric", "int_ior": 1.5, "ext_ior": 1.0}
+    ball = {"type": "sphere", "center": list(part.place), "radius": part.radius, "bsdf": surface}
+    return Translation({part.name: ball})
 
 
 def surface(searched: dict[str, list[float]], **values: float) -> Outcome:

@@ -24,7 +24,7 @@ from advsearch.scene.description import describe
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients.motion import Motion
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.parts import Part
+from advsearch.scene.parts import ScenePart
 from advsearch.scene.renderer import Renderer
 
 BARE = {"ground.size": 0.0}
@@ -53,7 +53,7 @@ def small(
     *,
     environment: str | Path | EnvironmentAsset | None = None,
     settings: Mapping[str, float] | None = None,
-    parts: Sequence[Part] = (),
+    parts: Sequence[ScenePart] = (),
     size: int = SIZE,
     denoise: str = "none",
     estimators: Mapping[str, str] | None = None,

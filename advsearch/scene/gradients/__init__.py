@@ -1,1 +1,1 @@
-"""How pictures are differentiated: the plan, the motion of coordinates, the material form."""
+"""How pictures are differentiated: the plan, and the motion of coordinates."""

@@ -9,8 +9,8 @@ import numpy as np
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.mitsuba_backend.inputs import SceneInput, number, transform
 from advsearch.scene.mitsuba_backend.variant import mitsuba
-from advsearch.scene.parts import PartInput, number, transform
 
 
 def scene_dict(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> dict[str, Any]:
@@ -66,7 +66,7 @@ def _camera(description: SceneDescription, resolution: tuple[int, int], filter: 
     return camera
 
 
-def camera_inputs(resolution: tuple[int, int]) -> tuple[PartInput, ...]:
+def camera_inputs(resolution: tuple[int, int]) -> tuple[SceneInput, ...]:
     """The camera's inputs. Our field of view is along the larger side, Mitsuba's parameter along the width."""
     height, width = resolution
 
@@ -77,10 +77,10 @@ def camera_inputs(resolution: tuple[int, int]) -> tuple[PartInput, ...]:
         return mitsuba().Float(2.0 * dr.rad2deg(dr.atan(dr.tan(half) * min(1.0, width / height))))
 
     return (
-        PartInput("camera.to_world", "camera.to_world", transform, shape=(4, 4)),
-        PartInput("camera.fov", "camera.x_fov", along_width, shape=(1,)),
-        PartInput("camera.shift_x", "camera.principal_point_offset_x", number, shape=(1,)),
-        PartInput("camera.shift_y", "camera.principal_point_offset_y", number, shape=(1,)),
-        PartInput("camera.aperture", "camera.aperture_radius", number, shape=(1,)),
-        PartInput("camera.focus", "camera.focus_distance", number, shape=(1,)),
+        SceneInput("camera.to_world", "camera.to_world", transform, shape=(4, 4)),
+        SceneInput("camera.fov", "camera.x_fov", along_width, shape=(1,)),
+        SceneInput("camera.shift_x", "camera.principal_point_offset_x", number, shape=(1,)),
+        SceneInput("camera.shift_y", "camera.principal_point_offset_y", number, shape=(1,)),
+        SceneInput("camera.aperture", "camera.aperture_radius", number, shape=(1,)),
+        SceneInput("camera.focus", "camera.focus_distance", number, shape=(1,)),
     )

@@ -19,12 +19,15 @@ from advsearch.errors import InputError
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import object_to_world
-from advsearch.scene.leaving_out import EVERYTHING, IDLE_LOBES, leave_dark_lamps_out
+from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.dictionary import camera_inputs, scene_dict
+from advsearch.scene.mitsuba_backend.inputs import SceneInput, as_is, key_of
+from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS
+from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, leave_dark_lamps_out, mesh_translation, translation
 from advsearch.scene.mitsuba_backend.population import population
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER, next_count
 from advsearch.scene.mitsuba_backend.variant import mitsuba
-from advsearch.scene.parts import MeshPart, PartInput, as_is
+from advsearch.scene.parts import MeshPart
 
 MAX_DEPTH = 6
 """Longest light path in segments: five bounces off surfaces."""
@@ -37,7 +40,7 @@ SHADOW_SPP = 4
 BASE_COLOR = "object.base_color"
 """Input: (h, w, 3) linear reflectance of the object, row 0 at v = 1 (top of the image)."""
 
-ENVIRONMENT_INPUT = PartInput("environment.padded", "environment.data", as_is, interior=True)
+ENVIRONMENT_INPUT = SceneInput("environment.padded", "environment.data", as_is, interior=True)
 """(H, W + 2, 3): Mitsuba keeps a copy of the last column before the first, and of the first after the last."""
 
 
@@ -87,25 +90,24 @@ class MitsubaScene:
             object_to_world(description),
             description.object.base_color,
             description.material,
-            {} if "lobes" in leave_out else dict(IDLE_LOBES),
         )
-        parts = (object_part, *description.parts)
-        self.volumetric = any(part.volumetric for part in parts)
+        self.volumetric = any(part.volumetric for part in description.parts)
         plugins = scene_dict(description, resolution, filter, sampler)
-        for part in parts:
-            plugins |= part.plugins()
-            plugins["camera"] |= part.sensor()
-        if "emitters" in leave_out:
-            leave_dark_lamps_out(plugins, parts)
+        translated = [mesh_translation(object_part, None if "lobes" in leave_out else IDLE_LOBES)]
+        translated += [translation(part) for part in description.parts]
         self._path: dict[str, Any] = {"type": integrator}
-        for part in parts:
-            self._path |= part.integrator(plugins)
+        for one in translated:
+            plugins |= one.plugins
+            self._path |= one.integrator
+        if "emitters" in leave_out:
+            leave_dark_lamps_out(plugins, description.parts)
         self._scene = mi.load_dict(plugins, optimize=False)
         self._sensor = self._scene.sensors()[0]
         self._parameters = mi.traverse(self._scene)
         self._integrators: dict[tuple[str, int], Any] = {}
-        declared = [*camera_inputs(resolution), ENVIRONMENT_INPUT, *(one for part in parts for one in part.inputs())]
-        self._inputs = {one.name: (key, one) for one in declared if (key := _key(self._parameters, one.key))}
+        parts = [one for part in translated for one in part.inputs]
+        declared = [*camera_inputs(resolution), ENVIRONMENT_INPUT, *parts]
+        self._inputs = {one.name: (key, one) for one in declared if (key := key_of(self._parameters, one.key))}
         self.names = frozenset(self._inputs)
         self.interior = frozenset(name for name, (_, one) in self._inputs.items() if one.interior)
         self._shapes = frozenset(name for name, (key, _) in self._inputs.items() if _is_of_a_shape(key))
@@ -239,7 +241,7 @@ class MitsubaScene:
             spp: samples a pixel of the interior term.
             meshes: names of the meshes.
         """
-        from advsearch.scene.gradients.material_form import material_adjoint
+        from advsearch.scene.mitsuba_backend.material_form.adjoint import material_adjoint
 
         self._apply(inputs)
         names = list(meshes)
@@ -397,21 +399,6 @@ def _torch(value: Any) -> Tensor:
 
 def _is_of_a_shape(key: str) -> bool:
     """Whether a change of this Mitsuba parameter moves a shape, so that ray tracing is set up anew."""
-    return key.endswith(("vertex_positions", "vertex_normals")) or (
+    return key.endswith((POSITIONS, NORMALS)) or (
         key.endswith("to_world") and not key.startswith(("camera", "environment"))
     )
-
-
-def _key(parameters: Any, pattern: str) -> str | None:
-    """Return the parameter that a pattern with at most one "*" means, or None if the scene has none such.
-
-    Raises:
-        RuntimeError: there are several.
-    """
-    before, star, after = pattern.partition("*")
-    found = [
-        key for key in parameters.keys() if (key.startswith(before) and key.endswith(after) if star else key == pattern)
-    ]
-    if len(found) > 1:
-        raise RuntimeError(f"expected one Mitsuba parameter {pattern}, found {found}")
-    return str(found[0]) if found else None

@@ -1,4 +1,7 @@
-"""Mitsuba's mesh and surface plugins from our assets."""
+"""Mitsuba's mesh and surface plugins from our assets, and the names of a mesh's parameters.
+
+Mitsuba 3.10 renames these parameters: they stand here and nowhere else.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,9 @@ import numpy.typing as npt
 from advsearch.scene.assets import Floats, Material, Mesh
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.mitsuba_backend.variant import mitsuba
+
+POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
+"""Names of a mesh's parameters: flat arrays of 3, 3 and 2 numbers a vertex, and 3 indices a face."""
 
 
 def principled(base_color: Floats, material: Material, extra: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -62,9 +68,9 @@ def mitsuba_mesh(name: str, mesh: Mesh, to_world: npt.NDArray[np.float64], bsdf:
         props=properties,
     )
     parameters = mi.traverse(result)
-    parameters["vertex_positions"] = mi.Float(vertices.astype(np.float32).ravel())
-    parameters["vertex_normals"] = mi.Float(normals.astype(np.float32).ravel())
-    parameters["vertex_texcoords"] = mi.Float(uvs.astype(np.float32).ravel())
-    parameters["faces"] = mi.UInt32(mesh.faces.astype(np.uint32).ravel())
+    parameters[POSITIONS] = mi.Float(vertices.astype(np.float32).ravel())
+    parameters[NORMALS] = mi.Float(normals.astype(np.float32).ravel())
+    parameters[TEXCOORDS] = mi.Float(uvs.astype(np.float32).ravel())
+    parameters[FACES] = mi.UInt32(mesh.faces.astype(np.uint32).ravel())
     parameters.update()
     return result

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from advsearch.scene.mitsuba_backend.meshes import FACES, POSITIONS
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 
 ROUGH_COTANGENT = 0.5
@@ -125,7 +126,7 @@ def _mesh(shape: Any, faces: Any, vertices: Tensor, normals: Tensor) -> TriMesh:
 def moving_mesh(scene: Any, parameters: Any, key: str, vertices: Tensor, normals: Tensor) -> TriMesh:
     _, dr = both_backends()
     shape = next(shape for shape in scene.shapes() if shape.id() == key)
-    mesh = _mesh(shape, parameters[f"{key}.faces"], vertices, normals)
+    mesh = _mesh(shape, parameters[f"{key}.{FACES}"], vertices, normals)
     dr.enable_grad(mesh.positions, mesh.normals)
     return mesh
 
@@ -135,13 +136,13 @@ def still_meshes(scene: Any, parameters: Any, moving: Sequence[str]) -> list[Tri
     found = []
     for shape in scene.shapes():
         if shape.is_mesh() and shape.face_count() > 2 and shape.id() not in moving:
-            places = parameters[f"{shape.id()}.vertex_positions"].torch().reshape(-1, 3).clone()
-            found.append(_mesh(shape, parameters[f"{shape.id()}.faces"], places, torch.zeros_like(places)))
+            places = parameters[f"{shape.id()}.{POSITIONS}"].torch().reshape(-1, 3).clone()
+            found.append(_mesh(shape, parameters[f"{shape.id()}.{FACES}"], places, torch.zeros_like(places)))
     return found
 
 
 @dataclass(frozen=True)
-class View:
+class FilmView:
     """What the three terms share: `weights` is the cotangent with a border of zeros, flat."""
 
     scene: Any

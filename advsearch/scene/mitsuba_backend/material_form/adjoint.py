@@ -33,12 +33,12 @@ from typing import Any
 
 from torch import Tensor
 
-from advsearch.scene.gradients.material_edges import outline_terms, shadow_terms
-from advsearch.scene.gradients.material_view import (
+from advsearch.scene.mitsuba_backend.material_form.edges import outline_terms, shadow_terms
+from advsearch.scene.mitsuba_backend.material_form.view import (
     _OUTLINES,
     _SHADOWS,
     Camera,
-    View,
+    FilmView,
     as_array,
     both_backends,
     gradient_of,
@@ -153,7 +153,7 @@ def material_adjoint(
     places, bent = ([vertices], [normals]) if single else (vertices, normals)
     meshes = [moving_mesh(scene, parameters, *one) for one in zip(keys, places, bent, strict=True)]
     still = still_meshes(scene, parameters, keys)
-    view = View(scene, read_camera(sensor), meshes, still, as_array(padded(cotangent)), max_depth)
+    view = FilmView(scene, read_camera(sensor), meshes, still, as_array(padded(cotangent)), max_depth)
     total = mitsuba().Float(0)
     if spp > 0:
         total += _interior(view, seed, spp, ROUGH_TILE if is_rough(cotangent) else 1)
@@ -169,7 +169,7 @@ def material_adjoint(
 # ---- inside the outlines --------------------------------------------------------------------------------------------
 
 
-def _interior(view: View, seed: int, spp: int, tile: int) -> Any:
+def _interior(view: FilmView, seed: int, spp: int, tile: int) -> Any:
     """A number whose gradient is the interior term's."""
     mi, dr = both_backends()
     with dr.suspend_grad():
@@ -189,7 +189,7 @@ def _interior(view: View, seed: int, spp: int, tile: int) -> Any:
     return total / spp
 
 
-def _first_hits(view: View, seed: int, spp: int, tile: int) -> tuple[Any, Any, Any]:
+def _first_hits(view: FilmView, seed: int, spp: int, tile: int) -> tuple[Any, Any, Any]:
     """Film positions that see a moving mesh, the hits, and the random numbers from there on.
 
     The film is cut into cells between pixel centres, `spp` samples in each, stratified.
@@ -215,7 +215,7 @@ def _first_hits(view: View, seed: int, spp: int, tile: int) -> tuple[Any, Any, A
     return film, hit, sampler
 
 
-def _contributions(view: View, film: Any, si: Any, sampler: Any, place: Any, facet: Any, bent: Any) -> Any:
+def _contributions(view: FilmView, film: Any, si: Any, sampler: Any, place: Any, facet: Any, bent: Any) -> Any:
     """Sum of W L J / J over all samples, attached to the given places and normals."""
     mi, dr = both_backends()
     camera = view.camera
@@ -252,7 +252,7 @@ def _attached(camera: Camera, si: Any, place: Any, facet: Any, bent: Any) -> Any
     return at
 
 
-def _reflected(view: View, at: Any, si: Any, sampler: Any) -> Any:
+def _reflected(view: FilmView, at: Any, si: Any, sampler: Any) -> Any:
     """One sample of the light reflected towards the camera, from directions fixed in the world."""
     mi, dr = both_backends()
     context, bsdf = mi.BSDFContext(), si.bsdf()
@@ -275,7 +275,7 @@ def _reflected(view: View, at: Any, si: Any, sampler: Any) -> Any:
     return total + dr.select(active, arriving * relative, 0.0)
 
 
-def _attached_light(view: View, at: Any, ds: Any, light: Any, lit: Any) -> tuple[Any, Any]:
+def _attached_light(view: FilmView, at: Any, ds: Any, light: Any, lit: Any) -> tuple[Any, Any]:
     """A light sample seen from a moving point. What is infinitely far away does not change."""
     mi, dr = both_backends()
     near = lit & ~mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
@@ -288,7 +288,7 @@ def _attached_light(view: View, at: Any, ds: Any, light: Any, lit: Any) -> tuple
     return moved, dr.replace_grad(light, shining) * dr.select(surface, _relative(fall), 1.0)
 
 
-def _arriving(view: View, si: Any, direction: Any, pdf: Any, smooth: Any, sampler: Any, active: Any) -> Any:
+def _arriving(view: FilmView, si: Any, direction: Any, pdf: Any, smooth: Any, sampler: Any, active: Any) -> Any:
     """Radiance from a sampled direction; what shines there itself is weighted against light sampling."""
     mi = mitsuba()
 

@@ -1,8 +1,8 @@
 """The `haze` control: a uniform haze around camera and object, by how dense it is and of which colour.
 
 A share `1 - exp(-density * l)` of the light is taken out of a line of length l (Beer and Lambert), and scattered light
-comes in: `advsearch.controls.haze.path` has the equation. Colour is the share that is scattered and not absorbed, per
-channel: white haze takes nothing away, dark haze is smoke. Haze fills a ball; the environment is outside of it.
+comes in: `advsearch.scene.mitsuba_backend.haze_path` has the equation. Colour is the share that is scattered and not
+absorbed, per channel: white haze takes nothing away, dark haze is smoke. Haze fills a ball; the environment is outside.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import Parameter
-from advsearch.controls.haze.part import HazePart
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed, Number, Range
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import srgb_to_linear
 from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.parts import HazePart
 
 LEAST_RADIUS = 4.0
 """The haze reaches at least this far from the scene's middle, object sizes."""

@@ -1,4 +1,4 @@
-"""Boundary terms of the material form: outlines and shadows, by sampled edges (see `material_form`)."""
+"""Boundary terms of the material form: outlines and shadows, by sampled edges (see `adjoint`)."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.scene.gradients.material_view import (
+from advsearch.scene.mitsuba_backend.material_form.view import (
     _PATHS,
     Camera,
+    FilmView,
     TriMesh,
-    View,
     as_numbers,
     as_vectors,
     both_backends,
@@ -36,7 +36,7 @@ NEAREST = 1e-3
 # ---- outlines -------------------------------------------------------------------------------------------------------
 
 
-def outline_terms(view: View, mesh: TriMesh, stream: int, spp: int) -> Any:
+def outline_terms(view: FilmView, mesh: TriMesh, stream: int, spp: int) -> Any:
     """A number whose gradient is the outline term's, for the edges of one mesh."""
     mi, dr = both_backends()
     found = _sampled_outline(view.camera, mesh, uniform_numbers(stream, spp * view.camera.pixels, 1)[:, 0])
@@ -140,7 +140,7 @@ def _silhouette(places: Tensor, corners: Tensor, eye: Tensor) -> tuple[Tensor, T
 # ---- shadows --------------------------------------------------------------------------------------------------------
 
 
-def shadow_terms(view: View, mesh: TriMesh, stream: int, spp: int) -> Any:
+def shadow_terms(view: FilmView, mesh: TriMesh, stream: int, spp: int) -> Any:
     """A number whose gradient is the shadow term's, for the edges of one mesh."""
     mi, dr = both_backends()
     found = _sampled_tangents(mesh, uniform_numbers(stream, spp * view.camera.pixels, 4))
@@ -170,7 +170,7 @@ def shadow_terms(view: View, mesh: TriMesh, stream: int, spp: int) -> Any:
     return dr.sum(strength * as_numbers(sine[chosen]) * speed) * -share
 
 
-def _lit_value(view: View, si: Any, d: Any) -> Any:
+def _lit_value(view: FilmView, si: Any, d: Any) -> Any:
     """W f J' of lit points that the camera sees, for light from d; elsewhere 0."""
     mi, dr = both_backends()
     camera = view.camera
@@ -185,7 +185,7 @@ def _lit_value(view: View, si: Any, d: Any) -> Any:
     return dr.select(active, value * view.weight(film, active), 0.0)
 
 
-def _past_minus_hit(view: View, si: Any, p: Any, beside: Any, stream: int) -> Any:
+def _past_minus_hit(view: FilmView, si: Any, p: Any, beside: Any, stream: int) -> Any:
     """Difference of the radiance that arrives at a lit point just past an edge and just inside it."""
     mi, dr = both_backends()
 

@@ -21,13 +21,13 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.base import Choice, Parameter
-from advsearch.controls.light.part import BallLightPart, PointLightPart
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed, Number
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.exposure import WHITE, metered_gain
 from advsearch.scene.formation import srgb_to_linear
+from advsearch.scene.parts import BallLamp, PointLamp
 
 TYPES = ("area", "point")
 LIT_WHITE = 0.9
@@ -128,7 +128,7 @@ class LightControl(NumberControl):
         return None if is_point and parameter.name == "size" else parameter.search
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
-        lamp = PointLightPart if self.chosen["type"] == "point" else BallLightPart
+        lamp = PointLamp if self.chosen["type"] == "point" else BallLamp
         power = self.specs.get("power")
         return scene.with_part(lamp(self.name, dark=isinstance(power, Fixed) and power.value == 0.0))
 

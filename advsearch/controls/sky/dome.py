@@ -10,18 +10,13 @@ can hold it; negative radiance is cut off; and below the horizon there is an inf
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
-from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.sunsky import sunsky_tables
 
 ROWS, COLUMNS = 256, 512
 """Size of the map."""
@@ -36,32 +31,10 @@ TURBIDITIES = (1.0, 10.0)
 NEARLY_NOTHING = 1e-12
 
 
-@dataclass(frozen=True, eq=False)
-class Coefficients:
-    """What the two models interpolate.
-
-    Attributes:
-        shape: (10 turbidities, 2 ground albedos, 6 control points, 3 channels, 9) shape of the dome.
-        level: (10, 2, 6, 3) its mean radiance.
-        sun: (10, 45 pieces, 3 channels, 4 powers of the elevation, 6 powers of the cosine at the limb) its radiance.
-    """
-
-    shape: Tensor
-    level: Tensor
-    sun: Tensor
-
-
 @cache
-def coefficients() -> Coefficients:
-    """Read Mitsuba's tables; once per process."""
-    mi: Any = mitsuba()
-    path = Path(mi.__file__).parent / "data" / "sunsky" / "sunsky_datasets.bin"
-    with contextlib.redirect_stdout(io.StringIO()):  # the reader prints what it loads
-        tables = mi.tensor_io.read(str(path))
-    shape, level, sun = (
-        torch.from_numpy(tables[name]).float() for name in ("sky_params_rgb", "sky_rad_rgb", "sun_rad_rgb")
-    )
-    return Coefficients(shape, level, sun)
+def tables() -> tuple[Tensor, Tensor, Tensor]:
+    """Return what the two models interpolate, see `sunsky_tables`; read once per process."""
+    return sunsky_tables()
 
 
 def direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
@@ -97,7 +70,7 @@ def sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
     share = float(radians.detach()) / (math.pi / 2.0)
     piece = min(44, int(45.0 * max(0.0, share) ** (1.0 / 3.0)))
     above = radians - (math.pi / 2.0) * (piece / 45.0) ** 3
-    terms = _at_turbidity(coefficients().sun, turbidity)[piece]
+    terms = _at_turbidity(tables()[2], turbidity)[piece]
     limb = torch.tensor([2.0 / (power + 2.0) for power in range(6)])
     powers = torch.stack([above**power for power in range(4)])
     solid_angle = 2.0 * math.pi * (1.0 - math.cos(SUN_APERTURE))
@@ -130,8 +103,8 @@ class Sky:
             elevation: () of the sun, degrees, over 0.
             turbidity: () in `TURBIDITIES`.
         """
-        a, b, c, d, e, f, g, i, h = self._interpolated(coefficients().shape, elevation, turbidity).unbind(-1)
-        level = self._interpolated(coefficients().level, elevation, turbidity)
+        a, b, c, d, e, f, g, i, h = self._interpolated(tables()[0], elevation, turbidity).unbind(-1)
+        level = self._interpolated(tables()[1], elevation, turbidity)
         cosine = (self.directions @ sun)[..., None]
         angle = angle_between(self.directions, sun)[..., None]
         horizon = 1.0 + a * torch.exp(b / (self.cosines + 0.01))

@@ -1,0 +1,84 @@
+"""Scene inputs inside Mitsuba: the parameter path that each of our names means, and the type that it takes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from advsearch.scene.mitsuba_backend.variant import mitsuba
+
+Write = Callable[[Any], Any]
+"""From a Dr.Jit `TensorXf` (perhaps with gradients enabled) to the type that the Mitsuba parameter takes."""
+
+
+def as_is(value: Any) -> Any:
+    """Textures, grids: Mitsuba takes the tensor itself."""
+    return value
+
+
+def flat(value: Any) -> Any:
+    """Vertex buffers: Mitsuba takes a flat array."""
+    return value.array
+
+
+def number(value: Any) -> Any:
+    """A single number."""
+    return mitsuba().Float(value.array)
+
+
+def color(value: Any) -> Any:
+    """Three numbers: an RGB colour."""
+    return mitsuba().Color3f(*_entries(value, 3))
+
+
+def point(value: Any) -> Any:
+    """Three numbers: a place."""
+    return mitsuba().Point3f(*_entries(value, 3))
+
+
+def transform(value: Any) -> Any:
+    """A 4 x 4 matrix, row by row."""
+    mi, found = mitsuba(), _entries(value, 16)
+    return mi.Transform4f(mi.Matrix4f([found[4 * row : 4 * row + 4] for row in range(4)]))
+
+
+def _entries(value: Any, count: int) -> list[Any]:
+    mi = mitsuba()
+    import drjit as dr
+
+    return [dr.gather(mi.Float, value.array, mi.UInt32(entry)) for entry in range(count)]
+
+
+@dataclass(frozen=True)
+class SceneInput:
+    """One named input of a scene.
+
+    Attributes:
+        name: the input's name, e.g. "key.position".
+        key: Mitsuba's parameter path, or its beginning and end with one "*" between for an unknown middle.
+        write: converts the tensor.
+        interior: the interior adjoint (`prb`) differentiates it correctly.
+        shape: of the tensor; None takes it from Mitsuba's own value.
+    """
+
+    name: str
+    key: str
+    write: Write = as_is
+    interior: bool = False
+    shape: tuple[int, ...] | None = None
+
+
+def key_of(parameters: Any, pattern: str) -> str | None:
+    """Return the parameter that a pattern with at most one "*" means, or None if the scene has none such.
+
+    Raises:
+        RuntimeError: there are several.
+    """
+    before, star, after = pattern.partition("*")
+    found = [
+        key for key in parameters.keys() if (key.startswith(before) and key.endswith(after) if star else key == pattern)
+    ]
+    if len(found) > 1:
+        raise RuntimeError(f"expected one Mitsuba parameter {pattern}, found {found}")
+    return str(found[0]) if found else None

@@ -1,0 +1,118 @@
+"""What each part of a described scene is inside Mitsuba: its plugins, its inputs, and the integrator that it needs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, MutableMapping, Sequence
+from dataclasses import dataclass, field
+from functools import singledispatch
+from typing import Any
+
+from advsearch.scene.mitsuba_backend.inputs import SceneInput, color, flat, number, point, transform
+from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, mitsuba_mesh, principled
+from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.parts import BallLamp, HazePart, MeshPart, PointLamp, ScenePart
+
+BLACK = {"type": "rgb", "value": [0.0, 0.0, 0.0]}
+ABSENT = {"type": "uniform", "value": 0.0}
+IDLE_LOBES: Mapping[str, Any] = {name: ABSENT for name in ("clearcoat", "sheen")}
+"""Entries of the principled surface that give it lobes of strength 0."""
+
+
+@dataclass(frozen=True)
+class Translation:
+    """A part inside Mitsuba.
+
+    Attributes:
+        plugins: entries of the scene's dictionary (plugin dictionaries or objects) by name. A name that the scene has
+            already ("environment") is replaced.
+        inputs: what may be set; the base value of each is whatever `plugins` made.
+        integrator: entries that replace those of the path integrator's dictionary (another type, for a medium).
+    """
+
+    plugins: dict[str, Any]
+    inputs: tuple[SceneInput, ...] = ()
+    integrator: dict[str, Any] = field(default_factory=dict)
+
+
+@singledispatch
+def translation(part: ScenePart) -> Translation:
+    """Return what a part is inside Mitsuba. Further kinds of parts are registered: `@translation.register`."""
+    raise TypeError(f"part {part.name}: {type(part).__name__} has no translation for Mitsuba; register one")
+
+
+@translation.register
+def mesh_translation(part: MeshPart, lobes: Mapping[str, Any] | None = None) -> Translation:
+    """A mesh.
+
+    Args:
+        part: the mesh.
+        lobes: further entries of the principled plugin's dictionary, such as `IDLE_LOBES`.
+    """
+    name, count = part.name, len(part.mesh.vertices)
+    surface = principled(part.base_color, part.material, lobes)
+    inputs = (
+        SceneInput(f"{name}.vertices", f"{name}.{POSITIONS}", flat, shape=(count, 3)),
+        SceneInput(f"{name}.normals", f"{name}.{NORMALS}", flat, shape=(count, 3)),
+        SceneInput(f"{name}.base_color", f"{name}.*.base_color.data", interior=True),
+        SceneInput(f"{name}.roughness", f"{name}.*.roughness.value", number, True, (1,)),
+        SceneInput(f"{name}.metallic", f"{name}.*.metallic.value", number, True, (1,)),
+        SceneInput(f"{name}.specular", f"{name}.*.specular", number, True, (1,)),
+        SceneInput(f"{name}.clearcoat", f"{name}.*.clearcoat.value", number, True, (1,)),
+    )
+    return Translation({name: mitsuba_mesh(name, part.mesh, part.to_world, surface)}, inputs)
+
+
+@translation.register
+def _point(part: PointLamp) -> Translation:
+    name = part.name
+    inputs = (
+        SceneInput(f"{name}.position", f"{name}.position", point, shape=(3,)),
+        SceneInput(f"{name}.intensity", f"{name}.intensity.value", color, interior=True, shape=(3,)),
+    )
+    return Translation({name: {"type": "point", "position": [0.0, 0.0, 2.0], "intensity": BLACK}}, inputs)
+
+
+@translation.register
+def _ball(part: BallLamp) -> Translation:
+    name = part.name
+    ball = {
+        "type": "sphere",
+        "to_world": mitsuba().ScalarTransform4f().translate([0.0, 0.0, 2.0]).scale(0.1),
+        "bsdf": {"type": "null"},
+        "emitter": {"type": "area", "radiance": BLACK},
+    }
+    inputs = (
+        SceneInput(f"{name}.ball", f"{name}.to_world", transform, shape=(4, 4)),
+        SceneInput(f"{name}.radiance", f"{name}.emitter.radiance.value", color, interior=True, shape=(3,)),
+    )
+    return Translation({name: ball}, inputs)
+
+
+@translation.register
+def _haze(part: HazePart) -> Translation:
+    """Mitsuba's medium only holds density and albedo for the integrator: no shape refers to it."""
+    import advsearch.scene.mitsuba_backend.haze_path  # noqa: F401  (registers the integrator)
+
+    name, albedo = part.name, {"type": "rgb", "value": [1.0, 1.0, 1.0]}
+    medium = mitsuba().load_dict({"type": "homogeneous", "albedo": albedo, "sigma_t": 0.0})
+    inputs = (
+        SceneInput(f"{name}.density", f"{name}.sigma_t.value.value", number, True, (1,)),
+        SceneInput(f"{name}.albedo", f"{name}.albedo.value.value", color, True, (3,)),
+    )
+    return Translation({name: medium}, inputs, {"type": "advsearch_haze", "medium": medium, "radius": part.radius})
+
+
+def leave_dark_lamps_out(plugins: MutableMapping[str, Any], parts: Sequence[ScenePart]) -> None:
+    """Take no samples towards lamps that emit nothing.
+
+    A path that arrives at one by chance still counts, with all of the weight, so that nothing is biased should it be
+    lit after all.
+
+    Args:
+        plugins: Mitsuba's dictionary of the scene; changed.
+        parts: of the scene.
+    """
+    for part in parts:
+        if isinstance(part, (PointLamp, BallLamp)) and part.dark:
+            plugin = plugins[part.name]
+            plugin.get("emitter", plugin)["sampling_weight"] = 0.0
