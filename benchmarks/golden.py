@@ -82,7 +82,7 @@ def commands() -> dict[str, list[str]]:
         "minimise": ["attack", "--control", "pose", "--minimise", *few],
         "smallest": ["attack", "--control", texture, "--smallest", *few],
         "gap": ["gap", "--control", "pose,camera", "--samples", "4", *few],
-        "region": ["region", "--control", "pose", "--samples", "4", "--trials", "6"],
+        "region": ["region", "--control", "pose", "--samples", "4"],
     }
 
 
