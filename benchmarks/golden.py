@@ -81,7 +81,7 @@ def commands() -> dict[str, list[str]]:
         "target": ["attack", "--control", texture, "--target", "bowl", *few],
         "minimise": ["attack", "--control", "pose", "--minimise", *few],
         "smallest": ["attack", "--control", texture, "--smallest", *few],
-        "gap": ["gap", "--control", "pose,camera", "--samples", "4", *few],
+        "gap": ["gap", "--control", "pose,camera", "--average", "4", *few],
         "region": ["region", "--control", "pose", "--samples", "4"],
     }
 
@@ -89,7 +89,8 @@ def commands() -> dict[str, list[str]]:
 def answers(command: Sequence[str], folder: Path) -> dict[str, Any]:
     """Run one command in this process; returns its rows and the numbers of its answer."""
     run = folder / "run"
-    said = written([*command, *SMALL, "--run", str(run), "--json"])
+    shared = [word.replace("--spp", "--verify-spp") for word in SMALL] if command[0] == "region" else SMALL
+    said = written([*command, *shared, "--run", str(run), "--json"])
     found: dict[str, Any] = {"answer": timeless(json.loads(said)) if said.strip() else None}
     if command[0] in ("attack", "sweep"):
         found["rows"] = [timeless(row) for row in csv.DictReader(io.StringIO(written(["export", str(run)])))]
