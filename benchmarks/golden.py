@@ -82,7 +82,7 @@ def commands() -> dict[str, list[str]]:
         "minimise": ["attack", "--control", "pose", "--minimise", *few],
         "smallest": ["attack", "--control", texture, "--smallest", *few],
         "gap": ["gap", "--control", "pose,camera", "--average", "4", *few],
-        "region": ["region", "--control", "pose", "--samples", "4"],
+        "region": ["region", "--control", "pose", "--samples", "8"],
     }
 
 
