@@ -31,6 +31,7 @@ from advsearch.evaluation.precision.image import (  # noqa: E402
 )
 from advsearch.evaluation.precision.points import MeasuredSetting, Sample, point_of  # noqa: E402
 from advsearch.evaluation.precision.rounds import TimeBudget  # noqa: E402
+from advsearch.runs.results.precision import Recommended  # noqa: E402
 
 SCENES = ("bowl/kitchen", "bottle/noon", "ball/studio")
 CONTROL = "environment"
@@ -92,7 +93,7 @@ def one(scene: str, args: argparse.Namespace) -> bool:
     return kept
 
 
-def measured(config: PrecisionConfig, found: dict[str, Any]) -> tuple[float, bool]:
+def measured(config: PrecisionConfig, found: Recommended) -> tuple[float, bool]:
     """The error of a recommended setting with other seeds, and whether the new reference can tell it."""
     problem, _ = problem_from_config(config.as_attack())
     renderer, budget = problem.renderer, TimeBudget(config.seconds / 3.0)

@@ -21,7 +21,9 @@ from advsearch.config import CheckConfig
 from advsearch.engine.memory import Memory
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed
-from advsearch.runs.summary import read_summary
+from advsearch.runs.results.base import Result
+from advsearch.runs.results.check import CheckResult
+from advsearch.runs.summary import read_result
 
 FLAGS = "check --object mug --control camera.azimuth,environment.rotation --loss linear --resolution 16 --spp 1"
 SMALL: dict[str, Any] = {
@@ -35,19 +37,26 @@ SMALL: dict[str, Any] = {
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+def whole(tmp_path_factory: pytest.TempPathFactory) -> CheckResult:
     """The summary of a check that nobody disturbed."""
     run = tmp_path_factory.mktemp("whole") / "run"
     return check_from_config(CheckConfig(**SMALL, run=str(run)))
 
 
-def values(summary: dict[str, Any]) -> list[dict[str, Any]]:
+def values(result: Result) -> list[dict[str, Any]]:
     """The rows without their times."""
-    return [{name: value for name, value in row.items() if name != "seconds"} for row in summary["rows"]]
+    return [{name: value for name, value in row.items() if name != "seconds"} for row in result.to_dict()["rows"]]
+
+
+def kept(folder: Path) -> CheckResult:
+    """What a run keeps."""
+    result = read_result(folder)
+    assert isinstance(result, CheckResult)
+    return result
 
 
 def test_ctrl_c_leaves_rows_and_resume_ends_with_the_same(
-    tmp_path: Path, whole: dict[str, Any], capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, whole: CheckResult, capfd: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "run"
     words = [sys.executable, "-m", "advsearch", *FLAGS.split(), "--threads", "1", "--run", str(folder)]
@@ -60,17 +69,17 @@ def test_ctrl_c_leaves_rows_and_resume_ends_with_the_same(
     said, _ = child.communicate(timeout=120)
     assert child.returncode == 130
     assert "Stopped after 0 of 1 parts" in said and said.endswith(f"Go on with: advsearch resume {folder}\n")
-    stopped = read_summary(folder)
-    assert stopped["ending"] == "interrupted" and 1 <= len(stopped["rows"]) < len(whole["rows"])
-    assert values(stopped) == values(whole)[: len(stopped["rows"])]
+    stopped = kept(folder)
+    assert stopped.ending == "interrupted" and 1 <= len(stopped.rows) < len(whole.rows)
+    assert values(stopped) == values(whole)[: len(stopped.rows)]
     assert listed(tmp_path)[0].state == "stopped"
     main(["resume", str(folder), "--json"])
-    answer = json.loads(capfd.readouterr().out)
-    assert answer["ending"] == "done" and values(answer) == values(whole)
-    assert finished(folder) and read_summary(folder)["rows"] == answer["rows"]
+    answer = CheckResult.of(json.loads(capfd.readouterr().out))
+    assert answer.ending == "done" and values(answer) == values(whole)
+    assert finished(folder) and kept(folder).to_dict() == answer.to_dict()
 
 
-def test_a_kill_leaves_the_rows_that_were_told(tmp_path: Path, whole: dict[str, Any]) -> None:
+def test_a_kill_leaves_the_rows_that_were_told(tmp_path: Path, whole: CheckResult) -> None:
     folder = tmp_path / "run"
     words = [sys.executable, "-m", "advsearch", *FLAGS.split(), "--threads", "1", "--run", str(folder)]
     child = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
@@ -80,26 +89,26 @@ def test_a_kill_leaves_the_rows_that_were_told(tmp_path: Path, whole: dict[str, 
             child.kill()
             break
     child.communicate(timeout=120)
-    killed = read_summary(folder)
-    assert killed["ending"] == "interrupted" and (killed["measured"], killed["planned"]) == (0, 1)
-    assert 1 <= len(killed["rows"]) < len(whole["rows"]) and values(killed) == values(whole)[: len(killed["rows"])]
+    killed = kept(folder)
+    assert killed.ending == "interrupted" and (killed.measured, killed.planned) == (0, 1)
+    assert 1 <= len(killed.rows) < len(whole.rows) and values(killed) == values(whole)[: len(killed.rows)]
 
 
 def test_a_summary_never_forgets_what_an_earlier_one_had(
-    tmp_path: Path, whole: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, whole: CheckResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    both = [checking.Part(number, CheckConfig(**SMALL), "linear") for number in (1, 2)]
+    both = [checking.CheckedPart(number, CheckConfig(**SMALL), "linear") for number in (1, 2)]
     told: list[int] = []
     monkeypatch.setattr(checking, "_parts", lambda *_: both)
-    monkeypatch.setattr(checking, "_linear", lambda *_: iter(whole["rows"]))
+    monkeypatch.setattr(checking, "_linear", lambda *_: iter(whole.rows))
     write = RunDirectory.write_summary
 
-    def written(run: RunDirectory, answer: dict[str, Any]) -> Path:
-        told.append(len(answer["rows"]))
+    def written(run: RunDirectory, answer: CheckResult) -> Path:
+        told.append(len(answer.rows))
         return write(run, answer)
 
     monkeypatch.setattr(RunDirectory, "write_summary", written)
-    config, count = CheckConfig(**SMALL, run=str(tmp_path / "run")), len(whole["rows"])
+    config, count = CheckConfig(**SMALL, run=str(tmp_path / "run")), len(whole.rows)
     check_from_config(config)
     assert told == [*range(1, 2 * count + 1), 2 * count]
     told.clear()
@@ -108,12 +117,12 @@ def test_a_summary_never_forgets_what_an_earlier_one_had(
 
 
 def test_seconds_end_a_check_and_resume_goes_on_for_as_long_again(
-    tmp_path: Path, whole: dict[str, Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, whole: CheckResult, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "run"
     config = CheckConfig(**SMALL, seconds=0.001, run=str(folder))
     summary = check_from_config(config)
-    assert summary["ending"] == "out of time" and not finished(folder)
+    assert summary.ending == "out of time" and not finished(folder)
     monkeypatch.setattr(checking, "Results", lambda memory, seconds=None: Results(memory))  # a sitting that is longer
     assert values(check_from_config(config, resumed=folder)) == values(whole) and finished(folder)
     assert main(["show", str(folder)]) == 0
@@ -133,11 +142,11 @@ def test_what_is_stored_is_not_measured_again(tmp_path: Path) -> None:
             late.get("c", lambda: 1)
 
 
-def test_a_finished_part_is_not_even_loaded(whole: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_finished_part_is_not_even_loaded(whole: CheckResult, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checking, "problem_from_config", lambda *_, **__: pytest.fail("loaded"))
     begun = time.perf_counter()
-    again = check_from_config(CheckConfig(**SMALL, run=whole["run"]), resumed=Path(whole["run"]))
-    assert again["rows"] == whole["rows"] and time.perf_counter() - begun < 20.0
+    again = check_from_config(CheckConfig(**SMALL, run=whole.run), resumed=Path(str(whole.run)))
+    assert values(again) == values(whole) and time.perf_counter() - begun < 20.0
 
 
 def test_all_goes_through_every_control_on_three_scenes() -> None:

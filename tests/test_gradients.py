@@ -13,7 +13,7 @@ from torch import Tensor
 
 from advsearch import load_scene
 from advsearch.api.attack import problem_from_config
-from advsearch.api.check import WHOLE, attempts, check
+from advsearch.api.check import attempts, check
 from advsearch.cli.check import table
 from advsearch.config import AttackConfig
 from advsearch.controls import make_control
@@ -31,6 +31,7 @@ from advsearch.engine.gradients import (
 )
 from advsearch.engine.planning import TELLS, Cosine, contested, cosines, measured_plan, tuned
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.runs.results.check import WHOLE, DerivativeRow, DirectionRow
 from advsearch.scene.gradients.plan import ESTIMATORS, SEARCH_STEP, GroupPlan, first_plan
 from advsearch.scene.renderer import Renderer
 
@@ -604,18 +605,24 @@ def test_the_smooth_loss_does_not_see_the_edge_of_the_picture() -> None:
 def test_a_check_says_of_both_losses_how_good_a_gradient_is() -> None:
     config = AttackConfig(object="mug", controls={"background": {}}, resolution=(24, 24), spp=4)
     rows = check(config)
-    linear = [row for row in rows if row["loss"] == "linear"]
-    assert {row["parameter"] for row in linear} >= {"hue", "saturation", "value"}
+    linear = [row for row in rows if row.loss == "linear"]
+    assert {row.parameter for row in linear} >= {"hue", "saturation", "value"}
     for row in linear:
-        assert row["status"] == "ok", row
-        assert row["noise"] <= 0.2 and row["spp"] == 4
-    whole = [row for row in rows if row["loss"] == "model" and row["parameter"] == WHOLE]
-    assert {row["control"] for row in whole} == {"background"} and whole[0]["estimator"] in ESTIMATORS
-    assert (whole[-1]["status"] == "ok") == (whole[-1]["cosine"] >= 0.9 and whole[-1]["converged"] >= TELLS)
-    single = {row["parameter"]: row for row in rows if row["loss"] == "model" and row["parameter"] != WHOLE}
-    assert set(single) == {row["parameter"] for row in linear}
+        assert row.status == "ok", row
+        assert isinstance(row, DerivativeRow) and row.noise <= 0.2 and row.spp == 4
+    whole = [row for row in rows if row.loss == "model" and row.parameter == WHOLE]
+    assert {row.control for row in whole} == {"background"} and whole[0].estimator in ESTIMATORS
+    assert isinstance(last := whole[-1], DirectionRow)
+    assert (last.status == "ok") == (last.cosine >= 0.9 and last.converged >= TELLS)
+    single = {row.parameter: row for row in rows if row.loss == "model" and row.parameter != WHOLE}
+    assert set(single) == {row.parameter for row in linear}
     for row in single.values():
-        assert row["reference_noise"] >= 0.0 and row["noise"] >= 0.0 and math.isfinite(row["gradient"])
-        assert row["status"] in ("ok", "noisy", "biased", "reference unusable")
+        assert (
+            isinstance(row, DerivativeRow)
+            and row.reference_noise >= 0.0
+            and row.noise >= 0.0
+            and math.isfinite(row.gradient)
+        )
+        assert row.status in ("ok", "noisy", "biased", "reference unusable")
     text = table(rows)
     assert "smooth linear loss" in text and "each parameter" in text and "cosine with the converged" in text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,8 @@ from advsearch.files import Json
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory, default_name
 from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME
-from advsearch.runs.summary import NAME, read_summary
+from advsearch.runs.results.check import WHOLE, CheckedRow, CheckedRows, CheckResult, DerivativeRow, DirectionRow
+from advsearch.runs.summary import NAME, read_result
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
 from advsearch.scene.gradients.plan import STEP_RANGE, GroupPlan
 
@@ -61,8 +62,6 @@ REFERENCE_SPP, SEEDS = 64, (6, 16)
 """Samples a pixel of a reference render, and how many seeds it gets: until its noise is small."""
 FEW_SEEDS = (3, 6)
 """Seeds of a reference of the model's loss, whose renders have more samples."""
-WHOLE = "*"
-"""What stands for the parameter in rows about a whole control."""
 REPEATS, AGAIN = 6, 8
 """Gradients of one estimator, from which its mean and its noise come; and of one with a wider step."""
 IN_SAMPLES = "counted in samples a pixel; `resolution` or fewer controls shorten it, `seconds` ends it"
@@ -72,7 +71,7 @@ IN_PARAMETERS = "one for each parameter; `resolution` or fewer controls shorten 
 
 def check(
     config: AttackConfig, *, losses: Sequence[str] = LOSSES, everything: bool = False, progress: Progress | None = None
-) -> list[dict[str, Any]]:
+) -> list[CheckedRow]:
     """Compare the gradient of every parameter with differences, on the actual scene.
 
     Args:
@@ -94,15 +93,11 @@ def check(
 
 def check_from_config(
     config: CheckConfig, *, progress: Progress | None = None, resumed: Path | None = None
-) -> dict[str, Any]:
+) -> CheckResult:
     """Do what a configuration describes, or go on with it, and keep it in a run directory; see `check`.
 
     What is measured is stored at once, so that a check that was stopped, by Ctrl-C, by a kill or because its `seconds`
     were over, goes on where it was and ends with the same rows; only times differ.
-
-    Returns:
-        What `summary.json` holds: `rows` so far; `ending`, "done", "interrupted" or "out of time"; of how many `parts`
-        (a scene with a control and a loss) how many are `measured`.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
@@ -113,39 +108,37 @@ def check_from_config(
     opened = RunDirectory.resume(resumed, config) if resumed is not None else _new_run(config)
     with opened as run:
         results, measured, ending = Results(Memory(run), config.seconds), 0, INTERRUPTED
-        rows: list[dict[str, Any]] = []
+        rows: list[CheckedRow] = []
         told = _told(run)
 
-        def summary() -> dict[str, Any]:
-            return {
-                "schema": 1,
-                "command": "check",
-                "run": str(run.path),
-                "object": ",".join(dict.fromkeys(part.config.object for part in parts)),
-                "environment": ",".join(dict.fromkeys(part.config.lit_by for part in parts)),
-                "controls": list(dict.fromkeys(name for part in parts for name in part.config.controls)),
-                "ending": ending,
-                "measured": measured,
-                "planned": len(parts),
-                "rows": rows,
-                "seconds": {"total": time.perf_counter() - begun},
-                "seed": config.seed,
-                "command_line": config.command_line(),
-            }
+        def result() -> CheckResult:
+            return CheckResult(
+                run=str(run.path),
+                object=",".join(dict.fromkeys(part.config.object for part in parts)),
+                environment=",".join(dict.fromkeys(part.config.lit_by for part in parts)),
+                controls=list(dict.fromkeys(name for part in parts for name in part.config.controls)),
+                ending=ending,
+                measured=measured,
+                planned=len(parts),
+                rows=rows,
+                seconds={"total": time.perf_counter() - begun},
+                seed=config.seed,
+                command_line=config.command_line(),
+            )
 
         try:
             for part in parts:
                 for row in _rows_of(part, len(parts), results, progress):
                     rows.append(row)
                     if len(rows) > told:
-                        run.write_summary(summary())  # what a kill leaves
+                        run.write_summary(result())  # what a kill leaves
                 measured += 1
             ending = "done"
         except KeyboardInterrupt:
             pass
         except OutOfTime:
             ending = OUT_OF_TIME
-        answer = summary()
+        answer = result()
         run.write_summary(answer)
         return answer
 
@@ -154,8 +147,8 @@ def _told(run: RunDirectory) -> int:
     """How many rows the summary has that an earlier sitting left."""
     if not (run.path / NAME).is_file():
         return 0
-    rows = read_summary(run.path).get("rows")
-    return len(rows) if isinstance(rows, list) else 0
+    earlier = read_result(run.path)
+    return len(earlier.rows) if isinstance(earlier, CheckResult) else 0
 
 
 # ---- what is measured, and what was ---------------------------------------------------------------------------------
@@ -203,7 +196,7 @@ class Results:
 
 
 @dataclass(frozen=True)
-class Part:
+class CheckedPart:
     """One scene with its controls and one loss: what is checked in one go.
 
     Attributes:
@@ -233,9 +226,9 @@ def _new_run(config: CheckConfig) -> RunDirectory:
     return run
 
 
-def _parts(config: AttackConfig, losses: Sequence[str], everything: bool) -> list[Part]:
+def _parts(config: AttackConfig, losses: Sequence[str], everything: bool) -> list[CheckedPart]:
     asked = [(one, loss) for one in _configurations(config, everything) for loss in losses]
-    return [Part(number, one, loss) for number, (one, loss) in enumerate(asked, start=1)]
+    return [CheckedPart(number, one, loss) for number, (one, loss) in enumerate(asked, start=1)]
 
 
 def _configurations(config: AttackConfig, everything: bool) -> Iterator[AttackConfig]:
@@ -248,7 +241,7 @@ def _configurations(config: AttackConfig, everything: bool) -> Iterator[AttackCo
                 continue  # a bottle is closed
             if control == "sky" and environment != DEFAULT_ENVIRONMENT:
                 continue  # a sky takes the place of the environment
-            update: dict[str, Any] = {
+            update: Json = {
                 "object": object,
                 "environment": None if environment == DEFAULT_ENVIRONMENT else environment,
                 "controls": {control: {}},
@@ -258,11 +251,11 @@ def _configurations(config: AttackConfig, everything: bool) -> Iterator[AttackCo
             yield config.model_copy(update=update)
 
 
-def _rows_of(part: Part, parts: int, results: Results, progress: Progress) -> Iterator[dict[str, Any]]:
+def _rows_of(part: CheckedPart, parts: int, results: Results, progress: Progress) -> Iterator[CheckedRow]:
     """The rows of a part, as they come; of one that was measured before, without loading anything."""
     stored = results.stored(part.key)
     if stored is not None:
-        yield from stored
+        yield from CheckedRows.of({"rows": stored}).rows
         return
     config = part.config
     what = f"{config.object} in {config.lit_by}, {' and '.join(config.controls)}"
@@ -270,21 +263,19 @@ def _rows_of(part: Part, parts: int, results: Results, progress: Progress) -> It
     progress.stage(f"loading {title}")
     rows = []
     for row in (_linear if part.loss == "linear" else _model)(part, title, results, progress):
-        row = json.loads(json.dumps(row))
-        rows.append(row)
+        rows.append(row.to_dict())
         yield row
         progress.message(_line(row))  # whoever reads it can stop the check and find the row kept
     results.put(part.key, rows)
 
 
-def _line(row: Mapping[str, Any]) -> str:
+def _line(row: CheckedRow) -> str:
     """A row in a line, for whoever waits."""
-    name = row["control"] if row["parameter"] == WHOLE else f"{row['control']}.{row['parameter']}"
-    how = f"cosine {row['cosine']:.2f}" if "cosine" in row else f"{row['gradient']:.3g}"
-    return f"{row['object']}, {name} by {row['estimator']}: {how}, {row['status']}"
+    how = f"cosine {row.cosine:.2f}" if isinstance(row, DirectionRow) else f"{row.gradient:.3g}"
+    return f"{row.object}, {row.name} by {row.estimator}: {how}, {row.status}"
 
 
-def _linear(part: Part, title: str, results: Results, progress: Progress) -> Iterator[dict[str, Any]]:
+def _linear(part: CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[DerivativeRow]:
     config = part.config
     problem, _ = problem_from_config(config, denoise="none")
     problem.renderer.formation = replace(problem.renderer.formation, transfer="linear")
@@ -305,7 +296,7 @@ def _linear(part: Part, title: str, results: Results, progress: Progress) -> Ite
     )
 
 
-def _model(part: Part, title: str, results: Results, progress: Progress) -> Iterator[dict[str, Any]]:
+def _model(part: CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[CheckedRow]:
     config = part.config
     problem, _ = problem_from_config(config)
     renderer, u = problem.renderer, inside(problem.renderer)
@@ -316,7 +307,7 @@ def _model(part: Part, title: str, results: Results, progress: Progress) -> Iter
         seed, tick = seeds.stream(config.seed, "measure"), lambda: progress.advance(1)
         return measured_plan(renderer, problem.loss, u, seed=seed, spp=problem.spp, counted=True, tick=tick).to_dict()
 
-    def compared() -> list[dict[str, Any]]:
+    def compared() -> list[Json]:
         most = cosine_samples(renderer.plan, counts=counts)
         progress.stage(f"{title}: the model's gradients", most, hint=IN_SAMPLES, at_most=True)
         table = cosines(renderer, problem.loss, u, seed=config.seed, counts=counts, tick=progress.advance)
@@ -328,8 +319,8 @@ def _model(part: Part, title: str, results: Results, progress: Progress) -> Iter
     renderer.plan, spp = tuned(renderer.plan, table)
     for row in table:
         taken = [group.estimator for group in renderer.plan.groups if group.control == row.control]
-        names = {"parameter": WHOLE, "estimator": ", ".join(dict.fromkeys(taken))}
-        yield {**_place(part), **vars(row), **names, "status": row.status}
+        names = ", ".join(dict.fromkeys(taken))
+        yield DirectionRow(**_place(part), **vars(row), parameter=WHOLE, estimator=names, status=row.status)
     wider = {group.name: group.step / steps[group.name] for group in renderer.plan.groups if steps[group.name]}
     for one in _rows(
         problem,
@@ -344,14 +335,14 @@ def _model(part: Part, title: str, results: Results, progress: Progress) -> Iter
         repeats=FEW_SEEDS,
         factors=(1.0,),
     ):
-        group = f"{one['control']}.{one['parameter'].partition('.')[0]}"  # coordinates of one have a number behind it
-        one["factor"] = one["reference_factor"] = wider.get(group, 1.0)
-        yield one
+        group = f"{one.control}.{one.parameter.partition('.')[0]}"  # coordinates of one have a number behind it
+        factor = wider.get(group, 1.0)
+        yield one.model_copy(update={"factor": factor, "reference_factor": factor})
 
 
 def _rows(
     problem: Problem,
-    part: Part,
+    part: CheckedPart,
     title: str,
     loss: Loss,
     spp: int,
@@ -362,7 +353,7 @@ def _rows(
     high: int,
     repeats: tuple[int, int],
     factors: Sequence[float],
-) -> Iterator[dict[str, Any]]:
+) -> Iterator[DerivativeRow]:
     """Rows of single parameters, with references of `high` samples, so many seeds, and steps so many times as wide."""
     renderer, seed = problem.renderer, seeds.stream(part.config.seed, "check")
     u = inside(renderer)
@@ -374,7 +365,7 @@ def _rows(
         references: dict[str, Reference] = {}
         for probe in mine:
 
-            def referred(probe: Probe = probe) -> dict[str, Any]:
+            def referred(probe: Probe = probe) -> Json:
                 # what acts on the picture clips: its mean depends on the noise, so both get the same
                 many = spp if probe.group.estimator == "image" else max(spp, high)
                 return vars(reference(renderer, loss, u, probe, seed=seed, spp=many, repeats=repeats, factors=factors))
@@ -394,7 +385,7 @@ def _rows(
 
                 def estimated(
                     wanted: Sequence[Probe] = wanted, estimator: str = estimator, factor: float = factor
-                ) -> list[dict[str, Any]]:
+                ) -> list[Json]:
                     many = REPEATS if factor == 1.0 else AGAIN  # another try has to be surer
                     found = estimates(
                         renderer, loss, u, estimator, wanted, seed=seed, spp=spp, repeats=many, factor=factor
@@ -404,13 +395,14 @@ def _rows(
                 stored = results.get(_key(part, f"{estimator} x {factor:g}", wanted), estimated)
                 for probe, one in zip(wanted, stored, strict=True):
                     against = references[probe.name]
-                    row = _row(probe, Estimate(**one), against, scale_of(against, list(references.values())))
-                    good |= {probe.name} if row["status"] == "ok" else set()
-                    yield {**_place(part), **row, "spp": spp}
+                    size = scale_of(against, list(references.values()))
+                    row = _row(part, spp, probe, Estimate(**one), against, size)
+                    good |= {probe.name} if row.status == "ok" else set()
+                    yield row
                 progress.advance(1)
 
 
-def _key(part: Part, what: str, along: Sequence[Probe]) -> str:
+def _key(part: CheckedPart, what: str, along: Sequence[Probe]) -> str:
     """Under which a measurement is stored."""
     return f"{part.key} {what} {','.join(probe.name for probe in along)}"
 
@@ -435,23 +427,27 @@ def attempts(group: GroupPlan) -> list[tuple[str, float]]:
     return found
 
 
-def _row(probe: Probe, estimate: Estimate, against: Reference, size: float) -> dict[str, Any]:
+def _row(
+    part: CheckedPart, spp: int, probe: Probe, estimate: Estimate, against: Reference, size: float
+) -> DerivativeRow:
     status, error = verdict(estimate, against, size)
-    return {
-        "control": probe.group.control,
-        "parameter": probe.name.partition(".")[2],
-        "estimator": estimate.estimator,
-        "factor": estimate.factor,
-        "gradient": estimate.value,
-        "reference": against.value,
-        "reference_steps": list(against.steps),
-        "reference_factor": against.factor,
-        "reference_noise": against.noise,
-        "relative_error": error,
-        "noise": estimate.noise / size if size else float("inf"),
-        "seconds": estimate.seconds,
-        "status": status,
-    }
+    return DerivativeRow(
+        **_place(part),
+        control=probe.group.control,
+        parameter=probe.name.partition(".")[2],
+        estimator=estimate.estimator,
+        factor=estimate.factor,
+        spp=spp,
+        gradient=estimate.value,
+        reference=against.value,
+        reference_steps=against.steps,
+        reference_factor=against.factor,
+        reference_noise=against.noise,
+        relative_error=error,
+        noise=estimate.noise / size if size else math.inf,
+        seconds=estimate.seconds,
+        status=status,
+    )
 
 
 def _sets(found: Sequence[Probe]) -> list[list[Probe]]:
@@ -462,5 +458,5 @@ def _sets(found: Sequence[Probe]) -> list[list[Probe]]:
     return list(sets.values())
 
 
-def _place(part: Part) -> dict[str, Any]:
+def _place(part: CheckedPart) -> Json:
     return {"object": part.config.object, "environment": part.config.lit_by, "loss": part.loss}

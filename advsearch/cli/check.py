@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from advsearch.config import CheckConfig
+    from advsearch.runs.results.check import CheckedRow, CheckResult, DerivativeRow
 
 HELP = "check the gradient of every parameter of a scene against differences"
 GROUPS = ("scene", "model")
@@ -91,81 +92,83 @@ def carry_out(config: CheckConfig, *, as_json: bool, quiet: bool, resumed: Path 
     with at_work(as_json=as_json, quiet=quiet) as progress:
         from advsearch.api.check import check_from_config
 
-        summary = check_from_config(config, progress=progress, resumed=resumed)
-    status = output.finish(summary, answer, as_json=as_json)
-    return status or (FELL_SHORT if fell_short(summary["rows"]) else 0)
+        result = check_from_config(config, progress=progress, resumed=resumed)
+    status = output.finish(result, answer, as_json=as_json)
+    return status or (FELL_SHORT if fell_short(result.rows) else 0)
 
 
-def fell_short(rows: Sequence[Mapping[str, Any]]) -> bool:
+def fell_short(rows: Sequence[CheckedRow]) -> bool:
     """Whether a parameter has no good gradient by any estimator."""
-    return any(row["status"] in ("biased", "noisy") for row in _best(rows))
+    return any(row.short for row in _best(rows))
 
 
-def answer(summary: Mapping[str, Any]) -> str:
+def answer(result: CheckResult) -> str:
     """Return what the table shows and how to read it, the table, and where the run is."""
     from advsearch.runs.results.base import OUT_OF_TIME
 
-    rows, left = summary["rows"], summary["planned"] - summary["measured"]
+    rows, left = result.rows, result.planned - result.measured
     parts = [READING, table(rows)] if rows else []
     if left:
-        why = "The time was up" if summary["ending"] == OUT_OF_TIME else "Stopped"
-        done = f"{summary['measured']} of {summary['planned']}"
+        why = "The time was up" if result.ending == OUT_OF_TIME else "Stopped"
+        done = f"{result.measured} of {result.planned}"
         parts.append(f"{why} after {done} parts (a scene, its controls and a loss).")
     short = _short(rows)
     if short:
         parts.append(f"No estimator is good enough for {', '.join(short)}.")
     elif rows:
         parts.append("Every parameter so far has a good gradient." if left else "Every parameter has a good gradient.")
-    time = wording.seconds_text(summary["seconds"]["total"])
-    return "\n\n".join([*parts, output.columns([["time", time], ["run", str(summary["run"])]])])
+    time = wording.seconds_text(result.seconds["total"])
+    return "\n\n".join([*parts, output.columns([["time", time], ["run", str(result.run)]])])
 
 
-def _short(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def _short(rows: Sequence[CheckedRow]) -> list[str]:
     """Names of what no estimator is good enough for, each once."""
-    short = [row for row in _best(rows) if row["status"] in ("biased", "noisy")]
-    names = [row["control"] if "cosine" in row else f"{row['control']}.{row['parameter']}" for row in short]
-    return list(dict.fromkeys(f"{name} ({row['status']})" for name, row in zip(names, short, strict=True)))
+    return list(dict.fromkeys(f"{row.name} ({row.status})" for row in _best(rows) if row.short))
 
 
-def _best(rows: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+def _best(rows: Sequence[CheckedRow]) -> list[CheckedRow]:
     """For each parameter and loss the row with the best status: an estimator that no plan would take may fall short.
 
     Of the model's loss the rows of whole controls count: what matters is where their gradient points.
     """
-    rows = [row for row in rows if row["loss"] == "linear" or "cosine" in row]
+    from advsearch.runs.results.check import DirectionRow
+
+    rows = [row for row in rows if row.loss == "linear" or isinstance(row, DirectionRow)]
     order = ("ok", "reference unusable", "noisy", "biased")
-    best: dict[tuple[str, ...], Mapping[str, Any]] = {}
+    best: dict[tuple[str, ...], CheckedRow] = {}
     for row in rows:
-        key = tuple(str(row[name]) for name in ("object", "environment", "loss", "control", "parameter"))
-        if key not in best or order.index(row["status"]) < order.index(best[key]["status"]):
+        key = row.object, row.environment, row.loss, row.control, row.parameter
+        if key not in best or order.index(row.status) < order.index(best[key].status):
             best[key] = row
     return list(best.values())
 
 
-def table(rows: Sequence[Mapping[str, Any]]) -> str:
+def table(rows: Sequence[CheckedRow]) -> str:
     """Return the rows as text: one table for each loss."""
+    from advsearch.runs.results.check import DerivativeRow, DirectionRow
+
     parts = []
     for loss, title in (
         ("linear", "smooth linear loss of the raw picture"),
         ("model", "the model's loss, each parameter in the setting that is taken"),
     ):
-        single = [row for row in rows if row["loss"] == loss and "cosine" not in row]
+        single = [row for row in rows if row.loss == loss and isinstance(row, DerivativeRow)]
         if single:
             parts.append(f"{title}:\n" + output.columns([SINGLE, *map(_single, single)]))
-    cosine = [row for row in rows if "cosine" in row]
+    cosine = [row for row in rows if isinstance(row, DirectionRow)]
     if cosine:
         heads = ["object", "control", "estimator", "step", "samples", "cosine", "converged", "seconds", "status"]
         body = [
             [
-                row["object"],
-                row["control"],
-                row["estimator"],
-                f"x {row['factor']:.3g}",
-                str(row["spp"]),
-                f"{row['cosine']:.3f}",
-                f"{row['converged']:.3f}",
-                f"{row['seconds']:.2f}",
-                row["status"],
+                row.object,
+                row.control,
+                row.estimator,
+                f"x {row.factor:.3g}",
+                str(row.spp),
+                f"{row.cosine:.3f}",
+                f"{row.converged:.3f}",
+                f"{row.seconds:.2f}",
+                row.status,
             ]
             for row in cosine
         ]
@@ -173,16 +176,16 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
     return "\n\n".join(parts)
 
 
-def _single(row: Mapping[str, Any]) -> list[str]:
+def _single(row: DerivativeRow) -> list[str]:
     return [
-        row["object"],
-        f"{row['control']}.{row['parameter']}",
-        row["estimator"],
-        f"x {row['factor']:.2g}",
-        f"{row['gradient']:.3g}",
-        f"{row['reference']:.3g} +- {row['reference_noise']:.1g}",
-        f"{100 * row['relative_error']:.1f} %",
-        f"{100 * row['noise']:.0f} %",
-        f"{row['seconds']:.2f}",
-        row["status"],
+        row.object,
+        row.name,
+        row.estimator,
+        f"x {row.factor:.2g}",
+        f"{row.gradient:.3g}",
+        f"{row.reference:.3g} +- {row.reference_noise:.1g}",
+        f"{100 * row.relative_error:.1f} %",
+        f"{100 * row.noise:.0f} %",
+        f"{row.seconds:.2f}",
+        row.status,
     ]

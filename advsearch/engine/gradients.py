@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
+from advsearch.runs.results.check import GradientStatus
 from advsearch.scene.gradients.plan import STEP_RANGE, GradientPlan, GroupPlan
 from advsearch.scene.renderer import Renderer
 
@@ -335,7 +336,7 @@ def scale_of(against: Reference, beside: Sequence[Reference]) -> float:
     return max(abs(against.value), SMALL * max(abs(one.value) for one in beside))
 
 
-def verdict(estimate: Estimate, against: Reference, size: float) -> tuple[str, float]:
+def verdict(estimate: Estimate, against: Reference, size: float) -> tuple[GradientStatus, float]:
     """Return the status of an estimate, and its error relative to `size` (see `scale_of`).
 
     - "reference unusable": the reference's own noise exceeds a fifth of the size, and covers the difference;

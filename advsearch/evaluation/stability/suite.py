@@ -21,7 +21,7 @@ from advsearch.evaluation.stability import (
 )
 from advsearch.evaluation.stability.case import FELL_SHORT, GROUPS, OK, Case, Check, Outcome
 from advsearch.progress import NullProgress, Progress
-from advsearch.runs.results.stability import CaseRow, CheckRow
+from advsearch.runs.results.stability import CaseRow, DecidingNumber
 
 CASES: tuple[Case, ...] = (
     *cases_radiometric.CASES,
@@ -74,7 +74,7 @@ def run_case(case: Case) -> CaseRow:
         status=outcome.status,
         decides=outcome.decides,
         holds=case.holds,
-        checks=[CheckRow.of(one) for one in outcome.checks],
+        checks=[DecidingNumber.of(one) for one in outcome.checks],
         measured=dict(outcome.measured),
         seconds=time.perf_counter() - begun,
     )

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from advsearch.runs.results.base import Result
+from advsearch.runs.results.check import CheckResult
 from advsearch.runs.results.precision import PrecisionResult
 from advsearch.runs.results.region import RegionResult
 
-KEPT: dict[str, type[Result]] = {one.command: one for one in (PrecisionResult, RegionResult)}
+KEPT: dict[str, type[Result]] = {one.command: one for one in (CheckResult, PrecisionResult, RegionResult)}
 """The results that a run keeps in `summary.json`, by command."""

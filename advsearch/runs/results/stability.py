@@ -9,7 +9,7 @@ from pydantic import Field
 from advsearch.runs.results.base import Fields, Number, Result
 
 
-class CheckRow(Fields):
+class DecidingNumber(Fields):
     """One number that decides, and the range that it has to be in."""
 
     what: str
@@ -32,7 +32,7 @@ class CaseRow(Fields):
     status: str = Field(description="`ok` or `fell short`")
     decides: str = Field(description="the number that decides")
     holds: str = Field(description="what must hold")
-    checks: list[CheckRow]
+    checks: list[DecidingNumber]
     measured: dict[str, Number]
     seconds: float
 
