@@ -161,13 +161,13 @@ def scene_parameters(record: Record) -> str:
     """Every parameter that `--set` fixes."""
     rows = [
         [
-            f"`{one.name}`",
+            f"`{name}`",
             one.unit if one.unit != "1" else "",
             f"{one.low:g} to {one.high:g}",
-            "worked out" if one.default is None else f"{one.default:g}",
+            one.default if isinstance(one.default, str) else f"{one.default:g}",
             one.description,
         ]
-        for one in SETTINGS.values()
+        for name, one in SETTINGS.items()
     ]
     return table(["parameter", "unit", "range", "default", "what"], rows)
 
@@ -208,7 +208,7 @@ def _searched(parameter: Any) -> str:
 
 def _remarks(parameter: Any) -> str:
     """Estimators, and what the plan has to know."""
-    said = [", ".join(parameter.estimators) if parameter.differentiable and parameter.estimators else "none"]
+    said = ["none" if parameter.options else ", ".join(parameter.estimators)]
     said += ["periodic"] if parameter.periodic else []
     return "; ".join(said + (["moves outlines"] if parameter.moves_silhouettes else []))
 

@@ -18,7 +18,7 @@ from advsearch.scene.assets import EnvironmentAsset, Material
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.exposure import METERED_WHITE, WHITE, irradiance, metered_gain, visible_irradiance, visible_normals
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.settings import SETTINGS
+from advsearch.scene.settings import resolve
 
 GREY = 0.214
 """Reflectance of display-referred 0.5."""
@@ -104,7 +104,7 @@ def test_a_setting_a_fixed_value_and_a_point_of_a_grid_are_one_picture(
 ) -> None:
     kind, _, name = parameter.partition(".")
     searched: dict[str, dict[str, object]] = {"corruption": {"severity": [0.0, 1.0]}}
-    grid = {kind: {name: {"choices": [SETTINGS[parameter].default or 0.1, value]}}}
+    grid = {kind: {name: {"choices": [resolve({})[parameter] or 0.1, value]}}}
     renders = [
         load_scene("hammer", settings={parameter: value}).renderer(searched, resolution=size),
         load_scene("hammer").renderer({kind: {name: value}, **searched}, resolution=size),

@@ -121,7 +121,7 @@ def _short(declared: Mapping[str, Any]) -> dict[str, Any]:
         return dict(declared)
     one = declared
     count = " x ".join("any" if side is None else str(side) for side in one["shape"])
-    ways = ", ".join(one["estimators"]) if one["differentiable"] and one["estimators"] else "none"
+    ways = "none" if one["options"] else ", ".join(one["estimators"])
     return {
         "name": one["name"],
         "unit": one["unit"] + (f" ({count})" if count else ""),

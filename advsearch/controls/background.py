@@ -46,7 +46,6 @@ class BackgroundControl(NumberControl):
             len(WHAT) - 1,
             "colour",
             "What is behind the object: the colour, or the environment as ever.",
-            differentiable=False,
             options=WHAT,
             estimators=(),
         ),

@@ -23,26 +23,14 @@ from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.framing import framing_distance, middle
 from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.settings import CAMERA, ORBIT, moving
 
-ORBIT = ("secant", "differences", "forward", "simultaneous")
-"""Mitsuba has no derivative of sensors, so a camera is differentiated by differences."""
 SENSOR_WIDTH = 36.0
 """Width in millimetres of the full-frame sensor that a focal length refers to."""
 
 
-def _moving(
-    name: str,
-    unit: str,
-    low: float,
-    high: float,
-    default: float | str,
-    text: str,
-    search: tuple[float, float] | None = None,
-    periodic: bool = False,
-    log: bool = False,
-    moves: bool = True,
-) -> Parameter:
-    return Parameter(name, (), unit, low, high, default, text, periodic, True, moves, search, log, estimators=ORBIT)
+def _lens(name: str, low: float, high: float, default: float | str, text: str, log: bool = False) -> Parameter:
+    return Parameter(name, (), "object sizes", low, high, default, text, log=log, estimators=ORBIT)
 
 
 class CameraControl(NumberControl):
@@ -51,21 +39,13 @@ class CameraControl(NumberControl):
     kind: ClassVar[str] = "camera"
     summary: ClassVar[str] = "An orbit around the object, the lens, and the exposure."
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        _moving("azimuth", "degrees", -3600.0, 3600.0, 40.0, "Direction around the object.", (0.0, 360.0), True),
-        _moving("elevation", "degrees", -89.0, 89.0, 25.0, "Height above the ground plane.", (5.0, 60.0)),
-        _moving(
-            "roll", "degrees", -360.0, 360.0, 0.0, "Rotation of the picture, counter-clockwise.", (-15.0, 15.0), True
-        ),
-        _moving(
-            "distance", "object sizes", 0.05, 1000.0, "fits the object", "To the object's middle.", (0.8, 1.5), log=True
-        ),
-        _moving("fov", "degrees", 1.0, 170.0, 35.0, "Field of view along the larger side."),
-        _moving("focal_length", "mm", 1.5, 2100.0, "as fov", "The same for a sensor 36 mm wide.", log=True),
-        _moving("shift_x", "picture widths", -2.0, 2.0, 0.0, "Shift of the picture to the right."),
-        _moving("shift_y", "picture heights", -2.0, 2.0, 0.0, "Shift of the picture downwards."),
-        _moving("aperture", "object sizes", 0.0, 10.0, 0.0, "Radius of the lens; 0 is a pinhole.", moves=False),
-        _moving("focus", "object sizes", 0.01, 1e4, "the object's middle", "Distance in focus.", log=True, moves=False),
-        Parameter("exposure", (), "stops", -10.0, 10.0, 0.0, "Over the metered exposure.", estimators=("image",)),
+        *CAMERA[:-1],
+        moving(ORBIT, "focal_length", "mm", 1.5, 2100.0, "as fov", "The same for a sensor 36 mm wide.", log=True),
+        moving(ORBIT, "shift_x", "picture widths", -2.0, 2.0, 0.0, "Shift of the picture to the right."),
+        moving(ORBIT, "shift_y", "picture heights", -2.0, 2.0, 0.0, "Shift of the picture downwards."),
+        _lens("aperture", 0.0, 10.0, 0.0, "Radius of the lens; 0 is a pinhole."),
+        _lens("focus", 0.01, 1e4, "the object's middle", "Distance in focus.", log=True),
+        CAMERA[-1],
     )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:

@@ -25,12 +25,11 @@ from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Parameter
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Choices, Fixed, Number, is_number
 from advsearch.errors import InputError
-from advsearch.scene import library
+from advsearch.scene import library, settings
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
 from advsearch.scene.exposure import metered_gain
+from advsearch.scene.settings import LIT
 
-LIT = ("adjoint", "differences")
-"""Valid estimators for what only changes light."""
 COEFFICIENTS = 27
 """Degrees 0 to 2 of three colour channels."""
 
@@ -49,25 +48,10 @@ class EnvironmentControl(NumberControl):
             float(len(library.list_environments())),
             OWN_MAP,
             "A bundled environment instead of the scene's own, metered afresh.",
-            differentiable=False,
             options=(OWN_MAP, *library.list_environments()),
             estimators=(),
         ),
-        Parameter(
-            "rotation",
-            (),
-            "degrees",
-            -3600.0,
-            3600.0,
-            0.0,
-            "Rotation about the vertical.",
-            periodic=True,
-            search=(0.0, 360.0),
-            estimators=LIT,
-        ),
-        Parameter(
-            "exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness, after metering.", search=(-1.0, 1.0), estimators=LIT
-        ),
+        *settings.ENVIRONMENT,
         *(
             Parameter(f"tint_{color}", (), "1", 0.0, 10.0, 1.0, f"Factor on the map's {color}.", estimators=LIT)
             for color in ("red", "green", "blue")

@@ -150,7 +150,7 @@ class NumberControl(Control, ABC):
 
     def estimators(self, scene: SceneDescription, parameter: Parameter) -> tuple[str, ...]:
         """Return the valid estimators of a parameter in this scene, preferred first."""
-        return parameter.estimators if parameter.differentiable else ()
+        return parameter.estimators
 
     # ---- what it makes of it ----------------------------------------------------------------------------------------
 

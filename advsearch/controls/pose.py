@@ -20,9 +20,7 @@ from advsearch.controls.base import Choice, Parameter
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
-
-GEOMETRIC = ("secant", "differences", "material", "simultaneous", "boundary")
-"""Valid estimators for what moves a mesh."""
+from advsearch.scene.settings import GEOMETRIC, POSE
 
 
 class PoseControl(NumberControl):
@@ -30,62 +28,20 @@ class PoseControl(NumberControl):
 
     kind: ClassVar[str] = "pose"
     summary: ClassVar[str] = "Where the object stands, how it is turned, and how large it is."
-    parameters: ClassVar[tuple[Parameter, ...]] = tuple(
-        Parameter(name, shape, unit, low, high, default, text, periodic, True, True, search, log, estimators=GEOMETRIC)
-        for name, shape, unit, low, high, default, text, periodic, search, log in (
-            ("yaw", (), "degrees", -3600.0, 3600.0, 0.0, "Rotation about the vertical.", True, (0.0, 360.0), False),
-            (
-                "pitch",
-                (),
-                "degrees",
-                -360.0,
-                360.0,
-                0.0,
-                "Rotation about the object's y axis.",
-                True,
-                (-15.0, 15.0),
-                False,
-            ),
-            (
-                "roll",
-                (),
-                "degrees",
-                -360.0,
-                360.0,
-                0.0,
-                "Rotation about the object's x axis.",
-                True,
-                (-15.0, 15.0),
-                False,
-            ),
-            (
-                "rotation",
-                (3,),
-                "degrees",
-                -180.0,
-                180.0,
-                0.0,
-                "Rotation vector on top of the angles.",
-                False,
-                None,
-                False,
-            ),
-            ("x", (), "object sizes", -1e4, 1e4, 0.0, "Shift along x.", False, (-0.15, 0.15), False),
-            ("y", (), "object sizes", -1e4, 1e4, 0.0, "Shift along y.", False, (-0.15, 0.15), False),
-            (
-                "z",
-                (),
-                "object sizes",
-                -1e4,
-                1e4,
-                0.0,
-                "Height of the lowest point above the ground.",
-                False,
-                None,
-                False,
-            ),
-            ("scale", (), "1", 0.01, 100.0, 1.0, "Size relative to the default.", False, (0.8, 1.25), True),
-        )
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        *POSE[:3],
+        Parameter(
+            "rotation",
+            (3,),
+            "degrees",
+            -180.0,
+            180.0,
+            0.0,
+            "Rotation vector on top of the angles.",
+            moves_silhouettes=True,
+            estimators=GEOMETRIC,
+        ),
+        *POSE[3:],
     )
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice("on_ground", "yes", "yes: the lowest point stays at height z however it turns; no: its middle stays."),

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.geometry import camera_to_world, object_to_world
-from advsearch.scene.settings import SETTINGS
+from advsearch.scene.settings import resolve
 from advsearch.scene.silhouettes import NEAREST, Frame, pixels_in
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def metered_gain(scene: SceneDescription) -> float:
 
     Where the camera sees nothing of the object, the card lies on the ground; where no light arrives the factor is 1.
     """
-    default = {name: setting.default for name, setting in SETTINGS.items() if name.startswith(MOVED)}
+    default = {name: value for name, value in resolve({}).items() if name.startswith(MOVED)}
     scene = replace(scene, values={**scene.values, **default}, aspect=1.0)
     seen = visible_irradiance(scene)
     metered = float(irradiance(scene, np.array([[0.0, 0.0, 1.0]])).mean()) if seen is None else seen

@@ -1,81 +1,162 @@
-"""The named, bounded numbers of a scene that `--set` fixes, and their defaults.
+"""The parameters that every scene has: `--set` fixes them, and the control of the same family searches them.
 
-A setting has the name that the matching control parameter has (`camera.azimuth`), so that what is fixed today can be
-searched tomorrow under the same name.
+A control takes its declarations from here (`POSE`, `CAMERA`, ...) and adds those that only it knows.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from functools import partial
 
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.parameters import Parameter
+
+GEOMETRIC = ("secant", "differences", "material", "simultaneous", "boundary")
+"""Valid estimators for what moves a mesh."""
+ORBIT = ("secant", "differences", "forward", "simultaneous")
+"""Mitsuba has no derivative of sensors, so a camera is differentiated by differences."""
+LIT = ("adjoint", "differences")
+"""Valid estimators for what only changes light and colours."""
 
 
-@dataclass(frozen=True)
-class Setting:
-    """One fixed number of a scene.
-
-    Attributes:
-        name: `family.parameter`.
-        default: the value when nothing is said; None means that the scene works it out (see `description`).
-        low: smallest allowed value, in `unit`.
-        high: largest allowed value, in `unit`.
-        unit: unit of the value, or "1" for a plain number.
-        description: one sentence for the help text.
-    """
-
-    name: str
-    default: float | None
-    low: float
-    high: float
-    unit: str
-    description: str
+def moving(
+    estimators: tuple[str, ...],
+    name: str,
+    unit: str,
+    low: float,
+    high: float,
+    default: float | str,
+    text: str,
+    search: tuple[float, float] | None = None,
+    *,
+    periodic: bool = False,
+    log: bool = False,
+) -> Parameter:
+    """Return a number that moves outlines."""
+    return Parameter(name, (), unit, low, high, default, text, periodic, True, search, log, estimators=estimators)
 
 
-_TABLE = (
-    Setting("camera.azimuth", 40.0, -3600.0, 3600.0, "degrees", "Direction of the camera around the object."),
-    Setting("camera.elevation", 25.0, -89.0, 89.0, "degrees", "Height of the camera above the ground plane."),
-    Setting("camera.roll", 0.0, -360.0, 360.0, "degrees", "Rotation of the picture, counter-clockwise."),
-    Setting(
-        "camera.distance", None, 0.05, 1000.0, "object sizes", "Distance to the object's middle; fits it if unset."
+def _color(name: str, default: float) -> Parameter:
+    return Parameter(name, (), "sRGB", 0.0, 1.0, default, f"{name.capitalize()} of the ground plane.")
+
+
+def _surface(name: str, text: str, search: tuple[float, float]) -> Parameter:
+    return Parameter(name, (), "1", 0.0, 1.0, "the material's own", text, search=search, estimators=LIT)
+
+
+_pose, _camera = partial(moving, GEOMETRIC), partial(moving, ORBIT)
+
+POSE = (
+    _pose("yaw", "degrees", -3600.0, 3600.0, 0.0, "Rotation about the vertical.", (0.0, 360.0), periodic=True),
+    _pose(
+        "pitch",
+        "degrees",
+        -360.0,
+        360.0,
+        0.0,
+        "Rotation about the object's y axis.",
+        (-15.0, 15.0),
+        periodic=True,
     ),
-    Setting("camera.fov", 35.0, 1.0, 170.0, "degrees", "Field of view along the larger side of the picture."),
-    Setting("camera.exposure", 0.0, -10.0, 10.0, "stops", "Brightness relative to the metered exposure."),
-    Setting("pose.yaw", 0.0, -3600.0, 3600.0, "degrees", "Rotation of the object about the vertical."),
-    Setting("pose.pitch", 0.0, -360.0, 360.0, "degrees", "Rotation of the object about its y axis."),
-    Setting("pose.roll", 0.0, -360.0, 360.0, "degrees", "Rotation of the object about its x axis."),
-    Setting("pose.x", 0.0, -1e4, 1e4, "object sizes", "Shift of the object along x."),
-    Setting("pose.y", 0.0, -1e4, 1e4, "object sizes", "Shift of the object along y."),
-    Setting("pose.z", 0.0, -1e4, 1e4, "object sizes", "Height of the object above the ground plane."),
-    Setting("pose.scale", 1.0, 0.01, 100.0, "1", "Size of the object relative to its default."),
-    Setting("environment.rotation", 0.0, -3600.0, 3600.0, "degrees", "Rotation of the environment about the vertical."),
-    Setting("environment.exposure", 0.0, -10.0, 10.0, "stops", "Brightness of the environment, after metering."),
-    Setting("ground.size", 3.0, 0.0, 1000.0, "object sizes", "Side of the square ground plane; 0 leaves it out."),
-    Setting("ground.red", 0.55, 0.0, 1.0, "sRGB", "Red of the ground plane."),
-    Setting("ground.green", 0.45, 0.0, 1.0, "sRGB", "Green of the ground plane."),
-    Setting("ground.blue", 0.37, 0.0, 1.0, "sRGB", "Blue of the ground plane."),
-    Setting("material.roughness", None, 0.0, 1.0, "1", "Roughness of the surface; the object's own if unset."),
-    Setting("material.metallic", None, 0.0, 1.0, "1", "How metallic the surface is; the object's own if unset."),
-    Setting("material.specular", None, 0.0, 1.0, "1", "Specular reflectance; the object's own if unset."),
-    Setting("material.clearcoat", None, 0.0, 1.0, "1", "Strength of a clear coat; the object's own if unset."),
+    _pose(
+        "roll",
+        "degrees",
+        -360.0,
+        360.0,
+        0.0,
+        "Rotation about the object's x axis.",
+        (-15.0, 15.0),
+        periodic=True,
+    ),
+    _pose("x", "object sizes", -1e4, 1e4, 0.0, "Shift of the object along x.", (-0.15, 0.15)),
+    _pose("y", "object sizes", -1e4, 1e4, 0.0, "Shift of the object along y.", (-0.15, 0.15)),
+    _pose("z", "object sizes", -1e4, 1e4, 0.0, "Height of the lowest point above the ground."),
+    _pose("scale", "1", 0.01, 100.0, 1.0, "Size relative to the default.", (0.8, 1.25), log=True),
 )
+CAMERA = (
+    _camera(
+        "azimuth",
+        "degrees",
+        -3600.0,
+        3600.0,
+        40.0,
+        "Direction of the camera around the object.",
+        (0.0, 360.0),
+        periodic=True,
+    ),
+    _camera("elevation", "degrees", -89.0, 89.0, 25.0, "Height of the camera above the ground plane.", (5.0, 60.0)),
+    _camera(
+        "roll",
+        "degrees",
+        -360.0,
+        360.0,
+        0.0,
+        "Rotation of the picture, counter-clockwise.",
+        (-15.0, 15.0),
+        periodic=True,
+    ),
+    _camera(
+        "distance",
+        "object sizes",
+        0.05,
+        1000.0,
+        "fits the object",
+        "Distance to the object's middle.",
+        (0.8, 1.5),
+        log=True,
+    ),
+    _camera("fov", "degrees", 1.0, 170.0, 35.0, "Field of view along the larger side of the picture."),
+    Parameter(
+        "exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness over the metered exposure.", estimators=("image",)
+    ),
+)
+ENVIRONMENT = (
+    Parameter(
+        "rotation",
+        (),
+        "degrees",
+        -3600.0,
+        3600.0,
+        0.0,
+        "Rotation about the vertical.",
+        periodic=True,
+        search=(0.0, 360.0),
+        estimators=LIT,
+    ),
+    Parameter(
+        "exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness, after metering.", search=(-1.0, 1.0), estimators=LIT
+    ),
+)
+GROUND = (
+    Parameter("size", (), "object sizes", 0.0, 1000.0, 3.0, "Side of the square ground plane; 0 leaves it out."),
+    _color("red", 0.55),
+    _color("green", 0.45),
+    _color("blue", 0.37),
+)
+MATERIAL = (
+    _surface("roughness", "Roughness of the surface: 0 is polished, 1 is matt.", (0.1, 1.0)),
+    _surface("metallic", "How metallic it is: 0 is paint, wood or glaze, 1 is bare metal.", (0.0, 1.0)),
+    _surface("specular", "Strength of the reflection off what is not metal.", (0.0, 1.0)),
+    _surface("clearcoat", "Strength of a clear coat on top.", (0.0, 1.0)),
+)
+FAMILIES = {"camera": CAMERA, "pose": POSE, "environment": ENVIRONMENT, "ground": GROUND, "material": MATERIAL}
 
-SETTINGS: Mapping[str, Setting] = {setting.name: setting for setting in _TABLE}
+SETTINGS: Mapping[str, Parameter] = {
+    f"{family}.{one.name}": one for family, parameters in FAMILIES.items() for one in parameters
+}
+"""Every setting by `family.parameter`; of no other control's parameters."""
 
 
 def resolve(given: Mapping[str, float]) -> dict[str, float | None]:
-    """Return every setting's value: what was given, checked, over the defaults.
+    """Return every setting's value: what was given, checked, over the defaults; None where the scene works it out.
 
     Raises:
         UnknownNameError: a name is not a setting.
         InputError: a value is not a finite number inside its range.
     """
-    values: dict[str, float | None] = {name: setting.default for name, setting in SETTINGS.items()}
-    for name, value in given.items():
-        values[name] = _checked(name, value)
-    return values
+    values = {name: None if isinstance(one.default, str) else one.default for name, one in SETTINGS.items()}
+    return {**values, **{name: _checked(name, value) for name, value in given.items()}}
 
 
 def _checked(name: str, value: object) -> float:

@@ -78,7 +78,6 @@ class CorruptionControl(NumberControl):
             len(NAMES) - 1,
             NAMES[0],
             "Which corruption.",
-            differentiable=False,
             search=(0, len(NAMES) - 1),
             options=NAMES,
             estimators=(),

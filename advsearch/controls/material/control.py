@@ -25,10 +25,11 @@ from advsearch.controls.values import Choices, Fixed, Number
 from advsearch.scene.assets import Material, Mesh
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
+from advsearch.scene.settings import LIT, MATERIAL
 
 BASE_COLOR = "object.base_color"
 OWN = "own"
-NUMBERS = ("roughness", "metallic", "specular", "clearcoat")
+NUMBERS = tuple(one.name for one in MATERIAL)
 TINT = ("red", "green", "blue")
 RENDERED = {"metallic": (0.0, 0.999), "specular": (0.02, 1.0), "clearcoat": (1e-4, 1.0)}
 """What is really rendered: a value beyond is moved to the nearest of these, where the adjoint is right.
@@ -38,13 +39,9 @@ exactly 0 it is 0, and towards a specular of 0 it grows without bound (the refra
 """
 
 
-def _number(name: str, default: str, text: str, search: tuple[float, float]) -> Parameter:
-    return Parameter(name, (), "1", 0.0, 1.0, default, text, search=search, estimators=("adjoint", "differences"))
-
-
 def _tint(name: str) -> Parameter:
     text = f"{name.capitalize()} of the tint that multiplies the colour; 1 leaves it."
-    return Parameter(name, (), "sRGB", 0.0, 1.0, 1.0, text, search=(0.3, 1.0), estimators=("adjoint", "differences"))
+    return Parameter(name, (), "sRGB", 0.0, 1.0, 1.0, text, search=(0.3, 1.0), estimators=LIT)
 
 
 class MaterialControl(NumberControl):
@@ -61,13 +58,9 @@ class MaterialControl(NumberControl):
             float(len(PATTERNS)),
             OWN,
             "The object's own surface, or a named material in its place.",
-            differentiable=False,
             options=(OWN, *PATTERNS),
         ),
-        _number("roughness", "the material's own", "0 is polished, 1 is matt.", (0.1, 1.0)),
-        _number("metallic", "the material's own", "0 is paint, wood or glaze, 1 is bare metal.", (0.0, 1.0)),
-        _number("specular", "the material's own", "Strength of the reflection off what is not metal.", (0.0, 1.0)),
-        _number("clearcoat", "the material's own", "Strength of a clear coat on top.", (0.0, 1.0)),
+        *MATERIAL,
         *(_tint(name) for name in TINT),
     )
 

@@ -84,7 +84,6 @@ class OcclusionControl(NumberControl):
             len(OPTIONS) - 1.0,
             "card",
             "What it is: a piece of cardboard, a grey sphere, or a bundled object.",
-            differentiable=False,
             moves_silhouettes=True,
             options=OPTIONS,
         ),
