@@ -33,7 +33,7 @@ from advsearch.api.attack import problem_from_config  # noqa: E402
 from advsearch.config import AttackConfig  # noqa: E402
 from advsearch.engine.gradients import Loss, estimated, inside, smooth_loss  # noqa: E402
 from advsearch.engine.loading import load_scene  # noqa: E402
-from advsearch.scene.gradients.plan import GroupPlan  # noqa: E402
+from advsearch.scene.gradients.group import Group  # noqa: E402
 from advsearch.scene.renderer import Renderer  # noqa: E402
 
 POSE = {"pose": {"on_ground": "no", "rotation": [-30, 30], "x": [-0.15, 0.15], "y": [-0.15, 0.15], "z": [0.05, 0.35]}}
@@ -118,7 +118,7 @@ def compare_steps(size: int, repeats: int) -> int:
     return 0
 
 
-def difference(renderer: Renderer, loss: Loss, group: GroupPlan, half: float, seed: int, spp: int) -> float:
+def difference(renderer: Renderer, loss: Loss, group: Group, half: float, seed: int, spp: int) -> float:
     """Return a central difference of the loss over one coordinate, all others as in the scene."""
     values = []
     for side in (half, -half):

@@ -83,10 +83,9 @@ def row(name: str, size: int) -> Image.Image:
 def _example(start: Tensor, groups: Any, number: int) -> Tensor:
     """A configuration that shows something: random numbers, the options in turn, balls left for the most part."""
     generator = torch.Generator().manual_seed(number)
-    u, begin = start.clone(), 0
-    for _, group in groups:
-        part = slice(begin, begin + group.size)
-        begin += group.size
+    u = start.clone()
+    for group in groups:
+        part = group.coordinates
         if group.options:
             u[part] = ((number * max(1, group.options // 4)) % group.options + 0.5) / group.options
         elif group.budget.norm == "box":

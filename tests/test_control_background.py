@@ -53,7 +53,7 @@ def test_it_starts_at_mid_grey_with_a_slope(scene: SceneDescription) -> None:
     (color * torch.tensor([1.0, 2.0, 4.0])).sum().backward()
     assert u.grad is not None and float(u.grad[1].abs()) > 0.1 and float(u.grad[2].abs()) > 0.1
     hue = bound.groups[0]
-    assert hue.name == "hue" and hue.periodic and hue.estimators == ("image",)
+    assert hue.parameter == "hue" and hue.periodic and hue.valid == ("image",)
     assert bound.describe(u)["background.green"] == {"value": pytest.approx(0.5), "unit": "sRGB"}
 
 
@@ -67,7 +67,7 @@ def test_it_asks_for_a_backdrop_and_takes_the_ground_away_unless_told_to_keep_it
 
 def test_the_environment_may_be_a_choice(scene: SceneDescription) -> None:
     bound = BackgroundControl(what=["colour", "environment"]).bind(scene)
-    assert [group.name for group in bound.groups] == ["what", "hue", "saturation", "value"]
+    assert [group.parameter for group in bound.groups] == ["what", "hue", "saturation", "value"]
     assert bound.inputs(bound.start) == {}, "it starts as the scene is"
     assert bound.describe(bound.start)["background.what"]["value"] == "environment"
     there = bound.start.clone()
@@ -77,7 +77,7 @@ def test_the_environment_may_be_a_choice(scene: SceneDescription) -> None:
 
 def test_only_what_is_given_a_range_is_searched(scene: SceneDescription) -> None:
     bound = BackgroundControl(hue=[0, 120], saturation=1.0).bind(scene)
-    assert [group.name for group in bound.groups] == ["hue"] and not bound.groups[0].periodic
+    assert [group.parameter for group in bound.groups] == ["hue"] and not bound.groups[0].periodic
     color = linear_to_srgb(bound.inputs(torch.tensor([1.0]))[COLOR])
     torch.testing.assert_close(color, torch.tensor([0.0, 0.5, 0.0]), atol=1e-5, rtol=0)
 

@@ -146,7 +146,7 @@ def test_proportions_add_up_to_one_within_their_ranges(scene: SceneDescription, 
 
 def test_two_coordinates_reach_every_mixture(scene: SceneDescription) -> None:
     filled = bound(scene)
-    assert [group.name for group in filled.groups] == ["level", "water", "milk"]
+    assert [group.parameter for group in filled.groups] == ["level", "water", "milk"]
     cuts = filled.control.cuts({"water": 0.2, "milk": 0.5, "coffee": 0.3})
     shares = filled.values(torch.tensor([0.5, cuts["water"], cuts["milk"]]))
     assert [float(shares[name]) for name in INGREDIENTS] == pytest.approx([0.2, 0.5, 0.3], abs=1e-6)

@@ -250,7 +250,7 @@ def test_the_tables_have_five_rows() -> None:
 
 def groups(scene: SceneDescription, **settings: object) -> dict[str, tuple[int, tuple[str, ...]]]:
     bound = CorruptionControl(**settings).bind(scene)
-    return {group.name: (group.options, group.estimators) for group in bound.groups}
+    return {group.parameter: (group.options, group.valid) for group in bound.groups}
 
 
 def test_what_is_not_fixed_is_searched(scene: SceneDescription) -> None:

@@ -99,9 +99,9 @@ def test_the_adjoint_agrees_with_differences(density: float, steps: dict[str, tu
 
 def test_density_is_left_to_differences_where_its_range_holds_0() -> None:
     groups = HazeControl().bind(plain()).groups
-    assert groups[0].estimators == ("differences",) and groups[1].estimators[0] == "adjoint"
+    assert groups[0].valid == ("differences",) and groups[1].valid[0] == "adjoint"
     (alone,) = HazeControl(density=[0.01, 0.5]).bind(plain()).groups
-    assert alone.estimators == ("adjoint", "differences")
+    assert alone.valid == ("adjoint", "differences")
 
 
 def test_it_starts_without_haze_unless_its_density_is_not_searched() -> None:

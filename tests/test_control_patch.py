@@ -258,12 +258,12 @@ def test_corners_of_the_box_are_finite(scene: SceneDescription) -> None:
 
 def test_groups_say_what_is_searched(scene: SceneDescription) -> None:
     pixels = bound(scene)
-    assert [group.name for group in pixels.groups] == ["pixels"] and len(pixels.start) == 32 * 32 * 3
-    assert pixels.groups[0].estimators == ("adjoint",) and pixels.groups[0].budget.norm == "box"
+    assert [group.parameter for group in pixels.groups] == ["pixels"] and len(pixels.start) == 32 * 32 * 3
+    assert pixels.groups[0].valid == ("adjoint",) and pixels.groups[0].budget.norm == "box"
     all_of_it = bound(scene, azimuth=[0, 360], size=[0.1, 0.4], norm="linf", epsilon=0.2)
-    assert [group.name for group in all_of_it.groups] == ["pixels", "azimuth", "size"]
+    assert [group.parameter for group in all_of_it.groups] == ["pixels", "azimuth", "size"]
     assert all_of_it.groups[0].budget.epsilon == pytest.approx(0.2)
-    assert all_of_it.groups[1].periodic and all_of_it.groups[1].estimators == ("differences",)
+    assert all_of_it.groups[1].periodic and all_of_it.groups[1].valid == ("differences",)
     said = all_of_it.describe(all_of_it.start)
     assert set(said) == {"patch.linf", "patch.rms", "patch.azimuth", "patch.size"}
     assert said["patch.azimuth"]["value"] == pytest.approx(towards_camera(scene)[0], abs=1e-3)

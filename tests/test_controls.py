@@ -60,7 +60,7 @@ def test_a_bound_control_starts_inside_and_maps_differentiably(kind: str) -> Non
     picture = torch.rand(24, 24, 3, generator=torch.Generator().manual_seed(0))
     total = sum((tensor.sin().sum() for tensor in control.inputs(u).values()), control.picture(u, picture).sin().sum())
     if not total.requires_grad:
-        assert not any(set(group.estimators) & {"adjoint", "image", "material"} for group in control.groups)
+        assert not any(set(group.valid) & {"adjoint", "image", "material"} for group in control.groups)
         return
     total.backward()
     assert u.grad is not None and bool(torch.isfinite(u.grad).all())
@@ -68,7 +68,7 @@ def test_a_bound_control_starts_inside_and_maps_differentiably(kind: str) -> Non
     for group in control.groups:
         part = u.grad[begin : begin + group.size]
         begin += group.size
-        if "adjoint" in group.estimators or "image" in group.estimators or "material" in group.estimators:
+        if "adjoint" in group.valid or "image" in group.valid or "material" in group.valid:
             assert bool(part.any()), f"{kind}.{group.name} says that its derivative runs through its inputs"
 
 

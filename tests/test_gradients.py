@@ -32,7 +32,8 @@ from advsearch.engine.gradients import (
 from advsearch.engine.planning import TELLS, Cosine, contested, cosines, measured_plan, tuned
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.runs.results.check import WHOLE, DerivativeRow, DirectionRow
-from advsearch.scene.gradients.plan import ESTIMATORS, SEARCH_STEP, GroupPlan, first_plan
+from advsearch.scene.gradients.group import Group
+from advsearch.scene.gradients.plan import ESTIMATORS, SEARCH_STEP, first_plan
 from advsearch.scene.renderer import Renderer
 
 SIZE = 48
@@ -45,9 +46,9 @@ def renderer(controls: Any, *, object: str = "mug", transfer: str = "linear", **
     return made
 
 
-def group(name: str, begin: int, size: int, valid: tuple[str, ...], **more: Any) -> GroupPlan:
+def group(name: str, begin: int, size: int, valid: tuple[str, ...], **more: Any) -> Group:
     control, _, parameter = name.partition(".")
-    return GroupPlan(control, parameter, begin, size, "none", valid, **more)
+    return Group(parameter, size, valid, control=control, begin=begin, **more)
 
 
 # ---- the plan as data -----------------------------------------------------------------------------------------------

@@ -48,7 +48,7 @@ from advsearch.evaluation.precision.report import Section, _rounding
 from advsearch.evaluation.precision.rounds import LEAST, TimeBudget, gather, in_rounds, part_samples
 from advsearch.report.diagrams import precision_figures
 from advsearch.runs.results.precision import PrecisionResult
-from advsearch.scene.gradients.plan import GroupPlan
+from advsearch.scene.gradients.group import Group
 from advsearch.scene.mitsuba_backend.samplers import next_count
 
 SIZE = 400
@@ -424,8 +424,8 @@ def test_a_gradient_is_recommended_in_counts_of_the_runs_sampler() -> None:
 
 
 def test_parts_of_a_control_with_other_estimators_have_names_of_their_own() -> None:
-    def group(parameter: str, *valid: str) -> GroupPlan:
-        return GroupPlan("light", parameter, 0, 1, "none", valid)
+    def group(parameter: str, *valid: str) -> Group:
+        return Group(parameter, 1, valid, control="light")
 
     found = parts_of([group("x", "differences"), group("power", "adjoint", "differences"), group("kind")], linear=True)
     assert [one.name for one in found] == ["light.x", "light.power"]

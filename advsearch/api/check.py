@@ -49,7 +49,8 @@ from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME
 from advsearch.runs.results.check import WHOLE, CheckedRow, CheckedRows, CheckResult, DerivativeRow, DirectionRow
 from advsearch.runs.summary import NAME, read_result
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
-from advsearch.scene.gradients.plan import STEP_RANGE, GroupPlan
+from advsearch.scene.gradients.group import Group
+from advsearch.scene.gradients.plan import STEP_RANGE
 
 SCENES = (("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"))
 """Bundled scenes that `check --all` goes through."""
@@ -349,7 +350,7 @@ def _rows(
     results: Results,
     progress: Progress,
     *,
-    tried: Callable[[GroupPlan], list[tuple[str, float]]],
+    tried: Callable[[Group], list[tuple[str, float]]],
     high: int,
     repeats: tuple[int, int],
     factors: Sequence[float],
@@ -407,7 +408,7 @@ def _key(part: CheckedPart, what: str, along: Sequence[Probe]) -> str:
     return f"{part.key} {what} {','.join(probe.name for probe in along)}"
 
 
-def attempts(group: GroupPlan) -> list[tuple[str, float]]:
+def attempts(group: Group) -> list[tuple[str, float]]:
     """Estimators to measure on a group, with the multiple of the step; other steps for what falls short with the first.
 
     Differences of the loss and of the picture are the same for a linear loss, so that wider steps are tried with one.

@@ -170,14 +170,11 @@ def _centre(problem: Problem, config: RegionConfig) -> Tensor:
 def _varied(problem: Problem, config: RegionConfig) -> Varied:
     """Where the parameters lie that the box grows in."""
     places: dict[str, Tensor] = {}
-    begin = 0
-    for control, group in problem.space.groups:
-        numbers = torch.arange(begin, begin + group.size)
-        begin += group.size
+    for group in problem.space.groups:
         if group.options:
             continue
-        for number, place in enumerate(numbers):
-            places[f"{control.name}.{group.name}" + (f".{number}" if group.size > 1 else "")] = place[None]
+        for number, place in enumerate(torch.arange(group.begin, group.begin + group.size)):
+            places[group.name + (f".{number}" if group.size > 1 else "")] = place[None]
     names = tuple(places) if config.vary is None else split_names(config.vary)
     for name in names:
         if name not in places:

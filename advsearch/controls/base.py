@@ -22,6 +22,9 @@ from torch import Tensor
 
 from advsearch.controls.clean import Moved
 from advsearch.scene.description import SceneDescription
+from advsearch.scene.gradients.group import WHOLE_RANGE as WHOLE_RANGE
+from advsearch.scene.gradients.group import Budget as Budget
+from advsearch.scene.gradients.group import Group as Group
 from advsearch.scene.parameters import Parameter as Parameter
 
 NOTHING: Mapping[str, Tensor] = MappingProxyType({})
@@ -47,47 +50,6 @@ class Choice:
     description: str
     run_setting: str = ""
     bounds: str = ""
-
-
-@dataclass(frozen=True)
-class Budget:
-    """How far a group of u may go from its start, inside the unit box.
-
-    Attributes:
-        norm: "linf" or "l2" for a ball around the start, "box" for the whole range.
-        epsilon: radius of the ball in units of u; None for "box".
-    """
-
-    norm: str
-    epsilon: float | None
-
-
-WHOLE_RANGE = Budget("box", None)
-
-
-@dataclass(frozen=True)
-class Group:
-    """Neighbouring coordinates of a control's slice with one budget and one way to be differentiated.
-
-    Attributes:
-        name: of the parameter behind them.
-        size: number of coordinates.
-        estimators: the valid estimators, preferred first; empty for a discrete choice, which has no derivative.
-        budget: how far they may go.
-        periodic: 0 and 1 are the same value.
-        options: number of options of a discrete choice; 0 for a continuous parameter.
-        moves_silhouettes: see `Parameter`.
-        setting: name of the scene's setting that says the same; may be empty.
-    """
-
-    name: str
-    size: int
-    estimators: tuple[str, ...]
-    budget: Budget = WHOLE_RANGE
-    periodic: bool = False
-    options: int = 0
-    moves_silhouettes: bool = False
-    setting: str = ""
 
 
 class Value(TypedDict):

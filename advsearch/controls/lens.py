@@ -101,8 +101,8 @@ class LensControl(NumberControl):
         bound = super().bind(scene)
         begin = 0
         for group in bound.groups:
-            if group.name in PLACES and not group.options:
-                bound.start[begin : begin + group.size] = spread(self.dots)[PLACES.index(group.name)]
+            if group.parameter in PLACES and not group.options:
+                bound.start[begin : begin + group.size] = spread(self.dots)[PLACES.index(group.parameter)]
             begin += group.size
         return bound
 

@@ -275,7 +275,6 @@ class BoundNumbers(BoundControl):
             WHOLE_RANGE if options else self.control.budget(self.scene, parameter),
             periodic=slot.periodic,
             options=options,
-            moves_silhouettes=parameter.moves_silhouettes,
             setting=self.control.setting(parameter),
         )
 

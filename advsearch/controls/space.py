@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from advsearch.controls.base import NOTHING, BoundControl, Group, Value
 from advsearch.controls.clean import Moved
 from advsearch.errors import InputError
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
-from advsearch.scene.gradients.plan import WITH_BOUNDARY, GroupPlan
+from advsearch.scene.gradients.plan import WITH_BOUNDARY
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +46,8 @@ class Space:
         return torch.cat([control.start for control in self.controls]) if self.controls else torch.zeros(0)
 
     @property
-    def groups(self) -> tuple[tuple[BoundControl, Group], ...]:
-        """Every group of coordinates with its control, in the order of u."""
-        return tuple((control, group) for control in self.controls for group in control.groups)
-
-    def group_plans(self) -> tuple[GroupPlan, ...]:
-        """Return every group as the gradient plan wants it, without an estimator yet.
+    def groups(self) -> tuple[Group, ...]:
+        """Every group of coordinates in the order of u, without an estimator yet.
 
         Adjoints with boundary terms know neither a medium nor a backdrop nor a thin lens, so that they are not valid
         beside these.
@@ -61,11 +57,11 @@ class Space:
             scene.backdrop or scene.thin_lens or any(part.volumetric for part in scene.parts)
         )
         found, begin = [], 0
-        for control, group in self.groups:
-            valid = tuple(one for one in group.estimators if not (unknown and one in WITH_BOUNDARY))
-            one = GroupPlan(control.name, group.name, begin, group.size, "none", valid, periodic=group.periodic)
-            found.append(one)
-            begin += group.size
+        for control in self.controls:
+            for group in control.groups:
+                valid = tuple(one for one in group.valid if not (unknown and one in WITH_BOUNDARY))
+                found.append(replace(group, control=control.name, begin=begin, valid=valid))
+                begin += group.size
         return tuple(found)
 
     def slices(self, u: Tensor) -> Sequence[tuple[BoundControl, Tensor]]:
@@ -122,9 +118,9 @@ class Space:
         Args:
             values: the configuration as it is described.
         """
-        for control, group in self.groups:
+        for group in self.groups:
             if group.setting == ENVIRONMENT:
-                chosen = str(values[f"{control.name}.{group.name}"]["value"])
+                chosen = str(values[group.name]["value"])
                 return None if chosen == OWN_MAP else chosen
         return self.environment
 

@@ -18,7 +18,8 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.runs.results.check import GradientStatus
-from advsearch.scene.gradients.plan import STEP_RANGE, GradientPlan, GroupPlan
+from advsearch.scene.gradients.group import Group
+from advsearch.scene.gradients.plan import STEP_RANGE, GradientPlan
 from advsearch.scene.renderer import Renderer
 
 Loss = Callable[[Tensor], Tensor]
@@ -55,7 +56,7 @@ class Probe:
         step: half-width of a difference along the direction.
     """
 
-    group: GroupPlan
+    group: Group
     name: str
     direction: Tensor
     step: float
@@ -161,7 +162,7 @@ def probes(renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int) -> li
     return found
 
 
-def _steep_probe(renderer: Renderer, loss: Loss, u: Tensor, group: GroupPlan, seed: int, spp: int) -> Probe:
+def _steep_probe(renderer: Renderer, loss: Loss, u: Tensor, group: Group, seed: int, spp: int) -> Probe:
     """One direction in a large group: mostly the estimator's own gradient, so that there is something to see, and a
     share of random signs, so that what the estimator leaves out shows too."""
     gradient = estimated(renderer, loss, u, group.estimator, [group.name], seeds.stream(seed, "probe"), spp)

@@ -20,7 +20,8 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.engine.gradients import EXPENSIVE, Loss, estimated, only
-from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, GradientPlan, GroupPlan
+from advsearch.scene.gradients.group import Group
+from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, GradientPlan
 from advsearch.scene.renderer import Renderer
 
 GOAL = 0.9
@@ -80,7 +81,7 @@ class Cosine:
         return "noisy" if self.converged >= GOAL else "reference unusable"
 
 
-def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[GroupPlan, ...], tuple[str, ...]]]:
+def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Group, ...], tuple[str, ...]]]:
     """Return groups of one control with the estimators to compare on them, where there is more than one.
 
     Args:
@@ -88,7 +89,7 @@ def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Gr
         every: compare all that are valid; otherwise only the adjoints and the first kind of differences, and only where
             an adjoint is preferred so far: over poses, the model's loss is so rough that none has won.
     """
-    sets: dict[tuple[str, tuple[str, ...]], list[GroupPlan]] = {}
+    sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
     for group in plan.groups:
         if "forced" in group.reason or not group.valid:
             continue
@@ -164,7 +165,7 @@ def _scores(
     renderer: Renderer,
     loss: Loss,
     u: Tensor,
-    groups: Sequence[GroupPlan],
+    groups: Sequence[Group],
     candidates: Sequence[str],
     seed: int,
     spp: int,

@@ -19,7 +19,8 @@ from advsearch.engine.domains import domain_of
 from advsearch.models import LabelSet, Model
 from advsearch.runs.results.plan import PlannedGradient
 from advsearch.scene.formation import to_8_bit
-from advsearch.scene.gradients.plan import GradientPlan, GroupPlan
+from advsearch.scene.gradients.group import Group
+from advsearch.scene.gradients.plan import GradientPlan
 from advsearch.scene.renderer import Renderer
 
 
@@ -156,7 +157,7 @@ class Problem:
             row["step_in_unit"], row["unit"] = self._in_unit(group) if group.step_reason else (None, "")
         return PlannedGradient.of(stored)
 
-    def _in_unit(self, group: GroupPlan) -> tuple[float | None, str]:
+    def _in_unit(self, group: Group) -> tuple[float | None, str]:
         """The step of one number in the middle of its range, and its unit; None of what has no number of its own."""
         u, half = self.whole(self.domain.start).clone(), min(group.step, 0.5)
         ends = []

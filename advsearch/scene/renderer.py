@@ -23,8 +23,9 @@ from advsearch import seeds
 from advsearch.errors import InputError
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.formation import ImageFormation
+from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.motion import Motion, steps_for
-from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, DIRECTIONS, TURN_STEP, GroupPlan, first_plan
+from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, DIRECTIONS, TURN_STEP, first_plan
 from advsearch.scene.mitsuba_backend.denoise import Denoiser
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 
@@ -38,7 +39,8 @@ class InputSpace(Protocol):
     def start(self) -> Tensor:
         """(d,) float32 in [0, 1]: the unchanged scene."""
 
-    def group_plans(self) -> tuple[GroupPlan, ...]:
+    @property
+    def groups(self) -> tuple[Group, ...]:
         """Every group of coordinates with its valid estimators."""
 
     def inputs(self, u: Tensor) -> dict[str, Tensor]:
@@ -88,7 +90,7 @@ class Renderer:
         self.gradients = 0
         self.non_finite = 0
         self._left_out: frozenset[str] = frozenset()
-        groups = space.group_plans()
+        groups = space.groups
         self.plan = first_plan(groups, self._steps(groups, motion), estimators, across=max(formation.resolution))
         self.routes = self._find_routes(groups)
 
@@ -264,7 +266,7 @@ class Renderer:
 
     # ---- differences ------------------------------------------------------------------------------------------------
 
-    def _differenced(self) -> tuple[GroupPlan, ...]:
+    def _differenced(self) -> tuple[Group, ...]:
         return self.plan.having(*sorted(BY_DIFFERENCES - self._left_out))
 
     def differences(self, u: Tensor, cotangent: Tensor, seed: int, spp: int) -> Tensor:
@@ -288,7 +290,7 @@ class Renderer:
         return self._finite(found)
 
     def _central(
-        self, group: GroupPlan, u: Tensor, noise: int, spp: int, loss: Callable[[Tensor], Tensor], found: Tensor
+        self, group: Group, u: Tensor, noise: int, spp: int, loss: Callable[[Tensor], Tensor], found: Tensor
     ) -> None:
         for number in range(group.begin, group.begin + group.size):
             step = torch.zeros_like(u)
@@ -299,7 +301,7 @@ class Renderer:
 
     def _one_sided(
         self,
-        groups: tuple[GroupPlan, ...],
+        groups: tuple[Group, ...],
         u: Tensor,
         noise: int,
         spp: int,
@@ -318,7 +320,7 @@ class Renderer:
 
     def _random_directions(
         self,
-        groups: tuple[GroupPlan, ...],
+        groups: tuple[Group, ...],
         u: Tensor,
         noise: int,
         spp: int,
@@ -347,7 +349,7 @@ class Renderer:
     def _assembled(self, u: Tensor) -> dict[str, Tensor]:
         return self.scene.assembly(self.space.inputs(u))
 
-    def _steps(self, groups: tuple[GroupPlan, ...], motion: Motion | None) -> Tensor:
+    def _steps(self, groups: tuple[Group, ...], motion: Motion | None) -> Tensor:
         moving = [
             number
             for group in groups
@@ -362,7 +364,7 @@ class Renderer:
                 steps[group.coordinates] = TURN_STEP
         return steps
 
-    def _find_routes(self, groups: tuple[GroupPlan, ...]) -> dict[str, frozenset[str]]:
+    def _find_routes(self, groups: tuple[Group, ...]) -> dict[str, frozenset[str]]:
         """Which scene inputs each group of coordinates reaches, found by autograd at a point inside the box."""
         routes: dict[str, set[str]] = {group.name: set() for group in groups}
         if not any(set(group.valid) & BY_ADJOINT for group in groups):

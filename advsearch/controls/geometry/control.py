@@ -150,7 +150,7 @@ class Moded(Shaper):
 
     def __init__(self, mesh: Mesh, count: int) -> None:
         self._modes = torch.from_numpy(shape_modes(mesh, count))
-        self.group = Group("amplitudes", self._modes.shape[2], ESTIMATORS, moves_silhouettes=True)
+        self.group = Group("amplitudes", self._modes.shape[2], ESTIMATORS)
 
     def field(self, u: Tensor) -> Tensor:
         return self._modes @ (2.0 * u.double() - 1.0)
@@ -163,7 +163,7 @@ class Pushed(Shaper):
         solid = body(mesh)
         self._spread = Preconditioner(solid)
         self._count = len(solid.places)
-        self.group = Group("pushes", 3 * self._count, ESTIMATORS, moves_silhouettes=True)
+        self.group = Group("pushes", 3 * self._count, ESTIMATORS)
 
     def field(self, u: Tensor) -> Tensor:
         return PUSH * self._spread((2.0 * u.double() - 1.0).reshape(self._count, 3))

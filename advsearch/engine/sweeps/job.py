@@ -153,10 +153,10 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
 
 def _check_draws(place: Place, space: Space) -> None:
     """Refuse to draw what the scene was asked to have."""
-    for control, group in space.groups:
+    for group in space.groups:
         if group.setting in place.scene.description.given - {ENVIRONMENT}:
             raise InputError(
-                f"`controls` {control.name}: draws {group.name} by chance, and `set` {group.setting} fixes it; "
+                f"`controls` {group.control}: draws {group.parameter} by chance, and `set` {group.setting} fixes it; "
                 "leave it out of one of the two"
             )
 

@@ -130,10 +130,11 @@ class Points:
         the table shows."""
         number_of = {axis.name: number for number, axis in enumerate(self._axes)}
         shown: list[Drawn] = []
-        for (control, group), (block, part) in zip(self._space.groups, self._domain.parts(), strict=True):
-            name = f"{control.name}.{group.name}"
-            if name in number_of:
-                number = number_of[name]
+        controls = {control.name: control for control in self._space.controls}
+        for group, (block, part) in zip(self._space.groups, self._domain.parts(), strict=True):
+            control = controls[group.control]
+            if group.name in number_of:
+                number = number_of[group.name]
                 self._places.append((part.start, number, self.grid.sizes[number]))
                 continue
             into = self._small if block.size <= MOST_QUASI else self._large
@@ -141,7 +142,7 @@ class Points:
             columns = slice(first, first + block.size + (block.norm == "l2"))
             into.append((block, part, columns))
             if block.size <= MOST_BINNED and block.norm != "l2" and isinstance(control, BoundNumbers):
-                shown += self._shown(control, group.name, block, part, first)
+                shown += self._shown(control, group.parameter, block, part, first)
         return tuple(shown)
 
     def _shown(self, control: BoundNumbers, name: str, block: Block, part: slice, first: int) -> list[Drawn]:
@@ -194,7 +195,7 @@ class Points:
     @property
     def environment(self) -> str | None:
         """What lights all pictures in the place of the scene's environment; None if that does, or if it varies."""
-        varies = any(group.setting == ENVIRONMENT for _, group in self._space.groups)
+        varies = any(group.setting == ENVIRONMENT for group in self._space.groups)
         return None if varies else self._space.environment
 
     def lit_by(self, values: Mapping[str, Value]) -> str | None:
@@ -256,13 +257,13 @@ def _by_column(control: BoundNumbers, part: slice, axes: Sequence[tuple[int, Axi
     columns: list[Callable[[Tensor, Picks], list[tuple[str, Value]]]] = []
     begin = part.start
     for group in control.groups:
-        name = f"{control.name}.{group.name}"
-        if group.name in number_of:
-            number, axis = number_of[group.name]
+        name = f"{control.name}.{group.parameter}"
+        if group.parameter in number_of:
+            number, axis = number_of[group.parameter]
             listed: list[Value] = [{"value": value, "unit": axis.unit} for value in axis.values]
             columns.append(_listed(name, listed, number))
         else:
-            columns += _drawn(control, group.name, name, begin, group.size)
+            columns += _drawn(control, group.parameter, name, begin, group.size)
         begin += group.size
 
     def tell(u: Tensor, picks: Picks) -> list[Mapping[str, Value]]:

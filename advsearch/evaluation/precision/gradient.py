@@ -15,7 +15,8 @@ from advsearch.engine.gradients import EXPENSIVE, Loss, Probe, estimated, refere
 from advsearch.evaluation.precision.fits import INDEPENDENT, STRATIFIED, UNKNOWN, Theory
 from advsearch.evaluation.precision.points import Array, MeasuredSetting, ReferenceValue, reference_of
 from advsearch.evaluation.precision.rounds import TimeBudget, gather, part_samples
-from advsearch.scene.gradients.plan import BY_ADJOINT, DIRECTIONS, GroupPlan
+from advsearch.scene.gradients.group import Group
+from advsearch.scene.gradients.plan import BY_ADJOINT, DIRECTIONS
 from advsearch.scene.renderer import Renderer
 
 COUNTS = (4, 8, 16, 32, 64, 128, 256)
@@ -40,7 +41,7 @@ class GradientPart:
     """
 
     name: str
-    groups: tuple[GroupPlan, ...]
+    groups: tuple[Group, ...]
     estimators: tuple[str, ...]
 
     @property
@@ -58,14 +59,14 @@ class GradientPart:
         return _array(torch.cat([gradient[group.coordinates] for group in self.groups]))
 
 
-def parts_of(groups: Sequence[GroupPlan], *, linear: bool) -> list[GradientPart]:
+def parts_of(groups: Sequence[Group], *, linear: bool) -> list[GradientPart]:
     """Return the parts of a space with the estimators that are valid for them.
 
     Args:
         groups: of the plan.
         linear: whether the loss is linear: differences of the loss are then those of the picture, and left out.
     """
-    sets: dict[tuple[str, tuple[str, ...]], list[GroupPlan]] = {}
+    sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
     for group in groups:
         if group.valid:
             sets.setdefault((group.control, group.valid), []).append(group)
@@ -228,7 +229,7 @@ class GradientBench:
         return Probe(group, group.name, direction, group.step if group.size <= 64 else 0.03)
 
 
-def _coordinate(u: Tensor, group: GroupPlan, number: int) -> Probe:
+def _coordinate(u: Tensor, group: Group, number: int) -> Probe:
     direction = torch.zeros_like(u)
     direction[group.begin + number] = 1.0
     return Probe(replace(group, size=1, begin=group.begin + number), f"{group.name}.{number}", direction, group.step)

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import Json
+from advsearch.scene.gradients.group import BY_DIFFERENCES as BY_DIFFERENCES
+from advsearch.scene.gradients.group import Group
 
 ESTIMATORS: Mapping[str, str] = {
     "adjoint": "interior adjoint (path replay); right for what moves no outline: textures, colours, lights' power",
@@ -31,7 +33,6 @@ ESTIMATORS: Mapping[str, str] = {
 }
 """Every estimator by the name that forces it."""
 
-BY_DIFFERENCES = frozenset({"differences", "secant", "forward", "simultaneous"})
 BY_ADJOINT = frozenset({"adjoint", "material", "boundary", "guided"})
 WITH_BOUNDARY = frozenset({"material", "boundary", "guided"})
 """Adjoints that know of moving outlines."""
@@ -56,63 +57,6 @@ things out of sight."""
 
 
 @dataclass(frozen=True)
-class GroupPlan:
-    """How one group of coordinates is differentiated.
-
-    Attributes:
-        control: name of the control.
-        parameter: name of the parameter.
-        begin: first coordinate in u.
-        size: number of coordinates.
-        estimator: a key of `ESTIMATORS`.
-        valid: the estimators that were valid, preferred first.
-        step: half-width of a difference in u; 0 where none is taken.
-        pixel: that half-width over which the fastest outline moves by a pixel; that of the group where nothing moves.
-        periodic: 0 and 1 are the same value.
-        reason: why this estimator, in words.
-        measured: what a measurement found for each valid estimator: variance x time, if one was made.
-    """
-
-    control: str
-    parameter: str
-    begin: int
-    size: int
-    estimator: str
-    valid: tuple[str, ...]
-    step: float = 0.0
-    pixel: float = 0.0
-    periodic: bool = False
-    reason: str = ""
-    measured: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def coordinates(self) -> slice:
-        """Where the group lies in u."""
-        return slice(self.begin, self.begin + self.size)
-
-    @property
-    def name(self) -> str:
-        """`control.parameter`."""
-        return f"{self.control}.{self.parameter}"
-
-    @property
-    def step_reason(self) -> str:
-        """Why the step is as wide as it is, in words; empty where none is taken."""
-        if self.estimator not in BY_DIFFERENCES:
-            return ""
-        if self.step == self.pixel:
-            return "an outline moves by a pixel, or nothing moves"
-        return f"{self.step / self.pixel:.2g} times as wide as moves an outline by a pixel, so that a search can follow"
-
-    @property
-    def renders(self) -> int:
-        """Primal renders that one gradient of this group takes, beside those shared by all groups."""
-        if self.estimator in ("differences", "secant"):
-            return 2 * self.size
-        return self.size if self.estimator == "forward" else 0
-
-
-@dataclass(frozen=True)
 class GradientPlan:
     """How the gradient of a whole space is obtained.
 
@@ -121,10 +65,10 @@ class GradientPlan:
         spp: samples a pixel of differences; None takes the primal's.
     """
 
-    groups: tuple[GroupPlan, ...]
+    groups: tuple[Group, ...]
     spp: int | None = None
 
-    def having(self, *estimators: str) -> tuple[GroupPlan, ...]:
+    def having(self, *estimators: str) -> tuple[Group, ...]:
         """Return the groups that use one of these estimators."""
         return tuple(group for group in self.groups if group.estimator in estimators)
 
@@ -198,7 +142,7 @@ class GradientPlan:
 
 
 def first_plan(
-    groups: Sequence[GroupPlan],
+    groups: Sequence[Group],
     steps: Tensor,
     forced: Mapping[str, str] | None = None,
     spp: int | None = None,
@@ -227,7 +171,7 @@ def first_plan(
     return GradientPlan(tuple(_first(group, steps, forced, across) for group in groups), spp)
 
 
-def _first(group: GroupPlan, steps: Tensor, forced: Mapping[str, str], across: float) -> GroupPlan:
+def _first(group: Group, steps: Tensor, forced: Mapping[str, str], across: float) -> Group:
     pixel = float(steps[group.coordinates].min()) if group.size else 0.0
     outline = group.size == 1 and not {"adjoint", "image"} & {*group.valid}
     step = max(pixel, min(SEARCH_STEP, SEARCH_SHARE * across * pixel)) if outline else pixel
