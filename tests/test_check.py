@@ -14,10 +14,11 @@ from typing import Any
 import pytest
 
 from advsearch.api import check as checking
-from advsearch.api.check import Results, check_from_config
+from advsearch.api.check import check_from_config
 from advsearch.cli import check as command
 from advsearch.cli.main import main
 from advsearch.config import CheckConfig
+from advsearch.engine.measuring import OutOfTime, Results
 from advsearch.engine.memory import Memory
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed
@@ -138,7 +139,7 @@ def test_what_is_stored_is_not_measured_again(tmp_path: Path) -> None:
         late = Results(Memory(run), seconds=0.0)
         assert late.get("a", lambda: pytest.fail("measured again")) == {"x": [0.1 + 0.2, float("inf")]}
         assert late.get("b", lambda: 1) == 1  # a sitting always gets on
-        with pytest.raises(checking.OutOfTime):
+        with pytest.raises(OutOfTime):
             late.get("c", lambda: 1)
 
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
@@ -29,6 +27,7 @@ from advsearch.engine.gradients import (
     smooth_loss,
     verdict,
 )
+from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.memory import Memory
 from advsearch.engine.naming import run_settings_for
 from advsearch.engine.planning import (
@@ -45,9 +44,7 @@ from advsearch.engine.problem import Problem
 from advsearch.files import Json
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory, default_name
-from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME
 from advsearch.runs.results.check import WHOLE, CheckedRow, CheckedRows, CheckResult, DerivativeRow, DirectionRow
-from advsearch.runs.summary import NAME, read_result
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import STEP_RANGE
@@ -106,13 +103,18 @@ def check_from_config(
     progress, begun = progress or NullProgress(), time.perf_counter()
     progress.stage(LOADING)
     parts = _parts(config, config.losses, config.all)
-    opened = RunDirectory.resume(resumed, config) if resumed is not None else _new_run(config)
+    name = default_name("all" if config.all else config.object, ["check"])
+    opened = RunDirectory.resume(resumed, config) if resumed is not None else RunDirectory.create_for(config, name)
     with opened as run:
-        results, measured, ending = Results(Memory(run), config.seconds), 0, INTERRUPTED
-        rows: list[CheckedRow] = []
-        told = _told(run)
+        results, measured = Results(Memory(run), config.seconds), 0
 
-        def result() -> CheckResult:
+        def rows() -> Iterator[CheckedRow]:
+            nonlocal measured
+            for part in parts:
+                yield from _rows_of(part, len(parts), results, progress)
+                measured += 1
+
+        def result(rows: Sequence[CheckedRow], ending: str) -> CheckResult:
             return CheckResult(
                 run=str(run.path),
                 object=",".join(dict.fromkeys(part.config.object for part in parts)),
@@ -121,79 +123,16 @@ def check_from_config(
                 ending=ending,
                 measured=measured,
                 planned=len(parts),
-                rows=rows,
+                rows=list(rows),
                 seconds={"total": time.perf_counter() - begun},
                 seed=config.seed,
                 command_line=config.command_line(),
             )
 
-        try:
-            for part in parts:
-                for row in _rows_of(part, len(parts), results, progress):
-                    rows.append(row)
-                    if len(rows) > told:
-                        run.write_summary(result())  # what a kill leaves
-                measured += 1
-            ending = "done"
-        except KeyboardInterrupt:
-            pass
-        except OutOfTime:
-            ending = OUT_OF_TIME
-        answer = result()
-        run.write_summary(answer)
-        return answer
-
-
-def _told(run: RunDirectory) -> int:
-    """How many rows the summary has that an earlier sitting left."""
-    if not (run.path / NAME).is_file():
-        return 0
-    earlier = read_result(run.path)
-    return len(earlier.rows) if isinstance(earlier, CheckResult) else 0
+        return kept_rows(run, rows(), result)
 
 
 # ---- what is measured, and what was ---------------------------------------------------------------------------------
-
-
-class OutOfTime(Exception):
-    """The time that a check was given is over."""
-
-
-class Results:
-    """What a check has measured, in the run's store; measures what is not there, until the time is up.
-
-    Args:
-        memory: of the run.
-        seconds: after which nothing more is measured; one measurement is always made, so that it gets on.
-    """
-
-    def __init__(self, memory: Memory, seconds: float | None = None) -> None:
-        self._memory = memory
-        self._end = math.inf if seconds is None else time.monotonic() + seconds
-        self._made = 0
-
-    def get(self, key: str, measure: Callable[[], Any]) -> Any:
-        """Return a JSON value: the one that is stored under a key, or what `measure` returns, which is stored then.
-
-        Raises:
-            OutOfTime: it is not stored, and the time is over.
-        """
-        stored = self._memory.note(key)
-        if stored is None:
-            if self._made and time.monotonic() >= self._end:
-                raise OutOfTime
-            self._made += 1
-            stored = json.loads(json.dumps(measure()))
-            self._memory.set_note(key, stored)
-        return stored
-
-    def put(self, key: str, value: Any) -> None:
-        """Store a JSON value."""
-        self._memory.set_note(key, value)
-
-    def stored(self, key: str) -> Any:
-        """Return what is stored under a key, or None."""
-        return self._memory.note(key)
 
 
 @dataclass(frozen=True)
@@ -214,17 +153,6 @@ class CheckedPart:
     def key(self) -> str:
         """Under which its results are stored."""
         return f"check {self.number}"
-
-
-def _new_run(config: CheckConfig) -> RunDirectory:
-    name = "all" if config.all else config.object
-    run = RunDirectory.create(config.run, overwrite=config.overwrite, default=default_name(name, ["check"]))
-    try:
-        run.write_config(config)
-    except BaseException:
-        run.discard()
-        raise
-    return run
 
 
 def _parts(config: AttackConfig, losses: Sequence[str], everything: bool) -> list[CheckedPart]:

@@ -118,9 +118,9 @@ class RunDirectory:
             raise
 
     @classmethod
-    def create_for(cls, config: SceneConfig) -> RunDirectory:
-        """Make the directory that `config` asks for, with its `run.yaml`; errors as for `create`."""
-        default = default_name(config.object, config.controls)
+    def create_for(cls, config: SceneConfig, default: str | None = None) -> RunDirectory:
+        """Make the directory that `config` asks for, with its `run.yaml`; arguments and errors as for `create`."""
+        default = default or default_name(config.object, config.controls)
         run = cls.create(config.run, overwrite=config.overwrite, default=default)
         try:
             run.write_config(config)

@@ -46,7 +46,9 @@ class RegionResult(RunResult):
     interval: Interval | None = Field(default=None, description="of that share")
     volume: float | None = Field(default=None, description="share of the ranges that the box takes up")
     spp: int | None = Field(default=None, description="samples a pixel")
-    map: MarginMap | None = Field(default=None, description="the margin over two parameters; only where `map` asks for it")
+    map: MarginMap | None = Field(
+        default=None, description="the margin over two parameters; only where `map` asks for it"
+    )
     image_formation: Formation
     clean: CleanScene
     warnings: list[str]

@@ -1,0 +1,90 @@
+"""Long measurements that can be stopped: what is measured is stored at once, and rows are kept as they come."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeVar
+
+from advsearch.engine.memory import Memory
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME, Result
+from advsearch.runs.summary import NAME, read_result
+
+Row = TypeVar("Row")
+Answer = TypeVar("Answer", bound=Result)
+
+
+class OutOfTime(Exception):
+    """The time that a measurement was given is over."""
+
+
+class Results:
+    """What a run has measured, in its store; measures what is not there, until the time is up.
+
+    Args:
+        memory: of the run.
+        seconds: after which nothing more is measured; one measurement is always made, so that it gets on.
+    """
+
+    def __init__(self, memory: Memory, seconds: float | None = None) -> None:
+        self._memory = memory
+        self._end = math.inf if seconds is None else time.monotonic() + seconds
+        self._made = 0
+
+    def get(self, key: str, measure: Callable[[], Any]) -> Any:
+        """Return a JSON value: the one that is stored under a key, or what `measure` returns, which is stored then.
+
+        Raises:
+            OutOfTime: it is not stored, and the time is over.
+        """
+        stored = self._memory.note(key)
+        if stored is None:
+            if self._made and time.monotonic() >= self._end:
+                raise OutOfTime
+            self._made += 1
+            stored = json.loads(json.dumps(measure()))
+            self._memory.set_note(key, stored)
+        return stored
+
+    def put(self, key: str, value: Any) -> None:
+        """Store a JSON value."""
+        self._memory.set_note(key, value)
+
+    def stored(self, key: str) -> Any:
+        """Return what is stored under a key, or None."""
+        return self._memory.note(key)
+
+
+def kept_rows(run: RunDirectory, rows: Iterable[Row], result: Callable[[Sequence[Row], str], Answer]) -> Answer:
+    """Take rows until they end, the time is up or there is an interrupt, and keep what they come to after each.
+
+    The summary never has fewer rows than an earlier sitting left in it: those are read back first.
+
+    Args:
+        run: open.
+        rows: as they come.
+        result: makes the result of the rows so far and of how it ended.
+    """
+    taken: list[Row] = []
+    told, ending = _told(run), INTERRUPTED
+    try:
+        for row in rows:
+            taken.append(row)
+            if len(taken) > told:
+                run.write_summary(result(taken, ending))  # what a kill leaves
+        ending = "done"
+    except KeyboardInterrupt:
+        pass
+    except OutOfTime:
+        ending = OUT_OF_TIME
+    answer = result(taken, ending)
+    run.write_summary(answer)
+    return answer
+
+
+def _told(run: RunDirectory) -> int:
+    """How many rows the summary has that an earlier sitting left."""
+    return len(getattr(read_result(run.path), "rows", ())) if (run.path / NAME).is_file() else 0
