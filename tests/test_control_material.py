@@ -12,8 +12,8 @@ import advsearch
 from advsearch.controls.material.control import BASE_COLOR, NUMBERS, TINT, MaterialControl
 from advsearch.controls.material.patterns import PATTERNS, SIDE, covering, tile
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
-from advsearch.scene.formation import srgb_to_linear
 from advsearch.scene.surface_map import texel_positions
 
 AGREEMENT = 0.15

@@ -22,7 +22,8 @@ from advsearch.scene.library import list_objects
 from advsearch.scene.mitsuba_backend.parts import translation
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.silhouettes import Frame, Sweep, middle_axes, pixels_in, silhouette
+from advsearch.scene.raster import pixels_in
+from advsearch.scene.silhouettes import Frame, Sweep, middle_axes, silhouette
 
 ACCURACY = 0.02
 """Allowed error of a hidden share: silhouettes have 128 pixels along their longer side."""

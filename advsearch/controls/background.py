@@ -21,8 +21,8 @@ from advsearch.controls.base import Choice, Parameter, Value
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Choices, Fixed, Number
 from advsearch.errors import InputError
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import srgb_to_linear
 
 COLOR = "backdrop.color"
 """The scene input: (3,) display-linear values in [0, 1]."""

@@ -17,8 +17,8 @@ from torch import Tensor
 from advsearch.controls.base import Parameter
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed, Number, Range
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import srgb_to_linear
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.parts import HazePart
 

@@ -23,8 +23,8 @@ from advsearch.controls.base import Choice, Parameter
 from advsearch.controls.numbers import BoundNumbers, NumberControl, Values
 from advsearch.controls.values import is_whole
 from advsearch.errors import InputError
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
 
 DOTS = 4
 """How many dots there are when nothing is said."""

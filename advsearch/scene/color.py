@@ -1,22 +1,34 @@
-"""Display-referred sRGB and linear values, in numpy (IEC 61966-2-1); `formation` has the torch form."""
+"""Display-referred sRGB and linear values (IEC 61966-2-1), of numpy arrays and of torch tensors alike."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-Floats = npt.NDArray[np.float32]
+if TYPE_CHECKING:
+    from torch import Tensor
+
+Values = TypeVar("Values", npt.NDArray[np.float32], "Tensor")
 
 
-def srgb_to_linear(display: Floats) -> Floats:
-    """Decode display-referred sRGB in [0, 1] to linear values in [0, 1]; any shape, float32."""
-    low = display / 12.92
-    high = ((np.maximum(display, 0.0) + 0.055) / 1.055) ** 2.4
-    return np.where(display <= 0.04045, low, high).astype(np.float32)
+def srgb_to_linear(display: Values) -> Values:
+    """Decode display-referred sRGB in [0, 1] to linear values; any shape, float32; differentiable everywhere."""
+    curve = ((display.clip(0.04045, None) + 0.055) / 1.055) ** 2.4
+    linear: Values = _either(display <= 0.04045, display / 12.92, curve)
+    return linear
 
 
-def linear_to_srgb(linear: Floats) -> Floats:
-    """Encode linear values as display-referred sRGB, clipped to [0, 1]; any shape, float32."""
-    clipped = np.clip(linear, 0.0, 1.0)
-    high = 1.055 * np.maximum(clipped, 0.0031308) ** (1.0 / 2.4) - 0.055
-    return np.where(clipped <= 0.0031308, clipped * 12.92, high).astype(np.float32)
+def linear_to_srgb(linear: Values) -> Values:
+    """Encode linear values as display-referred sRGB, clipped to [0, 1]; any shape, float32; differentiable."""
+    clipped = linear.clip(0.0, 1.0)
+    curve = 1.055 * clipped.clip(0.0031308, None) ** (1.0 / 2.4) - 0.055
+    display: Values = _either(clipped <= 0.0031308, clipped * 12.92, curve)
+    return display
+
+
+def _either(low_end: Any, low: Any, curve: Any) -> Any:
+    if isinstance(low, np.ndarray):
+        return np.where(low_end, low, curve).astype(np.float32)
+    return low.where(low_end, curve)

@@ -24,8 +24,9 @@ import numpy.typing as npt
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.raster import pixels_in
 from advsearch.scene.settings import resolve
-from advsearch.scene.silhouettes import NEAREST, Frame, pixels_in
+from advsearch.scene.silhouettes import NEAREST, Frame
 
 if TYPE_CHECKING:
     from advsearch.scene.description import SceneDescription

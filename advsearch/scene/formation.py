@@ -10,10 +10,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
+from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER, SAMPLERS
 
 DENOISERS = ("oidn", "none")
@@ -75,19 +75,6 @@ class ImageFormation:
             "resolution": [height, width],
             "gain": self.gain,
         }
-
-
-def linear_to_srgb(linear: Tensor) -> Tensor:
-    """Encode linear values as display-referred sRGB, clipped to [0, 1]; any shape; differentiable everywhere."""
-    clipped = linear.clamp(0.0, 1.0)
-    curve = 1.055 * clipped.clamp_min(0.0031308).pow(1.0 / 2.4) - 0.055
-    return torch.where(clipped <= 0.0031308, clipped * 12.92, curve)
-
-
-def srgb_to_linear(display: Tensor) -> Tensor:
-    """Decode display-referred sRGB in [0, 1] to linear values; any shape; differentiable everywhere."""
-    curve = ((display.clamp_min(0.04045) + 0.055) / 1.055).pow(2.4)
-    return torch.where(display <= 0.04045, display / 12.92, curve)
 
 
 def to_8_bit(display: Tensor) -> Tensor:

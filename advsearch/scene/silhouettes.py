@@ -16,8 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from advsearch.scene.raster import pixels_in
+
 Doubles = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 
 RASTER = 128
@@ -30,8 +31,6 @@ GRID = 24
 """Rows and columns of the directions that stand for the whole frame."""
 NEAREST = 1e-3
 """Points nearer to the camera plane than this, or behind it, are left out of silhouettes."""
-TOLERANCE = 1e-6
-"""Barycentric weight by which a pixel's centre may miss a triangle, so that shared edges leave no gaps."""
 
 
 @dataclass(frozen=True)
@@ -132,33 +131,6 @@ def silhouette(points: Doubles, faces: npt.NDArray[np.uint32], frame: Frame | No
     mask = np.zeros((height, width), dtype=np.bool_)
     mask[row, column] = True
     return Silhouette(mask, Frame(float(left), float(right), float(low), float(high))) if mask.any() else None
-
-
-def pixels_in(corners: Doubles, shape: tuple[int, int]) -> tuple[Ints, Ints, Ints, Doubles]:
-    """List the pixels whose centres lie in each of many triangles.
-
-    Args:
-        corners: (F, 3, 2) column and row; integers are pixel centres.
-        shape: (height, width) of the raster.
-
-    Returns:
-        For every such pixel: its triangle, row, column (N,) and the corners' barycentric weights (N, 3).
-    """
-    (ax, ay), (bx, by), (cx, cy) = (corners[:, number].T for number in range(3))
-    doubled = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-    low = np.clip(np.ceil(corners.min(axis=1) - 1e-6), 0, None).astype(np.int64)
-    high = np.clip(np.floor(corners.max(axis=1) + 1e-6), None, (shape[1] - 1, shape[0] - 1)).astype(np.int64)
-    counts = np.where((doubled != 0.0)[:, None], np.maximum(high - low + 1, 0), 0)
-    area = counts.prod(axis=1)
-    face = np.repeat(np.arange(len(corners)), area)
-    number = np.arange(len(face)) - np.repeat(np.cumsum(area) - area, area)
-    column, row = low[face, 0] + number % counts[face, 0], low[face, 1] + number // counts[face, 0]
-    scale = 1.0 / doubled[face]
-    second = ((column - ax[face]) * (cy - ay)[face] - (row - ay[face]) * (cx - ax)[face]) * scale
-    third = ((bx - ax)[face] * (row - ay[face]) - (by - ay)[face] * (column - ax[face])) * scale
-    weights = np.stack([1.0 - second - third, second, third], axis=-1)
-    inside = (weights >= -TOLERANCE).all(axis=1)
-    return face[inside], row[inside], column[inside], weights[inside]
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ from scipy.sparse import csgraph
 
 from advsearch.errors import InputError
 from advsearch.scene.assets import Floats, Mesh
+from advsearch.scene.raster import doubled_areas, pixels_near
 
 Doubles = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -25,8 +26,6 @@ Mask = npt.NDArray[np.bool_]
 
 BORDER = 2.0
 """Texels around a chart that still belong to it: a bilinear lookup inside a chart reaches one texel beyond it."""
-TOLERANCE = 1e-4
-"""Texels by which a centre may miss a triangle and still count, so that shared edges leave no gaps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +68,7 @@ class Charts:
         """Return the surface area (h, w) that each texel stands for, in squared mesh units; 0 where no chart is."""
         places = self.mesh.vertices[self.mesh.faces].astype(np.float64)
         surface = np.linalg.norm(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]), axis=1)
-        texels = np.abs(_doubled_areas(_in_texels(self.mesh, len(self.face))))
+        texels = np.abs(doubled_areas(_in_texels(self.mesh, len(self.face))))
         share = np.where(texels > 0.0, surface / np.maximum(texels, 1e-12), 0.0)
         return np.where(self.covered, share[self.face], 0.0).astype(np.float32)
 
@@ -101,16 +100,13 @@ def texel_area(mesh: Mesh, resolution: int) -> Floats:
 def rasterised(mesh: Mesh, resolution: int) -> Charts:
     """Find the face and the barycentric weights behind every texel centre.
 
-    Each triangle is cut into the spans of texel rows that it crosses, and each span into texels; where charts overlap,
-    one of their faces wins.
+    Where charts overlap, one of their faces wins.
 
     Raises:
         InputError: the texture coordinates cover no texel.
     """
     corners = _in_texels(mesh, resolution)
-    face, row = _ranges(corners[..., 1].min(axis=1), corners[..., 1].max(axis=1), resolution)
-    span, column = _ranges(*_crossing(corners[face], row), resolution)
-    face, row = face[span], row[span]
+    face, row, column = pixels_near(corners, (resolution, resolution))
     weights = _barycentric(corners[face], np.stack([column, row], axis=1))
     if len(face) == 0:
         raise InputError(
@@ -215,33 +211,9 @@ def _in_texels(mesh: Mesh, resolution: int) -> Doubles:
     return np.stack([uvs[..., 0] * resolution - 0.5, (1.0 - uvs[..., 1]) * resolution - 0.5], axis=-1)
 
 
-def _ranges(low: Doubles, high: Doubles, size: int) -> tuple[Ints, Ints]:
-    """List the integers of [low, high] within [0, size - 1] for many intervals: each one's interval, and its value."""
-    first = np.maximum(np.ceil(low - TOLERANCE), 0.0).astype(np.int64)
-    last = np.minimum(np.floor(high + TOLERANCE), size - 1.0).astype(np.int64)
-    counts = np.maximum(last - first + 1, 0)
-    owner = np.repeat(np.arange(len(counts)), counts)
-    begin = np.cumsum(counts) - counts
-    return owner, first[owner] + np.arange(len(owner)) - begin[owner]
-
-
-def _crossing(corners: Doubles, row: Ints) -> tuple[Doubles, Doubles]:
-    """Leftmost and rightmost column where a row's line meets a triangle: corners (N, 3, 2), row (N,)."""
-    left, right = np.full(len(row), np.inf), np.full(len(row), -np.inf)
-    for begin, end in ((0, 1), (1, 2), (2, 0)):
-        (x0, y0), (x1, y1) = corners[:, begin].T, corners[:, end].T
-        rise = y1 - y0
-        share = np.clip((row - y0) / np.where(rise == 0.0, 1.0, rise), 0.0, 1.0)
-        meets = (np.minimum(y0, y1) - TOLERANCE <= row) & (row <= np.maximum(y0, y1) + TOLERANCE) & (rise != 0.0)
-        x = x0 + share * (x1 - x0)
-        left, right = np.where(meets, np.minimum(left, x), left), np.where(meets, np.maximum(right, x), right)
-    empty = left > right
-    return np.where(empty, 0.0, left), np.where(empty, -1.0, right)
-
-
 def _barycentric(corners: Doubles, points: Ints) -> Doubles:
     """Weights (N, 3) of the corners (N, 3, 2) of flat triangles at points (N, 2), clipped to the triangle."""
-    whole = _doubled_areas(corners)
+    whole = doubled_areas(corners)
     parts = []
     for begin, end in ((1, 2), (2, 0), (0, 1)):
         a, b = corners[:, begin] - points, corners[:, end] - points
@@ -249,12 +221,6 @@ def _barycentric(corners: Doubles, points: Ints) -> Doubles:
     weights = np.maximum(np.stack(parts, axis=1), 0.0)
     total = weights.sum(axis=1, keepdims=True)
     return np.where(total > 0.0, weights / np.maximum(total, 1e-12), 1.0 / 3.0)
-
-
-def _doubled_areas(corners: Doubles) -> Doubles:
-    """Twice the signed area (F,) of flat triangles (F, 3, 2)."""
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def _face_normals(mesh: Mesh) -> Doubles:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from advsearch.scene.assets import Mesh, ObjectAsset
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.silhouettes import pixels_in
+from advsearch.scene.raster import pixels_in
 
 Doubles = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -23,8 +23,8 @@ from advsearch.controls.material.patterns import PATTERNS, covering
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Choices, Fixed, Number
 from advsearch.scene.assets import Material, Mesh
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import linear_to_srgb, srgb_to_linear
 from advsearch.scene.settings import LIT, MATERIAL
 
 BASE_COLOR = "object.base_color"

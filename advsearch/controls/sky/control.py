@@ -27,8 +27,8 @@ from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.sky.dome import TURBIDITIES, Sky
 from advsearch.errors import InputError
 from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.formation import srgb_to_linear
 
 EXPOSURES = ("metered", "fixed")
 METERED_IRRADIANCE = 0.9 * math.pi / 0.8

@@ -15,10 +15,11 @@ from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array, csgraph
 
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.geometry import Array, Ints, Soup
+from advsearch.scene.importing.geometry import Array, Soup
 from advsearch.scene.importing.images import TEXTURE_LIMIT
 from advsearch.scene.importing.surfaces import NEUTRAL, Surface
 from advsearch.scene.importing.unwrap import unwrapped
+from advsearch.scene.raster import pixels_in
 
 Floats = npt.NDArray[np.float32]
 
@@ -33,7 +34,6 @@ _SQUASHED = 0.05  # share of the surface that may have no area in UV space
 _CRAMPED = 0.02  # share of the unit square that UVs must cover in all
 _WINDOW = 1.5  # how many textures wide and high UVs may be and still keep their layout
 _FILLED = 0.5  # share of an atlas that its charts fill, about
-_CHUNK = 1 << 21  # candidate texels that are rasterised at a time
 
 
 def textured(soup: Soup, surfaces: Sequence[Surface]) -> tuple[Soup, Floats, list[str]]:
@@ -158,7 +158,8 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[Surface]) -> Floats:
         filtering finds no seam.
     """
     size = _baked_size(soup, surfaces)
-    rows, columns, face, weights = _rasterised(uvs, size)
+    corners = np.stack([uvs[:, :, 0] * size - 0.5, (1.0 - uvs[:, :, 1]) * size - 0.5], axis=2)
+    face, rows, columns, weights = pixels_in(corners, (size, size), tolerance=1e-9)
     image, inside = np.zeros((size, size, 3), np.float32), np.zeros((size, size), np.bool_)
     factor = np.einsum("tk,tkc->tc", weights, soup.colors[face])
     part = soup.part[face]
@@ -195,45 +196,8 @@ def _baked_size(soup: Soup, surfaces: Sequence[Surface]) -> int:
 
 def _mean(texture: Floats) -> Floats:
     """Return the mean colour (1, 3) of a texture, taken in linear light."""
-    return linear_to_srgb(srgb_to_linear(texture).mean(axis=(0, 1), dtype=np.float64).astype(np.float32))[None]
-
-
-def _rasterised(uvs: Array, size: int) -> tuple[Ints, Ints, Ints, Array]:
-    """Find the face under each texel centre of a size x size texture.
-
-    Returns:
-        For each of T covered texels: row (T,), column (T,), face (T,), and the weights of the face's corners (T, 3).
-    """
-    corners = np.stack([uvs[:, :, 0] * size - 0.5, (1.0 - uvs[:, :, 1]) * size - 0.5], axis=2)
-    low = np.clip(np.ceil(corners.min(axis=1)), 0, size - 1).astype(np.int64)
-    high = np.clip(np.floor(corners.max(axis=1)), -1, size - 1).astype(np.int64)
-    extent = np.maximum(high - low + 1, 0)
-    counts = extent.prod(axis=1)
-    found = []
-    chunk = np.cumsum(counts) // _CHUNK
-    for number in np.unique(chunk):
-        faces = np.flatnonzero((chunk == number) & (counts > 0))
-        face = np.repeat(faces, counts[faces])
-        if not len(face):
-            continue
-        place = np.arange(len(face)) - np.repeat(np.cumsum(counts[faces]) - counts[faces], counts[faces])
-        column, row = low[face, 0] + place % extent[face, 0], low[face, 1] + place // extent[face, 0]
-        weights = _barycentric(corners[face], column, row)
-        inside = (weights >= -1e-9).all(axis=1)
-        found.append((row[inside], column[inside], face[inside], weights[inside]))
-    row, column, face, weights = (np.concatenate(arrays) for arrays in zip(*found, strict=True))
-    return row, column, face, weights
-
-
-def _barycentric(corners: Array, x: Ints, y: Ints) -> Array:
-    """Return the (T, 3) weights of triangles (T, 3, 2) at points (x, y); NaN for triangles without area."""
-    origin, a, b = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    px, py = x - origin[:, 0], y - origin[:, 1]
-    with np.errstate(all="ignore"):
-        scale = 1.0 / (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
-        second = (px * b[:, 1] - py * b[:, 0]) * scale
-        third = (a[:, 0] * py - a[:, 1] * px) * scale
-    return np.stack([1.0 - second - third, second, third], axis=1)
+    mean: Floats = srgb_to_linear(texture).mean(axis=(0, 1), dtype=np.float64).astype(np.float32)
+    return linear_to_srgb(mean)[None]
 
 
 def sampled(texture: Floats, uvs: Array) -> Floats:
