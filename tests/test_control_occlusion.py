@@ -23,7 +23,7 @@ from advsearch.scene.mitsuba_backend.parts import translation
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import pixels_in
-from advsearch.scene.silhouettes import Frame, Sweep, middle_axes, silhouette
+from advsearch.scene.silhouettes import Frame, Passage, middle_axes, silhouette
 
 ACCURACY = 0.02
 """Allowed error of a hidden share: silhouettes have 128 pixels along their longer side."""
@@ -73,7 +73,7 @@ def test_a_card_across_a_card_hides_what_geometry_says() -> None:
     seen, cover = silhouette(points + ahead, card.faces), silhouette(points * 2.0 + ahead, card.faces)
     assert seen is not None and cover is not None
     directions = seen.directions()
-    sweep = Sweep(directions, cover, middle_axes(directions), direction=0.0)
+    sweep = Passage(directions, cover, middle_axes(directions), direction=0.0)
     angles = np.arctan(np.array([2.0, 1.25, 1.0, 0.75, 0.0]) / 10.0)
     np.testing.assert_allclose(sweep.coverage(angles), [0.0, 0.25, 0.5, 0.75, 1.0], atol=ACCURACY)
     assert sweep.solve(0.3, 0.5) == pytest.approx(math.atan(0.12), abs=0.002)

@@ -21,7 +21,7 @@ from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.library import list_objects, load_object
-from advsearch.scene.surface_map import Surface, rasterised, texel_area, texel_positions
+from advsearch.scene.surface_map import MeshSurface, rasterised, texel_area, texel_positions
 
 SIDE = 512
 
@@ -90,7 +90,7 @@ def test_texture_coordinates_without_area_are_refused(scene: SceneDescription) -
 
 
 def test_a_ray_meets_the_near_wall_and_a_ray_that_misses_the_nearest_corner(scene: SceneDescription) -> None:
-    surface = Surface(scene.object.mesh)
+    surface = MeshSurface(scene.object.mesh)
     face, point = surface.hit(np.array([-3.0, 0.0, 0.4]), np.array([1.0, 0.0, 0.0]))
     assert point[0] < -0.3 and point[1:] == pytest.approx([0.0, 0.4]) and surface.normals[face, 0] < -0.9
     face, point = surface.hit(np.array([-3.0, 0.0, 9.0]), np.array([1.0, 0.0, 0.0]))
@@ -122,7 +122,7 @@ def test_it_stays_on_the_part_that_it_is_stuck_to() -> None:
     vertices = np.concatenate([corners, corners + np.float32([1.1, 0, 0])])
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], dtype=np.uint32)
     up = np.tile(np.float32([0, 0, 1]), (8, 1))
-    surface = Surface(Mesh(vertices, faces, up, vertices[:, :2]))
+    surface = MeshSurface(Mesh(vertices, faces, up, vertices[:, :2]))
     region = surface.region(0, np.array([0.9, 0.1, 0.0]), np.array([0.0, 0.0, 1.0]), 5.0)
     assert region.tolist() == [True, True, False, False]
     assert not surface.region(0, np.array([0.9, 0.1, 0.0]), np.array([0.0, 0.0, 1.0]), 0.05)[2:].any()

@@ -29,7 +29,7 @@ def _fresh() -> Iterator[None]:
 def well(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every part works, and nothing is really tried."""
     monkeypatch.setattr(doctor, "probe", lambda: ALL_WELL)
-    monkeypatch.setattr(doctor, "reference_weights", lambda: doctor.Part("reference model", "", doctor.OK))
+    monkeypatch.setattr(doctor, "reference_weights", lambda: doctor.Component("reference model", "", doctor.OK))
 
 
 def process_that(code: str) -> tuple[str, ...]:
@@ -105,7 +105,7 @@ def test_a_process_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> No
 
 def test_llvm_tells_which_was_chosen_and_why_others_were_not(monkeypatch: pytest.MonkeyPatch) -> None:
     chosen, other = Path("/lib/libLLVM.so.19.1"), Path("/lib/libLLVM-15.so.1")
-    candidates = [llvm.Candidate(chosen, (19, 1), ""), llvm.Candidate(other, (15,), llvm.refusal((15,)))]
+    candidates = [llvm.LibraryFile(chosen, (19, 1), ""), llvm.LibraryFile(other, (15,), llvm.refusal((15,)))]
     monkeypatch.delenv(llvm.VARIABLE, raising=False)
     monkeypatch.setattr(llvm, "find", lambda: candidates)
     monkeypatch.setattr(llvm, "ensure_llvm", lambda: llvm.LLVM(chosen, (19, 1)))

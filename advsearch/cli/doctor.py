@@ -42,7 +42,7 @@ _NO_FIX_NEEDED = ""
 
 
 @dataclass(frozen=True)
-class Part:
+class Component:
     """One part of the installation.
 
     Attributes:
@@ -76,11 +76,11 @@ def run(json: bool = False) -> int:
     return 0 if good else FELL_SHORT
 
 
-def examine() -> list[Part]:
+def examine() -> list[Component]:
     """Check every part, in the order in which they depend on each other."""
     return [
-        Part("Python", platform.python_version(), OK, sys.executable),
-        Part("advsearch", __version__, OK, str(resources.files("advsearch"))),
+        Component("Python", platform.python_version(), OK, sys.executable),
+        Component("advsearch", __version__, OK, str(resources.files("advsearch"))),
         *packages(probe()),
         other_packages(),
         llvm(),
@@ -113,19 +113,19 @@ def probe(command: Sequence[str] = PROBE) -> dict[str, tuple[bool, str]]:
     return tried
 
 
-def packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Part]:
+def packages(tried: dict[str, tuple[bool, str]]) -> Iterator[Component]:
     """The packages that were tried, with their versions; a render stands for Mitsuba and Dr.Jit together."""
     for name in ("numpy", "torch", "mitsuba", "drjit", "render", "mitsuba-oidn", *_SMALL_PACKAGES):
         version = "" if name == "render" else installed_version(name)
         if version is None:
             yield _absent(name)
         elif name in ("mitsuba", "drjit"):
-            yield Part(name, version, OK, "tried by the render below")
+            yield Component(name, version, OK, "tried by the render below")
         else:
             yield _tried(name, version, tried)
 
 
-def other_packages(requirements: Sequence[str] | None = None) -> Part:
+def other_packages(requirements: Sequence[str] | None = None) -> Component:
     """The dependencies that need no trial: present or not.
 
     Args:
@@ -137,8 +137,10 @@ def other_packages(requirements: Sequence[str] | None = None) -> Part:
     versions = {name: installed_version(name) for name in rest}
     absent = [name for name, version in versions.items() if version is None]
     if absent:
-        return Part("other packages", "", MISSING, f"not installed: {', '.join(absent)}", _reinstall(" ".join(absent)))
-    return Part("other packages", "", OK, ", ".join(f"{name} {version}" for name, version in versions.items()))
+        return Component(
+            "other packages", "", MISSING, f"not installed: {', '.join(absent)}", _reinstall(" ".join(absent))
+        )
+    return Component("other packages", "", OK, ", ".join(f"{name} {version}" for name, version in versions.items()))
 
 
 def installed_version(name: str) -> str | None:
@@ -149,29 +151,29 @@ def installed_version(name: str) -> str | None:
         return None
 
 
-def _absent(name: str) -> Part:
+def _absent(name: str) -> Component:
     if name in OPTIONAL:
-        return Part(name, "", WARNING, f"not installed: {OPTIONAL[name]}", _reinstall(name))
-    return Part(name, "", MISSING, "not installed", _reinstall(name))
+        return Component(name, "", WARNING, f"not installed: {OPTIONAL[name]}", _reinstall(name))
+    return Component(name, "", MISSING, "not installed", _reinstall(name))
 
 
-def _tried(name: str, version: str, tried: dict[str, tuple[bool, str]]) -> Part:
+def _tried(name: str, version: str, tried: dict[str, tuple[bool, str]]) -> Component:
     if name not in tried:
-        return Part(name, version, BROKEN, f"not reached: {tried[''][1]}", "see libLLVM below")
+        return Component(name, version, BROKEN, f"not reached: {tried[''][1]}", "see libLLVM below")
     worked, detail = tried[name]
     if worked:
-        return Part(name, version, OK, detail)
+        return Component(name, version, OK, detail)
     if name == "render":
-        return Part(name, version, BROKEN, detail, "see libLLVM below, then mend mitsuba and drjit: make setup")
+        return Component(name, version, BROKEN, detail, "see libLLVM below, then mend mitsuba and drjit: make setup")
     status = WARNING if name in OPTIONAL else BROKEN
-    return Part(name, version, status, detail, _reinstall(name))
+    return Component(name, version, status, detail, _reinstall(name))
 
 
 def _reinstall(name: str) -> str:
     return f"pip install --force-reinstall --no-deps {name}, or make clean setup in a checkout"
 
 
-def llvm() -> Part:
+def llvm() -> Component:
     """The libLLVM that will be used, what else there is, and why that is not used."""
     from advsearch.scene.mitsuba_backend.llvm import VARIABLE, ensure_llvm, find, install_command
 
@@ -181,16 +183,16 @@ def llvm() -> Part:
         chosen = ensure_llvm()
     except AdvsearchError as error:
         fix = f"unset {VARIABLE}" if given else f"{install_command()} (or name a file in {VARIABLE})"
-        return Part("libLLVM", "", BROKEN if others or given else MISSING, str(error), fix)
+        return Component("libLLVM", "", BROKEN if others or given else MISSING, str(error), fix)
     refused = [str(c) for c in others if c.refused]
     usable = [str(c) for c in others if not c.refused and c.path != chosen.path.resolve()]
     detail = f"chosen: {chosen.path}" + (f", named by {VARIABLE}" if given else "")
     detail += f"; also usable: {', '.join(usable)}" if usable else ""
     detail += f"; refused: {', '.join(refused)}" if refused else ""
-    return Part("libLLVM", ".".join(map(str, chosen.version)), OK, detail)
+    return Component("libLLVM", ".".join(map(str, chosen.version)), OK, detail)
 
 
-def bundled_scenes() -> Part:
+def bundled_scenes() -> Component:
     """The objects and environments that travel inside the package."""
     name, fix = "bundled scenes", "reinstall advsearch; in a checkout: git restore scenes/data"
     try:
@@ -198,24 +200,24 @@ def bundled_scenes() -> Part:
 
         objects, environments = list_objects(), list_environments()
     except (ImportError, OSError, ValueError, KeyError, AdvsearchError) as error:
-        return Part(name, "", MISSING, f"{type(error).__name__}: {error}", fix)
+        return Component(name, "", MISSING, f"{type(error).__name__}: {error}", fix)
     status = OK if objects and environments else MISSING
     detail = f"{len(objects)} objects, {len(environments)} environments"
-    return Part(name, "", status, detail, _NO_FIX_NEEDED if status == OK else fix)
+    return Component(name, "", status, detail, _NO_FIX_NEEDED if status == OK else fix)
 
 
-def reference_weights() -> Part:
+def reference_weights() -> Component:
     """The weights and labels of the bundled classifier."""
     folder = resources.files("advsearch.models") / "data"
     absent = [n for n in ("reference.safetensors", "reference.json") if not folder.joinpath(n).is_file()]
     if absent:
         fix = "reinstall advsearch; in a checkout: git restore advsearch/models/data"
-        return Part("reference model", "", MISSING, f"{' and '.join(absent)} not in {folder}", fix)
+        return Component("reference model", "", MISSING, f"{' and '.join(absent)} not in {folder}", fix)
     size = os.path.getsize(str(folder.joinpath("reference.safetensors")))
-    return Part("reference model", "", OK, f"{size / 1e6:.1f} MB of weights")
+    return Component("reference model", "", OK, f"{size / 1e6:.1f} MB of weights")
 
 
-def kernel_cache(folder: Path) -> Part:
+def kernel_cache(folder: Path) -> Component:
     """The folder in which Dr.Jit keeps compiled kernels between runs."""
     name = "kernel cache"
     try:
@@ -224,30 +226,30 @@ def kernel_cache(folder: Path) -> Part:
             pass
     except OSError as error:
         detail = f"{folder} cannot be written ({error.strerror}): every run compiles its kernels again"
-        return Part(name, "", WARNING, detail, f"make {folder} writable")
+        return Component(name, "", WARNING, detail, f"make {folder} writable")
     files = [entry.stat().st_size for entry in os.scandir(folder) if entry.is_file()]
-    return Part(name, "", OK, f"{folder}: {len(files)} files, {sum(files) / 1e6:.0f} MB")
+    return Component(name, "", OK, f"{folder}: {len(files)} files, {sum(files) / 1e6:.0f} MB")
 
 
-def disk(folder: Path) -> Part:
+def disk(folder: Path) -> Component:
     """The space left where runs are written by default."""
     free = shutil.disk_usage(folder).free
     if free < DISK_WANTED:
-        return Part(
+        return Component(
             "disk", "", WARNING, f"{free / GIB:.1f} GiB free in {folder}", "free some space, or --run elsewhere"
         )
-    return Part("disk", "", OK, f"{free / GIB:.0f} GiB free in {folder}")
+    return Component("disk", "", OK, f"{free / GIB:.0f} GiB free in {folder}")
 
 
-def machine() -> Part:
+def machine() -> Component:
     """Cores and memory."""
     cores = threads.cores()
     memory = _memory()
     detail = f"{platform.system()} {platform.machine()}, {cores} core{'s' * (cores > 1)}"
     detail += f", {memory / GIB:.1f} GiB of memory" if memory else ""
     if memory and memory < MEMORY_WANTED:
-        return Part("machine", "", WARNING, detail, "a search peaks at 2.5 GiB: close other programs")
-    return Part("machine", "", OK, detail)
+        return Component("machine", "", WARNING, detail, "a search peaks at 2.5 GiB: close other programs")
+    return Component("machine", "", OK, detail)
 
 
 def _memory() -> int:
@@ -273,7 +275,7 @@ def _text(output: str | bytes | None) -> str:
     return output.decode("utf-8", "replace") if isinstance(output, bytes) else output or ""
 
 
-def _print_table(parts: list[Part], good: bool) -> None:
+def _print_table(parts: list[Component], good: bool) -> None:
     """Print the parts as a table, and below it what has to be done."""
     from rich.console import Console
     from rich.markup import escape

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from advsearch.controls.base import Choice, Parameter, Value
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Choices, Fixed, Number
+from advsearch.controls.values import Fixed, Number, OneOf
 from advsearch.errors import InputError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
@@ -96,7 +96,7 @@ class BackgroundControl(NumberControl):
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
         spec = self.specs.get("what")
-        as_ever = parameter.name == "what" and isinstance(spec, Choices) and "environment" in spec.values
+        as_ever = parameter.name == "what" and isinstance(spec, OneOf) and "environment" in spec.values
         return "environment" if as_ever else super().default(scene, parameter)
 
     def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Parameter
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Choices, Fixed, Number, is_number
+from advsearch.controls.values import Fixed, Number, OneOf, is_number
 from advsearch.errors import InputError
 from advsearch.scene import library, settings
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
@@ -110,7 +110,7 @@ class EnvironmentControl(NumberControl):
     def _allowed(self) -> tuple[Number, ...]:
         """The environments that can be chosen."""
         spec = self.specs.get("which")
-        return spec.values if isinstance(spec, Choices) else (spec.value,) if isinstance(spec, Fixed) else (OWN_MAP,)
+        return spec.values if isinstance(spec, OneOf) else (spec.value,) if isinstance(spec, Fixed) else (OWN_MAP,)
 
     def budget(self, scene: SceneDescription, parameter: Parameter) -> Budget:
         if parameter.name != "harmonics":

@@ -35,9 +35,9 @@ from advsearch.controls.base import (
 )
 from advsearch.controls.clean import Moved, apart, check_start, nearest, same
 from advsearch.controls.values import (
-    Choices,
     Fixed,
     Number,
+    OneOf,
     Range,
     Spec,
     in_words,
@@ -189,7 +189,7 @@ class NumberControl(Control, ABC):
         wanted = None if self.asked else self.search_range(scene, parameter)
         if wanted is None:
             return Fixed(value)
-        return Choices(parameter.options) if parameter.options else Range(*wanted)
+        return OneOf(parameter.options) if parameter.options else Range(*wanted)
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ class Slot:
     @property
     def width(self) -> int:
         """Number of coordinates of u."""
-        return 0 if isinstance(self.spec, Fixed) else 1 if isinstance(self.spec, Choices) else self.size
+        return 0 if isinstance(self.spec, Fixed) else 1 if isinstance(self.spec, OneOf) else self.size
 
     @property
     def turns(self) -> bool:
@@ -234,7 +234,7 @@ class Slot:
         spec, value = self.spec, self.start_value()
         if isinstance(spec, Fixed):
             return []
-        if isinstance(spec, Choices):
+        if isinstance(spec, OneOf):
             return [(spec.values.index(value) + 0.5) / len(spec.values)]
         return [to_unit(spec, self.parameter.log, float(value))] * self.size
 
@@ -266,7 +266,7 @@ class BoundNumbers(BoundControl):
 
     def _group(self, slot: Slot) -> Group:
         parameter, spec = slot.parameter, slot.spec
-        options = len(spec.values) if isinstance(spec, Choices) else 0
+        options = len(spec.values) if isinstance(spec, OneOf) else 0
         estimators = () if options else self.control.estimators(self.scene, parameter)
         return Group(
             parameter.name,

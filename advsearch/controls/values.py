@@ -45,13 +45,13 @@ class Range:
 
 
 @dataclass(frozen=True)
-class Choices:
+class OneOf:
     """One of a few values: numbers or names."""
 
     values: tuple[Number, ...]
 
 
-Spec = Fixed | Range | Choices
+Spec = Fixed | Range | OneOf
 
 
 def read(where: str, parameter: Parameter, given: object) -> Spec:
@@ -86,12 +86,12 @@ def read(where: str, parameter: Parameter, given: object) -> Spec:
     return Range(low, high)
 
 
-def _choices(where: str, values: Sequence[Number]) -> Choices:
+def _choices(where: str, values: Sequence[Number]) -> OneOf:
     """The values, of which none may come twice: it would be drawn twice as often."""
     twice = [value for value, count in Counter(values).items() if count > 1]
     if twice:
         raise InputError(f"{where}: expected different choices, got {_shown(twice[0])} twice; leave one of them out")
-    return Choices(tuple(values))
+    return OneOf(tuple(values))
 
 
 def _shown(value: Number) -> str:

@@ -134,7 +134,7 @@ def silhouette(points: Doubles, faces: npt.NDArray[np.uint32], frame: Frame | No
 
 
 @dataclass(frozen=True, eq=False)
-class Sweep:
+class Passage:
     """A thing that moves sideways past another, both as the camera sees them.
 
     Attributes:
@@ -202,14 +202,14 @@ def angle_outside(frame: Frame, cover: Silhouette, axes: Doubles, direction: flo
     Args:
         frame: what the picture shows.
         cover: silhouette of the moving thing, straight ahead.
-        axes: see `Sweep`.
+        axes: see `Passage`.
         direction: from which side it comes, degrees.
     """
     whole = Silhouette(np.ones((GRID, GRID), dtype=np.bool_), frame)
     radius = float(np.arccos(np.clip(cover.window.corners()[:, 2], -1.0, 1.0)).max())
     reach = float(np.arccos(np.clip(frame.corners() @ axes[2], -1.0, 1.0)).max())
     angles = np.linspace(min(reach + radius + 0.02, 0.9 * math.pi), 0.0, 2 * SCAN)
-    shown = Sweep(whole.directions(), cover, axes, direction).coverage(angles)
+    shown = Passage(whole.directions(), cover, axes, direction).coverage(angles)
     inside = np.nonzero(shown > 0.0)[0]
     return float(angles[max(int(inside[0]) - 1, 0)]) if len(inside) else float(angles[0])
 

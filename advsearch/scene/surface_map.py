@@ -4,7 +4,7 @@ Row 0 is at v = 1, as in every texture of ours. A texel belongs to the triangle 
 chart covers takes over what the nearest covered texel has, so that bilinear lookups at a chart's border find values
 that continue it.
 
-`Surface` finds places on a mesh by rays and the connected region around them, for what is stuck onto it.
+`MeshSurface` finds places on a mesh by rays and the connected region around them, for what is stuck onto it.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def rasterised(mesh: Mesh, resolution: int) -> Charts:
     return Charts(mesh, face_map[tuple(nearest)], weight_map[tuple(nearest)], covered, distance)
 
 
-class Surface:
+class MeshSurface:
     """The faces of a mesh, ready for rays and for neighbourhoods.
 
     Args:

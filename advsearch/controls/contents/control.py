@@ -23,7 +23,7 @@ from torch import Tensor
 from advsearch.controls.base import NOTHING, Parameter, Value
 from advsearch.controls.contents.vessel import COLUMNS, Vessel, interior
 from advsearch.controls.numbers import BoundNumbers, NumberControl, Values
-from advsearch.controls.values import Choices, Fixed, Number, Range, Spec
+from advsearch.controls.values import Fixed, Number, OneOf, Range, Spec
 from advsearch.errors import InputError
 from advsearch.scene.assets import Floats, Material, Mesh
 from advsearch.scene.description import SceneDescription
@@ -116,7 +116,7 @@ class ContentsControl(NumberControl):
         bounds: dict[str, tuple[float, float]] = {}
         for name in INGREDIENTS:
             spec = self.specs.get(name)
-            if isinstance(spec, Choices):
+            if isinstance(spec, OneOf):
                 raise InputError(
                     f"{self.name}.{name}: expected a number or a range [low, high], got a list of values; a choice "
                     "among proportions would not add up to 1"

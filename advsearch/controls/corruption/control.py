@@ -31,7 +31,7 @@ from advsearch.controls.corruption.noise import gaussian_noise, impulse_noise, s
 from advsearch.controls.corruption.tools import LEVELS
 from advsearch.controls.corruption.weather import fog, frost, snow
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Choices, Fixed, is_whole
+from advsearch.controls.values import Fixed, OneOf, is_whole
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
 
@@ -118,7 +118,7 @@ class CorruptionControl(NumberControl):
         spec = self.specs.get("which")
         if isinstance(spec, Fixed):
             return {str(spec.value)}
-        return {str(value) for value in spec.values} if isinstance(spec, Choices) else set(NAMES)
+        return {str(value) for value in spec.values} if isinstance(spec, OneOf) else set(NAMES)
 
     def on_picture(self, scene: SceneDescription, values: Values, image: Tensor) -> Tensor:
         seed = int(self.chosen["seed"])  # type: ignore[call-overload]

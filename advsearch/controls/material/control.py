@@ -21,7 +21,7 @@ from torch import Tensor
 from advsearch.controls.base import Parameter
 from advsearch.controls.material.patterns import PATTERNS, covering
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Choices, Fixed, Number
+from advsearch.controls.values import Fixed, Number, OneOf
 from advsearch.scene.assets import Material, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
@@ -106,14 +106,14 @@ class MaterialControl(NumberControl):
         spec = self.specs.get("which")
         if isinstance(spec, Fixed):
             return str(spec.value)
-        if isinstance(spec, Choices) and OWN not in spec.values:
+        if isinstance(spec, OneOf) and OWN not in spec.values:
             return str(spec.values[0])
         return OWN
 
     def _names_a_material(self) -> bool:
         """Whether anything but the object's own surface can be chosen."""
         spec = self.specs.get("which")
-        names = spec.values if isinstance(spec, Choices) else (spec.value,) if isinstance(spec, Fixed) else (OWN,)
+        names = spec.values if isinstance(spec, OneOf) else (spec.value,) if isinstance(spec, Fixed) else (OWN,)
         return names != (OWN,)
 
     def _colours(self) -> bool:

@@ -25,13 +25,13 @@ from torch import Tensor
 from advsearch.controls.base import Choice, Parameter, Value
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.occlusion.occluders import MADE, loaded, made
-from advsearch.controls.values import Choices, Fixed
+from advsearch.controls.values import Fixed, OneOf
 from advsearch.errors import InputError
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.parts import MeshPart
-from advsearch.scene.silhouettes import Frame, Silhouette, Sweep, angle_outside, middle_axes, silhouette
+from advsearch.scene.silhouettes import Frame, Passage, Silhouette, angle_outside, middle_axes, silhouette
 
 Doubles = npt.NDArray[np.float64]
 
@@ -206,7 +206,7 @@ class OcclusionControl(NumberControl):
         if self.chosen["object"] is not None:
             return (str(self.chosen["object"]),)
         spec = self.specs.get("which")
-        names = spec.values if isinstance(spec, Choices) else (spec.value if isinstance(spec, Fixed) else MADE[0],)
+        names = spec.values if isinstance(spec, OneOf) else (spec.value if isinstance(spec, Fixed) else MADE[0],)
         return tuple(dict.fromkeys(str(name) for name in names))
 
     def _option(self, values: Values) -> str:
@@ -296,7 +296,7 @@ def _solved(seen: _Seen, cover: Silhouette, asked: Mapping[str, float], size: fl
     """Find the angle at which the wanted share is hidden."""
     assert seen.directions is not None
     axes = middle_axes(seen.directions)
-    sweep = Sweep(seen.directions, cover, axes, asked["direction"])
+    sweep = Passage(seen.directions, cover, axes, asked["direction"])
     outside = angle_outside(seen.frame, cover, axes, asked["direction"])
     angle = sweep.solve(max(asked["coverage"], EASE), outside)
     if asked["coverage"] < EASE:

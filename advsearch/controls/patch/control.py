@@ -34,9 +34,9 @@ from advsearch.controls.patch.sticker import Sticker, towards_camera
 from advsearch.controls.texture import resampled
 from advsearch.controls.values import (
     LARGEST_EPSILON,
-    Choices,
     Fixed,
     Number,
+    OneOf,
     Range,
     in_words,
     is_number,
@@ -198,7 +198,7 @@ class PatchControl(Control):
         if self.picture is not None:
             raise InputError(f"{self.name}.pixels: expected none beside {self.name}.picture; leave one of them out")
         spec = read(f"{self.name}.pixels", self.parameters[0], self._pixels_given)
-        if isinstance(spec, Choices):
+        if isinstance(spec, OneOf):
             raise InputError(
                 f"{self.name}.pixels: expected [low, high] or one number, got a list of {len(spec.values)}"
             )

@@ -26,7 +26,7 @@ from advsearch.scene.assets import Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import Doubles, camera_to_world, object_to_world
-from advsearch.scene.surface_map import Charts, Surface, rasterised
+from advsearch.scene.surface_map import Charts, MeshSurface, rasterised
 
 BASE_SIDES = (512, 1024)
 """Smallest and largest side of the base-colour map that is painted into, in texels."""
@@ -84,7 +84,7 @@ class Sticker:
         mesh = scene.object.mesh
         self._shape = _shape(mesh)
         self._resting, self._side = resting, side
-        self._surface = Surface(mesh)
+        self._surface = MeshSurface(mesh)
         own = srgb_to_linear(torch.from_numpy(scene.object.base_color.copy()))
         charts = _fine_enough(mesh, max(own.shape[:2]), resting["size"] / side)
         self._own = _fitted(own, len(charts.face))

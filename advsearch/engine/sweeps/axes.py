@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from advsearch.controls import CONTROLS, Control, NumberControl, Parameter
-from advsearch.controls.values import Choices, Number, read
+from advsearch.controls.values import Number, OneOf, read
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import SceneDescription
 
@@ -140,7 +140,7 @@ def axis_values(where: str, parameter: Parameter, given: Any) -> tuple[Number, .
         raise InputError(_too_many(where, len(values)))
     plain = [one.item() if hasattr(one, "item") else one for one in values]
     spec = read(where, parameter, {"choices": plain})
-    assert isinstance(spec, Choices)
+    assert isinstance(spec, OneOf)
     _check_different(where, parameter, spec.values)
     return spec.values
 

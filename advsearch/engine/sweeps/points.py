@@ -22,7 +22,7 @@ from advsearch.attacks.product import Product
 from advsearch.controls import NumberControl, Parameter, Space
 from advsearch.controls.base import BoundControl, Value
 from advsearch.controls.numbers import BoundNumbers
-from advsearch.controls.values import Choices, Fixed, Range, to_value
+from advsearch.controls.values import Fixed, OneOf, Range, to_value
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.scene.description import ENVIRONMENT
 
@@ -148,7 +148,7 @@ class Points:
     def _shown(self, control: BoundNumbers, name: str, block: Block, part: slice, first: int) -> list[Drawn]:
         parameter, spec = _spec(control, name)
         full = f"{control.name}.{name}"
-        if isinstance(spec, Choices):
+        if isinstance(spec, OneOf):
             return [Drawn(full, _unit(parameter), first, spec.values)]
         found = []
         for number in range(block.size):
@@ -229,7 +229,7 @@ def _unit(parameter: Parameter) -> str:
     return "name" if parameter.options else parameter.unit
 
 
-def _spec(bound: BoundNumbers, name: str) -> tuple[Parameter, Range | Choices]:
+def _spec(bound: BoundNumbers, name: str) -> tuple[Parameter, Range | OneOf]:
     """A parameter that is not fixed, and what it is set to."""
     control = bound.control
     parameter = next(one for one in control.parameters if one.name == name)
@@ -237,7 +237,7 @@ def _spec(bound: BoundNumbers, name: str) -> tuple[Parameter, Range | Choices]:
     if spec is not None and not isinstance(spec, Fixed):
         return parameter, spec
     if parameter.options:
-        return parameter, Choices(parameter.options)
+        return parameter, OneOf(parameter.options)
     low, high = control.search_range(bound.scene, parameter) or (parameter.low, parameter.high)
     return parameter, Range(low, high)
 
@@ -285,7 +285,7 @@ def _drawn(
     """The columns of a drawn parameter."""
     parameter, spec = _spec(control, parameter_name)
     unit = _unit(parameter)
-    if isinstance(spec, Choices):
+    if isinstance(spec, OneOf):
         pairs: list[tuple[str, Value]] = [(name, {"value": value, "unit": unit}) for value in spec.values]
         return [lambda u, picks: [pairs[min(len(pairs) - 1, int(one * len(pairs)))] for one in u[:, begin].tolist()]]
 

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh
-from advsearch.scene.importing.parts import Part
+from advsearch.scene.importing.parts import ImportedPart
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -79,7 +79,7 @@ class Soup:
         return np.cross(b - a, c - a)
 
 
-def join(parts: Sequence[Part], source: str, *, y_up: bool) -> Soup:
+def join(parts: Sequence[ImportedPart], source: str, *, y_up: bool) -> Soup:
     """Join parts into one soup of unit extent, z up, with welded points.
 
     Args:

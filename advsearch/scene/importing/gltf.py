@@ -57,7 +57,7 @@ class Buffer(_Entry):
     uri: str | None = None
 
 
-class View(_Entry):
+class BufferView(_Entry):
     buffer: Index
     byteLength: Size
     byteOffset: Size = 0
@@ -84,7 +84,7 @@ class Primitive(_Entry):
     mode: Annotated[int, Field(ge=0, le=6)] = 4
 
 
-class Mesh(_Entry):
+class MeshEntry(_Entry):
     primitives: List[Primitive]
     name: str | None = None
 
@@ -99,7 +99,7 @@ class Node(_Entry):
     name: str | None = None
 
 
-class Scene(_Entry):
+class SceneEntry(_Entry):
     nodes: List[Index] = []
 
 
@@ -128,23 +128,23 @@ class _MaterialExtensions(_Entry):
     glossiness: SpecularGlossiness | None = Field(default=None, alias="KHR_materials_pbrSpecularGlossiness")
 
 
-class Material(_Entry):
+class MaterialEntry(_Entry):
     pbrMetallicRoughness: MetallicRoughness | None = None
     name: str | None = None
     extensions: _MaterialExtensions | None = None
 
-    def plain(self) -> Material:
+    def plain(self) -> MaterialEntry:
         """Return the material without extensions: the diffuse colour of an old one is its base colour."""
         old = self.extensions.glossiness if self.extensions else None
         if old is None:
-            return Material(pbrMetallicRoughness=self.pbrMetallicRoughness, name=self.name)
+            return MaterialEntry(pbrMetallicRoughness=self.pbrMetallicRoughness, name=self.name)
         surface = MetallicRoughness(
             baseColorFactor=old.diffuseFactor,
             baseColorTexture=old.diffuseTexture,
             metallicFactor=0.0,
             roughnessFactor=1.0 - old.glossinessFactor,
         )
-        return Material(pbrMetallicRoughness=surface, name=self.name)
+        return MaterialEntry(pbrMetallicRoughness=surface, name=self.name)
 
 
 class _WebpSource(_Entry):
@@ -176,13 +176,13 @@ class Header(_Entry):
 
     asset: Asset
     scene: Index | None = None
-    scenes: List[Scene] = []
+    scenes: List[SceneEntry] = []
     nodes: List[Node] = []
-    meshes: List[Mesh] = []
+    meshes: List[MeshEntry] = []
     accessors: List[Accessor] = []
-    bufferViews: List[View] = []
+    bufferViews: List[BufferView] = []
     buffers: List[Buffer] = []
-    materials: List[Material] = []
+    materials: List[MaterialEntry] = []
     textures: List[Texture] = []
     images: List[Image] = []
     extensionsUsed: List[str] = []
@@ -237,7 +237,7 @@ def rewritten(path: Path, data: bytes, header: Header) -> bytes:
     return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
 
 
-def base_color_image(header: Header, material: Material) -> str | None:
+def base_color_image(header: Header, material: MaterialEntry) -> str | None:
     """Return a name for the base colour image of a material, or None when it has none."""
     surface = material.plain().pbrMetallicRoughness
     if surface is None or surface.baseColorTexture is None:

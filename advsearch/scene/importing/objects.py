@@ -12,8 +12,8 @@ from advsearch.errors import InputError
 from advsearch.scene.assets import Material, ObjectAsset, UpAxis, normalised
 from advsearch.scene.importing.files import read_bytes, safe_name
 from advsearch.scene.importing.geometry import Soup, assemble, join, repaired
-from advsearch.scene.importing.parts import GLTF, Part, read_parts
-from advsearch.scene.importing.surfaces import Surface
+from advsearch.scene.importing.parts import GLTF, ImportedPart, read_parts
+from advsearch.scene.importing.surfaces import ImportedSurface
 from advsearch.scene.importing.texture import textured
 from advsearch.scene.importing.upright import guess_up
 
@@ -81,7 +81,7 @@ def _first(warnings: list[str], name: str) -> tuple[str, ...]:
     return (*kept, *([f"{name}: {more:,} more warnings are left out"] if more else []))
 
 
-def _upright(parts: list[Part], file: Path, up: str | None) -> tuple[Soup, UpAxis]:
+def _upright(parts: list[ImportedPart], file: Path, up: str | None) -> tuple[Soup, UpAxis]:
     """Return the joined parts, z up, and the axis of the file that was taken for up."""
     if up is None and file.suffix.lower() in GLTF:
         up = "y"
@@ -92,7 +92,7 @@ def _upright(parts: list[Part], file: Path, up: str | None) -> tuple[Soup, UpAxi
     return (soup if guess.axis == "z" else join(parts, str(file), y_up=True)), guess
 
 
-def _material(soup: Soup, surfaces: list[Surface]) -> tuple[Material, list[str]]:
+def _material(soup: Soup, surfaces: list[ImportedSurface]) -> tuple[Material, list[str]]:
     """Return the mean of the parts' roughness and metallic, weighted by area, and a warning where they differ."""
     area = np.bincount(soup.part, weights=np.linalg.norm(soup.face_vectors(), axis=1), minlength=len(surfaces))
     default = Material()

@@ -27,7 +27,7 @@ from advsearch.scene.importing.checks import check_faces, checked
 from advsearch.scene.importing.files import damaged, shown, text_of
 from advsearch.scene.importing.images import without_pillows_limit
 from advsearch.scene.importing.references import Named, References
-from advsearch.scene.importing.surfaces import UNNAMED, Surface, SurfaceReader
+from advsearch.scene.importing.surfaces import UNNAMED, ImportedSurface, SurfaceReader
 
 Array = npt.NDArray[np.float64]
 
@@ -36,7 +36,7 @@ GLTF = (".glb", ".gltf")
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class ImportedPart:
     """One piece of a mesh file, with the transform of its place in the file applied.
 
     Attributes:
@@ -54,7 +54,7 @@ class Part:
     normals: Array | None
     uvs: Array | None
     colors: Array | None
-    surface: Surface
+    surface: ImportedSurface
 
 
 @contextlib.contextmanager
@@ -73,7 +73,7 @@ def _silent() -> Iterator[None]:
 
 
 @_silent()
-def read_parts(path: Path, data: bytes) -> tuple[list[Part], list[str]]:
+def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     """Parse a mesh file.
 
     Args:
@@ -179,7 +179,7 @@ def _named_textures(path: Path, data: bytes, header: gltf.Header | None, referen
     return {name: (path.name, image) for name, image in images.items() if image}
 
 
-def _part(mesh: Any, surface: Surface, *, linear: bool) -> Part:
+def _part(mesh: Any, surface: ImportedSurface, *, linear: bool) -> ImportedPart:
     """Return what the file says about a parsed mesh; `linear` tells how its vertex colours are encoded."""
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     normals = mesh._cache.cache.get("vertex_normals")  # the public property would make normals up
@@ -188,7 +188,7 @@ def _part(mesh: Any, surface: Surface, *, linear: bool) -> Part:
     colors = _corner_colors(mesh, faces, plain=plain, linear=linear)
     if plain and colors is not None:  # they are the base colour then, and not its factor
         surface = replace(surface, color=np.ones(3, np.float32))
-    return Part(
+    return ImportedPart(
         vertices=vertices,
         faces=faces,
         normals=None if normals is None else np.asarray(normals, dtype=np.float64),
@@ -198,7 +198,7 @@ def _part(mesh: Any, surface: Surface, *, linear: bool) -> Part:
     )
 
 
-def _placed(part: Part, matrix: Array) -> Part:
+def _placed(part: ImportedPart, matrix: Array) -> ImportedPart:
     """Return a part moved to its place in the file by an affine transform (4, 4)."""
     if np.array_equal(matrix, np.eye(4)):
         return part

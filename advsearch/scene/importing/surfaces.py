@@ -34,7 +34,7 @@ UNNAMED = "material_0"
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class ImportedSurface:
     """What a part looks like; every colour is display-referred sRGB in [0, 1].
 
     Attributes:
@@ -49,7 +49,7 @@ class Surface:
     roughness: float | None = None
     metallic: float | None = None
 
-    def same_color(self, other: Surface) -> bool:
+    def same_color(self, other: ImportedSurface) -> bool:
         """Tell whether two surfaces have the same base colour everywhere."""
         pairs = ((self.color, other.color), (self.texture, other.texture))
         return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
@@ -72,28 +72,28 @@ class SurfaceReader:
     refused: Mapping[str, str]
     materials: int
     notes: list[str] = field(default_factory=list)
-    _known: dict[int, Surface] = field(default_factory=dict)
+    _known: dict[int, ImportedSurface] = field(default_factory=dict)
     _pictures: dict[int, Floats | str] = field(default_factory=dict)
     _pixels: int = 0
 
-    def surface(self, visual: Any) -> Surface:
+    def surface(self, visual: Any) -> ImportedSurface:
         """Return the surface of a parsed mesh's visual; an empty one where the file gives no material."""
         material = getattr(visual, "material", None)
         if id(material) not in self._known:
             self._known[id(material)] = self._read(material)
         return self._known[id(material)]
 
-    def _read(self, material: Any) -> Surface:
+    def _read(self, material: Any) -> ImportedSurface:
         if isinstance(material, PBRMaterial):
             return self._gltf(material)
         if isinstance(material, SimpleMaterial):
             # The Kd of a textured material is an exporter's default more often than a tint: the texture stands alone.
             color = _color(material.kwargs.get("kd"))
             texture = self._texture(material, material.image, color)
-            return Surface(_unless_white(color, material, self.named), texture)
-        return Surface()
+            return ImportedSurface(_unless_white(color, material, self.named), texture)
+        return ImportedSurface()
 
-    def _gltf(self, material: PBRMaterial) -> Surface:
+    def _gltf(self, material: PBRMaterial) -> ImportedSurface:
         """Follow glTF 2.0, section 3.9.2: linear factors multiply the textures. Unlike there, no metal by default."""
         given = material.baseColorFactor
         factor = (
@@ -110,7 +110,7 @@ class SurfaceReader:
             green, blue = packed[:, :, 1].mean(), packed[:, :, 2].mean()
             roughness = float(green) * (1.0 if roughness is None else roughness)
             metallic = float(blue) * (1.0 if metallic is None else metallic)
-        return Surface(_unless_white(color, material, self.named), texture, _unit(roughness), _unit(metallic))
+        return ImportedSurface(_unless_white(color, material, self.named), texture, _unit(roughness), _unit(metallic))
 
     def _texture(self, material: Any, image: Image.Image | None, color: Floats | None) -> Floats | None:
         """Return the base colour texture; where the material names one that cannot be had, warn."""

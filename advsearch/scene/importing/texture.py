@@ -17,7 +17,7 @@ from scipy.sparse import coo_array, csgraph
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.geometry import Array, Soup
 from advsearch.scene.importing.images import TEXTURE_LIMIT
-from advsearch.scene.importing.surfaces import NEUTRAL, Surface
+from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface
 from advsearch.scene.importing.unwrap import unwrapped
 from advsearch.scene.raster import pixels_in
 
@@ -36,7 +36,7 @@ _WINDOW = 1.5  # how many textures wide and high UVs may be and still keep their
 _FILLED = 0.5  # share of an atlas that its charts fill, about
 
 
-def textured(soup: Soup, surfaces: Sequence[Surface]) -> tuple[Soup, Floats, list[str]]:
+def textured(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[Soup, Floats, list[str]]:
     """Return the soup with UVs in [0, 1] on every corner, the base colour map that fits them, and the warnings.
 
     Args:
@@ -63,7 +63,7 @@ def textured(soup: Soup, surfaces: Sequence[Surface]) -> tuple[Soup, Floats, lis
     return fresh, baked(fresh.uvs, soup, surfaces), [_why(soup, used, uniform)]
 
 
-def _why(soup: Soup, used: Sequence[Surface], uniform: bool) -> str:
+def _why(soup: Soup, used: Sequence[ImportedSurface], uniform: bool) -> str:
     """Return the sentence that says why the object was unwrapped anew."""
     if not uniform:
         return f"the colours of its {len(used)} parts were baked into one texture"
@@ -79,7 +79,7 @@ def _one_factor(soup: Soup) -> bool:
     return bool((soup.colors == soup.colors[0, 0]).all())
 
 
-def _plain(surface: Surface) -> Floats:
+def _plain(surface: ImportedSurface) -> Floats:
     """Return the base colour of a surface without texture, (3,) display-referred."""
     return np.full(3, NEUTRAL, dtype=np.float32) if surface.color is None else surface.color
 
@@ -145,7 +145,7 @@ def _windowed(uvs: Array, texture: Floats) -> tuple[Array, Floats]:
 # --- baking ----------------------------------------
 
 
-def baked(uvs: Array, soup: Soup, surfaces: Sequence[Surface]) -> Floats:
+def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Floats:
     """Paint the colours of a soup into a texture for new UVs.
 
     Args:
@@ -181,7 +181,7 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[Surface]) -> Floats:
     return np.ascontiguousarray(image[nearest[0], nearest[1]])
 
 
-def _baked_size(soup: Soup, surfaces: Sequence[Surface]) -> int:
+def _baked_size(soup: Soup, surfaces: Sequence[ImportedSurface]) -> int:
     """Return a power of two, `BAKED_SIZE` to `TEXTURE_LIMIT`, that has room for the texels that the object shows."""
     texels, areas = 0.0, np.nan_to_num(np.abs(uv_areas(soup.uvs)))
     for number, area in enumerate(np.bincount(soup.part, areas)):

@@ -69,7 +69,7 @@ class LLVM:
 
 
 @dataclass(frozen=True)
-class Candidate:
+class LibraryFile:
     """A file that was found, its version (empty if it could not be told) and why it is refused (empty if it is not)."""
 
     path: Path
@@ -81,7 +81,7 @@ class Candidate:
         return f"{self.path} ({version}{': ' + self.refused if self.refused else ''})"
 
 
-def find(root: Path = Path("/"), environ: Mapping[str, str] = os.environ) -> list[Candidate]:
+def find(root: Path = Path("/"), environ: Mapping[str, str] = os.environ) -> list[LibraryFile]:
     """Every libLLVM of this machine, usable ones first, each group newest first; `DRJIT_LIBLLVM_PATH` is not looked at.
 
     Args:
@@ -93,7 +93,7 @@ def find(root: Path = Path("/"), environ: Mapping[str, str] = os.environ) -> lis
     return sorted(candidates, key=lambda c: (not c.refused, c.version), reverse=True)
 
 
-def examine(path: Path, *, name_hint: Path | None = None) -> Candidate:
+def examine(path: Path, *, name_hint: Path | None = None) -> LibraryFile:
     """Say which version a libLLVM file is, from its name or else by asking it, and whether Dr.Jit can use it.
 
     Args:
@@ -101,9 +101,9 @@ def examine(path: Path, *, name_hint: Path | None = None) -> Candidate:
         name_hint: the link through which it was found; its name may hold the version where the file's does not.
     """
     if problem := _unreadable(path):
-        return Candidate(path, (), problem)
+        return LibraryFile(path, (), problem)
     version = version_in(path) or (version_in(name_hint) if name_hint else ()) or _ask(str(path))
-    return Candidate(path, version, refusal(version))
+    return LibraryFile(path, version, refusal(version))
 
 
 def refusal(version: Version) -> str:
@@ -184,13 +184,13 @@ def _given(value: str) -> LLVM:
     return LLVM(path, candidate.version)
 
 
-def _bare(name: str) -> Candidate:
+def _bare(name: str) -> LibraryFile:
     """A library name without a folder is looked up by the dynamic loader; only the library itself knows its version."""
     version = _ask(name)
-    return Candidate(Path(name), version, refusal(version))
+    return LibraryFile(Path(name), version, refusal(version))
 
 
-def _newest(candidates: list[Candidate]) -> LLVM:
+def _newest(candidates: list[LibraryFile]) -> LLVM:
     """The first usable candidate that can be loaded."""
     refused = [str(c) for c in candidates if c.refused]
     for candidate in candidates:
