@@ -49,7 +49,7 @@ format: $(STAMP) ## format the code and mend what can be mended
 	@$(BIN)/ruff format $(SOURCES)
 	@$(BIN)/ruff check --fix $(SOURCES)
 
-typecheck: $(STAMP) ## mypy, strict, on the package
+typecheck: $(STAMP) ## mypy, strict
 	@$(BIN)/mypy
 
 docs: $(STAMP) ## build the documentation into build/site; fails on a broken link

@@ -97,7 +97,7 @@ def compare_steps(size: int, repeats: int) -> int:
     print(f"{'parameter':32} {'slope':>16} {'over a pixel':>16} {'plan':>16}")
     for name, environment in SCENES:
         config = AttackConfig(
-            object=name, environment=environment, resolution=(size, size), controls=["camera", "pose"]
+            object=name, environment=environment, resolution=(size, size), controls={"camera": {}, "pose": {}}
         )
         problem, _ = problem_from_config(config)
         renderer, loss = problem.renderer, problem.loss

@@ -14,8 +14,8 @@ from __future__ import annotations
 import argparse
 import math
 import os
+import resource
 import statistics
-import sys
 import time
 from pathlib import Path
 
@@ -29,7 +29,8 @@ threads.configure()
 
 from advsearch.attacks import get_objective, make_policy  # noqa: E402
 from advsearch.attacks.goal import Goal  # noqa: E402
-from advsearch.controls import TextureControl, make_space  # noqa: E402
+from advsearch.controls import make_space  # noqa: E402
+from advsearch.controls.texture import TextureControl  # noqa: E402
 from advsearch.engine.loading import load_scene, make_renderer  # noqa: E402
 from advsearch.engine.problem import Problem  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
@@ -79,16 +80,15 @@ def trend(ratios: list[float], blocks: int = 60, draws: int = 400) -> tuple[floa
     generator = np.random.default_rng(0)
     picks = [np.sort(generator.integers(0, blocks, blocks)) for _ in range(draws)]
     slopes = [theilslopes(medians[one], at[one])[0] for one in picks]
-    middle, low, high = theilslopes(medians, at)[0], *np.quantile(slopes, (0.025, 0.975))
-    return math.expm1(middle), math.expm1(low), math.expm1(high)
+    low, high = np.quantile(slopes, (0.025, 0.975))
+    return math.expm1(theilslopes(medians, at)[0]), math.expm1(low), math.expm1(high)
 
 
 def resident() -> int:
     """Return this process's resident memory in bytes."""
-    if sys.platform == "linux":
-        return int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    import resource
-
+    statm = Path("/proc/self/statm")
+    if statm.exists():
+        return int(statm.read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE")
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 

@@ -66,7 +66,7 @@ def gap(policy: Policy[object], kind: str, d: int, renders: int, noise: float, s
     spread = float(function(sample).std()) or 1.0
 
     def answer(by: Policy[object]) -> float:
-        def evaluate(u: Tensor, *, index: int, gradient: object) -> Evaluation:
+        def evaluate(u: Tensor, *, index: int, gradient: object, samples: int = 1) -> Evaluation:
             key = [seed, index, zlib.crc32(u.numpy().tobytes()), zlib.crc32(by.name.encode())]
             value = float(function(u.double().numpy()[None])[0]) / spread
             value += noise * float(np.random.default_rng(key).normal())

@@ -74,6 +74,7 @@ def one(scene: str, args: argparse.Namespace) -> bool:
     for found in report.recommendations:
         if found.estimator is None or found.measure == "margin_error" or found.among == "by path depth":
             continue
+        assert found.error is not None
         error, known = measured(config, found)
         ratio = error / found.error
         good = not known or 1.0 / FACTOR <= ratio <= FACTOR
@@ -97,6 +98,7 @@ def measured(config: PrecisionConfig, found: Recommended) -> tuple[float, bool]:
     """The error of a recommended setting with other seeds, and whether the new reference can tell it."""
     problem, _ = problem_from_config(config.as_attack())
     renderer, budget = problem.renderer, TimeBudget(config.seconds / 3.0)
+    assert found.estimator is not None and found.spp is not None
     setting = MeasuredSetting(found.quantity, found.estimator, found.spp, 1.0, found.control or "")
     bench: Any
     if found.quantity == "image":

@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable
 
 import torch
+from torch import Tensor
 
 from advsearch import threads
 
@@ -25,10 +26,12 @@ threads.configure()
 
 from advsearch.attacks import get_objective, make_policy  # noqa: E402
 from advsearch.attacks.goal import Goal  # noqa: E402
-from advsearch.controls import TextureControl, make_space  # noqa: E402
+from advsearch.controls import make_space  # noqa: E402
+from advsearch.controls.texture import TextureControl  # noqa: E402
 from advsearch.engine.loading import load_scene, make_renderer  # noqa: E402
 from advsearch.engine.problem import Problem  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
+from advsearch.scene.description import SceneDescription  # noqa: E402
 from advsearch.scene.leaving_out import EVERYTHING  # noqa: E402
 from advsearch.scene.mitsuba_backend.scene import BASE_COLOR, MitsubaScene  # noqa: E402
 from advsearch.scene.mitsuba_backend.variant import mitsuba  # noqa: E402
@@ -76,6 +79,7 @@ def steps(problem: Problem, count: int) -> Callable[[], None]:
     def step() -> None:
         nonlocal state, index
         proposal, state = policy.propose(state)
+        assert proposal is not None
         evaluation = evaluate(proposal.u, index=index, gradient=True)
         state = policy.update(state, proposal.u, evaluation)
         index += 1
@@ -86,7 +90,9 @@ def steps(problem: Problem, count: int) -> Callable[[], None]:
 class Floor:
     """The same work by Mitsuba's, Open Image Denoise's and torch's own calls, nothing around them."""
 
-    def __init__(self, description, size: int, spp: int, denoise: str, score: Callable) -> None:  # type: ignore[no-untyped-def]
+    def __init__(
+        self, description: SceneDescription, size: int, spp: int, denoise: str, score: Callable[[Tensor], Tensor]
+    ) -> None:
         self.mi = mitsuba()
         holder = MitsubaScene(description, (size, size), leave_out=EVERYTHING - {"tracing"})
         self.scene = holder._scene

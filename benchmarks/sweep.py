@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from unittest import mock
 
 import torch
 from torch import Tensor, nn
@@ -96,7 +97,7 @@ class Watch(NullProgress):
 
 def constant(configurations: int) -> None:
     """Print the speed of the loop and how much its memory grows, for a grid and for draws."""
-    view.make_renderer = lambda scene, space, size, *more, **named: ConstantRenderer(size)  # type: ignore[attr-defined]
+    mock.patch.object(view, "make_renderer", lambda scene, space, size, *more, **named: ConstantRenderer(size)).start()
     model = load_model(Trivial(), labels=("mug", "vase"), input_size=16, name="trivial")
     side = max(1, round(configurations**0.5))
     grid = {"pose.yaw": f"0:360:{side}", "camera.elevation": f"5:60:{side}"}

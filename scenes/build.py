@@ -13,9 +13,9 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-from advsearch.bundled.environments import ENVIRONMENTS, EnvironmentFamily
-from advsearch.bundled.files import exr, ply, png
-from advsearch.bundled.objects import OBJECTS, ObjectFamily
+from .environments import ENVIRONMENTS, EnvironmentFamily
+from .files import exr, ply, png
+from .objects import OBJECTS, ObjectFamily
 
 DATA = Path(__file__).resolve().parent / "data"
 

@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.bundled.environments import ENVIRONMENTS
-from advsearch.bundled.objects import OBJECTS
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
 from advsearch.scene.color import linear_to_srgb
+
+from .environments import ENVIRONMENTS
+from .objects import OBJECTS
 
 Floats = npt.NDArray[np.float32]
 VARIANTS = 3
@@ -75,7 +76,8 @@ def picture(
         }
     )
     layers = torch.from_numpy(np.array(mi.render(scene, spp=spp, seed=1), dtype=np.float32))
-    radiance = Denoiser(tuple(layers.shape[:2]))(layers[..., :3], layers[..., -6:-3].clamp(0.0, 1.0), layers[..., -3:])
+    height, width = layers.shape[:2]
+    radiance = Denoiser((height, width))(layers[..., :3], layers[..., -6:-3].clamp(0.0, 1.0), layers[..., -3:])
     return linear_to_srgb(radiance.numpy())
 
 

@@ -119,7 +119,7 @@ def _load_torchscript(path: Path, archive: Archive) -> Source:
         _try_to_load(path, checked)
     with warnings.catch_warnings(), _damaged(path, "TorchScript"):
         warnings.filterwarnings("ignore", message=r".*torch\.jit\.\w+.* is deprecated", category=DeprecationWarning)
-        module = torch.jit.load(checked, map_location="cpu")  # type: ignore[no-untyped-call]
+        module = torch.jit.load(checked, map_location="cpu")
     return source_of(module, path.stem)
 
 

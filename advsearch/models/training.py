@@ -204,7 +204,7 @@ class _Loop:
             logits = self.net(x).float()
         loss = F.cross_entropy(logits, labels, label_smoothing=self.label_smoothing)
         self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
+        loss.backward()
         nn.utils.clip_grad_norm_(self.net.parameters(), LARGEST_GRADIENT_NORM)
         self.optimiser.step()
         self.average.update(self.net)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from advsearch.bundled.environments.panorama import EnvironmentFamily
-from advsearch.bundled.environments.rooms import ROOMS
-from advsearch.bundled.environments.skies import SKIES
+from .panorama import EnvironmentFamily
+from .rooms import ROOMS
+from .skies import SKIES
 
 ENVIRONMENTS: dict[str, EnvironmentFamily] = {family.name: family for family in (*ROOMS, *SKIES)}
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from advsearch.bundled.environments.panorama import Array
+from .panorama import Array
 
 Surface = Callable[[Array, Array, Array], Array]  # (s, t in [-1, 1], points (N, 3)) -> (N, 3) albedo or radiance
 FAR = 1e9
@@ -144,7 +144,7 @@ def _lamps(shapes: Sequence[Quad | Block | Globe]) -> list[tuple[Array, Array | 
 
 def _lit(points: Array, normals: Array, lamps: Sequence[tuple[Array, Array | None, Array]], ambient: Array) -> Array:
     """Irradiance (N, 3) at surface points, without shadows."""
-    total = np.broadcast_to(ambient, (len(points), 3)).copy()
+    total: Array = np.broadcast_to(ambient, (len(points), 3)).copy()
     reach, lean = (points**2).sum(axis=1)[:, None], (points * normals).sum(axis=1)[:, None]
     for places, facing, power in lamps:
         square = np.maximum(reach - 2.0 * points @ places.T + (places**2).sum(axis=1), 0.04)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from advsearch.bundled.environments.panorama import Array, EnvironmentFamily
-from advsearch.bundled.environments.raycast import Block, Globe, Quad, Surface, cast, even, room
+from .panorama import Array, EnvironmentFamily
+from .raycast import Block, Globe, Quad, Surface, cast, even, room
 
 # ---------------------------------------------------------------------------------------------------- surfaces
 
@@ -19,7 +19,8 @@ def planks(dark: float, light: float, across: int = 1) -> Surface:
             0.5 + 0.5 * np.sin(board * 12.9898 + 3.0 * np.floor(p[:, 1 - across] / 0.9 + board * 0.37))
         )
         joint = np.where(np.abs(p[:, across] / 0.12 - board - 0.5) > 0.46, 0.5, 1.0)
-        return (tone * joint)[:, None] * np.array([1.0, 0.62, 0.34])
+        boards: Array = (tone * joint)[:, None] * np.array([1.0, 0.62, 0.34])
+        return boards
 
     return paint
 
@@ -29,7 +30,8 @@ def tiles(a: float, b: float, size: float = 0.3, tint: tuple[float, float, float
 
     def paint(s: Array, t: Array, p: Array) -> Array:
         odd = (np.floor(p[:, 0] / size) + np.floor(p[:, 1] / size)) % 2.0
-        return (a + (b - a) * odd)[:, None] * np.array(tint)
+        tiles: Array = (a + (b - a) * odd)[:, None] * np.array(tint)
+        return tiles
 
     return paint
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from advsearch.bundled.environments.panorama import Array, EnvironmentFamily
+from .panorama import Array, EnvironmentFamily
 
 SUN_WIDTH = 3.0  # degrees, the spot's standard deviation
 ROWS, COLUMNS = 24, 64  # of the grid on which the clear sky is read
@@ -30,7 +30,8 @@ def _ground(rays: Array, color: tuple[float, float, float], level: Array) -> Arr
     )
     haze = np.exp(-depth / 0.05)[:, None]
     field = np.array(color) * patch[:, None]
-    return level * (field * (1.0 - haze) + np.array([0.3, 0.33, 0.36]) * haze)
+    seen: Array = level * (field * (1.0 - haze) + np.array([0.3, 0.33, 0.36]) * haze)
+    return seen
 
 
 def _skyline(rays: Array) -> Array:
@@ -77,7 +78,8 @@ def _evaluate(emitter: Any, mi: Any, rays: Array) -> Array:
     """Radiance (N, 3) of a Mitsuba emitter against unit directions (N, 3)."""
     si = mi.SurfaceInteraction3f()
     si.wi = mi.Vector3f(*(mi.Float(np.ascontiguousarray(-rays[:, i]).astype(np.float32)) for i in range(3)))
-    return np.array(emitter.eval(si, True), dtype=np.float64).T.reshape(-1, 3)
+    radiance: Array = np.array(emitter.eval(si, True), dtype=np.float64).T.reshape(-1, 3)
+    return radiance
 
 
 def _digits(values: Array, digits: int = 3) -> Array:
@@ -145,7 +147,8 @@ def clear(azimuth: float, elevation: float, rays: Array) -> Array:
     sky = _sky(table, rays)
     level = np.pi * sky[rays[:, 2] > 0.0].mean(axis=0) + beam * sun[2]
     above = _landscape(rays, sky, level / np.pi)
-    return above + spot[:, None] * beam
+    whole: Array = above + spot[:, None] * beam
+    return whole
 
 
 def noon(rays: Array) -> Array:

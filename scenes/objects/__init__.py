@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from advsearch.bundled.objects.family import Instance, ObjectFamily
-from advsearch.bundled.objects.furniture import CHAIR, LAMP
-from advsearch.bundled.objects.kitchen import FRYING_PAN, TEAPOT
-from advsearch.bundled.objects.things import BALL, BANANA, BOOK
-from advsearch.bundled.objects.tools import DUMBBELL, HAMMER
-from advsearch.bundled.objects.vessels import BOTTLE, BOWL, MUG, VASE, WINE_GLASS
+from .family import Instance, ObjectFamily
+from .furniture import CHAIR, LAMP
+from .kitchen import FRYING_PAN, TEAPOT
+from .things import BALL, BANANA, BOOK
+from .tools import DUMBBELL, HAMMER
+from .vessels import BOTTLE, BOWL, MUG, VASE, WINE_GLASS
 
 OBJECTS: dict[str, ObjectFamily] = {
     family.name: family

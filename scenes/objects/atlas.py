@@ -12,10 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.bundled.objects.curves import Array
-from advsearch.bundled.objects.shapes import Patch
-from advsearch.bundled.objects.textures import Paint, Texels
 from advsearch.scene.assets import Mesh
+
+from .curves import Array
+from .shapes import Patch
+from .textures import Paint, Texels
 
 SIZE = 256  # texels along the atlas
 GUTTER = 2  # texels around each chart, on every side
@@ -86,7 +87,8 @@ def _in_atlas(slot: Slot, uvs: Array) -> Array:
     """Atlas coordinates in [0, 1] of chart coordinates (V, 2)."""
     local = np.stack([1.0 - uvs[:, 1], uvs[:, 0]], axis=1) if slot.turned else uvs
     inner = np.array([slot.width - 2 * GUTTER, slot.height - 2 * GUTTER])
-    return (np.array([slot.x, slot.y]) + GUTTER + local * inner) / SIZE
+    places: Array = (np.array([slot.x, slot.y]) + GUTTER + local * inner) / SIZE
+    return places
 
 
 def painted(patches: Sequence[Patch], slots: Sequence[Slot], paints: Mapping[str, Paint]) -> npt.NDArray[np.float32]:
@@ -101,7 +103,8 @@ def painted(patches: Sequence[Patch], slots: Sequence[Slot], paints: Mapping[str
         used[area] = True
     image[~used] = np.round(image[used].mean(axis=0), 2)
     levels = np.clip(np.round(image[::-1] * 255.0, 4) + 0.5, 0.5, 255.5).astype(np.uint8)
-    return levels.astype(np.float32) / np.float32(255.0)
+    stored: npt.NDArray[np.float32] = levels.astype(np.float32) / np.float32(255.0)
+    return stored
 
 
 def joined(patches: Sequence[Patch], slots: Sequence[Slot]) -> Mesh:

@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from advsearch.bundled.objects.atlas import joined, pack, painted
-from advsearch.bundled.objects.draw import Draw
-from advsearch.bundled.objects.shapes import Patch
-from advsearch.bundled.objects.textures import Paint
 from advsearch.scene.assets import Material, ObjectAsset
+
+from .atlas import joined, pack, painted
+from .draw import Draw
+from .shapes import Patch
+from .textures import Paint
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from advsearch.bundled.objects.curves import Array, dense, ellipse, rectangle, rotation, rounded, spline
-from advsearch.bundled.objects.draw import Draw
-from advsearch.bundled.objects.family import Instance, ObjectFamily, finish
-from advsearch.bundled.objects.shapes import Patch, ball, box, lathe, placed, sweep
-from advsearch.bundled.objects.textures import (
+from .curves import Array, dense, ellipse, rectangle, rotation, rounded, spline
+from .draw import Draw
+from .family import Instance, ObjectFamily, finish
+from .shapes import Patch, ball, box, lathe, placed, sweep
+from .textures import (
     Paint,
     between,
     checks,

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from advsearch.bundled.objects.curves import Array, ellipse, rectangle, rotation, spline
-from advsearch.bundled.objects.draw import Draw
-from advsearch.bundled.objects.family import Instance, ObjectFamily, finish
-from advsearch.bundled.objects.shapes import Patch, ball, frames, lathe, placed, sweep, vessel
-from advsearch.bundled.objects.textures import (
+from .curves import Array, ellipse, rectangle, rotation, spline
+from .draw import Draw
+from .family import Instance, ObjectFamily, finish
+from .shapes import Patch, ball, frames, lathe, placed, sweep, vessel
+from .textures import (
     Paint,
     between,
     colour,

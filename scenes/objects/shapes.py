@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.bundled.objects.curves import Array, dense, unit
+from .curves import Array, dense, unit
 
 Indices = npt.NDArray[np.int64]
 Rest = Callable[[Array, Array], Array]
@@ -71,7 +71,8 @@ def _without_slivers(vertices: Array, faces: Indices) -> Indices:
     """Drop triangles whose area is nothing beside the patch's (they arise where a row shrinks to a point)."""
     a, b, c = vertices[faces[:, 0]], vertices[faces[:, 1]], vertices[faces[:, 2]]
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    return faces[area > 1e-6 * float(np.median(area[area > 0.0]))]
+    kept: Indices = faces[area > 1e-6 * float(np.median(area[area > 0.0]))]
+    return kept
 
 
 def grid(tag: str, points: Array, normals: Array, size: tuple[float, float], down: Array, across: Array) -> Patch:
@@ -368,7 +369,8 @@ def cap(tag: str, ring: Array, normal: Array) -> Patch:
     vertices = np.concatenate([centre[None], ring])
 
     def rest(u: Array, v: Array) -> Array:
-        return centre + (u * span[0] + low[0])[:, None] * x + (v * span[1] + low[1])[:, None] * y
+        places: Array = centre + (u * span[0] + low[0])[:, None] * x + (v * span[1] + low[1])[:, None] * y
+        return places
 
     return Patch(tag, vertices, np.tile(normal, (len(vertices), 1)), uvs, faces, (float(span[0]), float(span[1])), rest)
 

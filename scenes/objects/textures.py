@@ -10,14 +10,15 @@ from __future__ import annotations
 import colorsys
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
-from advsearch.bundled.objects.curves import Array
-from advsearch.bundled.objects.draw import Draw
-from advsearch.bundled.objects.shapes import Indices
+from .curves import Array
+from .draw import Draw
+from .shapes import Indices
 
-Color = Array  # (3,) display-referred sRGB
+Color: TypeAlias = Array  # (3,) display-referred sRGB
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +148,8 @@ def wood(color: Color, scale: float, offset: Array, axis: int = 2, contrast: flo
         ring = p[:, across[0]] + 0.6 * p[:, across[1]] + 1.6 * noise(p * 0.45)
         rings = 0.5 + 0.5 * np.sin(2 * np.pi * ring * 0.8)
         fibre = noise(p * np.where(np.arange(3) == axis, 1.0, 4.0))
-        return np.clip(color * (1.0 - contrast * (0.55 * rings**2 + 0.45 * fibre))[:, None] * 1.12, 0.0, 1.0)
+        grain: Array = np.clip(color * (1.0 - contrast * (0.55 * rings**2 + 0.45 * fibre))[:, None] * 1.12, 0.0, 1.0)
+        return grain
 
     return paint
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from advsearch.bundled.objects.curves import Array, rotation, unit
-from advsearch.bundled.objects.draw import Draw
-from advsearch.bundled.objects.family import Instance, ObjectFamily, finish
-from advsearch.bundled.objects.shapes import Patch, ball, box, grid, placed, sweep
-from advsearch.bundled.objects.textures import (
+from .curves import Array, rotation, unit
+from .draw import Draw
+from .family import Instance, ObjectFamily, finish
+from .shapes import Patch, ball, box, grid, placed, sweep
+from .textures import (
     Paint,
     Texels,
     anything,
@@ -242,7 +242,8 @@ def _book(draw: Draw) -> Instance:
 
     def pages_paint(t: Texels) -> Array:
         lines = noise(np.stack([t.xyz[:, 2] * 9.0, 0.08 * t.xyz[:, 0], 0.08 * t.xyz[:, 1]], axis=1) + offset)
-        return paper * (0.72 + 0.28 * lines)[:, None]
+        pages: Array = paper * (0.72 + 0.28 * lines)[:, None]
+        return pages
 
     def spine(t: Texels) -> Array:
         y = np.abs(t.xyz[:, 1]) / height

@@ -67,7 +67,7 @@ class Coordinates:
             return torch.empty(0, self.count)
         if self.count > MOST_SOBOL:
             return self.tidy(torch.rand(n, self.count, generator=seeded(seed, 0)))
-        engine = torch.quasirandom.SobolEngine(self.count, scramble=True, seed=seed)  # type: ignore[no-untyped-call]
+        engine = torch.quasirandom.SobolEngine(self.count, scramble=True, seed=seed)
         return self.tidy(engine.draw(n))
 
     def moves(self, x: Tensor, generator: torch.Generator) -> Tensor:
