@@ -128,7 +128,8 @@ def test_searches_cut_paths_and_verifications_do_not() -> None:
 
 
 def test_a_long_search_says_what_paths_it_rendered() -> None:
-    options: dict[str, Any] = {"controls": "camera", "steps": 1, "trials": 6, "verify_spp": 4, "resolution": SIZE}
+    options: dict[str, Any] = {"controls": "camera.exposure", "steps": 1, "trials": 6, "verify_spp": 4}
+    options |= {"resolution": SIZE}
     options |= {"environment": "noon", "baseline": False, "measure": "full", "denoise": "none", "spp": 2}
     found = attack("bottle", **options)
     segments = found.summary["light_path_segments"]

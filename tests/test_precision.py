@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -502,7 +503,10 @@ def test_a_tiny_scene_from_end_to_end(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     words = "--object mug --control environment --resolution 32 --seconds 6 --samplers independent --depths 2 --steps 4"
-    assert main(["precision", *words.split(), "--repeats", "1", "--policies", "random", "--json", "--quiet"]) == 0
+    words += " --repeats 1 --policies random --threads 1 --json --quiet"
+    before = time.process_time()
+    assert main(["precision", *words.split()]) == 0
+    assert time.process_time() - before < 40.0  # of one thread: what others do on the machine takes none of it
     report = json.loads(capsys.readouterr().out)
     assert (report["schema"], report["command"]) == (1, "precision")
     assert {one["quantity"] for one in report["points"]} == {"image", "gradient", "objective"}
@@ -510,7 +514,7 @@ def test_a_tiny_scene_from_end_to_end(
         assert {"estimator", "spp", "error", "seconds"} <= set(one) and one["seconds"] > 0.0
     assert {"image", "gradient"} == {one["quantity"] for one in report["references"]}
     assert report["machine"]["cpu"] and report["machine"]["threads"]["render"] >= 1
-    assert report["seconds"]["total"] < 40.0
+    assert report["seconds"]["total"] > 0.0
     slopes = {(one["quantity"], one["estimator"], one["measure"], one["against"]): one for one in report["slopes"]}
     for one in report["recommendations"]:
         assert one.get("basis") != "confirmed" or one["repeats"] >= 4

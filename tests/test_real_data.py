@@ -1,4 +1,4 @@
-"""The main job on objects, environments and a classifier that nobody on this project made. Takes minutes."""
+"""The main job on objects, environments and a classifier that nobody on this project made."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from typing import Any
 
 import pytest
 
+SMALL = ["--resolution", "128", "--steps", "10", "--verify-spp", "16"]
 CASES = {
+    "small mug": ("mug.obj", "comfy_cafe_1k.hdr", "coffee mug,cup", 0.06, SMALL),
     "mug": ("mug.obj", "comfy_cafe_1k.hdr", "coffee mug,cup", 0.03, []),
     "mug-wide": ("mug.obj", "comfy_cafe_1k.hdr", "coffee mug,cup", 0.1, []),
     "teapot": ("teapot.obj", "artist_workshop_1k.hdr", "teapot,coffeepot", 0.1, ["--up", "y"]),
@@ -31,7 +33,9 @@ def attack(data: Path, run: Path, case: str) -> dict[str, Any]:
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("case", ["mug", pytest.param("mug-wide", marks=pytest.mark.slow), "teapot"])
+@pytest.mark.parametrize(
+    "case", [case if case == "small mug" else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
+)
 def test_a_real_object_is_fooled_and_verified(case: str, real_data: Path, tmp_path: Path) -> None:
     summary = attack(real_data, tmp_path / case, case)
     assert summary["ending"] == "found"
