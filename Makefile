@@ -16,7 +16,7 @@ SOURCES := advsearch scenes tests benchmarks docs tools
 export TORCH_INDEX
 
 .DEFAULT_GOAL := help
-.PHONY: help setup attack test test-slow fuzz check lint format typecheck docs bench study reference wheel check-wheel clean
+.PHONY: help setup attack test test-quick test-slow fuzz check lint format typecheck docs bench study reference wheel check-wheel clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -32,6 +32,9 @@ attack: $(STAMP) ## search the worst texture for a mug; more flags through ARGS=
 
 test: $(STAMP) ## run the tests; ARGS="-k name" picks some
 	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal $(ARGS)
+
+test-quick: $(STAMP) ## run the quick tests of every room
+	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow and not medium" $(ARGS)
 
 test-slow: $(STAMP) ## run the tests that take minutes
 	@$(BIN)/python -m pytest -m slow $(ARGS)
