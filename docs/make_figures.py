@@ -31,6 +31,7 @@ from advsearch.config import (
     PrecisionConfig,
     RegionConfig,
     RenderConfig,
+    StabilityConfig,
     SweepConfig,
 )
 from advsearch.controls import OWN
@@ -114,6 +115,7 @@ CONFIGS: dict[str, type[Config]] = {
     "region": RegionConfig,
     "plan": PlanConfig,
     "check": CheckConfig,
+    "stability": StabilityConfig,
     "precision": PrecisionConfig,
 }
 """The commands whose flags are settings, some of them the same as those of `attack`."""

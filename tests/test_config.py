@@ -28,6 +28,7 @@ from advsearch.config import (
     PrecisionConfig,
     RegionConfig,
     RenderConfig,
+    StabilityConfig,
     SweepConfig,
 )
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
@@ -163,7 +164,17 @@ def test_every_setting_is_documented_and_has_a_flag_of_its_own() -> None:
     assert flag("texture_resolution") == "--texture-resolution"
 
 
-CONFIGS = (AttackConfig, CheckConfig, GapConfig, PlanConfig, PrecisionConfig, RegionConfig, RenderConfig, SweepConfig)
+CONFIGS = (
+    AttackConfig,
+    CheckConfig,
+    GapConfig,
+    PlanConfig,
+    PrecisionConfig,
+    RegionConfig,
+    RenderConfig,
+    StabilityConfig,
+    SweepConfig,
+)
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.command)
@@ -185,6 +196,7 @@ def test_every_setting_of_every_command_says_what_it_is(config: type[Config]) ->
         ),
         SweepConfig(object="mug", grid={"pose.yaw": "0:360:24", "camera.elevation": [5, 50]}, samples=3, batch=2),
         PrecisionConfig(object="mug", controls="pose", quantities="image", seconds=9.0, depths="2,3"),
+        StabilityConfig(case=["ties", "saturated"], group="stiff", seconds=9.0, run="x", overwrite=True),
     ],
     ids=lambda config: config.command,
 )

@@ -43,13 +43,23 @@ from advsearch.cli.list import REGISTRIES
 from advsearch.cli.main import COMMANDS, _parse
 from advsearch.cli.run import COMMANDS as IN_FILES
 from advsearch.cli.sweep import axes_as_text
-from advsearch.config import TRIALS, TRIALS_OVER, AttackConfig, RegionConfig, RenderConfig, SceneConfig, SweepConfig
+from advsearch.config import (
+    TRIALS,
+    TRIALS_OVER,
+    AttackConfig,
+    RegionConfig,
+    RenderConfig,
+    SceneConfig,
+    StabilityConfig,
+    SweepConfig,
+)
 from advsearch.controls import CONTROLS, texture
 from advsearch.engine import outcome, stages
 from advsearch.engine.loading import as_controls
 from advsearch.engine.naming import check_run_settings, controls_of
 from advsearch.engine.sweeps.axes import read_axes
 from advsearch.evaluation import reference_scenes
+from advsearch.evaluation.stability.suite import chosen
 from advsearch.models import calibration, loading, reference
 from advsearch.runs import directory, export, store
 from advsearch.scene import environments, exposure, formation, library
@@ -58,7 +68,7 @@ from advsearch.scene.importing import objects
 from advsearch.scene.importing.images import TEXTURE_LIMIT
 from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
 from advsearch.scene.settings import SETTINGS, resolve
-from advsearch.settings import parse_assignment, read_yaml, settings
+from advsearch.settings import Config, parse_assignment, read_yaml, settings
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -361,12 +371,16 @@ def lines(page: Path) -> list[list[str]]:
     return [words for line in joined if (words := shlex.split(line, comments=True))]
 
 
-CONFIGS: dict[str, type[SceneConfig]] = {"attack": AttackConfig, **script("make_figures").CONFIGS}
+CONFIGS: dict[str, type[Config]] = {"attack": AttackConfig, **script("make_figures").CONFIGS}
 """What the flags of a command become."""
 
 
-def check_names(config: SceneConfig) -> None:
+def check_names(config: Config) -> None:
     """Look up every name in a configuration, as its command would; nothing is loaded."""
+    if isinstance(config, StabilityConfig):
+        chosen(config.cases, config.groups)
+        return
+    assert isinstance(config, SceneConfig)
     check_run_settings(config)
     controls_of(config.controls, config)
     resolve(config.set_)  # type: ignore[arg-type]
@@ -393,7 +407,7 @@ def check_advsearch(words: list[str], folder: Path) -> None:
     if args.command in CONFIGS:
         if "grid" in args:
             args.grid = axes_as_text(args.grid)
-        otherwise = {} if args.command in ("attack", "render", "sweep", "gap") else {"object": "mug"}
+        otherwise = {} if args.command in ("attack", "render", "stability", "sweep", "gap") else {"object": "mug"}
         check_names(config_from(args, CONFIGS[args.command], **otherwise))
     if args.command == "run":
         recipe = folder / "run.yaml"

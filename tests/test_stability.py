@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ import torch
 
 from advsearch.cli import stability as command
 from advsearch.cli.main import main
+from advsearch.config import StabilityConfig
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.evaluation.stability import suite
 from advsearch.evaluation.stability.case import holds
@@ -20,6 +22,9 @@ from advsearch.evaluation.stability.cases_noise import clipped_mean, median_of_m
 from advsearch.evaluation.stability.scene import sphere
 from advsearch.evaluation.stability.search import Toy, condition_number, hessian, numbers, quadratic
 from advsearch.evaluation.stability.suite import CASES, FELL_SHORT, GROUPS, OK, Case, Check, Outcome, chosen, run_case
+from advsearch.runs.directory import RunDirectory, find_run
+from advsearch.runs.results.stability import StabilityResult
+from advsearch.runs.summary import read_result
 
 WANTED = {
     "radiometric": (
@@ -166,6 +171,12 @@ def test_an_exception_is_a_finding(error: Exception, ending: str, text: str) -> 
 # ---- the command ----------------------------------------------------------------------------------------------------
 
 
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where runs are kept."""
+    monkeypatch.chdir(tmp_path)
+
+
 @pytest.fixture
 def two_cases(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     good = made(Outcome((Check("a", 1.0, most=2.0),), relative_error=0.02, ending="found"), "good")
@@ -204,12 +215,60 @@ def test_unknown_cases_and_groups_are_refused() -> None:
     assert {case.group for case in chosen(["ties"], ["stiff"])} == {"objective", "stiff"}
 
 
+def uncalled() -> Outcome:
+    pytest.fail("tried again")
+
+
+@pytest.mark.usefixtures("two_cases")
+def test_a_stopped_suite_goes_on_with_the_case_that_it_was_at(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`show` and `runs` know it, and the rows end up those of a suite that nobody stopped."""
+    good, bad = suite.CASES
+    assert main(["stability", "--quiet", "--json", "--run", "whole"]) == command.EXIT_FELL_SHORT
+    whole = json.loads(capsys.readouterr().out)["rows"]
+    assert main(["stability", "--quiet", "--seconds", "1e-9", "--run", "short"]) == 0
+    first = kept("short")
+    assert (first.ending, [row.case for row in first.rows], first.not_run) == ("out of time", ["good"], ["bad"])
+    capsys.readouterr()
+    assert main(["show", "short"]) == 0 and "Go on with: advsearch resume short" in capsys.readouterr().out
+    monkeypatch.setattr(suite, "CASES", (replace(good, find=uncalled), bad))
+    assert main(["resume", "short", "--quiet"]) == command.EXIT_FELL_SHORT
+    last = kept("short")
+    assert (last.ending, last.not_run) == ("done", [])
+    assert [{**row, "seconds": 0.0} for row in last.to_dict()["rows"]] == [{**row, "seconds": 0.0} for row in whole]
+    capsys.readouterr()
+    assert main(["runs", "--json"]) == 0
+    listed = {one["name"]: one for one in json.loads(capsys.readouterr().out)["runs"]}
+    assert (listed["short"]["command"], listed["short"]["state"]) == ("stability", "done")
+    assert (listed["short"]["object"], listed["short"]["answer"]) == ("", "1 of 2 hold")
+
+
+def kept(name: str) -> StabilityResult:
+    """What a run keeps."""
+    result = read_result(find_run(name))
+    assert isinstance(result, StabilityResult)
+    return result
+
+
+def test_a_suite_that_was_killed_in_its_first_case_says_what_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = StabilityConfig(case="good")
+    with RunDirectory.create("killed") as run:
+        run.write_config(config)
+    assert main(["show", "killed"]) == 0
+    said = capsys.readouterr().out
+    assert said.startswith("killed: stability.\n") and "Go on with: advsearch resume killed" in said
+
+
 @pytest.mark.usefixtures("two_cases")
 def test_seconds_and_ctrl_c_end_the_suite_and_say_what_was_not_run(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["stability", "--seconds", "1e-9", "--quiet"]) == 0
-    assert "not run: bad; --case NAME runs one" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "not run: bad" in said and said.endswith("Go on with: advsearch resume stability-001\n")
 
     def interrupted() -> Outcome:
         raise KeyboardInterrupt
@@ -220,7 +279,7 @@ def test_seconds_and_ctrl_c_end_the_suite_and_say_what_was_not_run(
     assert json.loads(told.out)["not_run"] == ["bad"] and len(json.loads(told.out)["rows"]) == 1
     assert "good: ok" in told.err
     assert main(["stability", "--seconds", "0"]) == 2
-    assert "--seconds: expected a number greater than 0, got 0" in capsys.readouterr().err
+    assert "--seconds: expected a number greater than 0 and at most 1e9, got 0" in capsys.readouterr().err
 
 
 # ---- the tools ------------------------------------------------------------------------------------------------------

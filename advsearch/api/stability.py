@@ -2,29 +2,52 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
+from pathlib import Path
 
-from advsearch.evaluation.stability.suite import Case, run_cases
-from advsearch.progress import Progress
-from advsearch.runs.results.base import INTERRUPTED
+from advsearch.config import StabilityConfig
+from advsearch.engine.measuring import Results, kept_rows
+from advsearch.engine.memory import Memory
+from advsearch.evaluation.stability.suite import chosen, run_cases
+from advsearch.progress import NullProgress, Progress
+from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.stability import CaseRow, StabilityResult
 
 
 def stability(
-    cases: Sequence[Case], *, seconds: float | None = None, progress: Progress | None = None
+    config: StabilityConfig, *, progress: Progress | None = None, resumed: Path | None = None
 ) -> StabilityResult:
     """Run cases of the suite one after the other, until they are done, the time is up or there is an interrupt.
 
+    A case that is done is stored at once: a run that was stopped goes on with the case that it was at.
+
     Args:
-        cases: from `advsearch.evaluation.stability.suite.chosen`.
-        seconds: time after which no case is begun any more.
+        config: which cases, and where the run is kept.
         progress: told how far it is.
+        resumed: the folder of a run to go on with.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
     """
-    rows: list[CaseRow] = []
-    ending = "done"
-    try:
-        for row in run_cases(cases, progress, seconds=seconds):
-            rows.append(row)
-    except KeyboardInterrupt:
-        ending = INTERRUPTED
-    return StabilityResult(rows=rows, not_run=[case.name for case in cases[len(rows) :]], ending=ending)
+    cases, begun = chosen(config.cases, config.groups), time.perf_counter()
+    if resumed is not None:
+        opened = RunDirectory.resume(resumed, config)
+    else:
+        opened = RunDirectory.create(config.run, overwrite=config.overwrite, default="stability")
+    with opened as run:
+        if resumed is None:
+            run.write_config(config)
+
+        def result(rows: Sequence[CaseRow], ending: str) -> StabilityResult:
+            return StabilityResult(
+                run=str(run.path),
+                ending=ending,
+                rows=list(rows),
+                not_run=[case.name for case in cases[len(rows) :]],
+                seconds={"total": time.perf_counter() - begun},
+                command_line=config.command_line(),
+            )
+
+        results = Results(Memory(run), config.seconds)
+        return kept_rows(run, run_cases(cases, results, progress or NullProgress()), result)

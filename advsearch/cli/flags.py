@@ -26,10 +26,10 @@ GROUPS = {
     "run": "run",
 }
 
-_NO_SETTINGS = {"case": "--case", "group": "--group", "code": "--code"}
+_NO_SETTINGS = {"code": "--code"}
 """Flags which messages name too and which are no setting of a configuration."""
 
-_LISTS = ("controls", "over", "set_", "estimators", "grid")
+_LISTS = ("controls", "over", "set_", "estimators", "grid", "case", "group")
 
 Given = TypeVar("Given", bound=Config)
 

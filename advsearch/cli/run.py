@@ -20,6 +20,7 @@ COMMANDS = {
     "region": "RegionConfig",
     "precision": "PrecisionConfig",
     "check": "CheckConfig",
+    "stability": "StabilityConfig",
 }
 """What the `command` of a file may say, and the configuration that it is."""
 

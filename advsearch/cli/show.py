@@ -56,6 +56,7 @@ def show_run(name: str, as_json: bool) -> int:
         "region": "advsearch.cli.region",
         "precision": "advsearch.cli.precision",
         "check": "advsearch.cli.check",
+        "stability": "advsearch.cli.stability",
     }
     kind = "gap" if "parts" in summary else summary.get("command")
     answer = importlib.import_module(tables.get(str(kind), "advsearch.cli.table")).answer
@@ -79,7 +80,9 @@ def _show_unfinished(found: Listed, as_json: bool) -> int:
     if as_json:
         output.print_json({"schema": 1, **vars(found), "run": found.path, "ending": None, "resume": go_on})
         return 0
-    what = f"{found.command} of {found.object}, {' and '.join(found.controls) or 'nothing searched'}"
+    what = found.command
+    if found.object:
+        what += f" of {found.object}, {' and '.join(found.controls) or 'nothing searched'}"
     how = {"running": "A process is working on it"}.get(found.state, "It was stopped before its end")
     kept = ", ".join(f"{count} of {kind}" for kind, count in found.kinds.items())
     lines = [f"{found.name}: {what}.", f"{how}; evaluations kept so far: {kept or 'none'}."]

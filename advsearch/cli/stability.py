@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import math
 import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
-from advsearch.errors import InputError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from advsearch.config import StabilityConfig
     from advsearch.evaluation.stability.case import Case
     from advsearch.runs.results.stability import StabilityResult
 
@@ -22,12 +23,17 @@ _EXAMPLES = """examples:
   advsearch stability
   advsearch stability --group objective --group stiff
   advsearch stability --case hdri-texel-100000 --json
+  advsearch stability --seconds 120 --run extremes
+  advsearch resume extremes
   advsearch stability --list
 """
 
 
 def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add the command."""
+    from advsearch.cli.flags import add_settings
+    from advsearch.config import StabilityConfig
+
     parser = subparsers.add_parser(
         "stability",
         help=HELP,
@@ -36,29 +42,38 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("--case", action="append", default=[], metavar="NAME", help="run this case; may be repeated")
-    parser.add_argument("--group", action="append", default=[], metavar="NAME", help="run this group; may be repeated")
-    parser.add_argument(
-        "--seconds", type=_seconds, metavar="SECONDS", help="time after which no case is begun any more (default: none)"
-    )
+    add_settings(parser, config=StabilityConfig)
     parser.add_argument("--list", action="store_true", help="list the cases and run none")
     output.add_flags(parser, quiet=True)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the cases, print the table; 3 if one falls short."""
+    """Run the cases, or list them; 3 if one falls short."""
+    from advsearch.cli.flags import config_from
+    from advsearch.config import StabilityConfig
+
+    config = config_from(args, StabilityConfig)
+    if not args.list:
+        return carry_out(config, as_json=args.json, quiet=args.quiet)
     from advsearch.cli.progress import at_work
 
-    with at_work(as_json=args.json, quiet=args.quiet) as progress:
-        from advsearch.api.stability import stability
-        from advsearch.evaluation.stability.suite import OK, chosen
+    with at_work(as_json=args.json, quiet=args.quiet):
+        from advsearch.evaluation.stability.suite import chosen
 
-        cases = chosen(args.case, args.group)
-        if not args.list:
-            result = stability(cases, seconds=args.seconds, progress=progress)
-    if args.list:
-        return _print_cases(cases, as_json=args.json)
-    status = output.finish(result, table, as_json=args.json)
+        cases = chosen(config.cases, config.groups)
+    return _print_cases(cases, as_json=args.json)
+
+
+def carry_out(config: StabilityConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
+    """Run the cases that `config` describes, or go on with them; print the table and return the exit status."""
+    from advsearch.cli.progress import at_work
+
+    with at_work(as_json=as_json, quiet=quiet) as progress:
+        from advsearch.api.stability import stability
+        from advsearch.evaluation.stability.suite import OK
+
+        result = stability(config, progress=progress, resumed=resumed)
+    status = output.finish(result, answer, as_json=as_json)
     return status or (0 if all(row.status == OK for row in result.rows) else EXIT_FELL_SHORT)
 
 
@@ -72,15 +87,9 @@ def _print_cases(cases: Sequence[Case], *, as_json: bool) -> int:
     return 0
 
 
-def _seconds(text: str) -> float:
-    """A number of seconds greater than 0."""
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not 0.0 < seconds < math.inf:
-        raise InputError(f"--seconds: expected a number greater than 0, got {text}")
-    return seconds
+def answer(result: StabilityResult) -> str:
+    """Return the table, and where the run is."""
+    return "\n\n".join([table(result), output.columns([["run", result.run]])])
 
 
 def table(result: StabilityResult) -> str:
@@ -114,7 +123,7 @@ def table(result: StabilityResult) -> str:
     short = [row for row in rows if row.status != OK]
     parts += [f"{row.case} fell short: {row.decides}\n  expected: {row.holds}" for row in short]
     if left:
-        parts.append("not run: " + ", ".join(left) + "; --case NAME runs one")
+        parts.append("not run: " + ", ".join(left))
     total = sum(row.seconds for row in rows)
     parts.append(f"{len(rows) - len(short)} of {len(rows)} cases hold, in {total:.0f} seconds")
     return "\n\n".join(parts)

@@ -8,7 +8,7 @@ that this package stays light.
 from __future__ import annotations
 
 from advsearch.config.attack import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
-from advsearch.config.checking import CheckConfig, PlanConfig
+from advsearch.config.checking import CheckConfig, PlanConfig, StabilityConfig
 from advsearch.config.precision import QUANTITIES, SAMPLERS, PrecisionConfig
 from advsearch.config.questions import FEWEST_SAMPLES, GapConfig, RegionConfig
 from advsearch.config.rendering import RenderConfig
@@ -33,5 +33,6 @@ __all__ = [
     "RegionConfig",
     "RenderConfig",
     "SceneConfig",
+    "StabilityConfig",
     "SweepConfig",
 ]

@@ -1,11 +1,15 @@
-"""What `check` and `plan` need to know."""
+"""What `check`, `plan` and `stability` need to know."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+from pydantic import field_validator
+
 from advsearch.config.attack import AttackConfig
-from advsearch.settings import Clash, setting
+from advsearch.config.scene import SceneConfig
+from advsearch.settings import Clash, Config, check_once, setting, split_names
 
 OF_ALL: dict[str, Any] = {"object": "mug", "environment": None, "controls": {"texture": {}}, "set_": {}}
 """What is as it is unless it is given, and has to be left so with `all`."""
@@ -69,3 +73,62 @@ class PlanConfig(AttackConfig):
         unit="seconds",
         gt=0.0,
     )
+
+
+class StabilityConfig(Config):
+    """Everything that decides what `stability` does: which cases it tries, for how long, and where that is kept."""
+
+    command: ClassVar[str] = "stability"
+    clashes: ClassVar[tuple[Clash, ...]] = tuple(one for one in SceneConfig.clashes if one.setting == "overwrite")
+
+    case: str | None = setting(None, "check", "cases to try, separated by commas", "names of cases", otherwise="all")
+    group: str | None = setting(
+        None, "check", "groups of cases to try, separated by commas", "names of groups", otherwise="all"
+    )
+    seconds: float | None = setting(
+        None,
+        "check",
+        "time after which no case is begun any more; `advsearch resume` goes on for as long again",
+        "a number greater than 0 and at most 1e9",
+        otherwise="no limit",
+        unit="seconds",
+        gt=0.0,
+        le=1e9,
+    )
+    run: str | None = setting(
+        None,
+        "run",
+        "where the run is kept",
+        "a name (kept in runs/) or the path of a folder",
+        otherwise="runs/stability-NNN",
+        min_length=1,
+    )
+    overwrite: bool = setting(False, "run", "replace a run that is there already", "true or false")
+
+    @field_validator("case", "group", "run", mode="before")
+    @classmethod
+    def _as_text(cls, value: Any) -> Any:
+        """Accept a path for a folder and a list of names for names; refuse what can't be a name."""
+        text = str(value) if isinstance(value, Path) else value
+        if isinstance(text, (list, tuple)) and all(isinstance(part, str) for part in text):
+            text = ",".join(text)
+        if isinstance(text, str) and (not text.strip(" ,\t\n") or "\0" in text):
+            raise ValueError("an empty name")
+        return text
+
+    @field_validator("case", "group")
+    @classmethod
+    def _each_once(cls, value: str | None, info: Any) -> str | None:
+        """Refuse a name that is given twice."""
+        check_once(split_names(value or ""), info.field_name)
+        return value
+
+    @property
+    def cases(self) -> tuple[str, ...]:
+        """Names of cases."""
+        return () if self.case is None else split_names(self.case)
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Names of groups."""
+        return () if self.group is None else split_names(self.group)

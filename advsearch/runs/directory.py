@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from advsearch.config import SceneConfig
     from advsearch.runs.results.base import Result
+    from advsearch.settings import Config
 
 HOME = Path("runs")
 """Where runs live that are called by name, in the current directory."""
@@ -130,7 +131,7 @@ class RunDirectory:
         return run
 
     @classmethod
-    def resume(cls, run: str | Path, config: SceneConfig | None = None) -> RunDirectory:
+    def resume(cls, run: str | Path, config: Config | None = None) -> RunDirectory:
         """Open and lock the directory of a run that is there, to go on with it.
 
         Args:
@@ -158,7 +159,7 @@ class RunDirectory:
             raise
         return opened
 
-    def _check_same(self, config: SceneConfig) -> None:
+    def _check_same(self, config: Config) -> None:
         """Refuse settings that decide other numbers than those that are stored: the rest would not fit to them."""
         before, now = self._begun_with(), config.deciding()
         changed = [
@@ -191,7 +192,7 @@ class RunDirectory:
         """Remove what only a run that goes on needs."""
         self.replay.remove()
 
-    def write_config(self, config: SceneConfig) -> Path:
+    def write_config(self, config: Config) -> Path:
         """Write `run.yaml`, from which `advsearch run` repeats the run, and return its path.
 
         What decides the numbers is noted in the store too, so that a file that was edited since is noticed.

@@ -22,7 +22,7 @@ class Listed:
         name: of its folder.
         path: of its folder.
         command: that made it.
-        object: what the model should recognise.
+        object: what the model should recognise; empty where a command has none.
         controls: what could change.
         rows: evaluated configurations in its store.
         state: ``"running"`` where a process works on it, ``"stopped"`` where it can be resumed, else its ending.
@@ -73,7 +73,7 @@ def described(path: Path) -> Listed:
         name=path.name,
         path=str(path),
         command=str(config.get("command") or answer.get("command") or "?"),
-        object=str(config.get("object") or answer.get("object") or "?"),
+        object=str(config.get("object") or answer.get("object") or ("" if config else "?")),
         controls=tuple(map(str, controls)) if isinstance(controls, (list, tuple, dict)) else ("?",),
         rows=sum(kinds.values()),
         state=_state(path, answer),
@@ -103,4 +103,8 @@ def _answer_words(answer: dict[str, Any]) -> str:
         return f"{verified['successes']}/{verified['trials']}"
     if answer.get("accuracy") is not None:
         return f"accuracy {answer['accuracy']:.1%}"
+    if answer.get("command") == "check":
+        return f"{answer['measured']} of {answer['planned']} parts"
+    if answer.get("command") == "stability":
+        return f"{sum(row['status'] == 'ok' for row in answer['rows'])} of {len(answer['rows'])} hold"
     return ""

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 
+from advsearch.engine.measuring import Results
 from advsearch.errors import AdvsearchError, UnknownNameError
 from advsearch.evaluation.stability import (
     cases_geometry,
@@ -20,7 +22,8 @@ from advsearch.evaluation.stability import (
     cases_stiff,
 )
 from advsearch.evaluation.stability.case import FELL_SHORT, GROUPS, OK, Case, Check, Outcome
-from advsearch.progress import NullProgress, Progress
+from advsearch.files import Json
+from advsearch.progress import Progress
 from advsearch.runs.results.stability import CaseRow, DecidingNumber
 
 CASES: tuple[Case, ...] = (
@@ -80,20 +83,26 @@ def run_case(case: Case) -> CaseRow:
     )
 
 
-def run_cases(
-    cases: Sequence[Case] = CASES, progress: Progress | None = None, *, seconds: float | None = None
-) -> Iterator[CaseRow]:
-    """Run cases one after the other and yield each row as it is done; after so many seconds none is begun any more."""
-    progress, begun = progress or NullProgress(), time.perf_counter()
+def run_cases(cases: Sequence[Case], results: Results, progress: Progress) -> Iterator[CaseRow]:
+    """Run cases one after the other and yield each row as it is done; what the results hold is not run again.
+
+    Raises:
+        OutOfTime: the time of the results is up.
+    """
     hint = "`case` and `group` pick some, `seconds` stops before the next one"
     progress.stage("trying extreme scenes, objectives and arithmetic", len(cases), hint=hint)
-    for number, case in enumerate(cases):
-        if number and seconds is not None and time.perf_counter() - begun >= seconds:
-            return
-        row = run_case(case)
-        progress.message(f"{case.name}: {row.status}, {row.seconds:.1f} s")
-        progress.advance(1)
+    for case in cases:
+        known = results.stored(case.name) is not None
+        row = CaseRow.of(results.get(case.name, partial(_values, case)))
         yield row
+        if not known:
+            progress.message(f"{case.name}: {row.status}, {row.seconds:.1f} s")
+        progress.advance(1)
+
+
+def _values(case: Case) -> Json:
+    """The row of a case as JSON values."""
+    return run_case(case).to_dict()
 
 
 __all__ = ["CASES", "FELL_SHORT", "GROUPS", "OK", "Case", "Check", "Outcome", "chosen", "run_case", "run_cases"]

@@ -42,6 +42,9 @@ class StabilityResult(Result):
 
     command: ClassVar[str] = "stability"
 
+    run: str = Field(description="the folder")
+    ending: str = Field(description="`done`, `interrupted` or `out of time`")
     rows: list[CaseRow]
     not_run: list[str] = Field(description="cases that were not begun")
-    ending: str
+    seconds: dict[str, Number] = Field(description="in `total`, of this sitting")
+    command_line: str = Field(description="that asks the same again")
