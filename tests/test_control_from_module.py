@@ -93,6 +93,42 @@ def test_code_that_somebody_elses_file_names_is_not_run(
     assert Path("imported").exists() and "RuntimeError: planted" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({"model": "planted:make"}, "planted:make"),
+        ({"model": "planted:make@weights.safetensors"}, "planted:make"),
+        ({"model": "torchvision:resnet18"}, ""),
+        ({"controls": {"planted:Fade": {}, "light:Key": {}}}, "planted:Fade"),
+        ({"controls": {"mine": {"kind": "planted:Fade"}}}, "planted:Fade"),
+        ({"model": "planted:make", "over": {"planted:Fade": {}}}, "planted:make planted:Fade"),
+    ],
+)
+def test_how_to_go_on_names_the_code_that_is_needed(
+    settings: dict[str, object], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The line that `show` prints goes on as it stands; nothing is imported to make it."""
+    stopped_run(**settings)
+    assert main(["show", "theirs"]) == 0
+    line = capsys.readouterr().out.splitlines()[-1]
+    flags = [word for name in named.split() for word in ("--code", name)]
+    assert line.split() == ["Go", "on", "with:", "advsearch", "resume", "theirs", *flags]
+    assert not Path("imported").exists()
+    if named:
+        assert main([*line.split()[4:], "--quiet"]) == 2
+        assert Path("imported").exists() and "RuntimeError: planted" in capsys.readouterr().err
+
+
+def test_a_run_that_is_stopped_says_how_to_go_on_with_its_code(capsys: pytest.CaptureFixture[str]) -> None:
+    words = (
+        "check --object mug --control own_controls:Fade --loss linear --resolution 16 --spp 1 --seconds 1e-9 --quiet"
+    )
+    assert main([*words.split(), "--quiet"]) == 0
+    line = capsys.readouterr().out.splitlines()[-1]
+    assert line == "Go on with: advsearch resume mug-check-001 --code own_controls:Fade"
+    assert main([*line.split()[4:], "--quiet"]) in (0, 3)
+
+
 def test_settings_and_a_name_of_its_own() -> None:
     given = {"old": {"kind": "own_controls:Fade", "amount": [0.0, 0.3]}}
     render = advsearch.load_scene("mug").renderer(given, resolution=16)

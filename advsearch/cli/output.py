@@ -6,10 +6,14 @@ import argparse
 import ctypes
 import json
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from advsearch.errors import AdvsearchError
 
 if TYPE_CHECKING:
     from advsearch.runs.results.base import Result
@@ -66,15 +70,40 @@ def finish(summary: Result | Mapping[str, Any], answer: Callable[[Any], str], *,
 
 def go_on_text(summary: Result | Mapping[str, Any]) -> str:
     """Return how to go on with a run that was stopped; nothing of one that was not, or that is kept nowhere."""
-    from advsearch.runs.directory import shown
     from advsearch.runs.summary import goes_on
 
-    if not isinstance(summary, Mapping):
-        run = getattr(summary, "run", None)
-        return f"\n\nGo on with: advsearch resume {shown(run)}" if summary.goes_on and run else ""
-    return (
-        f"\n\nGo on with: advsearch resume {shown(summary['run'])}" if goes_on(summary) and summary.get("run") else ""
-    )
+    if isinstance(summary, Mapping):
+        run, stopped = summary.get("run"), goes_on(summary)
+    else:
+        run, stopped = getattr(summary, "run", None), summary.goes_on
+    return f"\n\nGo on with: {go_on_command(run)}" if run and stopped else ""
+
+
+def go_on_command(run: str | Path) -> str:
+    """Return the shell command that goes on with a run, with the Python code that its settings name.
+
+    Args:
+        run: its folder.
+    """
+    from advsearch.runs.directory import CONFIG, shown
+
+    words = ["advsearch", "resume", shown(run)]
+    with suppress(AdvsearchError):
+        words += [word for name in _code_in(Path(run) / CONFIG) for word in ("--code", name)]
+    return shlex.join(words)
+
+
+def _code_in(file: Path) -> Sequence[str]:
+    """The Python code that a run.yaml names."""
+    from advsearch.cli.run import command_in, described
+    from advsearch.config import SceneConfig
+
+    config = described(command_in(file), file, {})
+    if not isinstance(config, SceneConfig) or ":" not in "".join([config.model, *config.kinds_of_controls]):
+        return ()
+    from advsearch.engine.naming import code_of  # takes seconds
+
+    return code_of(config)
 
 
 @contextmanager

@@ -28,10 +28,9 @@ def run(args: argparse.Namespace) -> int:
     """Do what is left of the run and print its answer; of a run that is done, its answer."""
     import sys
 
-    from advsearch.cli.run import carry_out
+    from advsearch.cli.run import carry_out, command_in
     from advsearch.runs.directory import CONFIG, find_run
     from advsearch.runs.listing import finished
-    from advsearch.settings import read_yaml
 
     path = find_run(args.run)
     if not (path / CONFIG).is_file():
@@ -41,5 +40,4 @@ def run(args: argparse.Namespace) -> int:
 
         print(f"advsearch: {path} is done already", file=sys.stderr)
         return show_run(str(path), args.json)
-    command = str(read_yaml(path / CONFIG).get("command", "attack"))
-    return carry_out(command, path / CONFIG, {}, args, resumed=path)
+    return carry_out(command_in(path / CONFIG), path / CONFIG, {}, args, resumed=path)

@@ -6,10 +6,13 @@ import argparse
 import importlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
 from advsearch.errors import UnknownNameError
+
+if TYPE_CHECKING:
+    from advsearch.settings import Config
 
 HELP = "do what a YAML file describes: a run.yaml repeats its run"
 
@@ -38,15 +41,36 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read the file, put the changes over it and do what it says."""
-    from advsearch.settings import parse_assignment, read_yaml
+    from advsearch.settings import parse_assignment
 
-    command = str(read_yaml(args.file).get("command", "attack"))
+    command = command_in(args.file)
     changes = dict(parse_assignment(text, f"change {text!r}") for text in args.change)
     if args.run is not None:
         changes["run"] = args.run
     if args.overwrite:
         changes["overwrite"] = True
     return carry_out(command, args.file, changes, args)
+
+
+def command_in(file: str | Path) -> str:
+    """Return the command that a file is for.
+
+    Raises:
+        FileFormatError: it is not a file with settings.
+    """
+    from advsearch.settings import read_yaml
+
+    return str(read_yaml(file).get("command", "attack"))
+
+
+def described(command: str, file: str | Path, changes: Mapping[str, Any]) -> Config:
+    """Return the configuration that a file describes; arguments and errors as for `carry_out`."""
+    from advsearch import config
+
+    if command not in COMMANDS:
+        raise UnknownNameError("command", command, COMMANDS, f"It stands in {file}.")
+    made: Config = getattr(config, COMMANDS[command]).from_yaml(file, changes)
+    return made
 
 
 def carry_out(
@@ -64,12 +88,9 @@ def carry_out(
     Raises:
         UnknownNameError: there is no such command.
     """
-    from advsearch import config
     from advsearch.registry import only_named_code
 
-    if command not in COMMANDS:
-        raise UnknownNameError("command", command, COMMANDS, f"It stands in {file}.")
-    described = getattr(config, COMMANDS[command]).from_yaml(file, changes)
+    config = described(command, file, changes)
     module = importlib.import_module(f"advsearch.cli.{command}")
     with only_named_code(file, args.code):
-        return int(module.carry_out(described, as_json=args.json, quiet=args.quiet, resumed=resumed))
+        return int(module.carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))

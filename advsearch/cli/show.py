@@ -74,9 +74,7 @@ def show_run(name: str, as_json: bool) -> int:
 
 def _show_unfinished(found: Listed, as_json: bool) -> int:
     """Say what a run is, how far it has come and how to go on."""
-    from advsearch.runs.directory import shown
-
-    go_on = f"advsearch resume {shown(found.path)}" if found.begun and found.state == "stopped" else None
+    go_on = output.go_on_command(found.path) if found.begun and found.state == "stopped" else None
     if as_json:
         output.print_json({"schema": 1, **vars(found), "run": found.path, "ending": None, "resume": go_on})
         return 0

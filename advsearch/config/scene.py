@@ -169,6 +169,12 @@ class SceneConfig(Config):
         return self.environment or DEFAULT_ENVIRONMENT
 
     @property
+    def kinds_of_controls(self) -> tuple[str, ...]:
+        """What says of which kind the controls are: their names, or the `kind` among their settings."""
+        named = {**self.controls, **getattr(self, "over", {})}
+        return tuple(str(given.get("kind", name)) for name, given in named.items())
+
+    @property
     def search_spp(self) -> int:
         """Samples a pixel of the search: what was asked for, or the default for the denoiser."""
         if self.spp == "auto":

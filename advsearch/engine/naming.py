@@ -12,6 +12,8 @@ from advsearch.controls import CONTROLS, Choice, Control, gathered, names_of
 from advsearch.engine.loading import Controls, as_controls, settings_of
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model, ModelWarning, load_model
+from advsearch.models.loading import named_code
+from advsearch.settings import split_names
 
 
 def scene_settings(fixed: Mapping[str, Any] | None, exposure: float | None) -> dict[str, Any]:
@@ -26,6 +28,13 @@ def scene_settings(fixed: Mapping[str, Any] | None, exposure: float | None) -> d
             raise InputError("`exposure` and `set` camera.exposure say the same thing; leave one of them out")
         given["camera.exposure"] = exposure
     return given
+
+
+def code_of(config: SceneConfig) -> tuple[str, ...]:
+    """Return the Python code that settings name, and that is imported for them: "package.module:attribute"."""
+    models = [named_code(name) for name in split_names(config.model)]
+    controls = [name for name in config.kinds_of_controls if CONTROLS.names_class(name)]
+    return tuple(dict.fromkeys(name for name in (*models, *controls) if name))
 
 
 RUN_SETTINGS = ("epsilon", "norm", "texture_resolution")

@@ -105,6 +105,14 @@ def load_model(
     return probe(bare, found.labels if names is None else names, origin)
 
 
+def named_code(spec: str) -> str | None:
+    """Return the "package.module:attribute" that a model's name imports; None of one that imports none."""
+    text = spec.strip()
+    if text.partition(":")[0].lower() in SOURCES or not re.fullmatch(r"[^\W\d][\w.]*:[^\W\d][\w.]*(@.+)?", text):
+        return None
+    return imported.split_weights(text)[0]
+
+
 def _find(spec: object) -> Source | Model:
     """Return what `spec` names."""
     if isinstance(spec, Model):
@@ -123,7 +131,7 @@ def _find(spec: object) -> Source | Model:
         return SOURCES[source](text)
     if re.fullmatch(r"[\w.-]+\.py:[\w.]+", text):
         raise InputError(f"model {text!r}: write {text.replace('.py:', ':')!r}, without the '.py'")
-    if re.fullmatch(r"[^\W\d][\w.]*:[^\W\d][\w.]*(@.+)?", text):
+    if named_code(text) is not None:
         return imported.load_callable(text)
     if Path(text).suffix.lower() in files.SUFFIXES or "/" in text or os.sep in text or os.path.exists(text):
         return files.load_file(Path(text))
