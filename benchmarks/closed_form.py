@@ -114,7 +114,7 @@ class Problem:
         """Evaluate without noise; more samples change nothing but the cost."""
         value = self.value(u)
         slope = self.gradient(u) if gradient else None
-        return Evaluation(value, slope, torch.tensor([0.0, value]), False, cost=samples)
+        return Evaluation(value, slope, False, cost=samples)
 
 
 def domain_of(start: Tensor, norm: str) -> Domain:

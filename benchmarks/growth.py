@@ -28,12 +28,12 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.attacks import get_objective, make_policy  # noqa: E402
-from advsearch.attacks.goal import Goal  # noqa: E402
 from advsearch.controls import make_space  # noqa: E402
 from advsearch.controls.texture import TextureControl  # noqa: E402
 from advsearch.engine.loading import load_scene, make_renderer  # noqa: E402
 from advsearch.engine.problem import Problem  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
+from advsearch.tasks import Classification, Facts  # noqa: E402
 
 
 def main() -> None:
@@ -45,8 +45,8 @@ def main() -> None:
     space = make_space([TextureControl()], description)
     model = load_model("reference")
     renderer = make_renderer(description, space, args.size, "oidn", 0)
-    labels = model.label_set("mug")
-    problem = Problem(renderer, space, model, labels, get_objective("margin"), Goal(labels.indices), 4, 0)
+    task = Classification().on(model)
+    problem = Problem(renderer, space, model, task, lambda _: Facts("mug", "mug"), get_objective("margin"), 4, 0)
     policy, evaluate = make_policy("pgd"), problem.evaluator("search")
     state = policy.start(problem.domain, torch.Generator().manual_seed(0), args.steps)
     ratios, seconds, memory = [], [], []

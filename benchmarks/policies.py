@@ -70,7 +70,7 @@ def gap(policy: Policy[object], kind: str, d: int, renders: int, noise: float, s
             key = [seed, index, zlib.crc32(u.numpy().tobytes()), zlib.crc32(by.name.encode())]
             value = float(function(u.double().numpy()[None])[0]) / spread
             value += noise * float(np.random.default_rng(key).normal())
-            return Evaluation(value, None, torch.tensor([0.0, value]), False)
+            return Evaluation(value, None, False)
 
         found = search(evaluate, domain, by, steps=renders, seed=seed).best_u
         return float(function(found.double().numpy()[None])[0]) / spread

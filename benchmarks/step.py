@@ -25,7 +25,6 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.attacks import get_objective, make_policy  # noqa: E402
-from advsearch.attacks.goal import Goal  # noqa: E402
 from advsearch.controls import make_space  # noqa: E402
 from advsearch.controls.texture import TextureControl  # noqa: E402
 from advsearch.engine.loading import load_scene, make_renderer  # noqa: E402
@@ -35,6 +34,7 @@ from advsearch.scene.description import SceneDescription  # noqa: E402
 from advsearch.scene.leaving_out import EVERYTHING  # noqa: E402
 from advsearch.scene.mitsuba_backend.scene import BASE_COLOR, MitsubaScene  # noqa: E402
 from advsearch.scene.mitsuba_backend.variant import mitsuba  # noqa: E402
+from advsearch.tasks import Classification, Facts  # noqa: E402
 
 
 def main() -> None:
@@ -55,10 +55,10 @@ def compare(size: int, denoise: str, spp: int, repeats: int) -> tuple[float, flo
     description = load_scene("mug").description
     space = make_space([TextureControl()], description)
     model = load_model("reference")
-    labels = model.label_set("mug")
+    task = Classification().on(model)
     renderer = make_renderer(description, space, size, denoise, 0)
-    problem = Problem(renderer, space, model, labels, get_objective("margin"), Goal(labels.indices), spp, 0)
-    floor = Floor(description, size, spp, denoise, lambda image: model(image)[0, labels.indices[0]])
+    problem = Problem(renderer, space, model, task, lambda _: Facts("mug", "mug"), get_objective("margin"), spp, 0)
+    floor = Floor(description, size, spp, denoise, lambda image: model(image)[0, model.label_set("mug").indices[0]])
     step = steps(problem, 3 + repeats)
     ratios = []
     for turn in range(3 + repeats):

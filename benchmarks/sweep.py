@@ -40,6 +40,7 @@ from advsearch.scene.formation import ImageFormation  # noqa: E402
 from advsearch.scene.leaving_out import EVERYTHING  # noqa: E402
 from advsearch.scene.mitsuba_backend.denoise import Denoiser  # noqa: E402
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene  # noqa: E402
+from advsearch.tasks import Classification  # noqa: E402
 
 ASKED_PER_SECOND, ASKED_SHARE = 10_000, 0.95
 GRID = {"pose.yaw": "0:360:24", "camera.elevation": "5:60:8"}
@@ -138,7 +139,8 @@ def job_of(config: SweepConfig, model) -> Job:  # type: ignore[no-untyped-def]
     drawn = as_controls(config.controls)
     axes = read_axes(config.grid, drawn)
     place = Place("mug", "studio", load_scene("mug", "studio"))
-    return Job(config, (place,), (model,), drawn, axes, config.samples or 1, ())
+    task = Classification().on(model)
+    return Job(config, (place,), (model,), (task,), drawn, axes, config.samples or 1, ())
 
 
 # ---- beside rendering -----------------------------------------------------------------------------------------------

@@ -68,7 +68,7 @@ class Smooth:
             sine = np.sin(self.frequency @ u.double().numpy() + self.phase)
             slope = torch.tensor(-sine @ self.frequency, dtype=torch.float32)
         cost = 1 + (self.domain.gradient_cost if gradient is True else 0)
-        return Evaluation(value, slope, torch.tensor([0.0, value]), value > 0, cost=cost)
+        return Evaluation(value, slope, value > 0, cost=cost)
 
 
 def played(domain: Domain, policy: Policy[object], steps: int, seed: int = 0) -> tuple[SearchResult, Smooth]:
@@ -155,7 +155,7 @@ def test_values_that_are_not_finite_are_the_worst(blocks: tuple[Block, ...]) -> 
     def evaluate(u: Tensor, *, index: int, gradient: bool | str) -> Evaluation:
         evaluation = problem(u, index=index, gradient=gradient)
         bad = index % 3 != 0 and float(u[-1]) > 0.6
-        return Evaluation(math.nan, evaluation.gradient, evaluation.logits, False) if bad else evaluation
+        return Evaluation(math.nan, evaluation.gradient, False) if bad else evaluation
 
     result = search(evaluate, problem.domain, Auto(), steps=40, seed=0)
     assert result.stopped is Ending.BUDGET_SPENT
@@ -215,7 +215,7 @@ def test_an_angle_is_searched_across_its_seam() -> None:
 
         def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
             sides.add(float(u[0]) < 0.5) if value(u) > 0.9 else None
-            return Evaluation(value(u), None, torch.zeros(2), False)
+            return Evaluation(value(u), None, False)
 
         reached.append(value(search(evaluate, domain, Auto(), steps=40, seed=seed).best_u))
     assert min(reached) > 0.97
@@ -301,7 +301,7 @@ def gap(kind: str, d: int, seed: int, noise: float = 0.3) -> float:
         def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
             rng = np.random.default_rng([seed, index, zlib.crc32(u.numpy().tobytes())])
             value = function(u.double().numpy()) + noise * rng.normal()
-            return Evaluation(value, None, torch.tensor([0.0, value]), value > 0)
+            return Evaluation(value, None, value > 0)
 
         return function(search(evaluate, domain, policy, steps=40, seed=seed).best_u.double().numpy())
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from advsearch.attacks import OBJECTIVES, Evaluation, get_objective, margin, stop_at_margin, succeeded
+from advsearch.attacks import OBJECTIVES, get_objective, margin
 from advsearch.attacks.feature_distance import NEARBY, feature_distance
 from advsearch.attacks.logit_objectives import (
     RELIEF,
@@ -28,6 +28,7 @@ from advsearch.attacks.logit_objectives import (
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective, objective_summaries
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import load_model
+from advsearch.tasks import Classification
 
 IMAGES = torch.zeros(2, 4, 4, 3)
 LOGITS = torch.tensor([[3.0, 1.0, 2.0, -1.0], [0.0, 5.0, 1.0, 4.0]])
@@ -152,7 +153,11 @@ def test_dlr_needs_two_classes_beside_the_label_set(function: Callable[..., Tens
 
 # ---- the battery: every objective in every form ---------------------------------------------------------------------
 
-FORMS = {"plain": {}, "targeted": {"target": (2, 4)}, "minimised": {"minimise": True}}
+FORMS = {
+    "plain": Classification(),
+    "targeted": Classification(target=(2, 4)),
+    "minimised": Classification(minimise=True),
+}
 RIGHT = (0, 3)
 LARGE = (1.0, 1e3, 1e4)
 
@@ -174,7 +179,7 @@ def form(name: str, chosen: str) -> Callable[[Tensor, tuple[int, ...]], Tensor]:
     if OBJECTIVE_KINDS[name].needs_features:
         objective = feature_distance(lambda images: images.flatten(1), torch.arange(6.0).reshape(1, 1, 2, 3))
         return lambda logits, labels: objective(logits, logits.reshape(-1, 1, 2, 3), labels)
-    found = get_objective(name, **FORMS[chosen])  # type: ignore[arg-type]
+    found = get_objective(name, FORMS[chosen])
     return lambda logits, labels: found(logits, torch.zeros(len(logits), 1, 2, 3), labels)
 
 
@@ -192,10 +197,10 @@ every_form_of_logits = pytest.mark.parametrize(("name", "chosen"), [one for one 
 
 
 def test_the_battery_knows_every_objective() -> None:
-    known = {"margin", "log_odds", "cross_entropy", "dlr", "feature_distance"}
+    known = {"margin", "log_odds", "cross_entropy", "dlr", "feature_distance", "score"}
     assert set(OBJECTIVE_KINDS) == known, "a new objective needs a test of its values above"
     assert {name for name, _ in all_forms()} == known
-    assert set(OBJECTIVES) == {name for name, kind in OBJECTIVE_KINDS.items() if not kind.needs_features}
+    assert set(OBJECTIVES) == {name for name, kind in OBJECTIVE_KINDS.items() if kind.plain is not None}
     for name, kind in OBJECTIVE_KINDS.items():
         assert kind.name == name and kind.unit and kind.summary == objective_summaries()[name]
 
@@ -255,7 +260,7 @@ def test_nan_stays_nan_and_with_its_image(name: str, chosen: str) -> None:
 @every_form_of_logits
 def test_a_thousand_classes_and_almost_all_of_them_right(name: str, chosen: str) -> None:
     logits = 1e4 * torch.randn(4, 1000, generator=torch.Generator().manual_seed(7))
-    objective = get_objective(name, **FORMS[chosen])  # type: ignore[arg-type]
+    objective = get_objective(name, FORMS[chosen])
     right = tuple(i for i in range(1000) if i not in (2, 4, 5))
     gradient = slope(objective, logits, right)
     assert bool(torch.isfinite(gradient).all()) and bool((gradient.abs().amax(dim=1) > 0).all())
@@ -281,19 +286,6 @@ def test_the_gradient_comes_through_a_network_that_answers_with_probabilities() 
         assert bool(torch.isfinite(gradient).all())
         # the scale of the logits, which dlr takes out, is here the scale of the gradient
         assert name == "dlr" or float(gradient[0, 0, 0, 0]) < -1e-5
-
-
-def test_success_follows_the_label_set_alone() -> None:
-    assert succeeded(LOGITS, (0,)).tolist() == [False, True]
-    assert succeeded(LOGITS, (0, 1)).tolist() == [False, False]
-    tie_and_nan = torch.tensor([[1.0, 1.0], [math.nan, 0.0]])
-    assert succeeded(tie_and_nan, (0,)).tolist() == [False, False]
-
-
-def test_stop_at_margin_looks_at_the_logits_not_at_the_objective() -> None:
-    stop = stop_at_margin(1.5, (0,))
-    assert stop(Evaluation(-99.0, None, torch.tensor([0.0, 2.0]), True))
-    assert not stop(Evaluation(99.0, None, torch.tensor([0.0, 1.0]), True))
 
 
 # ---- the distance of features ---------------------------------------------------------------------------------------
@@ -405,11 +397,9 @@ def test_a_bad_label_set_is_refused(name: str, labels: tuple[int, ...], message:
 
 def test_a_bad_target_is_refused() -> None:
     with pytest.raises(InputError, match=r"target: expected class indices from 0 to 3, got \(9,\)"):
-        get_objective("margin", target=(9,))(LOGITS, IMAGES, (0,))
-    with pytest.raises(InputError, match="target: expected classes that are wrong, got #1, which `label` names as"):
-        get_objective("margin", target=(1, 2))(LOGITS, IMAGES, (0, 1))
+        get_objective("margin", Classification(target=(9,)))(LOGITS, IMAGES, (0,))
     with pytest.raises(InputError, match="minimise: expected no `target` beside it"):
-        get_objective("margin", target=(1,), minimise=True)
+        check_objective("margin", targeted=True, minimise=True)
 
 
 def test_logits_without_a_batch_axis_are_refused() -> None:
@@ -427,10 +417,12 @@ def test_unknown_objectives_name_their_neighbours() -> None:
 
 
 def test_forms_are_called_with_the_right_answers() -> None:
-    targeted = get_objective("margin", target=(2,))
+    targeted = get_objective("margin", Classification(target=(2,)))
     assert torch.equal(targeted(LOGITS, IMAGES, (0,)), targeted_margin(LOGITS, IMAGES, (2,)))
-    assert torch.equal(get_objective(margin, target=(2,))(LOGITS, IMAGES, (0,)), targeted(LOGITS, IMAGES, (0,)))
-    minimised = get_objective("margin", minimise=True)
+    assert torch.equal(
+        get_objective(margin, Classification(target=(2,)))(LOGITS, IMAGES, (0,)), targeted(LOGITS, IMAGES, (0,))
+    )
+    minimised = get_objective("margin", Classification(minimise=True))
     assert torch.equal(minimised(LOGITS, IMAGES, (0,)), -margin(LOGITS, IMAGES, (0,)))
 
 
@@ -439,8 +431,8 @@ def test_a_users_function_gets_the_target_and_is_negated_too() -> None:
         return logits[:, labels[0]]
 
     assert get_objective(score)(LOGITS, IMAGES, (0,)).tolist() == [3.0, 0.0]
-    assert get_objective(score, target=(2,))(LOGITS, IMAGES, (0,)).tolist() == [2.0, 1.0]
-    assert get_objective(score, minimise=True)(LOGITS, IMAGES, (0,)).tolist() == [-3.0, 0.0]
+    assert get_objective(score, Classification(target=(2,)))(LOGITS, IMAGES, (0,)).tolist() == [2.0, 1.0]
+    assert get_objective(score, Classification(minimise=True))(LOGITS, IMAGES, (0,)).tolist() == [-3.0, 0.0]
 
 
 def test_a_users_function_may_return_a_scalar_for_one_image() -> None:
@@ -456,7 +448,7 @@ def test_a_users_function_may_return_a_scalar_for_one_image() -> None:
         (lambda z, x, y: z.sum(), r"expected one value per image, shape \(2,\), got \(\)"),
         (lambda z, x, y: z, r"expected one value per image, shape \(2,\), got \(2, 4\)"),
         (lambda z, x, y: z.argmax(dim=1), "expected floating-point values, got torch.int64"),
-        (lambda z, x, y: z.detach().sum(dim=1), "does not depend on logits or images differentiably"),
+        (lambda z, x, y: z.detach().sum(dim=1), "does not depend on the output or the images differentiably"),
     ],
 )
 def test_a_users_mistakes_are_explained(function: object, message: str) -> None:
@@ -467,7 +459,7 @@ def test_a_users_mistakes_are_explained(function: object, message: str) -> None:
 
 @pytest.mark.parametrize("function", [lambda logits, labels: logits.sum(), lambda *, logits, images, labels: logits])
 def test_a_function_that_cannot_take_the_three_arguments_is_refused_at_once(function: Callable[..., Tensor]) -> None:
-    with pytest.raises(InputError, match=r"expected a function that takes \(logits, images, labels\), by position: "):
+    with pytest.raises(InputError, match=r"expected a function that takes \(output, images, truth\), by position: "):
         check_objective(function)
 
 

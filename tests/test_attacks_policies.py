@@ -59,7 +59,7 @@ class Problem:
             exact = self.gradient(u)
             rough = exact + noise * exact.square().mean().sqrt() * torch.randn(exact.shape, generator=rng)
             value = self.value(u) + noise * 0.05 * self.optimum * float(torch.randn(1, generator=rng))
-            return Evaluation(value, rough if gradient else None, torch.tensor([0.0, value]), value > 0)
+            return Evaluation(value, rough if gradient else None, value > 0)
 
         return evaluate
 
@@ -176,7 +176,7 @@ def test_random_tries_every_option_of_a_discrete_choice() -> None:
 
     def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
         seen.append(float(u[0]))
-        return Evaluation(0.0, None, torch.zeros(2), False)
+        return Evaluation(0.0, None, False)
 
     search(evaluate, domain, Random(), steps=60, seed=0, candidates=0)
     assert sorted(set(seen)) == pytest.approx([0.1, 0.3, 0.5, 0.7, 0.9])
@@ -227,7 +227,7 @@ def test_pgd_halves_its_step_when_the_objective_stalls_and_not_before() -> None:
     climbing = Domain(torch.zeros(4), (Block(4),))
 
     def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
-        return Evaluation(float(index), torch.ones(4), torch.zeros(2), False)
+        return Evaluation(float(index), torch.ones(4), False)
 
     assert search(evaluate, climbing, PGD(), steps=STEPS, seed=0).history[-1].step_size == PGD().step_size
 
@@ -236,7 +236,7 @@ def test_pgd_goes_back_to_its_best_when_it_has_fallen_behind() -> None:
     """A peak that only the first steps see; then the gradient leads away from it, downhill."""
 
     def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
-        return Evaluation(5.0 if index == 2 else -0.1 * index, torch.ones(2), torch.zeros(2), False)
+        return Evaluation(5.0 if index == 2 else -0.1 * index, torch.ones(2), False)
 
     seen: list[Tensor] = []
     domain = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),))
@@ -265,7 +265,7 @@ def test_a_non_finite_objective_sends_pgd_back_with_half_the_step() -> None:
 
     def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
         value = float(u[0]) if float(u[0]) < wall else math.nan
-        return Evaluation(value, torch.ones(1) if gradient else None, torch.zeros(2), False)
+        return Evaluation(value, torch.ones(1) if gradient else None, False)
 
     domain = Domain(torch.tensor([0.5]), (Block(1, "linf", 0.1),))
     result = search(evaluate, domain, PGD(step_size=1.0, momentum=0.0), steps=STEPS, seed=0)
@@ -276,7 +276,7 @@ def test_a_non_finite_objective_sends_pgd_back_with_half_the_step() -> None:
 
 def test_pgd_without_any_gradient_stalls() -> None:
     def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
-        return Evaluation(-1.0, torch.zeros_like(u), torch.zeros(2), False)
+        return Evaluation(-1.0, torch.zeros_like(u), False)
 
     domain = Domain(torch.full((5,), 0.5), (Block(5, "linf", 0.1),))
     result = search(evaluate, domain, PGD(), steps=STEPS, seed=0)
@@ -291,7 +291,7 @@ def test_pgd_goes_on_along_its_momentum_when_a_gradient_cannot_be_paid() -> None
 
     def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
         seen.append(float(u[0]))
-        return Evaluation(seen[-1], torch.ones(2) if gradient else None, torch.zeros(2), False, cost=1 + 3 * gradient)
+        return Evaluation(seen[-1], torch.ones(2) if gradient else None, False, cost=1 + 3 * gradient)
 
     result = search(evaluate, domain, PGD(step_size=0.125), steps=10, seed=0, candidates=0)
     assert (result.gradients, result.renders, len(seen)) == (2, 10, 4)
@@ -304,7 +304,7 @@ def test_pgd_leaves_a_flat_start_at_random() -> None:
 
     def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
         evaluation = problem.evaluator()(u, index=index, gradient=gradient)
-        return Evaluation(0.0, torch.zeros(20), evaluation.logits, False) if index == 0 else evaluation
+        return Evaluation(0.0, torch.zeros(20), False) if index == 0 else evaluation
 
     result = search(evaluate, problem.domain, PGD(), steps=STEPS, seed=0)
     assert problem.value(result.best_u) >= problem.optimum / RATIO
@@ -382,13 +382,13 @@ def classifier(d: int = 18, objective: str = "margin", nan_at: int = -1, cost: i
             slope[index % d] = math.nan
         number = math.nan if index == nan_at else float(value.detach())
         price = samples * (1 + cost * (gradient is True))
-        return Evaluation(number, slope, logits[0].detach(), bool(logits.argmax() % 2), cost=price)
+        return Evaluation(number, slope, bool(logits.argmax() % 2), cost=price)
 
     return evaluate
 
 
 def constant(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
-    return Evaluation(0.5, torch.zeros_like(u) if gradient else None, torch.zeros(2), False, cost=samples)
+    return Evaluation(0.5, torch.zeros_like(u) if gradient else None, False, cost=samples)
 
 
 @pytest.mark.parametrize("objective", sorted(OBJECTIVES))
@@ -510,7 +510,7 @@ def test_choices_and_angles_are_searched_by_every_policy(policy: Policy[Any]) ->
         value = 2.0 * (first == 2) + (second == 0) + 0.2 * math.sin(2.0 * math.pi * float(u[1])) + 0.2 * float(u[2])
         slope = torch.tensor([0.0, 0.4 * math.pi * math.cos(2.0 * math.pi * float(u[1])), 0.2, 0.0, 0.0])
         cost = samples * (3 if gradient else 1)
-        return Evaluation(value, slope if gradient else None, torch.zeros(2), False, cost=cost)
+        return Evaluation(value, slope if gradient else None, False, cost=cost)
 
     result = search(evaluate, CHOOSY, policy, steps=120, seed=0, candidates=0)
     assert (int(result.best_u[0] * 3), int(result.best_u[4] * 2)) == (2, 0)
@@ -523,9 +523,7 @@ def test_one_number_is_enough(policy: Policy[Any]) -> None:
     domain = Domain(torch.tensor([0.5]), (Block(1, "linf", 0.1),))
 
     def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
-        return Evaluation(
-            -abs(float(u[0]) - 0.57), torch.ones(1) if gradient else None, torch.zeros(2), False, 0, samples
-        )
+        return Evaluation(-abs(float(u[0]) - 0.57), torch.ones(1) if gradient else None, False, 0, samples)
 
     result = search(evaluate, domain, policy, steps=40, seed=0, candidates=0)
     assert float(result.best_u[0]) == pytest.approx(0.57, abs=0.04)
@@ -667,7 +665,7 @@ def test_outliers_and_steps_taken_back_are_counted(name: str) -> None:
         if index == 5:
             gradient[3] = 50.0
         value = float("nan") if index == 12 else float(u.sum())
-        return Evaluation(value, gradient, torch.zeros(2), False)
+        return Evaluation(value, gradient, False)
 
     found = told(make_policy(name, **options.get(name, {})), objective, domain, 20)
     assert found.counts.shortened == 2 and found.counts.rejected >= 1
@@ -677,16 +675,14 @@ def test_outliers_and_steps_taken_back_are_counted(name: str) -> None:
 
 def test_a_smooth_objective_is_taken_as_it_comes() -> None:
     domain = Domain(torch.full((12,), 0.5), (Block(12, "linf", 0.3),))
-    found = told(
-        make_policy("pgd"), lambda _, u: Evaluation(float(u.sum()), torch.ones(12), torch.zeros(2), False), domain, 10
-    )
+    found = told(make_policy("pgd"), lambda _, u: Evaluation(float(u.sum()), torch.ones(12), False), domain, 10)
     assert vars(found.counts) == {"cut": 0, "shortened": 0, "rejected": 0}
     assert found.agreement == pytest.approx([1.0] * (found.gradients - 1))
 
 
 def test_gradients_of_zero_agree_with_nothing() -> None:
     domain = Domain(torch.full((12,), 0.5), (Block(12, "linf", 0.3),))
-    found = told(make_policy("pgd"), lambda _, u: Evaluation(0.0, torch.zeros(12), torch.zeros(2), False), domain, 10)
+    found = told(make_policy("pgd"), lambda _, u: Evaluation(0.0, torch.zeros(12), False), domain, 10)
     assert found.agreement == () and found.gradients > 1
 
 

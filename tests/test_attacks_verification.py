@@ -18,15 +18,11 @@ from advsearch.attacks import (
     Ending,
     Evaluation,
     Random,
-    Trial,
     Trials,
     choose_spp,
     clopper_pearson,
-    needed,
     run_trials,
     search,
-    typical,
-    verdict,
     verify,
 )
 from advsearch.attacks.region import Region, grow
@@ -34,18 +30,24 @@ from advsearch.attacks.verification import EASIER, LEAST_RATE, OVER_CONDITIONS, 
 from advsearch.config import FEWEST_SAMPLES, FEWEST_TRIALS
 from advsearch.errors import InputError
 from advsearch.seeds import stream
+from advsearch.tasks import Answer, Judgement
 
 DOMAIN = Domain(torch.full((4,), 0.5), (Block(4, "linf", 0.1),))
 WORST = DOMAIN.start + 0.1
 
 
-def noisy(clean: float, adversarial: float, noise: float) -> Callable[[torch.Tensor, int, int], Trial]:
+def judged(margin: float, label: str = "", right: bool | None = None) -> Judgement:
+    """A judgement of so large a margin, which is what is sought."""
+    return Judgement(margin, margin, margin <= 0.0 if right is None else right, Answer(label))
+
+
+def noisy(clean: float, adversarial: float, noise: float) -> Callable[[torch.Tensor, int, int], Judgement]:
     """Margins that move linearly from the start (`clean`) to WORST (`adversarial`), with gaussian noise."""
 
-    def render(u: torch.Tensor, seed: int, spp: int) -> Trial:
+    def render(u: torch.Tensor, seed: int, spp: int) -> Judgement:
         way = float((u - DOMAIN.start).mean()) / 0.1
         margin = clean + way * (adversarial - clean) + noise * float(np.random.default_rng(seed).normal())
-        return Trial(margin, 7 if margin > 0 else 0, 0.9)
+        return judged(margin)
 
     return render
 
@@ -185,7 +187,7 @@ def test_a_bad_ladder_is_refused(ladder: tuple[int, ...]) -> None:
 
 
 def test_nineteen_of_twenty_are_needed() -> None:
-    assert [needed(n) for n in (10, 19, 20, 21, 40, 100, 200)] == [10, 19, 19, 20, 38, 95, 190]
+    assert [WORST_CASE.needed(n) for n in (10, 19, 20, 21, 40, 100, 200)] == [10, 19, 19, 20, 38, 95, 190]
 
 
 @pytest.mark.parametrize("rule", [WORST_CASE, OVER_CONDITIONS, EASIER])
@@ -210,10 +212,10 @@ def test_too_few_trials_find_nothing_even_if_all_succeed(trials: int) -> None:
 def test_conditions_under_which_the_clean_scene_is_seldom_right_leave_too_few_trials() -> None:
     """Right in 5 of 10: those 5 may all succeed, and say nothing yet."""
 
-    def render(u: torch.Tensor, seed: int, spp: int) -> Trial:
+    def render(u: torch.Tensor, seed: int, spp: int) -> Judgement:
         order = [stream(0, "verification", number) for number in range(10)]
         hard = order.index(seed) % 2 == 1
-        return Trial(1.0 if hard or not torch.equal(u, DOMAIN.start) else -1.0, 0, 0.5)
+        return judged(1.0 if hard or not torch.equal(u, DOMAIN.start) else -1.0)
 
     result = verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=10, rule=OVER_CONDITIONS)
     assert (result.adversarial.successes, result.adversarial.trials) == (5, 5)
@@ -245,7 +247,7 @@ def test_the_fewest_samples_of_a_region_follow_from_the_confidence_of_its_interv
     ],
 )
 def test_the_verdict(search_ending: Ending, clean: int, adversarial: int, expected: Ending) -> None:
-    assert verdict(search_ending, Trials(clean, 20, 64), Trials(adversarial, 20, 64)) is expected
+    assert WORST_CASE.verdict(search_ending, Trials(clean, 20, 64), Trials(adversarial, 20, 64)) is expected
 
 
 def test_a_real_success_is_verified() -> None:
@@ -259,7 +261,7 @@ def test_a_real_success_is_verified() -> None:
 def test_a_success_counts_only_where_the_clean_one_is_right() -> None:
     """The clean margin is noise around zero: whatever the answer does, half of its trials prove nothing."""
     result = verify(noisy(-0.1, 5.0, 1.0), DOMAIN, WORST, claim=Ending.FOUND, spp=64, seed=0)
-    assert all(trial.wrong for trial in result.adversarial_trials)
+    assert all(trial.success for trial in result.adversarial_trials)
     assert result.adversarial.successes == result.clean.successes < 19
     assert result.ending in (Ending.NOT_VERIFIED, Ending.ALREADY_WRONG)
 
@@ -278,7 +280,7 @@ def test_a_lucky_claim_is_not_verified(seed: int) -> None:
 
     def evaluate(u: torch.Tensor, *, index: int, gradient: bool) -> Evaluation:
         margin = render(u, 1_000_003 * (seed + 1) + index, 16).margin
-        return Evaluation(margin, None, torch.tensor([0.0, margin]), margin > 0)
+        return Evaluation(margin, None, margin > 0)
 
     claim = search(evaluate, DOMAIN, Random(), steps=60, seed=seed)
     assert claim.claimed_objective > 0.2  # the raw claim: a success, 1.2 logits over anything there is
@@ -297,9 +299,9 @@ def test_the_answer_is_projected_again() -> None:
 def test_both_groups_get_the_same_fresh_seeds_and_the_control_can_be_shared() -> None:
     seeds: list[int] = []
 
-    def render(u: torch.Tensor, seed: int, spp: int) -> Trial:
+    def render(u: torch.Tensor, seed: int, spp: int) -> Judgement:
         seeds.append(seed)
-        return Trial(-1.0 if torch.equal(u, DOMAIN.start) else 1.0, 0, 0.5)
+        return judged(-1.0 if torch.equal(u, DOMAIN.start) else 1.0)
 
     clean = run_trials(render, DOMAIN.start, spp=8, seed=5, trials=6, group="clean")
     shared = verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=8, seed=5, trials=6, clean=clean)
@@ -326,9 +328,7 @@ def test_trials_are_reported_as_they_come() -> None:
 
 
 def test_a_nan_margin_is_neither_right_nor_wrong() -> None:
-    result = verify(
-        lambda u, seed, spp: Trial(math.nan, 0, math.nan), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=4
-    )
+    result = verify(lambda u, seed, spp: judged(math.nan), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, trials=4)
     assert (result.clean.successes, result.adversarial.successes) == (0, 0)
     assert result.ending is not Ending.FOUND
 
@@ -343,14 +343,6 @@ def test_a_nan_margin_is_neither_right_nor_wrong() -> None:
 def test_bad_trial_counts_are_refused(options: dict[str, int], message: str) -> None:
     with pytest.raises(InputError, match=message):
         verify(noisy(-1, 1, 0), DOMAIN, WORST, claim=Ending.FOUND, seed=0, **({"spp": 4} | options))  # type: ignore[arg-type]
-
-
-def test_the_typical_answer_is_the_most_frequent_one() -> None:
-    trials = (Trial(1.0, 7, 0.5), Trial(3.0, 7, 0.7), Trial(2.0, 3, 0.99))
-    answer = typical(trials)
-    assert answer.predicted == 7
-    assert (answer.margin, answer.probability) == pytest.approx((2.0, 0.6))
-    assert typical((Trial(1.0, 9, 0.1), Trial(1.0, 2, 0.3))).predicted == 2
 
 
 def test_every_ending_has_a_value_for_json_and_a_sentence() -> None:

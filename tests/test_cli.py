@@ -705,6 +705,7 @@ def registries(monkeypatch: pytest.MonkeyPatch) -> None:
     put("advsearch.scene.library", list_objects=lambda: ("ball", "mug"), list_environments=lambda: ("studio",))
     put("advsearch.controls", CONTROLS={"camera": Camera()})
     put("advsearch.attacks", POLICIES={"pgd": Pgd})
+    put("advsearch.tasks", TASKS={"classification": Pgd})
     put("advsearch.attacks.objectives", objective_summaries=lambda: {"margin": "Largest wrong logit."})
 
 
@@ -714,7 +715,7 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
     found = json.loads(capsys.readouterr().out)
     assert found == {
         "schema": 1, "objects": ["ball", "mug"], "environments": ["studio"], "controls": ["camera"],
-        "policies": ["pgd"], "objectives": ["margin"], "models": ["reference"],
+        "policies": ["pgd"], "tasks": ["classification"], "objectives": ["margin"], "models": ["reference"],
     }  # fmt: skip
     assert main(["list"]) == 0
     out = capsys.readouterr().out

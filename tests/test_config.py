@@ -47,6 +47,7 @@ WRONG: dict[str, tuple[Any, str]] = {
         "or torchvision:NAME",
     ),
     "labels": (True, "expected a JSON or text file, got True"),
+    "task": ("  ", "expected the name of a task, got '  '"),
     "label": ("  ", "expected names of classes or their numbers, such as \"coffee mug,cup\" or #504, got '  '"),
     "controls": (
         {"texture": 3},
@@ -88,7 +89,8 @@ WRONG: dict[str, tuple[Any, str]] = {
 GIVEN: dict[str, Any] = {
     "object": "mug.obj", "environment": "room.hdr", "up": "y",
     "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
-    "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2", "labels": "labels.json", "label": "coffee mug,cup",
+    "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2",
+    "labels": "labels.json", "task": "detection", "label": "coffee mug,cup",
     "controls": {"texture": {}, "pose": {"yaw": [0, 90]}}, "epsilon": {"texture": 0.03, "pose": 2.0},
     "seconds": 20.0, "target": "bowl", "minimise": False, "smallest": False, "over": {"camera": {}}, "draws": 2,
     "average": 50,

@@ -28,7 +28,6 @@ from advsearch.attacks import (
     POLICIES,
     clopper_pearson,
     make_policy,
-    needed,
     planned_renders,
     region,
     sample_count,
@@ -38,6 +37,7 @@ from advsearch.attacks import (
 )
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
 from advsearch.attacks.policies import pgd
+from advsearch.attacks.verification import WORST_CASE
 from advsearch.cli.flags import config_from
 from advsearch.cli.list import REGISTRIES
 from advsearch.cli.main import COMMANDS, _parse
@@ -69,6 +69,7 @@ from advsearch.scene.importing.images import TEXTURE_LIMIT
 from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
 from advsearch.scene.settings import SETTINGS, resolve
 from advsearch.settings import Config, parse_assignment, read_yaml, settings
+from advsearch.tasks import make_task
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -274,7 +275,7 @@ MADE_BY_HAND = [
     ("design.md", f"is at most {sample_count.DRIFT} of the margin itself"),
     ("design.md", f"**Trials**: {TRIALS} renders (`--trials`; {TRIALS_OVER} with `--over`)"),
     ("design.md", f"must reach {verification.PASS_PERCENT_OVER} % of the trials in which the clean scene is right"),
-    ("design.md", f"rounded up: {needed(20)} of 20"),
+    ("design.md", f"rounded up: {WORST_CASE.needed(20)} of 20"),
     ("design.md", f"20 of 20 means a true rate of at least {100 * clopper_pearson(20, 20)[0]:.0f} %"),
     ("design.md", f"at most {mitsuba_scene.MAX_DEPTH} segments"),
     ("questions.md", {8: "Eight renders of the best configurations"}[planned_renders(0)]),
@@ -394,7 +395,12 @@ def check_names(config: Config) -> None:
     if isinstance(config, AttackConfig):
         as_controls(config.over)
         make_policy(config.policy_name, **config.policy_options)
-        check_objective(config.objective, targeted=config.target is not None, minimise=config.minimise)
+        check_objective(
+            config.objective or make_task(config.task).objective,
+            config.task,
+            targeted=config.target is not None,
+            minimise=config.minimise,
+        )
         known = script("make_figures").stored_record()["labels"]
         assert config.model != "reference" or set((config.target or known[0]).split(",")) <= set(known)
     if isinstance(config, SweepConfig):

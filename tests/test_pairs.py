@@ -21,9 +21,9 @@ from advsearch.engine.domains import domain_of
 from advsearch.engine.loading import framed, make_renderer
 from advsearch.engine.sweeps.axes import on_grid, read_axes
 from advsearch.engine.sweeps.points import Points
-from advsearch.engine.sweeps.view import judge
 from advsearch.scene.description import describe
 from advsearch.scene.formation import to_8_bit
+from advsearch.tasks import Classification
 
 SIZE = 16
 ROWS = 2
@@ -115,8 +115,8 @@ def test_a_row_of_a_sweep_is_true_of_its_own_picture(pair: tuple[str, ...], mode
         assert_close(said, space.describe(u))
         renderer = make_renderer(description, space, SIZE, "none", 3)
         picture = to_8_bit(renderer(u, seed=row.seed, spp=1)[None])
-        (seen,) = judge(model, (0,), picture)
-        assert (row.label_index, row.probability) == (seen.predicted, pytest.approx(seen.probability, rel=1e-4))
+        ((seen,),) = Classification().answers(model(picture))
+        assert (row.label_index, row.probability) == (seen.index, pytest.approx(seen.probability, rel=1e-4))
         assert_true_of_fixed_values(scene, drawn, said, picture[0], row.seed)
 
 
@@ -168,8 +168,10 @@ def test_a_row_of_an_attack_is_true_of_its_own_picture(pair: tuple[str, ...]) ->
         alone, _ = problem_from_config(config)
         assert_close(values, alone.describe(u))
         again = alone.trial(u, 7, 1)
-        assert trial.predicted == again.predicted
-        assert (trial.margin, trial.probability) == pytest.approx((again.margin, again.probability), rel=1e-3, abs=1e-3)
+        assert trial.answer.index == again.answer.index
+        assert (trial.margin, trial.answer.probability) == pytest.approx(
+            (again.margin, again.answer.probability), rel=1e-3, abs=1e-3
+        )
         assert objective == pytest.approx(alone.evaluator("search")(u, index=5, gradient=False).objective, abs=1e-3)
 
 

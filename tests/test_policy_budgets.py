@@ -134,7 +134,7 @@ def test_the_policy_of_the_page_stays_in_a_ball_and_gets_choices_for_free() -> N
     def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
         assert domain.contains(u)
         value = float(u[0] - u[1]) + (int(u[3] * 4) == 2) if index % 7 else math.nan
-        return Evaluation(value, None, torch.zeros(2), False)
+        return Evaluation(value, None, False)
 
     result = search(evaluate, domain, users_class()(), steps=100, seed=0, candidates=0)
     assert int(result.best_u[3] * 4) == 2

@@ -13,7 +13,7 @@ from advsearch.errors import InputError
 
 
 def flat(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
-    return Evaluation(0.0, None, torch.zeros(2), False)
+    return Evaluation(0.0, None, False)
 
 
 def points(policy: Policy[object], domain: Domain, steps: int, seed: int = 0) -> tuple[Tensor, SearchResult]:

@@ -81,7 +81,7 @@ def played(
         seen.append(u.clone())
         slope = torch.ones_like(u) if gradient else None
         cost = samples * (1 + domain.gradient_cost * (gradient is True))
-        return Evaluation(value(u), slope, torch.zeros(2), False, cost=cost)
+        return Evaluation(value(u), slope, False, cost=cost)
 
     return search(evaluate, domain, policy, steps=steps, seed=0, candidates=0), seen
 
@@ -139,7 +139,7 @@ def test_a_costly_gradient_does_not_overdraw_a_turn() -> None:
     def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
         asked.append(gradient)
         slope = torch.ones_like(u) if gradient else None
-        return Evaluation(float(u[0]), slope, torch.zeros(2), False, cost=1 + 3 * gradient)
+        return Evaluation(float(u[0]), slope, False, cost=1 + 3 * gradient)
 
     search(evaluate, domain, Restarts(Still(0.5, gradient=True), 2), steps=20, seed=0, candidates=0)
     assert asked == [True, True, False, False] * 2
@@ -194,7 +194,7 @@ def test_restarts_find_the_higher_of_two_hills() -> None:
         return -40 * (low[0] * (u - low[1]) + 2 * high[0] * (u - high[1]))
 
     def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
-        return Evaluation(value(u), slope(u) if gradient else None, torch.zeros(2), False)
+        return Evaluation(value(u), slope(u) if gradient else None, False)
 
     domain = Domain(torch.tensor([0.25, 0.15]), (Block(2),))
     alone = search(evaluate, domain, PGD(step_size=0.1), steps=80, seed=0, candidates=0)
@@ -228,7 +228,7 @@ def halved(policy: Halving, steps: int, value: Callable[[Tensor], float]) -> lis
     told: list[tuple[StepRecord, tuple[float, ...]]] = []
 
     def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
-        return Evaluation(value(u), None, torch.zeros(2), False, cost=samples)
+        return Evaluation(value(u), None, False, cost=samples)
 
     search(
         evaluate,
@@ -311,7 +311,7 @@ def test_choices_beside_a_ball_keep_its_gradient_and_its_distribution() -> None:
 
     def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
         bonus = 0.3 * (int(u[1] * 3) == 1)
-        return Evaluation(float(w @ u) + bonus, w.clone() if gradient else None, torch.zeros(2), False)
+        return Evaluation(float(w @ u) + bonus, w.clone() if gradient else None, False)
 
     best = search(evaluate, domain, PGD(), steps=60, seed=0, candidates=0)
     assert best.best_u.tolist() == pytest.approx([0.6, 0.5, 0.5 - 0.02**0.5, 0.5 + 0.02**0.5], abs=1e-3)

@@ -34,7 +34,7 @@ def test_the_smallest_epsilon_of_a_linear_model_is_within_five_per_cent(norm: st
         return float((u - domain.start) @ weights) + bias
 
     def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
-        return Evaluation(value(u), weights.clone(), torch.tensor([0.0, value(u)]), value(u) > 0.0)
+        return Evaluation(value(u), weights.clone(), value(u) > 0.0)
 
     def found(inside: Domain, number: int) -> Tensor:
         return search(evaluate, inside, make_policy("pgd"), steps=20, seed=number).best_u

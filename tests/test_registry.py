@@ -19,6 +19,7 @@ from advsearch.controls import CONTROLS
 from advsearch.errors import InputError
 from advsearch.models.loading import SOURCES
 from advsearch.registry import Registry
+from advsearch.tasks import TASKS
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -61,7 +62,7 @@ def test_an_entry_that_does_not_fit_is_named_with_its_package(
         list(numbers)
 
 
-@pytest.mark.parametrize("known", [CONTROLS, POLICIES, OBJECTIVE_KINDS, SOURCES], ids=lambda known: known.group)
+@pytest.mark.parametrize("known", [CONTROLS, POLICIES, OBJECTIVE_KINDS, TASKS, SOURCES], ids=lambda known: known.group)
 def test_every_registry_is_in_the_page_that_says_how_to_add_to_it(known: Registry[Any]) -> None:
     assert f"| `{known.group}` |" in (DOCS / "extending.md").read_text("utf-8")
     assert len(known) > 0 and all(known[name] is not None for name in known)
@@ -108,13 +109,40 @@ def advsearch(installed: Path, *words: str) -> Any:
     return json.loads(done.stdout)
 
 
+def examples() -> list[list[str]]:
+    """The words of the page's commands, each behind `advsearch`."""
+    lines = blocks("extending.md", "text")[0].splitlines()
+    return [line.split()[1:] for line in lines if line.startswith("advsearch")]
+
+
 def test_its_names_are_listed_and_its_parts_work_together(installed: Path, tmp_path: Path) -> None:
     listed = advsearch(installed, "list")
-    for kind, name in (("controls", "fade"), ("policies", "shrinking"), ("objectives", "brightness")):
-        assert listed[kind][-1] == name
-    example = next(words for words in blocks("extending.md", "text")[0].splitlines() if words.startswith("advsearch"))
+    names = {"controls": "fade", "policies": "shrinking", "objectives": "brightness", "tasks": "fading"}
+    assert {kind: listed[kind][-1] for kind in names} == names
     small = ["--run", str(tmp_path / "run"), "--no-baseline", "--steps", "4", "--spp", "1", "--verify-spp", "1"]
-    words = [*example.split()[1:], *small, "--denoise", "none", "--label", "bowl", "--quiet"]
+    words = [*examples()[0], *small, "--denoise", "none", "--label", "bowl", "--quiet"]
     summary = advsearch(installed, *words)
     assert (summary["controls"], summary["policy"], summary["objective"]) == (["fade"], "shrinking", "brightness")
     assert summary["model"] == "tiny" and summary["steps"] == 4
+
+
+def test_its_task_is_searched_swept_and_rendered(installed: Path, tmp_path: Path) -> None:
+    small = ["--denoise", "none", "--spp", "16", "--quiet"]
+    run = tmp_path / "run"
+    attack = [*examples()[1], "--run", str(run), "--no-baseline", "--steps", "12", "--verify-spp", "16", *small]
+    found = advsearch(installed, *attack)
+    assert (found["task"], found["objective"], found["model"]) == ("fading", "score", "gauge")
+    assert found["label_set"] == ["0.0"] and found["clean"]["correct"] and found["clean"]["index"] is None
+    assert found["ending"] == "found" and found["configuration"]["fade.amount"]["value"] > 0.7
+    assert found["adversarial"]["label"].endswith(" faded") and found["verified"]["margin"] > 0.0
+    assert "task: fading" in (run / "run.yaml").read_text("utf-8")
+
+    given = ["--object", "mug", "--task", "fading", "--model", "zoo:gauge", *small]
+    sweep = ["sweep", *given, "--grid", "fade.amount=0,0.4,1", "--trials", "0", "--run", str(tmp_path / "sweep")]
+    swept = advsearch(installed, *sweep)
+    assert (swept["task"], swept["correct"], swept["configurations"]) == ("fading", 2, 3)
+    assert swept["worst"]["values"]["fade.amount"]["value"] == 1.0 and swept["worst"]["label_set"] == ["1.0"]
+
+    picture = ["render", *given, "--control", "fade={amount: 0.4}", "--out", str(tmp_path / "mug.png")]
+    (view,) = advsearch(installed, *picture)["views"]
+    assert view["answers"][0]["probability"] is None and 0.3 < float(view["answers"][0]["label"].split()[0]) < 0.5

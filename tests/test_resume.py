@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,8 +18,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from advsearch.attacks import Block, Domain, Evaluation, Policy, Proposal, Trial, make_policy
-from advsearch.attacks.goal import Goal
+from advsearch.attacks import Block, Domain, Evaluation, Policy, Proposal, make_policy
+from advsearch.attacks.verification import WORST_CASE, Rule
 from advsearch.config import AttackConfig
 from advsearch.engine.memory import Memory
 from advsearch.engine.record import Findings, Recorder, Stages
@@ -31,6 +30,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.replay import Entry, ReplayLog
 from advsearch.runs.store import Row
 from advsearch.seeds import stream
+from advsearch.tasks import Classification, Judgement
 
 POLICIES = ("pgd", "auto", "random", "cmaes")
 
@@ -48,6 +48,11 @@ class StandInPlan:
         return self
 
 
+def judged(logits: Tensor) -> Judgement:
+    """What is said of two logits, of which the first is right."""
+    return Classification(labels=("mug", "bowl")).judge(logits[None], (0,))[0]
+
+
 @dataclass
 class StandInProblem:
     """A noisy quadratic where a scene, a model and an objective would be; `pause` seconds an evaluation."""
@@ -56,13 +61,12 @@ class StandInProblem:
     on_evaluation: Callable[[], None] = lambda: None
     domain: Domain = field(default_factory=lambda: Domain(torch.full((6,), 0.5), (Block(4, "linf", 0.2), Block(2))))
     conditions: None = None
-    goal: Goal = field(default_factory=lambda: Goal((0,)))
+    rule: Rule = WORST_CASE
     spp: int = 4
     search_depth: int | None = None
     seed: int = 3
     draws: int = 1
     plan: StandInPlan = StandInPlan()
-    model: Any = field(default_factory=lambda: SimpleNamespace(labels=["mug", "bowl"]))
 
     def _logits(self, u: Tensor, seed: int) -> Tensor:
         noise = 0.02 * torch.randn(1, generator=torch.Generator().manual_seed(seed))
@@ -79,19 +83,15 @@ class StandInProblem:
             slope = torch.autograd.grad(value, at)[0] if gradient else None
             if tell is not None and tell.wants(index):
                 tell.tell(index, torch.full((2, 2, 3), float(u.mean())))
-            return Evaluation(float(value.detach()), slope, logits.detach(), bool(value > 0), cost=samples)
+            return Evaluation(
+                float(value.detach()), slope, bool(value > 0), cost=samples, judgement=judged(logits.detach())
+            )
 
         return evaluate
 
-    def trial(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True) -> Trial:
+    def trial(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True) -> Judgement:
         time.sleep(self.pause)
-        logits = self._logits(u, seed)
-        return Trial(
-            float(logits[1] - logits[0]),
-            int(logits.argmax()),
-            float(logits.softmax(0).max()),
-            bool(logits.argmax() == 0),
-        )
+        return judged(self._logits(u, seed))
 
     def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Any]:
         return {f"u.{number}": {"value": float(value), "unit": "1"} for number, value in enumerate(u)}

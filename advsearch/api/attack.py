@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,14 +14,13 @@ from torch import Tensor, nn
 
 from advsearch import seeds
 from advsearch.attacks import Objective, Policy, get_objective, make_policy
-from advsearch.attacks.goal import Goal
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
 from advsearch.config import AttackConfig
 from advsearch.config.scene import one_only
 from advsearch.controls import make_space
 from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
-from advsearch.engine.answers import right_answers
+from advsearch.engine.answers import check_truth, facts_of
 from advsearch.engine.loading import Controls, Scene, framed, load_scene, make_renderer, settings_of
 from advsearch.engine.memory import Memory
 from advsearch.engine.naming import (
@@ -37,12 +37,13 @@ from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.samples import search_samples
 from advsearch.engine.stages import Attack
 from advsearch.errors import InputError
-from advsearch.models import LabelSet, Model
+from advsearch.models import Model
 from advsearch.models.features import features_of
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import CONFIG, RunDirectory, check_free, find_run, is_run, run_path
 from advsearch.scene.leaving_out import EVERYTHING, NOTHING
 from advsearch.scene.renderer import Renderer
+from advsearch.tasks import Task, make_task
 
 OVER_CONDITIONS = {"momentum": 0.9, "step_size": 0.2}
 """Options of `pgd` where conditions vary."""
@@ -54,7 +55,7 @@ CLEAN_SPP = 64
 """Samples a pixel of the clean picture that an objective compares features with."""
 
 
-_OWN_ARGUMENTS = ("model", "controls", "over", "objective", "policy", "run")
+_OWN_ARGUMENTS = ("model", "task", "controls", "over", "objective", "policy", "run")
 """Arguments of `attack` that may be more than a file can say."""
 
 
@@ -62,8 +63,9 @@ def attack(
     scene: Scene | str | Path,
     model: Model | nn.Module | str | Path = "reference",
     *,
+    task: str | Task = "classification",
     controls: Controls = ("texture",),
-    objective: str | Callable[..., Tensor] = "margin",
+    objective: str | Callable[..., Tensor] | None = None,
     policy: str | Policy[Any] = "auto",
     over: Controls = (),
     run: str | Path | None = None,
@@ -106,10 +108,12 @@ def attack(
     Args:
         scene: from `load_scene`, or what that takes.
         model: from `load_model`, or what that takes.
+        task: what judges the model's output: a name, or an instance with options of its own.
         controls: what may vary: names, instances, or a mapping from names to settings.
-        objective: "margin", "log_odds", "cross_entropy", "dlr", "feature_distance", or a function of (logits (N, C),
-            images (N, H, W, 3), indices of the right answers, or of the target's where there is one) that returns (N,)
-            values, which are maximised.
+        objective: "margin", "log_odds", "cross_entropy", "dlr", "feature_distance", "score", or a function of (output,
+            images (N, H, W, 3), truth, or the target where there is one) that returns (N,) values, which are maximised;
+            in classification the output is logits (N, C) and the truth the indices of the right answers. None takes the
+            task's own.
         policy: a name, or an instance with options of its own.
         over: controls that vary by chance: the answer has to hold for all of their values.
         run: folder to keep the run in; None keeps it in memory only.
@@ -132,14 +136,16 @@ def attack(
         "model": model if isinstance(model, str) else getattr(model, "name", None) or type(model).__name__,
         "controls": settings_of(controls),
         "over": settings_of(over),
-        "objective": objective if isinstance(objective, str) else getattr(objective, "__name__", "custom"),
+        "task": task if isinstance(task, str) else task.name,
+        "objective": getattr(objective, "__name__", "custom") if callable(objective) else objective,
         "policy": policy if isinstance(policy, str) else policy.name,
         "set": _set_by(scene, options),
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
-    check_objective(objective, targeted=config.target is not None, minimise=config.minimise)
     searched, drawn = _controls(config, controls, over)
-    job = _Job(config, scene, _model(model, config), searched, drawn, objective, policy, run is not None)
+    asked, objective = _asked(config, task, objective)
+    loaded = _model(model, config, asked)
+    job = _Job(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None)
     if resume and run is not None and is_run(run_path(run)):
         return _go_on(job, run, progress or NullProgress())
     return _carry_out(job, progress or NullProgress())
@@ -216,6 +222,7 @@ class _Job:
     config: AttackConfig
     scene: Scene
     loaded: tuple[Model, list[str]]
+    task: Task
     controls: tuple[Any, ...]
     over: tuple[Any, ...]
     objective: str | Callable[..., Tensor]
@@ -228,12 +235,12 @@ def _job(config: AttackConfig) -> _Job:
     if len(config.objects) > 1:
         raise one_only("object", config.objects)
     searched, drawn = _controls(config, config.controls, config.over)
-    check_objective(config.objective, targeted=config.target is not None, minimise=config.minimise)
-    objective, policy = config.objective, make_policy(config.policy_name, **_policy_options(config))
+    task, objective = _asked(config, config.task, config.objective)
+    policy = make_policy(config.policy_name, **_policy_options(config))
     given = scene_settings(config.set_, config.exposure)
     scene = load_scene(config.object, config.environment, up=config.up, settings=given)
-    model = _model(config.model, config)
-    return _Job(config, scene, model, searched, drawn, objective, policy, True)
+    model = _model(config.model, config, task)
+    return _Job(config, scene, model, task, searched, drawn, objective, policy, True)
 
 
 def _controls(
@@ -245,9 +252,21 @@ def _controls(
     return controls_of(searched, config), controls_of(drawn, config, [one for one in RUN_SETTINGS if one != "epsilon"])
 
 
-def _model(model: Model | nn.Module | str | Path, config: AttackConfig) -> tuple[Model, list[str]]:
+Wanted = str | Callable[..., Tensor]
+"""An objective: its name, or the user's own function."""
+
+
+def _asked(config: AttackConfig, task: str | Task, objective: Wanted | None) -> tuple[Task, Wanted]:
+    """The task, and the objective that was asked for or else the task's own, checked before anything is loaded."""
+    made = make_task(task)
+    wanted = made.objective if objective is None else objective
+    check_objective(wanted, made.name, targeted=config.target is not None, minimise=config.minimise)
+    return made, wanted
+
+
+def _model(model: Model | nn.Module | str | Path, config: AttackConfig, task: Task) -> tuple[Model, list[str]]:
     """Load the model; its warnings become sentences of the run."""
-    (loaded,), said = load_models([model], config)
+    (loaded,), said = load_models([model], config, task)
     return loaded, said
 
 
@@ -258,7 +277,9 @@ def _policy_options(config: AttackConfig) -> dict[str, Any]:
 def _problem(job: _Job) -> Problem:
     config, (model, _) = job.config, job.loaded
     description = job.scene.description
-    labels = right_answers(model, job.scene, config.object, config)
+    task = job.task.on(model, target=config.target, minimise=config.minimise)
+    facts = partial(facts_of, job.scene, config.object, config.label)
+    check_truth(task, model, job.scene, facts(dict), config)
     resolution = config.resolution or (model.input_size[0], model.input_size[1])
     description = framed(description, resolution)
     space = make_space((*job.controls, *job.over), description)
@@ -272,15 +293,14 @@ def _problem(job: _Job) -> Problem:
         leave_out=EVERYTHING if config.specialise else NOTHING,
         sampler=config.pixel_sampler,
     )
-    goal = _goal(model, labels, config)
-    objective = _objective(job, goal, renderer)
+    objective = _objective(job, task, renderer)
     return Problem(
         renderer,
         space,
         model,
-        labels,
+        task,
+        facts,
         objective,
-        goal,
         search_samples(config),
         config.seed,
         searched=len(job.controls),
@@ -288,28 +308,17 @@ def _problem(job: _Job) -> Problem:
     )
 
 
-def _objective(job: _Job, goal: Goal, renderer: Renderer) -> Objective:
+def _objective(job: _Job, task: Task, renderer: Renderer) -> Objective:
     """What is maximised. One that compares features with those of the clean picture is shown that first."""
     kind = OBJECTIVE_KINDS.get(job.objective) if isinstance(job.objective, str) else None
     if kind is None or not kind.needs_features:
-        return get_objective(job.objective, target=goal.targets, minimise=goal.minimise)
+        return get_objective(job.objective, task)
     features = features_of(job.loaded[0])
     if not features.penultimate:
         job.loaded[1].append(features.source)
     with torch.no_grad():
         clean = renderer(renderer.start, seed=seeds.stream(job.config.seed, "clean features"), spp=CLEAN_SPP)
-    return get_objective(job.objective, features=features, clean=clean)
-
-
-def _goal(model: Model, labels: LabelSet, config: AttackConfig) -> Goal:
-    """What counts as success."""
-    if config.target is None:
-        return Goal(labels.indices, minimise=config.minimise)
-    try:
-        targets = model.label_set(config.target)
-    except InputError as error:
-        raise InputError(f"target: {error}") from None
-    return Goal(labels.indices, targets.indices)
+    return get_objective(job.objective, task, features=features, clean=clean)
 
 
 # ---- carrying it out ------------------------------------------------------------------------------------------------

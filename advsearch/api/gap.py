@@ -12,7 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from advsearch.api.attack import attack_from_config, resume_attack
-from advsearch.attacks import clopper_pearson, needed
+from advsearch.attacks import clopper_pearson
+from advsearch.attacks.verification import WORST_CASE
 from advsearch.config import AttackConfig, GapConfig
 from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.naming import check_run_settings, different, load_models, run_settings_for
@@ -78,6 +79,7 @@ def _study(config: Any, body: Callable[[Any, _Parts], Summary], progress: Progre
             "controls": list(config.controls),
             "environment": config.lit_by,
             "model": config.model,
+            "task": config.task,
             "policy": config.policy_name,
             **body(config, parts),
             "warnings": [*said, *parts.warnings],
@@ -194,7 +196,7 @@ def _known(row: Summary, epsilon: float | None) -> bool:
     if ending in ("found", "already wrong"):
         return True
     clean = row["clean"]
-    steady = clean is not None and clean["correct"] >= needed(clean["trials"])
+    steady = clean is not None and clean["correct"] >= WORST_CASE.needed(clean["trials"])
     return steady and (epsilon is None or row["tried"] >= epsilon)
 
 

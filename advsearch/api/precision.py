@@ -118,8 +118,7 @@ class _Measurement:
         )
 
         def margin(picture: Tensor) -> float:
-            with torch.no_grad():
-                return -float(problem.goal.score(problem.model(picture))[0])
+            return -problem.judge(picture, problem.whole(problem.domain.start)).score
 
         self.progress.stage("the picture: preparing every sampler and path length")
         bench = PictureBench(renderer, problem.whole(problem.domain.start), margin, chosen)

@@ -82,6 +82,7 @@ def region_from_config(
             object=config.object,
             environment=problem.space.environment or config.lit_by,
             model=problem.model.name,
+            task=problem.task.name,
             controls=[bound.name for bound in problem.space.controls],
             ending=ending,
             **found,
@@ -127,7 +128,7 @@ def _found(attack: Attack, config: RegionConfig, varied: Varied, centre: Tensor,
         trial = attack.one_trial("region", number, at(values))
         if checks:
             stages.progress.advance(1)
-        return trial.wrong == verdict
+        return trial.success == verdict
 
     seed = seeds.stream(config.seed, "region")
     found = grow(same, centre[varied.places], seed=seed, samples=config.samples, on_part=on_part)
@@ -195,15 +196,15 @@ def _verdict(attack: Attack, centre: Tensor) -> bool:
     attack.stages.begin("verification", "looking at the centre", AT_CENTRE)
     wrong = 0
     for number in range(AT_CENTRE):
-        wrong += attack.one_trial("centre", number, centre).wrong
+        wrong += attack.one_trial("centre", number, centre).success
         attack.stages.progress.advance(1)
-    needed = attack.rule.needed(AT_CENTRE)
-    if AT_CENTRE - needed < wrong < needed:
+    verdict = attack.problem.rule.decided(wrong, AT_CENTRE)
+    if verdict is None:
         raise InputError(
             f"the model is wrong in {wrong} of {AT_CENTRE} trials at the centre, so its verdict there depends on the "
             "noise; choose another centre, or more samples with `verify_spp`"
         )
-    return wrong >= needed
+    return verdict
 
 
 def _box(problem: Problem, found: Region, at: Any, varied: Varied) -> list[BoxSide]:
@@ -239,7 +240,7 @@ def _map(attack: Attack, side: int, at: Any, box: Sequence[BoxSide], run: RunDir
     def margin(row: int, column: int) -> float:
         trial = attack.one_trial("map", row * side + column, at(torch.stack([steps[column], steps[row]])))
         attack.stages.progress.advance(1)
-        return trial.margin
+        return trial.score
 
     margins = [[margin(row, column) for column in range(len(steps))] for row in range(len(steps))]
     ends = [attack.problem.describe(at(torch.full((2,), end))) for end in (0.0, 1.0)]

@@ -36,6 +36,7 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
     found = render(
         scene,
         model,
+        task=config.task,
         controls=controls,
         around=config.around,
         resolution=config.resolution,

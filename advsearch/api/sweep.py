@@ -22,6 +22,7 @@ from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import CONFIG, RunDirectory, check_free, default_name, find_run, is_run, run_path
 from advsearch.runs.listing import finished
 from advsearch.settings import split_names
+from advsearch.tasks import Task, make_task
 
 SAMPLES = 100
 """Draws where there is no grid and nothing is said."""
@@ -35,6 +36,7 @@ def sweep(
     model: AnyModel | Sequence[AnyModel] = "reference",
     grid: Mapping[str, Any] | None = None,
     *,
+    task: str | Task = "classification",
     samples: int | None = None,
     controls: Controls = (),
     run: str | Path | None = None,
@@ -66,6 +68,7 @@ def sweep(
     Args:
         scene: from `load_scene`, or what that takes; or several.
         model: from `load_model`, or what that takes; or several, which are shown the same pictures.
+        task: what judges the models' outputs: a name, or an instance with options of its own.
         grid: parameter to its values: a list, a range, or "FIRST:LAST:COUNT".
         samples: draws of `controls` at each point of the grid; by default 1, or 100 without a grid.
         controls: what is drawn by chance, as for `attack`.
@@ -77,7 +80,7 @@ def sweep(
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
-    options = options_of(locals(), SweepConfig, without=("model", "controls", "grid", "samples", "run"))
+    options = options_of(locals(), SweepConfig, without=("model", "task", "controls", "grid", "samples", "run"))
     scenes = _several(scene)
     networks = _several(model)
     names = [split_names(one) if isinstance(one, str) else (str(one),) for one in scenes if not isinstance(one, Scene)]
@@ -85,6 +88,7 @@ def sweep(
         raise InputError("scene: expected scenes from load_scene or names of objects, got some of each")
     described: dict[str, Any] = {
         "model": ",".join(_model_name(one) for one in networks),
+        "task": task if isinstance(task, str) else task.name,
         "controls": settings_of(controls),
         "grid": dict(grid or {}),
         "samples": samples,
@@ -100,7 +104,7 @@ def sweep(
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
     asked = [name for one in networks for name in (split_names(one) if isinstance(one, str) else (one,))]
-    job = _job(config, loaded or _places(config), asked, controls)
+    job = _job(config, loaded or _places(config), asked, task, controls)
     return _kept(job, progress, resumed) if config.run is not None else carry_out(job, None, progress)
 
 
@@ -166,10 +170,12 @@ def _described(places: Sequence[Place]) -> dict[str, Any]:
 
 def _job_of(config: SweepConfig) -> Job:
     """Find and load everything that a configuration names."""
-    return _job(config, _places(config), config.models, config.controls)
+    return _job(config, _places(config), config.models, config.task, config.controls)
 
 
-def _job(config: SweepConfig, places: Sequence[Place], models: Sequence[AnyModel], controls: Controls) -> Job:
+def _job(
+    config: SweepConfig, places: Sequence[Place], models: Sequence[AnyModel], task: str | Task, controls: Controls
+) -> Job:
     check_run_settings(config)
     drawn = controls_of(controls, config)
     axes = read_axes(config.grid, drawn)
@@ -185,12 +191,14 @@ def _job(config: SweepConfig, places: Sequence[Place], models: Sequence[AnyModel
         )
     samples = config.samples or (SAMPLES if drawn and not axes else 1)
     check_scenes(places, drawn, axes)
-    networks, said = _models(models, config)
+    made = make_task(task)
+    networks, said = _models(models, config, made)
+    tasks = tuple(made.on(network) for network in networks)
     own = {place.object: place.scene.description.object.label for place in places}
     said += one_label_for_several(networks, config.label, own)
     for place in places:
         said += [*place.scene.description.object.notes, *place.scene.description.environment.warnings]
-    return Job(config, tuple(places), networks, drawn, axes, samples, tuple(dict.fromkeys(said)))
+    return Job(config, tuple(places), networks, tasks, drawn, axes, samples, tuple(dict.fromkeys(said)))
 
 
 def _places(config: SweepConfig) -> tuple[Place, ...]:
@@ -209,7 +217,7 @@ def _places(config: SweepConfig) -> tuple[Place, ...]:
     )
 
 
-def _models(models: Sequence[AnyModel], config: SweepConfig) -> tuple[tuple[Model, ...], list[str]]:
+def _models(models: Sequence[AnyModel], config: SweepConfig, task: Task) -> tuple[tuple[Model, ...], list[str]]:
     """Load the models; their warnings become sentences of the run."""
     names = [_model_name(one) for one in models]
     if len(set(names)) < len(names):
@@ -217,7 +225,7 @@ def _models(models: Sequence[AnyModel], config: SweepConfig) -> tuple[tuple[Mode
             f"model: expected models with different names, got {', '.join(names)}; from Python, "
             "load_model(..., name=...) gives one"
         )
-    return load_models(models, config)
+    return load_models(models, config, task)
 
 
 # ---- where it is kept -----------------------------------------------------------------------------------------------

@@ -12,8 +12,6 @@ from advsearch.attacks.objectives import (
     cross_entropy,
     get_objective,
     margin,
-    stop_at_margin,
-    succeeded,
 )
 from advsearch.attacks.policies import (
     CMAES,
@@ -40,14 +38,9 @@ from advsearch.attacks.sample_count import Rung, SampleCount, choose_spp
 from advsearch.attacks.search import SearchResult, StepRecord, planned_renders, search
 from advsearch.attacks.trials import Trials, clopper_pearson
 from advsearch.attacks.verification import (
-    Trial,
     Verification,
-    already_wrong,
     count_right,
-    needed,
     run_trials,
-    typical,
-    verdict,
     verify,
 )
 
@@ -80,11 +73,9 @@ __all__ = [
     "SearchResult",
     "Sobol",
     "StepRecord",
-    "Trial",
     "Trials",
     "Verification",
     "Wanted",
-    "already_wrong",
     "choose_spp",
     "clopper_pearson",
     "count_right",
@@ -93,14 +84,9 @@ __all__ = [
     "get_objective",
     "make_policy",
     "margin",
-    "needed",
     "planned_renders",
     "run_trials",
     "search",
     "seeded",
-    "stop_at_margin",
-    "succeeded",
-    "typical",
-    "verdict",
     "verify",
 ]

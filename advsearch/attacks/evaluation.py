@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
+
+from advsearch.tasks import Judgement
 
 Wanted = bool | Literal["free"]
 """Which derivative is wanted: none, all of it, or only what costs no extra render, with zeros elsewhere."""
@@ -16,24 +17,24 @@ Wanted = bool | Literal["free"]
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """One configuration, rendered once and classified.
+    """One configuration, rendered once and judged.
 
     Attributes:
         objective: what is maximised; a noisy number, because a render is.
         gradient: (d,) float32 derivative of the objective with respect to u, or None where it was not asked for.
-        logits: (C,) float32 output of the model.
-        success: the model's answer lies outside the label set. Never derived from the objective.
+        success: the model's answer is what is sought, by the task. Never derived from the objective.
         non_finite: gradient elements that were NaN or infinite and were set to zero where they arose.
         cost: pictures that were rendered for it, at least 1: one, and those that differences took, each times
             `samples`. An adjoint is not a picture and counts 0; `SearchResult.gradients` counts it.
+        judgement: what the task says of it, for the log; None where there is no task. No policy looks at it.
     """
 
     objective: float
     gradient: Tensor | None
-    logits: Tensor
     success: bool
     non_finite: int = 0
     cost: int = 1
+    judgement: Judgement | None = None
 
     @property
     def finite(self) -> bool:
@@ -42,7 +43,7 @@ class Evaluation:
 
 
 class Evaluate(Protocol):
-    """Renders a configuration and classifies it; supplied by whoever owns the scene."""
+    """Renders a configuration and judges it; supplied by whoever owns the scene."""
 
     def __call__(self, u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
         """Evaluate u.
@@ -58,9 +59,6 @@ class Evaluate(Protocol):
                 passed where it is not 1, so an evaluation that no policy asks for more need not know it.
         """
         ...
-
-
-StopWhen = Callable[[Evaluation], bool]
 
 
 def usable(evaluation: Evaluation) -> Evaluation:

@@ -20,8 +20,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from advsearch.errors import InputError
-
-Labels = tuple[int, ...]
+from advsearch.tasks.classification import Labels, largest, members, target_lead, wrong_lead
 
 SUREST = -15.0
 """Log-odds below which cross-entropy is continued by its tangent. In float32 its own slope, exp(log-odds), would be
@@ -40,14 +39,12 @@ def margin(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
     max over j not in Y of z_j, minus max over y in Y of z_y. In logits (log-odds), unbounded, and with a gradient of
     one at every confidence (Carlini and Wagner 2017, f_6 without its hinge). Ties share the gradient.
     """
-    right = members(logits, labels)
-    return _largest(logits, ~right) - _largest(logits, right)
+    return wrong_lead(logits, labels)
 
 
 def targeted_margin(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
     """max over t in T of z_t, minus max over j not in T of z_j: over 0 exactly where the answer is in T."""
-    hit = members(logits, target, "target")
-    return _largest(logits, hit) - _largest(logits, ~hit)
+    return target_lead(logits, target)
 
 
 def log_odds(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
@@ -127,34 +124,6 @@ def targeted_dlr(logits: Tensor, images: Tensor, target: Labels) -> Tensor:
 # ---- parts ----------------------------------------------------------------------------------------------------------
 
 
-def members(logits: Tensor, labels: Labels, setting: str = "label") -> Tensor:
-    """Return (C,) bool, true for the classes of a label set; checks the logits and the labels.
-
-    Args:
-        logits: (N, C).
-        labels: class indices.
-        setting: what an error names.
-
-    Raises:
-        InputError: logits of another shape, no index, one out of range, or all classes.
-    """
-    if logits.ndim != 2:
-        raise InputError(f"model output: expected logits of shape (N, classes), got {tuple(logits.shape)}")
-    classes = logits.shape[1]
-    if not labels or not all(0 <= label < classes for label in labels):
-        raise InputError(f"{setting}: expected class indices from 0 to {classes - 1}, got {tuple(labels)}")
-    found = torch.zeros(classes, dtype=torch.bool, device=logits.device)
-    found[list(labels)] = True
-    if bool(found.all()):
-        outcome = "no answer could be wrong" if setting == "label" else "every answer would be a hit"
-        raise InputError(f"{setting}: the label set holds all {classes} classes, so {outcome}")
-    return found
-
-
-def _largest(logits: Tensor, among: Tensor) -> Tensor:
-    return logits.masked_fill(~among, -math.inf).amax(dim=1)
-
-
 def _log_odds(logits: Tensor, of: Tensor) -> Tensor:
     inside = logits.masked_fill(~of, -math.inf).logsumexp(dim=1)
     return inside - logits.masked_fill(of, -math.inf).logsumexp(dim=1)
@@ -183,7 +152,7 @@ def _sorted(logits: Tensor, one: Tensor) -> tuple[Tensor, Tensor]:
         The 4 largest logits (3, if there are no more), (N, 3 or 4), in falling order; and the distance (N,) from the
         largest to the smallest of all.
     """
-    single = _largest(logits, one)[:, None]
+    single = largest(logits, one)[:, None]
     others = logits[:, ~one]
     collapsed = torch.cat([single, others], dim=1)
     top = collapsed.topk(min(4, collapsed.shape[1]), dim=1).values

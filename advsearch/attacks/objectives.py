@@ -1,10 +1,11 @@
-"""What a search maximises; what counts as success is another thing (`advsearch.attacks.goal`, docs/objectives.md).
+"""What a search maximises; what counts as success is another thing (`advsearch.tasks`, docs/objectives.md).
 
-An objective is a callable `(logits, images, labels) -> values`, the larger the nearer to what the search is after:
+An objective is a callable `(output, images, truth) -> values`, the larger the nearer to what the search is after:
 
-- logits: (N, C) float32 output of the model;
+- output: of the model for N pictures, as its task takes it; in classification logits (N, C) float32;
 - images: (N, H, W, 3) float32 that the model saw, display-referred sRGB in [0, 1];
-- labels: the indices of the label set Y, every one of which is a right answer;
+- truth: what is true of the scene, as the task has it; in classification the indices of the label set Y, every one of
+  which is a right answer;
 - values: (N,), differentiable.
 """
 
@@ -13,15 +14,13 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, final
+from typing import Any, Protocol, final
 
 import torch
 from torch import Tensor
 
-from advsearch.attacks.evaluation import Evaluation, StopWhen
 from advsearch.attacks.feature_distance import ReadFeatures, feature_distance
 from advsearch.attacks.logit_objectives import (
-    Labels,
     cross_entropy,
     dlr,
     log_odds,
@@ -33,11 +32,11 @@ from advsearch.attacks.logit_objectives import (
 )
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.registry import Registry
+from advsearch.tasks import Classification, Task
 
 __all__ = [
     "OBJECTIVES",
     "OBJECTIVE_KINDS",
-    "Labels",
     "Objective",
     "ObjectiveKind",
     "check_objective",
@@ -50,8 +49,6 @@ __all__ = [
     "margin",
     "negated",
     "objective_summaries",
-    "stop_at_margin",
-    "succeeded",
     "targeted_margin",
 ]
 
@@ -59,7 +56,7 @@ __all__ = [
 class Objective(Protocol):
     """The signature of an objective, called by position; see the module's docstring."""
 
-    def __call__(self, logits: Tensor, images: Tensor, labels: Labels, /) -> Tensor:
+    def __call__(self, output: Any, images: Tensor, truth: Any, /) -> Tensor:
         """Return (N,) values to maximise."""
         ...
 
@@ -73,9 +70,11 @@ class ObjectiveKind:
         name: its name.
         summary: one line about it.
         unit: of its values.
-        plain: the function of the right answers; None for one that has to be made from the model's features.
-        targeted: the same, of a target; None if it has no such form.
+        plain: the function of the right answers; None for one that has to be made for a run.
+        targeted: the same, of a target in their place; None if it has no such form.
         rivals: how many classes there must be beside the label set.
+        task: name of the task whose outputs it takes; None for any.
+        needs_features: whether it is made from the model's features and a clean picture.
     """
 
     name: str
@@ -84,17 +83,14 @@ class ObjectiveKind:
     plain: Objective | None = None
     targeted: Objective | None = None
     rivals: int = 1
-
-    @property
-    def needs_features(self) -> bool:
-        """Whether it is made from the model's features and a clean picture."""
-        return self.plain is None
+    task: str | None = Classification.name
+    needs_features: bool = False
 
     def form(self, *, targeted: bool) -> Objective:
         """Return the plain or the targeted function."""
         found = self.targeted if targeted else self.plain
         if found is None:
-            raise InputError(f"objective {self.name!r}: expected one of logits alone; it needs the model's features")
+            raise InputError(f"objective {self.name!r}: has no {'targeted' if targeted else 'plain'} form; use another")
         return found
 
 
@@ -134,6 +130,13 @@ _OWN = {
             "feature_distance",
             "how far the features lie from those of the clean picture",
             "lengths of the clean features",
+            needs_features=True,
+        ),
+        ObjectiveKind(
+            "score",
+            "the task's own score, over 0 where an answer is what is sought; in classification the margin",
+            "that of the task",
+            task=None,
         ),
     )
 }
@@ -155,55 +158,38 @@ def objective_summaries() -> dict[str, str]:
     return {name: kind.summary for name, kind in OBJECTIVE_KINDS.items()}
 
 
-def succeeded(logits: Tensor, labels: Labels) -> Tensor:
-    """Return (N,) bool: the largest logit lies outside the label set. Ties and NaN are no success."""
-    return margin(logits, logits, labels) > 0.0
-
-
-def stop_at_margin(threshold: float, labels: Labels) -> StopWhen:
-    """Return a `stop_when` for `search`: stop once one render shows a margin of at least `threshold` logits.
-
-    One render is noisy, so a threshold a few times the margin's noise saves the search from stopping on luck.
-    """
-
-    def reached(evaluation: Evaluation) -> bool:
-        logits = evaluation.logits.reshape(1, -1)
-        return bool(margin(logits, logits, labels)[0] >= threshold)
-
-    return reached
-
-
 # ---- from names and functions to objectives -------------------------------------------------------------------------
 
 
 def get_objective(
     objective: str | Callable[..., Tensor],
+    task: Task | None = None,
     *,
-    target: Labels = (),
-    minimise: bool = False,
     features: ReadFeatures | None = None,
     clean: Tensor | None = None,
 ) -> Objective:
     """Return the objective of that name, or the user's own function wrapped so that its mistakes are explained.
 
-    What comes back is called with the right answers, whatever the search is after. With a target, a named objective
-    takes its targeted form, and the user's function gets the target's indices in place of the right answers'. To
-    minimise, either is negated.
+    What comes back is called with the truth, whatever the search is after. With a target, a named objective takes its
+    targeted form, and the user's function gets the target in place of the truth. To minimise, either is negated.
 
     Args:
-        objective: a name, or a function of (logits, images, labels).
-        target: indices of the answers to lead to; empty for any wrong one.
-        minimise: make the object easier to recognise.
+        objective: a name, or a function of (output, images, truth).
+        task: judges the model; classification of any wrong answer if None.
         features: for an objective that `needs_features`: `advsearch.models.features.features_of(model)`.
         clean: likewise: the clean picture (H, W, 3), or renders of it (N, H, W, 3).
 
     Raises:
         UnknownNameError, InputError: as for `check_objective`; no features.
     """
-    check_objective(objective, targeted=bool(target), minimise=minimise)
+    task = task or Classification()
+    targeted = task.target is not None
+    check_objective(objective, task.name, targeted=targeted, minimise=task.minimise)
     kind = _kind_of(objective)
     if kind is None:
         found = checked(objective)  # type: ignore[arg-type]
+    elif kind.task is None:
+        return _score_of(task)
     elif kind.needs_features:
         if features is None or clean is None:
             raise InputError(
@@ -212,18 +198,26 @@ def get_objective(
             )
         found = feature_distance(features, clean)
     else:
-        found = kind.form(targeted=bool(target))
-    found = _aimed(found, target) if target else found
-    return negated(found) if minimise else found
+        found = kind.form(targeted=targeted)
+    found = _aimed(found, task.target) if targeted else found
+    return negated(found) if task.minimise else found
 
 
-def check_objective(objective: object, *, targeted: bool = False, minimise: bool = False) -> None:
+def check_objective(
+    objective: object, task: str = Classification.name, *, targeted: bool = False, minimise: bool = False
+) -> None:
     """Check, before anything is loaded, that there is such an objective and that it can do what is asked.
+
+    Args:
+        objective: a name, or a function.
+        task: name of the task whose outputs it will get.
+        targeted: whether there is a target.
+        minimise: whether a right answer is sought.
 
     Raises:
         UnknownNameError: no such name.
-        InputError: neither a name nor a function of three arguments; a target to minimise; an objective of features
-            with either of them.
+        InputError: neither a name nor a function of three arguments; an objective of another task; a target to
+            minimise; an objective of features with either of them.
     """
     if targeted and minimise:
         raise InputError(
@@ -231,19 +225,35 @@ def check_objective(objective: object, *, targeted: bool = False, minimise: bool
             "give that as `label`"
         )
     if isinstance(objective, str) and objective not in OBJECTIVE_KINDS:
-        hint = "From Python, objective= also takes a function (logits, images, labels)."
+        hint = "From Python, objective= also takes a function (output, images, truth)."
         raise UnknownNameError("objective", objective, OBJECTIVE_KINDS, hint)
     if not isinstance(objective, str) and not callable(objective):
-        raise InputError(f"objective: expected a name or a function (logits, images, labels), got {objective!r}")
+        raise InputError(f"objective: expected a name or a function (output, images, truth), got {objective!r}")
     kind = _kind_of(objective)
     if kind is None:
         _check_signature(objective)  # type: ignore[arg-type]
-    elif kind.needs_features and (targeted or minimise):
+        return
+    if kind.task not in (None, task):
+        fitting = [name for name, one in OBJECTIVE_KINDS.items() if one.task in (None, task)]
+        raise InputError(
+            f"objective: expected one of task {task} ({', '.join(fitting)}), got {kind.name}, which takes outputs of "
+            f"{kind.task}"
+        )
+    if kind.needs_features and (targeted or minimise):
         setting, reason = "minimise", "it is least at the start already"
         if targeted:
             setting, reason = "target", "it leads away from the clean picture, to no class in particular"
         expected = f"expected `objective` {' or '.join(OBJECTIVES)}"
         raise InputError(f"{setting}: {expected}, got {kind.name}; {reason}")
+
+
+def _score_of(task: Task) -> Objective:
+    """The score of a task, which knows of target and direction itself."""
+
+    def score(output: Any, images: Tensor, truth: Any) -> Tensor:
+        return task.score(output, truth)
+
+    return score
 
 
 def _kind_of(objective: object) -> ObjectiveKind | None:
@@ -253,15 +263,11 @@ def _kind_of(objective: object) -> ObjectiveKind | None:
     return next((kind for kind in OBJECTIVE_KINDS.values() if kind.plain is objective), None)
 
 
-def _aimed(objective: Objective, target: Labels) -> Objective:
-    """Wrap an objective of a target so that it is called with the right answers, like any other."""
+def _aimed(objective: Objective, target: Any) -> Objective:
+    """Wrap an objective of a target so that it is called with the truth, like any other."""
 
-    def aimed(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
-        both = sorted(set(labels) & set(target))
-        if both:
-            listed = ", ".join(f"#{index}" for index in both)
-            raise InputError(f"target: expected classes that are wrong, got {listed}, which `label` names as right")
-        return objective(logits, images, target)
+    def aimed(output: Any, images: Tensor, truth: Any) -> Tensor:
+        return objective(output, images, target)
 
     return aimed
 
@@ -269,8 +275,8 @@ def _aimed(objective: Objective, target: Labels) -> Objective:
 def negated(objective: Objective) -> Objective:
     """Wrap an objective so that what is maximised is its negative: easier to recognise instead of harder."""
 
-    def negative(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
-        return -objective(logits, images, labels)
+    def negative(output: Any, images: Tensor, truth: Any) -> Tensor:
+        return -objective(output, images, truth)
 
     return negative
 
@@ -278,7 +284,7 @@ def negated(objective: Objective) -> Objective:
 def checked(function: Callable[..., Tensor]) -> Objective:
     """Wrap a user's function: a scalar becomes (1,), and a wrong type, shape or a lost gradient is an InputError.
 
-    The function gets (logits, images, labels) as the module's docstring says and returns (N,), or a scalar for one
+    The function gets (output, images, truth) as the module's docstring says and returns (N,), or a scalar for one
     image. What it raises itself passes through. NaN values pass too: a search has a rule for them.
 
     Raises:
@@ -287,9 +293,9 @@ def checked(function: Callable[..., Tensor]) -> Objective:
     name = _name_of(function)
     _check_signature(function)
 
-    def objective(logits: Tensor, images: Tensor, labels: Labels) -> Tensor:
-        values = function(logits, images, labels)
-        count = logits.shape[0]
+    def objective(output: Any, images: Tensor, truth: Any) -> Tensor:
+        values = function(output, images, truth)
+        count = images.shape[0]
         if not isinstance(values, Tensor):
             raise InputError(
                 f"objective {name!r}: expected a torch tensor of shape ({count},), got {type(values).__name__}; "
@@ -307,10 +313,11 @@ def checked(function: Callable[..., Tensor]) -> Objective:
                 f"objective {name!r}: expected one value per image, shape ({count},), got {tuple(values.shape)}; "
                 "reduce over everything but the first axis"
             )
-        wanted = torch.is_grad_enabled() and (logits.requires_grad or images.requires_grad)
+        seen = [images, output] if isinstance(output, Tensor) else [images]
+        wanted = torch.is_grad_enabled() and any(one.requires_grad for one in seen)
         if wanted and not values.requires_grad:
             raise InputError(
-                f"objective {name!r}: the result does not depend on logits or images differentiably; "
+                f"objective {name!r}: the result does not depend on the output or the images differentiably; "
                 "remove .detach(), torch.no_grad() or argmax, or choose a policy without gradients (random)"
             )
         return values
@@ -329,6 +336,6 @@ def _check_signature(function: Callable[..., Tensor]) -> None:
         return
     except TypeError as error:
         raise InputError(
-            f"objective {_name_of(function)!r}: expected a function that takes (logits, images, labels), by position: "
+            f"objective {_name_of(function)!r}: expected a function that takes (output, images, truth), by position: "
             f"{error}"
         ) from None

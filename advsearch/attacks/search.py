@@ -16,7 +16,7 @@ from advsearch.attacks.candidates import Candidate, admit, best, contenders
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import TOLERANCE, Domain
 from advsearch.attacks.ending import Ending
-from advsearch.attacks.evaluation import Evaluate, Evaluation, StopWhen, usable
+from advsearch.attacks.evaluation import Evaluate, Evaluation, usable
 from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, affordable, answer_of
 from advsearch.attacks.policies.choices import with_choices
 from advsearch.errors import InputError
@@ -126,7 +126,6 @@ def search(
     candidates: int = 4,
     repeats: int = 2,
     close: int = 0,
-    stop_when: StopWhen | None = None,
     on_step: OnStep | None = None,
     seconds: float | None = None,
     late: Late | None = None,
@@ -150,7 +149,7 @@ def search(
     through.
 
     Args:
-        evaluate: renders and classifies one configuration.
+        evaluate: renders and judges one configuration.
         domain: where to search.
         policy: what proposes.
         steps: renders of the search, at least 1; as many evaluations where no gradient costs any. By default all are
@@ -158,7 +157,6 @@ def search(
         seed: root seed of this search's own randomness (not of the renders), at least 0.
         candidates, repeats, close: see above; together they cost at most `candidates * (repeats + close)` renders on
             top of `steps`.
-        stop_when: ends step 1 early where it returns true, e.g. `stop_at_margin(1.0, labels)`.
         on_step: called after every evaluation.
         seconds: end step 1 after the first evaluation that is done later than this, over 0; None for no limit. There
             is always one evaluation, and step 2 comes on top. Policies still plan for `steps`.
@@ -181,7 +179,7 @@ def search(
     log = _Log(evaluate, domain, on_step, max(1, candidates))
     try:
         in_time = math.inf if seconds is None else begun + seconds
-        stopped = _explore(log, policy, steps, seed, stop_when, late or (lambda _: time.perf_counter() >= in_time))
+        stopped = _explore(log, policy, steps, seed, late or (lambda _: time.perf_counter() >= in_time))
         if candidates:
             _rank(log, steps, repeats, close)
     except KeyboardInterrupt:
@@ -254,7 +252,7 @@ class _Log:
         self.before = gradient
 
 
-def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, stop_when: StopWhen | None, late: Late) -> Ending:
+def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) -> Ending:
     """Let the policy propose until the budget is spent or something ends it sooner; return what."""
     generator = torch.Generator().manual_seed(stream(seed, "search"))
     name, policy = policy.name, with_choices(policy, log.domain)
@@ -270,8 +268,6 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, stop_when: S
         in_a_row = 0 if evaluation.finite else in_a_row + 1
         if in_a_row == NON_FINITE_LIMIT:
             return Ending.NON_FINITE
-        if evaluation.finite and stop_when is not None and stop_when(evaluation):
-            return Ending.FOUND
         if log.renders < steps:
             state = policy.update(state, proposal.u, evaluation)
             log.answer, log.counts = partial(answer_of, policy, state), partial(policy.counts, state)

@@ -1,17 +1,15 @@
 """The independent re-check of a search's answer (docs/design.md, "Verification"). A verdict's rule stands here only.
 
 Every trial renders a configuration with a seed nobody has used, at a sample count shown to be high enough, with the
-pixels rounded to 8 bits, and classifies it. The clean configuration goes through exactly the same trials as a control
-group.
+pixels rounded to 8 bits, and has a task judge what the model says of it. The clean configuration goes through exactly
+the same trials as a control group.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from torch import Tensor
 
@@ -20,6 +18,7 @@ from advsearch.attacks.ending import Ending
 from advsearch.attacks.trials import Trials, clopper_pearson
 from advsearch.errors import InputError
 from advsearch.seeds import stream
+from advsearch.tasks import Judgement
 
 PASS_PERCENT = 95
 """What a claim must hold in, in per cent of the trials, and what the clean control must pass: 19 of 20."""
@@ -30,37 +29,6 @@ PASS_PERCENT_OVER = 90
 LEAST_RATE = 0.5
 """Where the 95 % interval of a claim's rate may begin: what is called found holds more often than not. So 6 trials are
 the fewest that can verify anything (54 to 100 %); 5 of 5 begin at 48 %."""
-
-
-class Trial(NamedTuple):
-    """One render and its verdict.
-
-    Attributes:
-        margin: `Goal.score`: over 0 means success. Without a target, the largest logit outside the label set minus the
-            largest inside.
-        predicted: index of the class the model answers.
-        probability: the probability it gives that class.
-        correct: whether that answer is right; None where the margin says it: it is at most 0.
-        wrong_lead: the largest logit outside the label set minus the largest inside, whatever counts as success; None
-            where that is the margin.
-    """
-
-    margin: float
-    predicted: int
-    probability: float
-    correct: bool | None = None
-    wrong_lead: float | None = None
-
-    @property
-    def wrong(self) -> bool:
-        """Whether the answer is the one that is wanted: outside the label set, or a target. A margin of 0 or NaN is
-        not."""
-        return self.margin > 0.0
-
-    @property
-    def right(self) -> bool:
-        """Whether the model answers inside the label set. NaN is not right either."""
-        return self.margin <= 0.0 if self.correct is None else self.correct
 
 
 @dataclass(frozen=True)
@@ -80,15 +48,59 @@ class Rule:
 
     def needed(self, trials: int) -> int:
         """Return how many of `trials` must succeed: the percentage, rounded up, and never under `fewest`."""
-        return max(self._share(trials), self.fewest)
+        return max(self.share(trials), self.fewest)
+
+    def allowed(self, trials: int) -> int:
+        """Return how many of `trials` may fail."""
+        return trials - self.needed(trials)
 
     @property
     def fewest(self) -> int:
         """Trials under which nothing is verified: even without a failure their interval begins under `LEAST_RATE`."""
-        return next(n for n in itertools.count(1) if clopper_pearson(self._share(n), n)[0] >= LEAST_RATE)
+        return next(n for n in itertools.count(1) if clopper_pearson(self.share(n), n)[0] >= LEAST_RATE)
 
-    def _share(self, trials: int) -> int:
+    def share(self, trials: int) -> int:
+        """Return the percentage of so many trials, rounded up."""
         return -(-self.percent * trials // 100)
+
+    def succeeded(self, trial: Judgement, clean: Judgement) -> bool:
+        """Whether a trial counts beside that of the clean configuration with the same seed.
+
+        That has to be right, so that what the noise does by itself does not count; where it may be wrong, the trial has
+        to have the larger score.
+        """
+        return trial.success and (clean.right if self.control else trial.score > clean.score)
+
+    def already_wrong(self, clean: Trials) -> bool:
+        """Whether a clean configuration is no start at all: right in less than half of its trials."""
+        return self.control and 2 * clean.successes < clean.trials
+
+    def decided(self, successes: int, trials: int) -> bool | None:
+        """Return what so many trials of one configuration say: success, none, or None where it depends on the noise."""
+        if min(successes, trials - successes) > self.allowed(trials):
+            return None
+        return successes >= self.needed(trials)
+
+    def verdict(self, search: Ending, clean: Trials, adversarial: Trials) -> Ending:
+        """Return the run's ending from the search's ending and the trials of both groups.
+
+        In this order:
+
+        1. INTERRUPTED stays interrupted.
+        2. The control group is `already_wrong`: ALREADY_WRONG. There was nothing to attack.
+        3. Control group and successes both reach what the rule needs: FOUND, whatever the search itself believed.
+        4. The search claimed FOUND: NOT_VERIFIED.
+        5. Else what the search ended with.
+        """
+        if search is Ending.INTERRUPTED:
+            return search
+        if self.already_wrong(clean):
+            return Ending.ALREADY_WRONG
+        enough = adversarial.successes >= self.needed(adversarial.trials)
+        control = not self.control or self.conditional or clean.successes >= self.needed(clean.trials)
+        if control and enough:
+            return Ending.FOUND
+        return Ending.NOT_VERIFIED if search is Ending.FOUND else search
 
 
 WORST_CASE = Rule()
@@ -98,10 +110,10 @@ EASIER = Rule(control=False)
 recognised better than the clean one with the same seed."""
 
 
-RenderMargin = Callable[[Tensor, int, int], Trial]
-"""(u, seed, spp) -> Trial: renders, rounds to 8 bits, classifies."""
+RenderTrial = Callable[[Tensor, int, int], Judgement]
+"""(u, seed, spp) -> Judgement: renders, rounds to 8 bits, asks the model, judges."""
 
-OnTrial = Callable[[str, int, Trial], None]
+OnTrial = Callable[[str, int, Judgement], None]
 """Called after every trial with "clean" or "adversarial", its number from 0, and the trial."""
 
 
@@ -110,11 +122,11 @@ class Verification:
     """What the trials say.
 
     Attributes:
-        ending: the run's ending; FOUND only if the rule of `verdict` holds.
+        ending: the run's ending; FOUND only if `Rule.verdict` says so.
         reason: one sentence with the numbers behind it.
         u: (d,) the configuration verified, projected into its budget again.
         clean: right answers of the control group.
-        adversarial: successes: wrong on the configuration and right on the clean one with the same seed.
+        adversarial: successes, by `Rule.succeeded`.
         clean_trials, adversarial_trials: every single trial, in the order of their seeds.
         renders: renders spent here.
     """
@@ -124,46 +136,13 @@ class Verification:
     u: Tensor
     clean: Trials
     adversarial: Trials
-    clean_trials: tuple[Trial, ...]
-    adversarial_trials: tuple[Trial, ...]
+    clean_trials: tuple[Judgement, ...]
+    adversarial_trials: tuple[Judgement, ...]
     renders: int
 
 
-def needed(trials: int) -> int:
-    """Return how many of `trials` must succeed: ceil of 95 %, so 19 of 20, and never fewer than 6."""
-    return WORST_CASE.needed(trials)
-
-
-def verdict(search: Ending, clean: Trials, adversarial: Trials, rule: Rule = WORST_CASE) -> Ending:
-    """Return the run's ending from the search's ending and the trials of both groups.
-
-    In this order:
-
-    1. INTERRUPTED stays interrupted.
-    2. The control group is right in less than half of its trials: ALREADY_WRONG. There was nothing to attack. (Not
-       where the rule has no control group.)
-    3. Control group and successes both reach what the rule needs: FOUND, whatever the search itself believed.
-    4. The search claimed FOUND: NOT_VERIFIED.
-    5. Else what the search ended with.
-    """
-    if search is Ending.INTERRUPTED:
-        return search
-    if rule.control and already_wrong(clean):
-        return Ending.ALREADY_WRONG
-    enough = adversarial.successes >= rule.needed(adversarial.trials)
-    control = not rule.control or rule.conditional or clean.successes >= rule.needed(clean.trials)
-    if control and enough:
-        return Ending.FOUND
-    return Ending.NOT_VERIFIED if search is Ending.FOUND else search
-
-
-def already_wrong(clean: Trials) -> bool:
-    """Return whether a clean configuration is no start at all: right in less than half of its trials."""
-    return 2 * clean.successes < clean.trials
-
-
 def run_trials(
-    render_margin: RenderMargin,
+    render_trial: RenderTrial,
     u: Tensor,
     *,
     spp: int,
@@ -171,8 +150,8 @@ def run_trials(
     trials: int = 20,
     group: str = "adversarial",
     on_trial: OnTrial | None = None,
-) -> tuple[Trial, ...]:
-    """Render and classify one configuration `trials` times, trial k with seed k of the stream "verification".
+) -> tuple[Judgement, ...]:
+    """Render and judge one configuration `trials` times, trial k with seed k of the stream "verification".
 
     Two groups run with the same root seed get the same seeds, trial by trial, which is what a control group needs.
 
@@ -185,20 +164,20 @@ def run_trials(
         raise InputError(f"verify_spp: expected at least 1, got {spp}")
     done = []
     for number in range(trials):
-        trial = Trial(*render_margin(u, stream(seed, "verification", number), spp))
+        trial = render_trial(u, stream(seed, "verification", number), spp)
         done.append(trial)
         if on_trial is not None:
             on_trial(group, number, trial)
     return tuple(done)
 
 
-def count_right(trials: Sequence[Trial], spp: int) -> Trials:
+def count_right(trials: Sequence[Judgement], spp: int) -> Trials:
     """Count the right answers of a control group."""
     return Trials(sum(trial.right for trial in trials), len(trials), spp)
 
 
 def verify(
-    render_margin: RenderMargin,
+    render_trial: RenderTrial,
     domain: Domain,
     u: Tensor,
     *,
@@ -206,18 +185,17 @@ def verify(
     spp: int,
     seed: int,
     trials: int = 20,
-    clean: Sequence[Trial] | None = None,
+    clean: Sequence[Judgement] | None = None,
     rule: Rule = WORST_CASE,
     on_trial: OnTrial | None = None,
 ) -> Verification:
     """Check a search's answer in fresh trials against the clean configuration as control group.
 
-    A success is a trial that is wrong on the projected answer while the clean configuration, rendered with the same
-    seed, is right: what the noise does by itself does not count. See `verdict` for the rule. KeyboardInterrupt passes
+    See `Rule` for what counts as a success, and for the ending. KeyboardInterrupt passes
     through.
 
     Args:
-        render_margin: renders one configuration with one seed, rounds to 8 bits, classifies.
+        render_trial: renders one configuration with one seed, rounds to 8 bits, asks the model and judges.
         domain: the budget; the clean configuration is its start.
         u: (d,) the answer; projected into the domain again.
         claim: the search's ending.
@@ -235,7 +213,7 @@ def verify(
     renders = trials if clean is not None else 2 * trials
     if clean is None:
         clean = run_trials(
-            render_margin,
+            render_trial,
             domain.start,
             spp=spp,
             seed=seed,
@@ -246,27 +224,14 @@ def verify(
     if len(clean) != trials:
         raise InputError(f"clean trials: expected {trials}, as many as `trials`, got {len(clean)}")
     u = domain.project(u)
-    adversarial = run_trials(render_margin, u, spp=spp, seed=seed, trials=trials, on_trial=on_trial)
+    adversarial = run_trials(render_trial, u, spp=spp, seed=seed, trials=trials, on_trial=on_trial)
     control = count_right(clean, spp)
-    pairs = list(zip(adversarial, clean, strict=True))
-    successes = sum(bad.wrong and (good.right if rule.control else bad.margin > good.margin) for bad, good in pairs)
+    successes = sum(map(rule.succeeded, adversarial, clean))
     counted = max(1, control.successes) if rule.conditional else trials
     verified = Trials(successes, counted, spp)
-    ending = verdict(claim, control, verified, rule)
+    ending = rule.verdict(claim, control, verified)
     reason = (
         f"{ending.explanation} A success in {successes} of {counted} trials, {rule.needed(counted)} are needed; clean "
         f"right in {control.successes} of {trials}."
     )
     return Verification(ending, reason, u, control, verified, tuple(clean), adversarial, renders)
-
-
-def typical(trials: Sequence[Trial]) -> Trial:
-    """Return what the model usually answers: the most frequent class (the lowest index of equals) over all trials,
-    with the mean margin and mean probability of the trials that gave it."""
-    counts: dict[int, int] = {}
-    for trial in trials:
-        counts[trial.predicted] = counts.get(trial.predicted, 0) + 1
-    predicted = min(counts, key=lambda i: (-counts[i], i))
-    chosen = [trial for trial in trials if trial.predicted == predicted]
-    margin = math.fsum(trial.margin for trial in chosen) / len(chosen)
-    return Trial(margin, predicted, math.fsum(trial.probability for trial in chosen) / len(chosen), chosen[0].correct)

@@ -1,4 +1,4 @@
-"""`advsearch list`: the names of objects, environments, controls, policies, objectives and models."""
+"""`advsearch list`: the names of objects, environments, controls, policies, tasks, objectives and models."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from typing import Any
 
 from advsearch.cli import output
 
-HELP = "list the objects, environments, controls, policies, objectives and models that have names"
+HELP = "list the objects, environments, controls, policies, tasks, objectives and models that have names"
 
 REGISTRIES = {
     "objects": "advsearch.scene.library:list_objects",
     "environments": "advsearch.scene.library:list_environments",
     "controls": "advsearch.controls:CONTROLS",
     "policies": "advsearch.attacks:POLICIES",
+    "tasks": "advsearch.tasks:TASKS",
     "objectives": "advsearch.attacks.objectives:objective_summaries",
     "models": "advsearch.cli.list:MODELS",
 }

@@ -62,9 +62,9 @@ def text(found: RenderResult) -> str:
         return "\n".join([*lines, f"Model {found.model} sees", output.columns(rows)])
     rows = [["azimuth", f"model {found.model} sees"]]
     for view in found.views:
-        rows.append([f"{view.azimuth:g}", ", ".join(f"{one.label} {_percent(one)}" for one in view.answers)])
+        rows.append([f"{view.azimuth:g}", ", ".join(f"{one.label} {_percent(one)}".strip() for one in view.answers)])
     return "\n".join([*lines, output.columns(rows)])
 
 
 def _percent(answer: ClassAnswer) -> str:
-    return f"{100 * answer.probability:.1f} %"
+    return "" if answer.probability is None else f"{100 * answer.probability:.1f} %"

@@ -10,7 +10,9 @@ from advsearch.report import wording
 
 Summary = Mapping[str, Any]
 
-MARGIN = f"\n  margin: {wording.MARGIN}, in the trials of the worst case"
+
+def _margin(summary: Summary) -> str:
+    return f"\n  margin: {wording.margin_text(summary)}, in the trials of the worst case"
 
 
 def answer(summary: Summary) -> str:
@@ -23,7 +25,7 @@ def answer(summary: Summary) -> str:
 
 def _objects(summary: Summary) -> str:
     heads = ["object", "clean right", "ending", "epsilon", "wrong", "margin"]
-    return columns([heads, *([row["object"], *_seen(row)] for row in summary["table"])]) + MARGIN
+    return columns([heads, *([row["object"], *_seen(row)] for row in summary["table"])]) + _margin(summary)
 
 
 def _seen(row: Summary) -> list[str]:
@@ -71,7 +73,7 @@ def _gap(summary: Summary) -> str:
                 str(row["ending"]),
             ]
         )
-    return columns([heads, *rows]) + MARGIN
+    return columns([heads, *rows]) + _margin(summary)
 
 
 def _plain(value: Any) -> str:

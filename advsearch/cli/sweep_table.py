@@ -90,7 +90,7 @@ def _facts(summary: Summary) -> dict[str, str]:
     renders = summary.get("renders") or {}
     return {
         "worst": _configuration(worst),
-        "": _said(worst),
+        "": _said(summary),
         "renders": f"{renders.get('sweep', 0)}" + (f", {speed:.3g} a second" if speed else ""),
         "time": wording.seconds_text(seconds) if seconds is not None else "",
         "kept in": str(summary.get("run") or ""),
@@ -104,11 +104,11 @@ def _configuration(worst: Summary) -> str:
     return ", ".join([*(wording.short_name(worst["values"][name]["value"]) for name in outer), *names]) if worst else ""
 
 
-def _said(worst: Summary) -> str:
+def _said(summary: Summary) -> str:
+    worst = summary.get("worst") or {}
     if not worst:
         return ""
     claim, checked = worst["claimed"], worst.get("verified")
     text = f"answer {claim['label']}" + (f" ({wording.percent(claim['probability'])})" if claim["probability"] else "")
-    if not checked:
-        return f"{text}; margin ({wording.MARGIN}) {claim['margin']:.3g}; not verified"
-    return f"{text}; margin ({wording.MARGIN}) {claim['margin']:.3g}; wrong in {wording.rate_text(checked)}"
+    text += f"; margin ({wording.margin_text(summary)}) {claim['margin']:.3g}; "
+    return f"{text}wrong in {wording.rate_text(checked)}" if checked else f"{text}not verified"

@@ -129,7 +129,9 @@ class AttackConfig(SceneConfig):
         gt=0.0,
         le=2.0,
     )
-    objective: str = setting("margin", "search", "what is maximised", "the name of an objective")
+    objective: str | None = setting(
+        None, "search", "what is maximised", "the name of an objective", otherwise="the task's own: margin"
+    )
     target: str | None = setting(
         None,
         "search",

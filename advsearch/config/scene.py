@@ -92,6 +92,9 @@ class SceneConfig(Config):
     labels: str | None = setting(
         None, "model", "names of the model's classes", "a JSON or text file", otherwise="the model's own"
     )
+    task: str = setting(
+        "classification", "model", "what the model is to do, and how it is judged", "the name of a task"
+    )
     label: str | None = setting(
         None,
         "model",
@@ -197,6 +200,7 @@ class SceneConfig(Config):
         "model",
         "labels",
         "label",
+        "task",
         "run",
         "objective",
         "target",

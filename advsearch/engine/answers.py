@@ -1,47 +1,64 @@
-"""Which answers of a model are right for an object; and where nothing says so, what the model answers to it."""
+"""What is true of a scene, for a task to judge by; and where nothing says so, what the model answers to it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from advsearch.config import SceneConfig
+from advsearch.controls.base import Value
 from advsearch.engine.loading import Scene
 from advsearch.engine.rendering import render
 from advsearch.errors import InputError
-from advsearch.models import LabelSet, Model
-from advsearch.models.model import Answer
+from advsearch.models import Model
+from advsearch.tasks import Answer, Facts, Task
 
 LOOK_SPP = 16
 """Samples a pixel of the clean picture that the model is shown."""
 
+Described = Callable[[], Mapping[str, Value]]
+"""What says the configuration in named values, when it is asked."""
 
-def right_answers(model: Model, scene: Scene, name: str, config: SceneConfig) -> LabelSet:
-    """Return the right answers for an object: what was said, or else its own label.
+
+def facts_of(scene: Scene, name: str, label: str | None, describe: Described) -> Facts:
+    """Return what a scene gives a task to judge by.
 
     Args:
-        model: whose classes.
         scene: with the object.
         name: the object's, for messages.
-        config: its `label` is what was said.
+        label: what was said to be right.
+        describe: says the configuration; what it does not say has the value that the scene was given.
+    """
+    fixed = {key: value for key, value in scene.description.values.items() if value is not None}
+
+    def numbers() -> dict[str, float]:
+        said = {key: one["value"] for key, one in describe().items()}
+        return {key: float(v) for key, v in {**fixed, **said}.items() if isinstance(v, (int, float))}
+
+    return Facts(name, label, scene.description.object.label, numbers)
+
+
+def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, config: SceneConfig) -> None:
+    """Refuse a scene of which the task cannot say what is right, before anything is prepared.
+
+    Args:
+        task: on the model.
+        model: whose answers it judges.
+        scene: with the object.
+        facts: of the scene.
+        config: how it is rendered.
 
     Raises:
-        InputError: the model has no such class, or the object has no label; then the message has the model's first
-            answers to a clean picture.
+        InputError: what `Task.truth` raises; where no label was given, with the model's first answers to a clean
+            picture.
     """
-    own = scene.description.object.label
-    if config.label is not None:
-        try:
-            return model.label_set(config.label)
-        except InputError as error:
-            raise InputError(f"label: {error}") from None
-    if own is None:
-        problem = f"label: expected the right answers for {name}, got none"
-    else:
-        try:
-            return model.label_set(own)
-        except InputError as error:
-            problem = f"label: the label of {name} itself does not fit the model ({error})"
-    raise InputError(f"{problem}; {_advice(model, scene, config)}")
+    if task.varies:
+        return
+    try:
+        task.truth(facts)
+    except InputError as error:
+        if config.label is not None or not task.reads_logits:
+            raise
+        raise InputError(f"{error}; {_advice(task, model, scene, config)}") from None
 
 
 def one_label_for_several(models: Sequence[Model], label: str | None, objects: Mapping[str, str | None]) -> list[str]:
@@ -75,11 +92,12 @@ def _differs(models: Sequence[Model], label: str, own: str) -> bool:
     return False
 
 
-def _advice(model: Model, scene: Scene, config: SceneConfig) -> str:
+def _advice(task: Task, model: Model, scene: Scene, config: SceneConfig) -> str:
     """What the model answers to a clean picture, and how to take the first of these for right."""
     looked = render(
         scene,
         model,
+        task=task,
         resolution=config.resolution,
         spp=LOOK_SPP,
         denoise=config.denoise,
@@ -87,7 +105,7 @@ def _advice(model: Model, scene: Scene, config: SceneConfig) -> str:
         seed=config.seed,
     )
     answers = looked.views[0].answers
-    listed = ", ".join(f"{answer.label!r} {100 * answer.probability:.1f} %" for answer in answers)
+    listed = ", ".join(f"{answer.label!r} {100 * (answer.probability or 0.0):.1f} %" for answer in answers)
     return (
         f"model {model.name} calls a clean picture of it {listed}; name what is right, such as "
         f'`label="{_term(model, answers[0])}"`'

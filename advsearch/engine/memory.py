@@ -7,21 +7,23 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from advsearch.attacks import Evaluate, Evaluation, Trial
+from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Wanted
-from advsearch.attacks.goal import Goal
 from advsearch.engine.problem import OnImage
+from advsearch.engine.rows import judgement_of
 from advsearch.errors import InputError
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.replay import Entry
 from advsearch.runs.store import Row
 from advsearch.scene.formation import to_8_bit
+from advsearch.tasks import Answer, Judgement
 
 PLAN = "gradient plan"
 """The note under which the store keeps how derivatives are obtained."""
@@ -154,16 +156,10 @@ class Memory:
             yield log.read(kind, number)
             number += 1
 
-    def trial(self, kind: str, number: int, goal: Goal) -> Trial | None:
-        """Return a trial that was made already, or None."""
+    def trial(self, kind: str, number: int) -> Judgement | None:
+        """Return a trial that was made already, or None; one of an older run that does not say what was right, too."""
         row = self._trials.get((kind, number))
-        if row is None:
-            return None
-        score = float("nan") if row.objective is None else row.objective
-        right = row.correct
-        if right is None:  # of an older run
-            right = row.label_index in goal.labels if goal.targets else score >= 0.0 if goal.minimise else score <= 0.0
-        return Trial(score, int(row.label_index or 0), float(row.probability or 0.0), right, row.margin)
+        return None if row is None or row.correct is None else judgement_of(row)
 
     def note(self, key: str) -> Any:
         """Return the JSON value that was noted, or None."""
@@ -200,8 +196,9 @@ def _entry(
         "non_finite": found.non_finite,
         "cost": found.cost,
         "seconds": seconds,
+        "judgement": None if found.judgement is None else asdict(found.judgement),
     }
-    arrays = {"logits": found.logits.detach().numpy()}
+    arrays = {}
     if found.gradient is not None:
         arrays["gradient"] = found.gradient.detach().numpy()
     if picture is not None:
@@ -212,13 +209,14 @@ def _entry(
 def _evaluation(entry: Entry) -> Evaluation:
     text = entry.facts["objective"]
     gradient = entry.arrays.get("gradient")
+    told = entry.facts.get("judgement")
     return Evaluation(
         objective=float.fromhex(text) if "x" in text else float(text),
         gradient=None if gradient is None else torch.from_numpy(gradient),
-        logits=torch.from_numpy(entry.arrays["logits"]),
         success=entry.facts["success"],
         non_finite=entry.facts["non_finite"],
         cost=entry.facts["cost"],
+        judgement=None if told is None else Judgement(**{**told, "answer": Answer(**told["answer"])}),
     )
 
 

@@ -14,6 +14,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.loading import named_code
 from advsearch.settings import split_names
+from advsearch.tasks import Task, make_task
 
 
 def scene_settings(fixed: Mapping[str, Any] | None, exposure: float | None) -> dict[str, Any]:
@@ -154,12 +155,21 @@ def _bounded(kind: str) -> str:
     return f", or search {bounded[0]} with it" if bounded else ""
 
 
-def load_models(models: Sequence[Any], config: SceneConfig) -> tuple[tuple[Model, ...], list[str]]:
-    """Load models in the threads that are asked for; their warnings become sentences of the run."""
+def load_models(
+    models: Sequence[Any], config: SceneConfig, task: Task | None = None
+) -> tuple[tuple[Model, ...], list[str]]:
+    """Load models in the threads that are asked for; their warnings become sentences of the run.
+
+    Args:
+        models: as `load_model` takes them.
+        config: of the run.
+        task: what their outputs are for; that of the configuration if None.
+    """
     threads.configure(1 if config.deterministic else config.threads)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ModelWarning)
-        loaded = tuple(load_model(one, labels=config.labels) for one in models)
+        read = (task or make_task(config.task)).reader
+        loaded = tuple(load_model(one, labels=config.labels, read=read) for one in models)
     said = [str(one.message) for one in caught if issubclass(one.category, ModelWarning)]
     for one in caught:
         if not issubclass(one.category, ModelWarning):

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import statistics
-from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +13,14 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Ending, SearchResult, Trial, Trials, Verification, already_wrong, count_right, typical
+from advsearch.attacks import Ending, SearchResult, Trials, Verification, count_right
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.smallest import Bracket
 from advsearch.config import AttackConfig
 from advsearch.engine.memory import ANSWER, MOST_NUMBERS
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
+from advsearch.engine.rows import answered
 from advsearch.errors import InputError
 from advsearch.report.notebook import attack_html
 from advsearch.report.page import write_report
@@ -29,6 +29,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
 from advsearch.scene.formation import to_8_bit
+from advsearch.tasks.base import typical
 
 PICTURE_SPP = 64
 """Samples a pixel of the pictures that are kept, unless verification needed more."""
@@ -113,7 +114,7 @@ def summarise(
     )
     space = problem.searched_space
     artifacts = space.artifacts(u)
-    answers = _answers(config, problem, findings, clean, adversarial)
+    answers = _answers(config, problem, findings, u, clean, adversarial)
     run = recorder.run
     costs = _costs(findings, problem, stages)
     where = {"run": None if run is None else str(run.path)}
@@ -138,26 +139,28 @@ def summarise(
 
 
 def _answers(
-    config: AttackConfig, problem: Problem, findings: Findings, clean: Tensor, adversarial: Tensor
+    config: AttackConfig, problem: Problem, findings: Findings, u: Tensor, clean: Tensor, adversarial: Tensor
 ) -> dict[str, Any]:
-    verification, labels = findings.verification, problem.model.labels
-    clean_trial = typical(findings.clean) if findings.clean else _look(problem, clean)
-    found = typical(verification.adversarial_trials) if verification else _look(problem, adversarial)
+    verification, task, start = findings.verification, problem.task, problem.domain.start
+    clean_trial = typical(findings.clean) if findings.clean else problem.judge(clean, problem.whole(start))
+    trials = verification.adversarial_trials if verification else (problem.judge(adversarial, problem.whole(u)),)
+    found = typical(trials)
     control = count_right(findings.clean, findings.spp) if findings.clean else None
     controls = problem.searched_space.controls
     budgets = [bound.budget for bound in controls]
     summary: dict[str, Any] = {
         "object": config.object,
         "model": problem.model.name,
+        "task": task.name,
         "environment": problem.space.environment or config.lit_by,
         "controls": [bound.name for bound in controls],
         "policy": config.policy_name,
-        "objective": config.objective,
+        "objective": config.objective or task.objective,
         "epsilon": budgets[0].epsilon if len(budgets) == 1 else {b.name: b.budget.epsilon for b in controls},
         "norm": budgets[0].norm if len(budgets) == 1 else {b.name: b.budget.norm for b in controls},
-        "label_set": list(problem.labels.names),
-        "goal": problem.goal.rule,
-        "target": [problem.model.labels[index] for index in problem.goal.targets] or None,
+        "label_set": list(task.truth_names(problem.truth())),
+        "goal": task.goal,
+        "target": list(task.target_names) or None,
         "over": [bound.name for bound in problem.space.controls[len(controls) :]],
         "ending": _ending(findings, problem).value,
         "image_formation": problem.renderer.formation.summary(),
@@ -167,23 +170,23 @@ def _answers(
             "verification": problem.renderer.scene.max_depth,
         },
         "clean": {
-            **_named(clean_trial, labels),
-            "correct": clean_trial.predicted in problem.labels.indices,
+            **asdict(clean_trial.answer),
+            "correct": clean_trial.right,
             "moved": [one.to_dict() for one in problem.space.moved],
             "control": control.to_control_dict() if control else None,
         },
-        "adversarial": _named(found, labels) if findings.search else None,
-        "verified": _verified(verification, labels),
+        "adversarial": asdict(found.answer) if findings.search else None,
+        "verified": _verified(verification),
     }
     if findings.baseline is not None:
         summary["baseline"] = {
             "policy": "random",
             "renders": findings.baseline.renders * problem.draws,
-            "verified": _verified(findings.baseline_verification, labels),
+            "verified": _verified(findings.baseline_verification),
         }
     if findings.beaten is not None:
         summary["answer_from"] = "random"
-        summary["policy_verified"] = _verified(findings.beaten, labels)
+        summary["policy_verified"] = _verified(findings.beaten)
     if findings.average:
         summary["average"] = _average(findings, problem)
     if findings.smallest is not None:
@@ -217,14 +220,14 @@ def _gradients(found: SearchResult) -> dict[str, Any]:
 def _average(findings: Findings, problem: Problem) -> dict[str, Any]:
     """How often the model is right over configurations drawn from the whole space."""
     counted = Trials(sum(trial.right for trial in findings.average), len(findings.average), findings.spp)
-    margins = [trial.margin for trial in findings.average]
+    scores = [trial.score for trial in findings.average]
     return {
         "configurations": counted.trials,
         "correct": counted.successes,
         "accuracy": counted.rate,
         "interval": list(counted.interval),
-        "margin": sum(margins) / len(margins),
-        "worst_margin": max(margins),
+        "margin": sum(scores) / len(scores),
+        "worst_margin": max(scores),
     }
 
 
@@ -257,35 +260,16 @@ def _ending(findings: Findings, problem: Problem) -> Ending:
         return Ending.INTERRUPTED
     if findings.verification is not None:
         return findings.verification.ending
-    if findings.clean and not problem.goal.minimise and already_wrong(count_right(findings.clean, findings.spp)):
+    if findings.clean and problem.rule.already_wrong(count_right(findings.clean, findings.spp)):
         return Ending.ALREADY_WRONG
     return Ending.INTERRUPTED
 
 
-def _look(problem: Problem, picture: Tensor) -> Trial:
-    """What the model says of a finished picture."""
-    with torch.no_grad():
-        probabilities = problem.model(picture)[0].softmax(dim=0)
-    predicted = int(probabilities.argmax())
-    return Trial(float("nan"), predicted, float(probabilities[predicted]))
-
-
-def _named(trial: Trial, labels: Sequence[str]) -> dict[str, Any]:
-    return {"label": labels[trial.predicted], "index": trial.predicted, "probability": trial.probability}
-
-
-def _verified(verification: Verification | None, labels: Sequence[str]) -> dict[str, Any] | None:
-    """Rates and what the model answered in the trials that it got wrong."""
+def _verified(verification: Verification | None) -> dict[str, Any] | None:
+    """Rates, and what the model answered in the trials that it got wrong."""
     if verification is None:
         return None
-    trials: Trials = verification.adversarial
-    answers = Counter(labels[trial.predicted] for trial in verification.adversarial_trials if trial.wrong)
-    return {**trials.to_dict(), "labels": dict(answers.most_common()), "margin": _mean_margin(verification)}
-
-
-def _mean_margin(verification: Verification) -> float:
-    margins = [trial.margin for trial in verification.adversarial_trials]
-    return sum(margins) / len(margins)
+    return {**verification.adversarial.to_dict(), **answered(verification.adversarial_trials)}
 
 
 def _costs(findings: Findings, problem: Problem, stages: Stages) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What a search works on: a scene, a model, a space and an objective, joined into the calls that `attacks` asks for."""
+"""What a search works on: scene, space, model, task and objective, joined into the calls that `attacks` asks for."""
 
 from __future__ import annotations
 
@@ -10,18 +10,21 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Domain, Evaluate, Evaluation, Objective, Trial, margin
+from advsearch.attacks import Domain, Evaluate, Evaluation, Objective
 from advsearch.attacks.evaluation import Wanted
-from advsearch.attacks.goal import Goal
+from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.controls import Space
 from advsearch.controls.base import Value
+from advsearch.engine.answers import Described
 from advsearch.engine.domains import domain_of
-from advsearch.models import LabelSet, Model
+from advsearch.models import Model
 from advsearch.runs.results.plan import PlannedGradient
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import GradientPlan
 from advsearch.scene.renderer import Renderer
+from advsearch.tasks import Facts, Judgement, Task
+from advsearch.tasks.base import Output, Truth
 
 
 class OnImage(NamedTuple):
@@ -47,9 +50,9 @@ class Problem:
         renderer: `render(u, seed, spp)` of the whole space.
         space: the controls behind the whole of u: those that are searched, then those that vary by chance.
         model: the network under test.
-        labels: the right answers.
+        task: judges the model's output; says what counts as success.
+        facts: what the scene gives it to judge by, from what describes the configuration.
         objective: what is maximised.
-        goal: what counts as success.
         spp: samples a pixel while searching.
         seed: root of every stream.
         searched: how many of the controls are searched; None for all. The others are the conditions: drawn anew from
@@ -64,9 +67,9 @@ class Problem:
     renderer: Renderer
     space: Space
     model: Model
-    labels: LabelSet
+    task: Task
+    facts: Callable[[Described], Facts]
     objective: Objective
-    goal: Goal
     spp: int
     seed: int
     searched: int | None = None
@@ -77,6 +80,7 @@ class Problem:
 
     def __post_init__(self) -> None:
         self.plan = self.renderer.plan
+        self._start_truth = self.task.truth(self._facts(self.whole(self.domain.start)))
 
     @property
     def plan(self) -> GradientPlan:
@@ -102,6 +106,13 @@ class Problem:
     def searched_space(self) -> Space:
         """The controls that are searched, as a space of their own: it describes and keeps what was found."""
         return replace(self.space, controls=self.space.controls[: self.searched])
+
+    @property
+    def rule(self) -> Rule:
+        """When an answer counts as verified."""
+        if self.task.minimise:
+            return EASIER
+        return WORST_CASE if self.conditions is None else OVER_CONDITIONS
 
     # ---- pictures ---------------------------------------------------------------------------------------------------
 
@@ -131,15 +142,23 @@ class Problem:
         with torch.no_grad():
             return to_8_bit(self.renderer(self.whole(u, seed if drawn else None), seed=seed, spp=spp))
 
-    def trial(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True) -> Trial:
-        """Render, round to 8 bits, classify: one trial of a verification; arguments as for `picture`."""
+    def trial(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True) -> Judgement:
+        """Render, round to 8 bits, ask and judge: one trial of a verification; arguments as for `picture`."""
+        return self.judge(self.picture(u, seed, spp, drawn=drawn), self.whole(u, seed if drawn else None))
+
+    def judge(self, picture: Tensor, whole: Tensor) -> Judgement:
+        """Return what the task says of the model's output for a picture (H, W, 3) of the whole space at `whole`."""
         with torch.no_grad():
-            logits = self.model(self.picture(u, seed, spp, drawn=drawn))
-        probabilities = logits[0].softmax(dim=0)
-        predicted = int(probabilities.argmax())
-        score, right = float(self.goal.score(logits)[0]), bool(self.goal.right(logits)[0])
-        lead = float(margin(logits, logits, self.labels.indices)[0])
-        return Trial(score, predicted, float(probabilities[predicted]), right, lead)
+            return self.task.judge(self.model(picture), self.truth(whole))[0]
+
+    def truth(self, whole: Tensor | None = None) -> Truth:
+        """Return what is true of the scene at a configuration of the whole space; None for the start."""
+        if whole is None or not self.task.varies:
+            return self._start_truth
+        return self.task.truth(self._facts(whole))
+
+    def _facts(self, whole: Tensor) -> Facts:
+        return self.facts(lambda: self.space.describe(whole))
 
     def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Value]:
         """Say a configuration of the searched controls in named values with units, under the conditions of a draw.
@@ -183,26 +202,26 @@ class Problem:
         def evaluate(u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
             noise = seeds.stream(self.seed, stream, index)
             if self.conditions is None:
-                return self._evaluate(u, noise, index, gradient, samples, on_image)
+                return self._evaluate(u, noise, index, gradient, samples, on_image)[0]
             draws = [seeds.stream(noise, "draw", number) for number in range(self.draws)]
             found = [self._evaluate(self.whole(u, d), d, index, gradient, samples, None) for d in draws]
             if on_image is not None and on_image.wants(index):
                 on_image.tell(index, self.picture(u, noise, self.spp, drawn=False))
-            return _mean(found, u.numel())
+            return self._mean(found, u)
 
         return evaluate
 
     def _evaluate(
         self, whole: Tensor, noise: int, index: int, gradient: Wanted, samples: int, on_image: OnImage | None
-    ) -> Evaluation:
-        """One picture of the whole space, classified, with the derivative that is wanted."""
-        before, renders = self.renderer.non_finite, self.renderer.renders
-        seen: list[tuple[Tensor, Tensor]] = []
+    ) -> tuple[Evaluation, Output]:
+        """One picture of the whole space, judged, with the derivative that is wanted; and the model's output."""
+        before, renders, truth = self.renderer.non_finite, self.renderer.renders, self.truth(whole)
+        seen: list[tuple[Tensor, Output]] = []
 
         def loss(image: Tensor) -> Tensor:
-            value, logits = self._judge(image)
-            seen.append((image.detach(), logits.detach()))
-            return value
+            output = self.model(image)
+            seen.append((image.detach(), output))
+            return self.objective(output, image[None], truth)[0]
 
         spp, derivative = self.spp * samples, None
         with self.renderer.scene.shorter(self.search_depth):
@@ -211,37 +230,37 @@ class Problem:
             else:
                 with torch.no_grad():
                     value = loss(self.renderer(whole, seed=noise, spp=spp))
-        image, logits = seen[0]
+        image, output = seen[0]
         if on_image is not None and on_image.wants(index):
             on_image.tell(index, image)
-        return Evaluation(
+        with torch.no_grad():
+            judgement = self.task.judge(output, truth)[0]
+        evaluation = Evaluation(
             objective=float(value),
             gradient=derivative,
-            logits=logits[0],
-            success=bool(self.goal.score(logits)[0] > 0.0),
+            success=judgement.success,
             non_finite=self.renderer.non_finite - before,
             cost=(self.renderer.renders - renders) * samples,
+            judgement=judgement,
+        )
+        return evaluation, output
+
+    def _mean(self, found: Sequence[tuple[Evaluation, Output]], u: Tensor) -> Evaluation:
+        """The mean over conditions. Its cost is counted in evaluations, each of which takes a picture a draw."""
+        each, count = [one for one, _ in found], len(found)
+        gradients = [one.gradient[: u.numel()] for one in each if one.gradient is not None]
+        with torch.no_grad():
+            output = self.task.average([output for _, output in found])
+            judgement = self.task.judge(output, self.truth(self.whole(u)))[0]
+        return Evaluation(
+            objective=sum(one.objective for one in each) / count,
+            gradient=torch.stack(gradients).mean(dim=0) if gradients else None,
+            success=sum(one.success for one in each) >= OVER_CONDITIONS.share(count),
+            non_finite=sum(one.non_finite for one in each),
+            cost=max(one.cost for one in each),
+            judgement=judgement,
         )
 
-    def _judge(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """The objective of a picture (H, W, 3), and the logits (1, C) behind it."""
-        logits = self.model(image)
-        return self.objective(logits, image[None], self.labels.indices)[0], logits
-
     def loss(self, image: Tensor) -> Tensor:
-        """The objective of a picture (H, W, 3) sRGB, as a number with a graph."""
-        return self._judge(image)[0]
-
-
-def _mean(found: Sequence[Evaluation], size: int) -> Evaluation:
-    """The mean over conditions. Its cost is counted in evaluations, each of which takes a picture a draw."""
-    count = len(found)
-    gradients = [one.gradient[:size] for one in found if one.gradient is not None]
-    return Evaluation(
-        objective=sum(one.objective for one in found) / count,
-        gradient=torch.stack(gradients).mean(dim=0) if gradients else None,
-        logits=torch.stack([one.logits for one in found]).mean(dim=0),
-        success=sum(one.success for one in found) * 10 >= 9 * count,
-        non_finite=sum(one.non_finite for one in found),
-        cost=max(one.cost for one in found),
-    )
+        """The objective of a picture (H, W, 3) sRGB near the start, as a number with a graph."""
+        return self.objective(self.model(image), image[None], self.truth())[0]

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Evaluation, SampleCount, SearchResult, StepRecord, Trial, Verification, margin
+from advsearch.attacks import Evaluation, SampleCount, SearchResult, StepRecord, Verification
 from advsearch.attacks.smallest import Bracket
 from advsearch.engine.memory import Memory
 from advsearch.engine.problem import Problem
+from advsearch.engine.rows import judged, trial_row
 from advsearch.progress import Progress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
+from advsearch.tasks import Judgement
 
 MEASURED = ("centre", "region", "map")
 """Kinds of trials that seek no answer but see what the model says."""
@@ -43,15 +44,15 @@ class Findings:
         verification_renders: renders spent on choosing the sample count and on trials.
     """
 
-    first_look: tuple[Trial, ...] = ()
+    first_look: tuple[Judgement, ...] = ()
     search: SearchResult | None = None
     baseline: SearchResult | None = None
     sample_count: SampleCount | None = None
-    clean: tuple[Trial, ...] = ()
+    clean: tuple[Judgement, ...] = ()
     verification: Verification | None = None
     baseline_verification: Verification | None = None
     beaten: Verification | None = None
-    average: tuple[Trial, ...] = ()
+    average: tuple[Judgement, ...] = ()
     smallest: Bracket | None = None
     frames: list[Any] = field(default_factory=list)
     interrupted: bool = False
@@ -125,34 +126,25 @@ class Recorder:
         if self.run is None or self._memory.holds(kind, record.step):
             return
         problem = self._problem
-        probabilities = evaluation.logits.softmax(dim=0)
-        predicted = int(probabilities.argmax())
-        lead = float(margin(evaluation.logits[None], evaluation.logits[None], problem.goal.labels)[0])
-        self.run.record(
-            Row(
-                kind=kind,
-                step=record.step,
-                seed=seeds.stream(problem.seed, kind, record.index),
-                spp=problem.spp * record.samples,
-                objective=record.objective,
-                success=record.success,
-                correct=lead <= 0.0,
-                margin=lead,
-                label=problem.model.labels[predicted],
-                label_index=predicted,
-                probability=float(probabilities[predicted]),
-                values=problem.describe(u),
-                seconds=record.seconds,
-                renders=renders * problem.draws,
-            )
+        row = Row(
+            kind=kind,
+            step=record.step,
+            seed=seeds.stream(problem.seed, kind, record.index),
+            spp=problem.spp * record.samples,
+            objective=record.objective,
+            success=record.success,
+            values=problem.describe(u),
+            seconds=record.seconds,
+            renders=renders * problem.draws,
         )
+        self.run.record(row if evaluation.judgement is None else judged(row, evaluation.judgement))
 
     def trial(
         self,
         kind: str,
         number: int,
         spp: int,
-        trial: Trial,
+        trial: Judgement,
         seed: int,
         u: Tensor,
         *,
@@ -173,42 +165,6 @@ class Recorder:
         """
         if self.run is None or self._memory.holds(kind, number):
             return
-        labels = self._problem.model.labels
         told = self._problem.describe(u, seed) if described else {}
         told = {**told, **(self._problem.conditions_of(u, seed) if drawn else {})}
-        self.run.record(trial_row(kind, number, seed, spp, trial, labels, told, sought=kind not in MEASURED))
-
-
-def trial_row(
-    kind: str,
-    number: int,
-    seed: int,
-    spp: int,
-    trial: Trial,
-    labels: Sequence[str],
-    values: Mapping[str, Any] | None = None,
-    *,
-    sought: bool = True,
-) -> Row:
-    """Return what the store keeps of a trial; arguments as for `Recorder.trial`.
-
-    Args:
-        labels: of the model.
-        values: that describe it.
-        sought: whether a search sought some answer there, so that there is a success.
-    """
-    return Row(
-        kind=kind,
-        step=number,
-        seed=seed,
-        spp=spp,
-        objective=trial.margin,
-        success=trial.wrong if sought else None,
-        correct=trial.right,
-        margin=trial.margin if trial.wrong_lead is None else trial.wrong_lead,
-        label=labels[trial.predicted],
-        label_index=trial.predicted,
-        probability=trial.probability,
-        values=values or {},
-        renders=1,
-    )
+        self.run.record(trial_row(kind, number, seed, spp, trial, told, sought=kind not in MEASURED))

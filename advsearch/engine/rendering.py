@@ -17,7 +17,6 @@ from advsearch.controls.clean import sentences
 from advsearch.engine.loading import Controls, Scene, as_controls, framed, load_scene, make_renderer
 from advsearch.errors import InputError
 from advsearch.models import Model, load_model
-from advsearch.models.model import Answer
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.contact_sheet import contact_sheet
 from advsearch.runs.files import placed_by
@@ -27,6 +26,10 @@ from advsearch.runs.results.render import MeshUp, RenderResult, ViewAnswers
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import ImageFormation, to_8_bit
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER
+from advsearch.tasks import Answer, Task, make_task
+
+MOST_ANSWERS = 5
+"""Answers of the model that are kept of a picture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +40,7 @@ class View:
         azimuth: of the camera, degrees.
         picture: (H, W, 3) display-referred sRGB in [0, 1], rounded to 8 bits: what the model sees.
         linear: (H, W, 3) linear radiance times the gain, before what controls do to the finished picture.
-        answers: the model's likeliest classes, the first one first.
+        answers: what the model says, the likeliest first.
     """
 
     azimuth: float
@@ -53,6 +56,7 @@ class Rendering:
     Attributes:
         scene: what was rendered.
         model: name of the model that was asked.
+        task: name of the task that it was asked to do.
         formation: how the pictures were formed, with size and gain.
         spp: samples a pixel.
         views: one, or one for each azimuth.
@@ -61,6 +65,7 @@ class Rendering:
 
     scene: SceneDescription
     model: str
+    task: str
     formation: ImageFormation
     spp: int
     views: tuple[View, ...]
@@ -90,10 +95,7 @@ class Rendering:
 
     def sheet(self) -> Any:
         """Return all views side by side, (h, w, 3) float32 sRGB in [0, 1], with azimuth and answers under each."""
-        captions = [
-            [f"azimuth {view.azimuth:g}", *(f"{one.probability:.1%} {one.label}" for one in view.answers)]
-            for view in self.views
-        ]
+        captions = [[f"azimuth {view.azimuth:g}", *map(_caption, view.answers)] for view in self.views]
         return contact_sheet([view.picture.numpy() for view in self.views], captions)
 
     def result(self, out: Path, size: tuple[int, int], warnings: Sequence[str]) -> RenderResult:
@@ -110,6 +112,7 @@ class Rendering:
             object=self.scene.object_spec or self.scene.object.name,
             environment=self.scene.environment_spec or self.scene.environment.name,
             model=self.model,
+            task=self.task,
             spp=self.spp,
             image_formation=Formation.of(self.formation),
             gain=self.formation.gain,
@@ -123,6 +126,7 @@ def render(
     scene: Scene | str | Path,
     model: Model | nn.Module | str | Path = "reference",
     *,
+    task: str | Task = "classification",
     controls: Controls = (),
     around: int | None = None,
     resolution: int | tuple[int, int] | None = None,
@@ -137,6 +141,7 @@ def render(
     Args:
         scene: from `load_scene`, or what that takes.
         model: from `load_model`, or what that takes.
+        task: what says the model's answers: a name, or an instance.
         controls: what differs from the scene: names, instances, or a mapping from names to settings. A parameter with
             a range stays where a search would start.
         around: number of views, from azimuths all around the object; None for one, from the scene's own camera.
@@ -152,7 +157,9 @@ def render(
             control.
     """
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
-    model = model if isinstance(model, Model) else load_model(model)
+    made = make_task(task)
+    model = load_model(model, read=made.reader)
+    asked = made.on(model)
     instances = as_controls(controls)
     if around is not None and any(_turns(one) for one in instances):
         raise InputError("around: sets camera.azimuth itself, and `controls` fixes it; leave one of them out")
@@ -169,14 +176,19 @@ def render(
         with torch.no_grad():
             radiance = renderer.radiance(space.start, seeds.stream(seed, "pictures"), spp)
             picture = to_8_bit(space.picture(space.start, formation.display(radiance)))
+            answers = asked.answers(model(picture), MOST_ANSWERS)[0]
         azimuth = description.number("camera.azimuth")
-        views.append(View(azimuth, picture, radiance * formation.gain, model.answers(picture)))
+        views.append(View(azimuth, picture, radiance * formation.gain, answers))
         progress.advance(1)
     assert formation is not None
     own = scene.description
     warnings = (*own.object.notes, *own.environment.warnings, *sentences(space.moved))
     shown = replace(own, environment_spec=space.environment or own.environment_spec)
-    return Rendering(shown, model.name, formation, spp, tuple(views), warnings)
+    return Rendering(shown, model.name, made.name, formation, spp, tuple(views), warnings)
+
+
+def _caption(answer: Answer) -> str:
+    return answer.label if answer.probability is None else f"{answer.probability:.1%} {answer.label}"
 
 
 def writable(path: str | Path, views: int) -> Path:

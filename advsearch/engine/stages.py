@@ -18,9 +18,7 @@ from advsearch.attacks import (
     Policy,
     SearchResult,
     StepRecord,
-    Trial,
     Verification,
-    already_wrong,
     choose_spp,
     count_right,
     make_policy,
@@ -31,7 +29,6 @@ from advsearch.attacks import search as run_search
 from advsearch.attacks import verify as run_verify
 from advsearch.attacks.sample_count import most_samples
 from advsearch.attacks.smallest import ATTEMPTS, MOST_CHECKS, ROUNDS, confirmed, scaled, smallest
-from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.config import AttackConfig
 from advsearch.engine.bounces import WORTH, bounces_of, most_pictures
 from advsearch.engine.gradients import inside
@@ -41,6 +38,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.samples import search_samples, verification_ladder
 from advsearch.report.wording import count
+from advsearch.tasks import Judgement
 
 FIRST_LOOK = 4
 """Renders of the clean configuration before the search; wrong in all of them, it goes through the full trials first."""
@@ -74,7 +72,7 @@ class Attack:
     stages: Stages
     findings: Findings = field(default_factory=Findings)
     _clean_spp: int = 0
-    _probed: dict[tuple[str, int], Trial] = field(default_factory=dict)
+    _probed: dict[tuple[str, int], Judgement] = field(default_factory=dict)
 
     def carry_out(self) -> Findings:
         """Do everything; what an interrupt leaves undone is missing from the findings."""
@@ -94,13 +92,6 @@ class Attack:
             self.findings.interrupted = True
         self.stages.end()
         return self.findings
-
-    @property
-    def rule(self) -> Rule:
-        """When the answer counts as verified."""
-        if self.problem.goal.minimise:
-            return EASIER
-        return WORST_CASE if self.problem.conditions is None else OVER_CONDITIONS
 
     # ---- before the search ------------------------------------------------------------------------------------------
 
@@ -184,12 +175,12 @@ class Attack:
             on_trial=lambda *_: self._advance(),
         )
         looks_right = any(trial.right for trial in findings.first_look)
-        if not self.rule.control or (looks_right and not config.smallest):
+        if not self.problem.rule.control or (looks_right and not config.smallest):
             return True
         self.choose_spp({"clean": start})
         self._begin_trials("checking the clean scene with fresh renders", config.trial_count)
         self.clean_trials()
-        return not already_wrong(count_right(findings.clean, findings.spp))
+        return not self.problem.rule.already_wrong(count_right(findings.clean, findings.spp))
 
     # ---- searching --------------------------------------------------------------------------------------------------
 
@@ -310,13 +301,13 @@ class Attack:
             number, count = count, count + 1
             trial = self._probed.get((kind, number))
             if trial is None:
-                trial = self.memory.trial(kind, number, self.problem.goal)
+                trial = self.memory.trial(kind, number)
                 trial = trial or self.problem.trial(u, seed, spp, drawn=False)
                 self.recorder.trial(kind, number, spp, trial, seed, u, drawn=False)
                 self.findings.verification_renders += 1
                 self._probed[kind, number] = trial
             self.stages.progress.advance(spp)
-            return trial.margin
+            return trial.score
 
         return margin
 
@@ -355,25 +346,25 @@ class Attack:
             seed=self.config.seed,
             trials=self.config.trial_count,
             clean=self.findings.clean,
-            rule=self.rule,
+            rule=self.problem.rule,
             on_trial=self._teller(kind, self.problem.domain.project(found.best_u)),
         )
 
-    def _trial(self, kind: str) -> Callable[[Tensor, int, int], Trial]:
+    def _trial(self, kind: str) -> Callable[[Tensor, int, int], Judgement]:
         """Trials of one kind, one after the other; those that are stored are read back."""
         count = 0
 
-        def trial(u: Tensor, seed: int, spp: int) -> Trial:
+        def trial(u: Tensor, seed: int, spp: int) -> Judgement:
             nonlocal count
             number, count = count, count + 1
-            return self.memory.trial(kind, number, self.problem.goal) or self.problem.trial(u, seed, spp)
+            return self.memory.trial(kind, number) or self.problem.trial(u, seed, spp)
 
         return trial
 
-    def one_trial(self, kind: str, number: int, u: Tensor) -> Trial:
+    def one_trial(self, kind: str, number: int, u: Tensor) -> Judgement:
         """One trial of a configuration of its own, with a seed of its own; read back if it is stored."""
         seed, spp = seeds.stream(self.config.seed, kind, number), self.findings.spp
-        trial = self.memory.trial(kind, number, self.problem.goal) or self.problem.trial(u, seed, spp)
+        trial = self.memory.trial(kind, number) or self.problem.trial(u, seed, spp)
         self.recorder.trial(kind, number, spp, trial, seed, u, described=self.problem.domain.dim <= MANY)
         self.findings.verification_renders += 1
         return trial
@@ -383,7 +374,7 @@ class Attack:
         if self.findings.sample_count is None:
             self.choose_spp({"clean": self.problem.domain.start})
         self._begin_trials("trying random configurations", self.config.average, name="average", flags="`average`")
-        found: list[Trial] = []
+        found: list[Judgement] = []
         for number in range(self.config.average):
             generator = torch.Generator().manual_seed(seeds.stream(self.config.seed, "draw", number))
             u = self.problem.domain.sample(generator)[0]
@@ -414,8 +405,8 @@ class Attack:
     def _advance(self, steps: int = 1) -> None:
         self.stages.progress.advance(steps)
 
-    def _teller(self, kind: str, u: Tensor) -> Callable[[str, int, Trial], None]:
-        def on_trial(group: str, number: int, trial: Trial) -> None:
+    def _teller(self, kind: str, u: Tensor) -> Callable[[str, int, Judgement], None]:
+        def on_trial(group: str, number: int, trial: Judgement) -> None:
             seed = seeds.stream(self.config.seed, "verification", number)
             self.recorder.trial(kind, number, self.findings.spp, trial, seed, u)
             self.findings.verification_renders += 1
@@ -426,8 +417,8 @@ class Attack:
 
 def _rank(verification: Verification) -> tuple[bool, int, float]:
     """How bad an answer is for the model: found, then successes, then the mean margin."""
-    margins = [trial.margin for trial in verification.adversarial_trials]
-    mean = sum(margins) / len(margins)
+    scores = [trial.score for trial in verification.adversarial_trials]
+    mean = sum(scores) / len(scores)
     mean = mean if mean == mean else -math.inf
     return verification.ending is Ending.FOUND, verification.adversarial.successes, mean
 
@@ -458,9 +449,9 @@ def find_smallest(attack: Attack) -> None:
         return results[-1].best_u
 
     def passes(u: Tensor, check: int) -> bool:
-        failures, allowed = 0, config.trial_count - attack.rule.needed(config.trial_count)
+        failures, allowed = 0, problem.rule.allowed(config.trial_count)
         for number in range(config.trial_count):
-            failures += not attack.one_trial(f"check {check}", number, u).wrong
+            failures += not attack.one_trial(f"check {check}", number, u).success
             attack._advance()
             if failures > allowed:
                 return False

@@ -197,7 +197,7 @@ def _pooled(value: Tensor, axis: int) -> Tensor:
 
 def _centred_logits(model: Model) -> Read:
     def read(x: Tensor) -> Tensor:
-        logits = model.ask(x)
+        logits: Tensor = model.ask(x)
         return logits - logits.mean(dim=1, keepdim=True)
 
     return read

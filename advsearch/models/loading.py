@@ -15,7 +15,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import files, imported, reference
 from advsearch.models import preprocessing as pre
 from advsearch.models.labels import fitting_labels, read_labels
-from advsearch.models.model import Model
+from advsearch.models.model import Model, Read
 from advsearch.models.preprocessing import Preprocessing
 from advsearch.models.probe import probe
 from advsearch.models.source import Source, source_of
@@ -50,6 +50,7 @@ def load_model(
     layout: str | None = None,
     channels: str | None = None,
     max_batch: int | None = None,
+    read: Read | None = None,
 ) -> Model:
     """Load a model, look at its answers once, and return it as a function from images to logits.
 
@@ -68,6 +69,8 @@ def load_model(
         layout: ``"NCHW"`` (default) or ``"NHWC"``.
         channels: ``"RGB"`` (default) or ``"BGR"``.
         max_batch: the most images at once; default 64, or what the program allows.
+        read: what finds the output in the network's answer to so many images, where it is not logits: a tensor (N, ...)
+            or a list of N things. A task that is not classification has one (`Task.reader`).
 
     Raises:
         UnknownNameError: `spec` is a name that means nothing; near matches are given.
@@ -91,6 +94,7 @@ def load_model(
     names, origin = _given_labels(labels)  # first, because loading a model takes seconds
     found = _find(spec)
     if isinstance(found, Model):
+        found = dataclasses.replace(found, read=read or found.read)
         return _relabelled(found, names, origin, name, given)
     low, high = found.batch_limits
     bare = Model(
@@ -101,6 +105,7 @@ def load_model(
         batch_limits=(low, max(low, min(high, _positive("max_batch", max_batch, high)))),
         dtype=found.dtype,
         device=found.device,
+        read=read,
     )
     return probe(bare, found.labels if names is None else names, origin)
 

@@ -1,4 +1,4 @@
-"""The model: any network, seen as a differentiable function from display-referred images to logits."""
+"""The model: any network, seen as a differentiable function from display-referred images to its output."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from advsearch.models.preprocessing import Preprocessing
 
 CPU = torch.device("cpu")
 
+Read = Callable[[Any, int], Any]
+"""From what a network answered to so many images, to its output; ValueError says what was expected."""
+
 #: Probabilities below this count as this before the logarithm is taken (its derivative stays finite in float32).
 SMALLEST_PROBABILITY = 1e-30
 
@@ -24,21 +27,6 @@ RANGE_TOLERANCE = 0.01
 
 class ModelWarning(UserWarning):
     """A model that works, but not as an attack would like it to (probabilities, randomness, no gradient)."""
-
-
-@dataclass(frozen=True)
-class Answer:
-    """One class as an answer to a picture.
-
-    Attributes:
-        label: its name.
-        index: its number.
-        probability: in [0, 1].
-    """
-
-    label: str
-    index: int
-    probability: float
 
 
 @final
@@ -56,7 +44,9 @@ class Model:
         differentiable: a gradient of the logits reaches the image.
         named: False if `labels` are placeholders.
         dtype: the type of the network's floating-point input.
-        device: where the network lives. Images go there, logits come back.
+        device: where the network lives. Images go there, the output comes back.
+        read: from what the network answers to so many images, to its output: a tensor (N, ...), or a list with one
+            thing for each; None for logits.
     """
 
     module: Callable[[Tensor], Any] = field(repr=False)
@@ -69,10 +59,12 @@ class Model:
     named: bool = True
     dtype: torch.dtype = torch.float32
     device: torch.device = CPU
+    read: Read | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         height, width = self.input_size
-        return f"Model({self.name!r}, {self.classes} classes, {height} x {width} pixels)"
+        classes = f"{self.classes} classes, " if self.labels else ""
+        return f"Model({self.name!r}, {classes}{height} x {width} pixels)"
 
     @property
     def input_size(self) -> tuple[int, int]:
@@ -84,8 +76,8 @@ class Model:
         """The number of classes."""
         return len(self.labels)
 
-    def __call__(self, images: Tensor) -> Tensor:
-        """Return the logits of one image or a batch; differentiable with respect to the images.
+    def __call__(self, images: Tensor) -> Any:
+        """Return the output for one image or a batch; differentiable with respect to the images.
 
         Args:
             images: (H, W, 3) or (N, H, W, 3), floating, display-referred sRGB in [0, 1]. Non-finite values pass
@@ -93,32 +85,20 @@ class Model:
 
         Returns:
             Logits (N, classes), float32, on the device of the images; N is 1 for a single image. Of a network that
-            answers with probabilities p, log p.
+            answers with probabilities p, log p. Where there is `read`, what that returns.
 
         Raises:
             InputError: not an image, or values that are clearly not in [0, 1].
-            ModelError: the network's answer is not (N, classes).
+            ModelError: the network's answer is not (N, classes), or `read` finds no output in it.
         """
         images = checked_images(images)
         parts = [self.ask(x)[:count] for x, count in self.batches(images)]
-        logits = parts[0] if len(parts) == 1 else torch.cat(parts)
-        return logits.to(images.device)
+        together = joined(parts)
+        return each_tensor(together, lambda one: one.to(images.device))
 
     def label_set(self, text: str | int | Sequence[str | int]) -> LabelSet:
         """Return the classes that `text` names, e.g. ``"coffee mug,cup"`` or ``"#504"``; see `find_label_set`."""
         return find_label_set(text, self.labels, named=self.named)
-
-    def answers(self, image: Tensor, count: int = 5) -> tuple[Answer, ...]:
-        """Return what the model says of one picture: its likeliest classes, the first one first.
-
-        Args:
-            image: (H, W, 3), as for a call.
-            count: how many, at most as many as there are classes.
-        """
-        with torch.no_grad():
-            likeliest = self(image)[0].softmax(dim=0).topk(min(count, self.classes))
-        pairs = zip(likeliest.indices.tolist(), likeliest.values.tolist(), strict=True)
-        return tuple(Answer(self.labels[index], index, probability) for index, probability in pairs)
 
     def batches(self, images: Tensor) -> Iterator[tuple[Tensor, int]]:
         """Yield what the network is given for images (N, H, W, 3), and how many rows of each part count.
@@ -132,8 +112,10 @@ class Model:
             full = torch.cat([part, part[-1:].expand(missing, -1, -1, -1)]) if missing > 0 else part
             yield self.preprocessing(full.to(device=self.device, dtype=torch.float32)).to(self.dtype), len(part)
 
-    def ask(self, x: Tensor) -> Tensor:
-        """Return the logits (N, classes), float32, for a batch as `batches` yields it."""
+    def ask(self, x: Tensor) -> Any:
+        """Return the output for a batch as `batches` yields it."""
+        if self.read is not None:
+            return read_by(self.read, self.module(x), len(x), self.name)
         logits = logits_of(self.module(x), len(x), self.classes, self.name)
         return logits.clamp_min(SMALLEST_PROBABILITY).log() if self.probabilities else logits
 
@@ -153,6 +135,46 @@ def checked_images(images: Tensor) -> Tensor:
             f"{expected}, got values from {low:.4g} to {high:.4g}; `value_range` is for the network's side"
         )
     return images if images.dim() == 4 else images.unsqueeze(0)
+
+
+def read_by(read: Read, answer: Any, count: int, name: str) -> Any:
+    """Return the output that a reader finds in a network's answer.
+
+    Raises:
+        ModelError: it finds none, or another number than `count`.
+    """
+    try:
+        output = read(answer, count)
+    except ValueError as error:
+        raise ModelError(
+            f"model {name}: {error}, got {described(answer)}; wrap the network, or ask for another task"
+        ) from None
+    if len(output) != count:
+        raise ModelError(f"model {name}: expected an output for each of {count} images, got {len(output)}")
+    return output
+
+
+def described(answer: Any) -> str:
+    """Return what an answer of a network is: its type, and the shape of a tensor."""
+    return f"one of shape {tuple(answer.shape)}" if isinstance(answer, Tensor) else type(answer).__name__
+
+
+def joined(parts: Sequence[Any]) -> Any:
+    """Return the outputs of several batches as one: tensors (N, ...) and lists are put end to end."""
+    if len(parts) == 1:
+        return parts[0]
+    return torch.cat(list(parts)) if isinstance(parts[0], Tensor) else [one for part in parts for one in part]
+
+
+def each_tensor(output: Any, function: Callable[[Tensor], Tensor]) -> Any:
+    """Return an output with a function of every tensor in it in that one's place."""
+    if isinstance(output, Tensor):
+        return function(output)
+    if isinstance(output, Mapping):
+        return {name: each_tensor(one, function) for name, one in output.items()}
+    if isinstance(output, (list, tuple)):
+        return [each_tensor(one, function) for one in output]
+    return output
 
 
 def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 from advsearch.errors import ModelError
 from advsearch.models.deadline import TookTooLong, within
 from advsearch.models.labels import fitting_labels
-from advsearch.models.model import Model, ModelWarning, logits_of
+from advsearch.models.model import Model, ModelWarning, each_tensor, logits_of, read_by
 
 #: Rows that are non-negative and sum to 1 within this are taken for probabilities.
 PROBABILITY_TOLERANCE = 1e-3
@@ -48,14 +48,17 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
     with torch.no_grad():
         rows = torch.cat([_run(model, grey), _run(model, noise)])
         again = _run(model, grey)
+    logits = model.read is None
     if not bool(torch.isfinite(rows).all()):
         which = "grey" if not bool(torch.isfinite(rows[0]).all()) else "noise"
+        what = "logits" if logits else "numbers"
         raise ModelError(
-            f"model {model.name}: expected finite logits, got NaN or infinity for a {which} image; "
+            f"model {model.name}: expected finite {what}, got NaN or infinity for a {which} image; "
             "check its weights and the value range and normalisation that it expects"
         )
-    found = fitting_labels(rows.shape[1], labels, labels_source, model.name)
-    fields: dict[str, Any] = {"labels": found, "named": labels is not None, "probabilities": _probabilities(rows)}
+    found = fitting_labels(rows.shape[1], labels, labels_source, model.name) if logits else labels or ()
+    fields: dict[str, Any] = {"labels": found, "named": labels is not None}
+    fields["probabilities"] = logits and _probabilities(rows)
     if fields["probabilities"]:
         _warn(
             f"model {model.name} answers with probabilities. Their logarithm is used, so that margins are log-odds, "
@@ -76,11 +79,30 @@ def _test_images(model: Model) -> tuple[Tensor, Tensor]:
 
 
 def _run(model: Model, images: Tensor) -> Tensor:
-    """Return the raw answer of the network for images (N, H, W, 3) as (N, classes) float32 on the CPU."""
+    """Return the raw answer of the network for images (N, H, W, 3) as (N, classes) float32 on the CPU.
+
+    An output of another kind comes as three numbers of each image, (N, 3); see `_numbers`.
+    """
     padded = torch.cat([images, images[-1:].expand(max(model.batch_limits[0] - len(images), 0), -1, -1, -1)])
     x = model.preprocessing(padded.to(model.device)).to(model.dtype)
     output = _guarded(model, lambda: model.module(x))
-    return logits_of(output, len(padded), None, model.name)[: len(images)].cpu()
+    if model.read is None:
+        return logits_of(output, len(padded), None, model.name)[: len(images)].cpu()
+    outputs = read_by(model.read, output, len(padded), model.name)[: len(images)]
+    return torch.stack([_numbers(one) for one in outputs]).cpu()
+
+
+def _numbers(output: Any) -> Tensor:
+    """Return three numbers (3,) of the output for one image: how many it has, their sum, and the sum of their sizes."""
+    found: list[Tensor] = []
+
+    def keep(one: Tensor) -> Tensor:
+        found.append(one.float().flatten())
+        return one
+
+    each_tensor(output, keep)
+    values = torch.cat(found) if found else torch.zeros(0)
+    return torch.stack([torch.tensor(float(len(values))).to(values), values.sum(), values.abs().sum()])
 
 
 def _guarded(model: Model, call: Callable[[], Any]) -> Any:

@@ -252,7 +252,8 @@ def _figure(data: RunData, name: str, heading: str, caption: str) -> Html | None
 def _answer(answer: Any) -> str:
     if not answer or answer.get("label") is None:
         return "no answer recorded"
-    return f"{answer['label']}, {wording.percent(answer.get('probability'))}"
+    known = answer.get("probability") is not None
+    return f"{answer['label']}, {wording.percent(answer['probability'])}" if known else str(answer["label"])
 
 
 def _trial(name: str) -> str:

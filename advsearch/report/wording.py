@@ -11,6 +11,7 @@ Summary = Mapping[str, Any]
 NO_INTERVAL = "no interval"
 
 MARGIN = "how far the wrong answer leads the right one, in logits"
+OTHER_MARGIN = "over 0 where the answer is wrong"
 NORMS = {"linf": "the largest change of any value", "l2": "the root of the sum of all squared changes"}
 """What these words mean, said where they are first used."""
 
@@ -28,8 +29,8 @@ def verdict(summary: Summary) -> str:
     thing = f"this {noun(summary)}"
     verified = summary.get("verified") or {}
     if ending == "already wrong":
-        wrong = _called(summary.get("clean"))
-        return f"The model already calls {thing} {wrong}: nothing was changed and nothing counts as found."
+        wrong = _calls(summary, thing, summary.get("clean"))
+        return f"The model already {wrong}: nothing was changed and nothing counts as found."
     if not verified.get("trials"):
         return f"{ending[:1].upper()}{ending[1:]} after {count(summary.get('steps'), 'step')}; nothing is verified."
     rate = rate_text(verified) + _each(summary)
@@ -57,7 +58,7 @@ def remarks(summary: Summary) -> list[str]:
         said.append(
             "The random search beside it found a worse configuration than the policy did "
             f"({tally(own)} with a margin of {own.get('margin', 0.0):.2f}); that of the random search is the answer. "
-            f"The margin is {MARGIN}."
+            f"The margin is {margin_text(summary)}."
         )
     else:
         said += _against_random(summary)
@@ -72,6 +73,16 @@ def noun(summary: Summary) -> str:
 def title(summary: Summary) -> str:
     """Return a short name for the run: ``mug, texture``."""
     return ", ".join([noun(summary), *controls(summary)])
+
+
+def margin_text(summary: Summary) -> str:
+    """Return what the margin of the run's task is, as a clause."""
+    return MARGIN if classifies(summary) else OTHER_MARGIN
+
+
+def classifies(summary: Summary) -> bool:
+    """Return whether answers are names of classes."""
+    return bool(summary.get("task", "classification") == "classification")
 
 
 def controls(summary: Summary) -> list[str]:
@@ -247,11 +258,14 @@ def _how_it_errs(summary: Summary, verified: Mapping[str, Any], thing: str) -> s
         return f"The model recognises {thing}, more surely than in the clean scene,"
     answers = verified.get("labels") or {}
     if len(answers) == 1:
-        return f"The model calls {thing} {with_article(next(iter(answers)))}"
+        return f"The model {_calls(summary, thing, {'label': next(iter(answers))})}"
     if answers:
         most = max(answers, key=lambda label: answers[label])
         what = "takes {} for one of the targets" if targets(summary) else "is wrong about {}"
-        return f"The model {what.format(thing)}, most often calling it {with_article(most)},"
+        often = f"calling it {with_article(most)}" if classifies(summary) else f'answering "{most}"'
+        return f"The model {what.format(thing)}, most often {often},"
+    if not classifies(summary):
+        return f"The model is wrong about {thing}"
     return f"The model takes {thing} for something else ({_called(summary.get('adversarial'))})"
 
 
@@ -291,6 +305,14 @@ def _against_random(summary: Summary) -> list[str]:
     if theirs == ours and ours > 0:
         return [f"Random search with as many renders does as well: {tally(random)}. The policy adds nothing here."]
     return []
+
+
+def _calls(summary: Summary, thing: str, answer: Any) -> str:
+    """Return ``calls this mug a vase``, or ``answers "0.81" for this mug`` where answers are no names."""
+    if classifies(summary):
+        return f"calls {thing} {_called(answer)}"
+    label = (answer or {}).get("label") or "something else"
+    return f'answers "{label}" for {thing}'
 
 
 def _called(answer: Any) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from advsearch.attacks import Trial
+from advsearch.tasks import Judgement
 
 MOST_CELLS = 4096
 """Cells of a map; with more pairs of values there is none."""
@@ -28,7 +28,7 @@ class Cells:
         self._finite = [[0] * wide for _ in range(high)]
         self._margin = [[0.0] * wide for _ in range(high)]
 
-    def add(self, places: Sequence[int], trial: Trial) -> None:
+    def add(self, places: Sequence[int], trial: Judgement) -> None:
         """Count one configuration by its places on the axes."""
         if not self.shown:
             return

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 from advsearch.config import SweepConfig
 from advsearch.controls import CONTROLS, Control, Space, make_space
 from advsearch.controls.base import Value
-from advsearch.engine.answers import right_answers
+from advsearch.engine.answers import check_truth, facts_of
 from advsearch.engine.domains import domain_of
 from advsearch.engine.loading import Scene, framed
 from advsearch.engine.sweeps.axes import Axis, on_grid
 from advsearch.engine.sweeps.points import BINS, Drawn, Points
 from advsearch.errors import InputError
-from advsearch.models import LabelSet, Model
+from advsearch.models import Model
 from advsearch.scene.description import ENVIRONMENT
+from advsearch.tasks import Facts, Task
+from advsearch.tasks.base import Truth
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,7 @@ class Job:
         config: what was asked for.
         places: the scenes.
         models: the networks, loaded.
+        tasks: what judges the output of each.
         controls: what is drawn by chance.
         axes: of the grid.
         samples: draws at each point of the grid.
@@ -59,6 +62,7 @@ class Job:
     config: SweepConfig
     places: tuple[Place, ...]
     models: tuple[Model, ...]
+    tasks: tuple[Task, ...]
     controls: tuple[Control, ...]
     axes: tuple[Axis, ...]
     samples: int
@@ -84,13 +88,27 @@ class Job:
         config = self.config
         return Points(space, domain_of(space.controls), self.axes, self.samples, config.sampler, config.seed)
 
-    def label_set(self, place: Place, model: Model) -> LabelSet:
-        """The right answers: what was said, or else the object's own label.
+    def truth(self, place: Place, model: int, values: Mapping[str, Value]) -> Truth:
+        """What is true of a configuration, as the task of a model needs it.
+
+        Args:
+            place: the scene.
+            model: number of the model.
+            values: the configuration as it is described.
+        """
+        return self.tasks[model].truth(self._facts(place, values))
+
+    def _facts(self, place: Place, values: Mapping[str, Value]) -> Facts:
+        return facts_of(place.scene, place.object, self.config.label, lambda: values)
+
+    def check_truths(self, place: Place) -> None:
+        """Refuse a scene of which a task cannot say what is right.
 
         Raises:
-            InputError: the model has no such class, or the object has no label.
+            InputError: a model has no such class, say, or the object has no label.
         """
-        return right_answers(model, place.scene, place.object, self.config)
+        for task, model in zip(self.tasks, self.models, strict=True):
+            check_truth(task, model, place.scene, self._facts(place, {}), self.config)
 
 
 def check_scenes(places: Sequence[Place], controls: Sequence[Control], axes: Sequence[Axis]) -> None:
@@ -135,8 +153,7 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
         spaces = [job.space(place, size) for size in dict.fromkeys(job.sizes)]
         _check_draws(place, spaces[0])
         found += [(place, job.points(space)) for space in spaces]
-        for model in job.models:
-            job.label_set(place, model)
+        job.check_truths(place)
     first = found[0][1]
     for place, points in found:
         if points.drawn_numbers != first.drawn_numbers:

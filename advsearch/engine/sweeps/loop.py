@@ -8,24 +8,23 @@ that was stopped goes on bit for bit as one that was not.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from advsearch.attacks import Trial
 from advsearch.attacks.draws import Seeds
 from advsearch.attacks.product import batches
 from advsearch.controls.base import Value
 from advsearch.engine.record import Stages
+from advsearch.engine.rows import judgement_of, trial_row
 from advsearch.engine.samples import search_samples
 from advsearch.engine.sweeps.job import Job, check_all
 from advsearch.engine.sweeps.points import Picks, Points
 from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally
 from advsearch.engine.sweeps.view import View
-from advsearch.engine.sweeps.worst import check_worst, trial_of
+from advsearch.engine.sweeps.worst import check_worst
 from advsearch.progress import Progress
 from advsearch.report.notebook import sweep_html
 from advsearch.report.studies import sweep_figure
@@ -34,6 +33,7 @@ from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
+from advsearch.tasks import Judgement
 
 KIND = "sweep"
 """Rows of the sweep; those of the trials are called "verification"."""
@@ -185,8 +185,7 @@ class Sweep:
             self.run.record(*rows)
         for k in range(len(numbers)):
             for model in range(self.models):
-                row = rows[k * self.models + model]
-                self._count(tally, view.number, picks, k, model, seen[model][k], str(row.label))
+                self._count(tally, view.number, picks, k, model, seen[model][k])
         self._rendered += len(numbers) * len(view.renderers)
         if view.not_finite and not self._not_finite:
             self._not_finite = True
@@ -195,28 +194,14 @@ class Sweep:
         self._tell(len(rows), tally)
 
     def _row(
-        self, number: int, model: int, seed: int, trial: Trial, values: dict[str, Value], seconds: float
+        self, number: int, model: int, seed: int, trial: Judgement, values: dict[str, Value], seconds: float
     ) -> store.Row:
-        network = self.job.models[model]
         place = self.job.places[number // self.per_scene]
         lit_by = self.points.lit_by(values)
         lit: dict[str, Value] = {} if lit_by is None else {"environment": {"value": lit_by, "unit": ""}}
-        known = not math.isnan(trial.margin)
-        return store.Row(
-            kind=KIND,
-            step=number * self.models + model,
-            seed=seed,
-            spp=self.samples,
-            objective=trial.margin if known else None,
-            correct=trial.right,
-            margin=trial.margin if known else None,
-            label=network.labels[trial.predicted],
-            label_index=trial.predicted,
-            probability=trial.probability,
-            values={**place.values, **lit, "model": {"value": network.name, "unit": ""}, **values},
-            seconds=seconds,
-            renders=int(self.job.sizes[model] not in self.job.sizes[:model]),
-        )
+        named = {**place.values, **lit, "model": {"value": self.job.models[model].name, "unit": ""}, **values}
+        row = trial_row(KIND, number * self.models + model, seed, self.samples, trial, named, sought=False)
+        return replace(row, seconds=seconds, renders=int(self.job.sizes[model] not in self.job.sizes[:model]))
 
     def _tell(self, count: int, tally: Tally) -> None:
         self._untold += count
@@ -248,11 +233,11 @@ class Sweep:
                 key, begin = (scene, block), block * READ_AT_ONCE
                 size = min(READ_AT_ONCE, self.per_scene - begin)
                 picks = self.points.picks(begin, size, scene * self.per_scene)
-            self._count(tally, scene, picks, place, model, trial_of(row), str(row.label))
+            self._count(tally, scene, picks, place, model, judgement_of(row))
         return tally
 
-    def _count(self, tally: Tally, scene: int, picks: Picks, k: int, model: int, trial: Trial, label: str) -> None:
-        tally.add((picks.number + k) * self.models + model, (*self._places[scene], model), picks, k, trial, label)
+    def _count(self, tally: Tally, scene: int, picks: Picks, k: int, model: int, trial: Judgement) -> None:
+        tally.add((picks.number + k) * self.models + model, (*self._places[scene], model), picks, k, trial)
 
     # ---- the worst configuration ------------------------------------------------------------------------------------
 
@@ -264,9 +249,9 @@ class Sweep:
         points, picks, model = self._find(index)
         values = points.values(points.configurations(picks), picks)[0]
         row = self._row(picks.number, model, self._seeds(picks.number), seen, values, 0.0)
-        claim = {"label": row.label, "index": seen.predicted, "probability": seen.probability, "margin": seen.margin}
-        place, network = self.job.places[picks.number // self.per_scene], self.job.models[model]
-        right = list(self.job.label_set(place, network).names)
+        claim = {**asdict(seen.answer), "margin": seen.margin}
+        truth = self.job.truth(self.job.places[picks.number // self.per_scene], model, values)
+        right = list(self.job.tasks[model].truth_names(truth))
         facts = {"configuration": index, "values": dict(row.values), "seed": row.seed, "label_set": right}
         return {**facts, "claimed": claim, "verified": None}
 
@@ -302,6 +287,7 @@ class Sweep:
             "run": None if self.run is None else str(self.run.path),
             "object": config.object,
             "model": ",".join(model.name for model in job.models),
+            "task": config.task,
             "environment": self.points.environment or config.lit_by,
             "controls": [control.name for control in job.controls],
             "ending": ending,

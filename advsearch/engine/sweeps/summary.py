@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from advsearch.attacks import Trial, Trials, clopper_pearson
+from advsearch.attacks import Trials, clopper_pearson
+from advsearch.engine.rows import answered
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.engine.sweeps.cells import Cells
 from advsearch.engine.sweeps.points import Drawn, Picks
+from advsearch.tasks import Judgement
 
 FINISHED, INTERRUPTED = "finished", "interrupted"
 """How a sweep ends."""
@@ -84,7 +86,7 @@ class Tally:
         self, outer: Sequence[tuple[str, Sequence[str]]], axes: Sequence[Axis], drawn: Sequence[Drawn]
     ) -> None:
         self.seen = self.correct = self.not_finite = 0
-        self.worst: tuple[int, Trial] | None = None
+        self.worst: tuple[int, Judgement] | None = None
         self.answers: Counter[str] = Counter()
         self._outer = [Count(name, "", list(dict.fromkeys(values))) for name, values in outer]
         self._grid = [Count(axis.name, axis.unit, axis.values) for axis in axes]
@@ -95,7 +97,7 @@ class Tally:
         self._mapped = listed or several
         self._cells = Cells([(every[n].name, every[n].unit, every[n].values) for n in self._mapped])
 
-    def add(self, index: int, outer: Sequence[int], picks: Picks, place: int, trial: Trial, label: str) -> None:
+    def add(self, index: int, outer: Sequence[int], picks: Picks, place: int, trial: Judgement) -> None:
         """Count one configuration.
 
         Args:
@@ -117,8 +119,8 @@ class Tally:
             count.add(part, right)
         places = (*picks.digits[place], *reversed(outer), *picks.parts[place])
         self._cells.add([places[number] for number in self._mapped], trial)
-        if trial.wrong:
-            self.answers[label] += 1
+        if trial.success:
+            self.answers[trial.answer.label] += 1
         if trial.margin != trial.margin:
             self.not_finite += 1
         elif self.worst is None or trial.margin > self.worst[1].margin:
@@ -140,16 +142,11 @@ class Tally:
         }
 
 
-def verified(
-    trials: Sequence[Trial], labels: Sequence[str], spp: int, *, converged: bool, renders: int
-) -> dict[str, Any]:
+def verified(trials: Sequence[Judgement], spp: int, *, converged: bool, renders: int) -> dict[str, Any]:
     """Return what fresh renders of the worst configuration say; a success is a wrong answer."""
-    wrong = [trial for trial in trials if trial.wrong]
-    answers = Counter(labels[trial.predicted] for trial in wrong)
     return {
-        **Trials(len(wrong), len(trials), spp).to_dict(),
-        "labels": dict(answers.most_common()),
-        "margin": sum(trial.margin for trial in trials) / len(trials),
+        **Trials(sum(trial.success for trial in trials), len(trials), spp).to_dict(),
+        **answered(trials),
         "converged": converged,
         "renders": renders,
     }

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from advsearch.attacks import Trial, margin
 from advsearch.controls.base import Value
 from advsearch.engine.loading import framed, make_renderer
 from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.points import Picks, Points
-from advsearch.models import Model
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
+from advsearch.tasks import Judgement
 
 Values = dict[str, Value]
 
@@ -30,7 +30,6 @@ class View:
     Attributes:
         points: its configurations for each size of picture, on which what a control frames may depend.
         renderers: likewise.
-        labels: indices of the right answers for each model.
         not_finite: whether a picture had values that are not finite, which were set to 0.
     """
 
@@ -39,21 +38,21 @@ class View:
         self.number, self._job = number, job
         self.points: dict[tuple[int, int], Points] = {}
         self.renderers: dict[tuple[int, int], Renderer] = {}
-        for size in dict.fromkeys(job.sizes):
-            space = job.space(place, size)
+        self._spaces = {size: job.space(place, size) for size in dict.fromkeys(job.sizes)}
+        for size, space in self._spaces.items():
             description = framed(place.scene.description, size)
             self.renderers[size] = make_renderer(
                 description, space, size, config.denoise, config.seed, sampler=config.pixel_sampler
             )
             self.points[size] = job.points(space)
-        self.labels = tuple(job.label_set(place, model).indices for model in job.models)
+        self._truths = [None if task.varies else job.truth(place, k, {}) for k, task in enumerate(job.tasks)]
 
     @property
     def not_finite(self) -> bool:
         return any(renderer.non_finite for renderer in self.renderers.values())
 
-    def look(self, picks: Picks, noise: Sequence[int], spp: int) -> tuple[list[list[Trial]], list[list[Values]]]:
-        """Render configurations, round to 8 bits and classify.
+    def look(self, picks: Picks, noise: Sequence[int], spp: int) -> tuple[list[list[Judgement]], list[list[Values]]]:
+        """Render configurations, round to 8 bits, ask and judge.
 
         Args:
             picks: n of them.
@@ -68,14 +67,15 @@ class View:
             u = self.points[size].configurations(picks)
             pictures[size] = self._pictures(renderer, u, noise, spp)
             values[size] = self.points[size].values(u, picks)
-        models = zip(self._job.models, self._job.sizes, self.labels, strict=True)
-        seen = [judge(model, labels, pictures[size]) for model, size, labels in models]
-        return seen, [values[size] for size in self._job.sizes]
+        sizes = self._job.sizes
+        seen = [self._judged(model, pictures[size], values[size]) for model, size in enumerate(sizes)]
+        return seen, [values[size] for size in sizes]
 
-    def trial(self, number: int, u: Tensor, seed: int, spp: int) -> Trial:
+    def trial(self, number: int, u: Tensor, seed: int, spp: int) -> Judgement:
         """What one model says of one configuration."""
-        picture = self._pictures(self.renderers[self._job.sizes[number]], u[None], [seed], spp)
-        return judge(self._job.models[number], self.labels[number], picture)[0]
+        size = self._job.sizes[number]
+        picture = self._pictures(self.renderers[size], u[None], [seed], spp)
+        return self._judged(number, picture, [self._spaces[size].describe(u)])[0]
 
     def picture(self, number: int, u: Tensor, seed: int, spp: int) -> Tensor:
         """The picture (H, W, 3) that one model sees of one configuration."""
@@ -88,14 +88,17 @@ class View:
                 torch.stack([renderer(one, seed=seed, spp=spp) for one, seed in zip(u, noise, strict=True)])
             )
 
+    def _judged(self, number: int, pictures: Tensor, values: Sequence[Mapping[str, Value]]) -> list[Judgement]:
+        """What one model says of pictures (n, H, W, 3); a margin that is not finite becomes NaN."""
+        job = self._job
+        task, place = job.tasks[number], job.places[self.number]
+        with torch.no_grad():
+            output = job.models[number](pictures)
+            if not task.varies:
+                return [_finite(one) for one in task.judge(output, self._truths[number])]
+            truths = [job.truth(place, number, one) for one in values]
+            return [_finite(task.judge(output[k : k + 1], one)[0]) for k, one in enumerate(truths)]
 
-def judge(model: Model, labels: tuple[int, ...], pictures: Tensor) -> list[Trial]:
-    """Return what a model says of pictures (n, H, W, 3); a margin that is not finite becomes NaN."""
-    with torch.no_grad():
-        logits = model(pictures)
-        probabilities = logits.softmax(dim=1)
-        predicted = probabilities.argmax(dim=1)
-        chosen = probabilities.gather(1, predicted[:, None])[:, 0]
-        margins = margin(logits, pictures, labels)
-    found = zip(margins.tolist(), predicted.tolist(), chosen.tolist(), strict=True)
-    return [Trial(value if math.isfinite(value) else math.nan, index, share) for value, index, share in found]
+
+def _finite(seen: Judgement) -> Judgement:
+    return seen if math.isfinite(seen.margin) else replace(seen, score=math.nan, margin=math.nan, right=False)

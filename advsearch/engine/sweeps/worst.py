@@ -6,22 +6,23 @@ group: a trial counts where the model is wrong.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from torch import Tensor
 
-from advsearch.attacks import Trial, choose_spp, run_trials
+from advsearch.attacks import choose_spp, run_trials
 from advsearch.attacks.sample_count import most_samples
-from advsearch.engine.record import Stages, trial_row
+from advsearch.attacks.verification import RenderTrial
+from advsearch.engine.record import Stages
+from advsearch.engine.rows import judgement_of, trial_row
 from advsearch.engine.samples import verification_ladder
 from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.summary import verified
 from advsearch.engine.sweeps.view import View
-from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
 from advsearch.seeds import stream
+from advsearch.tasks import Judgement
 
 KIND, PROBES = "verification", "sample count worst"
 """Rows of the trials, and of the renders that chose their sample count."""
@@ -45,7 +46,7 @@ def check_worst(
     Returns:
         As `verified` in the summary; None without trials.
     """
-    config, network = job.config, job.models[model]
+    config = job.config
     if config.trials == 0:
         return None
     ladder = verification_ladder(config)
@@ -64,40 +65,34 @@ def check_worst(
         nonlocal number
         trial = probe(u, seed, spp)
         if run is not None and number >= known:
-            run.record(trial_row(PROBES, number, seed, spp, trial, network.labels, sought=False))
+            run.record(trial_row(PROBES, number, seed, spp, trial, sought=False))
         number += 1
         stages.progress.advance(spp)
-        return trial.margin
+        return trial.score
 
     count = choose_spp({"worst": margin_of}, seed=config.seed, ladder=ladder)
     hint = f"{config.trials} pictures of {count.spp} samples a pixel; `trials` or `verify_spp` shorten it"
     stages.begin("verification", "checking the worst configuration with fresh renders", config.trials, hint=hint)
     stored = _stored(run, KIND)
 
-    def keep(group: str, number: int, trial: Trial) -> None:
+    def keep(group: str, number: int, trial: Judgement) -> None:
         stages.progress.advance(1)
         if run is not None and number >= len(stored):
             seed = stream(config.seed, KIND, number)
-            run.record(trial_row(KIND, number, seed, count.spp, trial, network.labels, sought=False))
+            run.record(trial_row(KIND, number, seed, count.spp, trial, sought=False))
 
     render = _after(stored, lambda at, seed, spp: view.trial(model, at, seed, spp))
     trials = run_trials(render, u, spp=count.spp, seed=config.seed, trials=config.trials, on_trial=keep)
     settled = count.converged or len(ladder) == 1
     renders = count.renders + len(trials)
-    return verified(trials, network.labels, count.spp, converged=settled, renders=renders)
+    return verified(trials, count.spp, converged=settled, renders=renders)
 
 
-def _stored(run: RunDirectory | None, kind: str) -> list[Trial]:
-    return [] if run is None else [trial_of(row) for row in run.store.rows(kind)]
+def _stored(run: RunDirectory | None, kind: str) -> list[Judgement]:
+    return [] if run is None else [judgement_of(row) for row in run.store.rows(kind)]
 
 
-def trial_of(row: store.Row) -> Trial:
-    """Return what was seen of a configuration from its row."""
-    seen = math.nan if row.objective is None else row.objective
-    return Trial(seen, row.label_index or 0, math.nan if row.probability is None else row.probability)
-
-
-def _after(stored: Sequence[Trial], render: Callable[[Tensor, int, int], Trial]) -> Callable[[Tensor, int, int], Trial]:
+def _after(stored: Sequence[Judgement], render: RenderTrial) -> RenderTrial:
     """Return the trials that are stored, one after the other, then rendered ones."""
     left = list(reversed(stored))
     return lambda u, seed, spp: left.pop() if left else render(u, seed, spp)

@@ -10,14 +10,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from advsearch.attacks import POLICIES, Ending, Trial, make_policy, search, verify
-from advsearch.attacks.goal import Goal
+from advsearch.attacks import POLICIES, Ending, make_policy, search, verify
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.evaluation.stability.case import Case, Check, Outcome, holds
 from advsearch.evaluation.stability.search import Toy, numbers, quadratic
 from advsearch.models.model import Model
 from advsearch.models.preprocessing import Preprocessing
 from advsearch.seeds import stream
+from advsearch.tasks import Answer, Classification, Judgement
 
 LABELS = (0,)
 IMAGE = torch.zeros(1, 2, 2, 3)
@@ -69,14 +69,14 @@ def ties() -> Outcome:
     """The largest logits are equal: the gradient is shared, and a tie is no success."""
     rows = [[1.0, 1.0, 0.0, -1.0], [2.0, 2.0, 2.0, 2.0], [0.0, 3.0, 3.0, 3.0]]
     found = logits_like(rows)
-    goal = Goal(LABELS)
+    task = Classification()
     tied = torch.tensor(rows[:2])
     _, slope = _differentiated(torch.tensor([rows[2]]), FORMS["margin"], torch.float32)
     return Outcome(
         (
             *found.checks,
-            holds("a tie is no success", not bool((goal.score(tied) > 0.0).any())),
-            holds("a tie is right", bool(goal.right(tied).all())),
+            holds("a tie is no success", not bool((task.score(tied, LABELS) > 0.0).any())),
+            holds("a tie is right", all(one.right for one in task.judge(tied, LABELS))),
             Check("gradient of each of three tied rivals", float(slope[1:].min()), 1.0 / 3.0 - 1e-6, 1.0 / 3.0 + 1e-6),
         ),
         found.finite,
@@ -178,10 +178,10 @@ def chance(rate: float, runs: int = 100) -> Outcome:
             value = margin(stream(run, "search", index))
             return Toy(lambda v: 0.0 * v.sum() + value, domain, threshold=0.0)(u, index=index, gradient=False)
 
-        def trial(u: Tensor, seed: int, spp: int, run: int = run) -> Trial:
+        def trial(u: Tensor, seed: int, spp: int, run: int = run) -> Judgement:
             # the picture decides, so another configuration gives another answer
             value = margin(stream(run, f"trial {u.tolist()}", seed))
-            return Trial(value, int(value > 0.0), 0.6)
+            return Judgement(value, value, value <= 0.0, Answer("wrong" if value > 0.0 else "right"))
 
         result = search(noisy, domain, make_policy("random"), steps=STEPS, seed=run)
         claimed += result.ending is Ending.FOUND

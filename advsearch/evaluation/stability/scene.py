@@ -310,8 +310,7 @@ class Evaluator:
                 value = self.loss(renderer(u, seed=index, spp=self.spp * samples))
         objective = float(value)
         cost = (renderer.renders - renders) * samples
-        logits = torch.tensor([0.0, objective])
-        return Evaluation(objective, derivative, logits, objective > 0.0, renderer.non_finite - bad, cost)
+        return Evaluation(objective, derivative, objective > 0.0, renderer.non_finite - bad, cost)
 
 
 def domain_of(renderer: Renderer, start: Tensor | None = None) -> Domain:

@@ -27,7 +27,7 @@ class Toy:
         domain: where.
         scale: factor on the objective, as if it were in other units.
         disturb: what becomes of gradients.
-        broken: indices of evaluations whose objective is NaN, as are their gradient and logits.
+        broken: indices of evaluations whose objective is NaN, as is their gradient.
         threshold: an objective over it is a success.
     """
 
@@ -52,8 +52,7 @@ class Toy:
         if index in self.broken:
             objective = math.nan
             slope = None if slope is None else torch.full_like(slope, math.nan)
-        logits = torch.tensor([0.0, objective])
-        return Evaluation(objective, slope, logits, objective > self.threshold, cost=samples)
+        return Evaluation(objective, slope, objective > self.threshold, cost=samples)
 
 
 def numbers(start: Sequence[float]) -> Domain:

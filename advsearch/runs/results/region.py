@@ -38,6 +38,7 @@ class RegionResult(RunResult):
 
     object: str
     model: str
+    task: str = "classification"
     verdict: str | None = Field(default=None, description="`right` or `wrong`, at the centre")
     box: list[BoxSide] | None = Field(default=None, description="for each parameter, the range of its values")
     same: int | None = Field(default=None, description="fresh samples of the box that had that verdict")

@@ -10,11 +10,11 @@ from advsearch.runs.results.base import Fields, Formation, Result
 
 
 class ClassAnswer(Fields):
-    """One class as an answer to a picture."""
+    """One answer to a picture."""
 
-    label: str
-    index: int
-    probability: float
+    label: str = Field(description="in words")
+    index: int | None = Field(description="its number among the model's classes; null where there are none")
+    probability: float | None = Field(description="null where the model gives none")
 
 
 class ViewAnswers(Fields):
@@ -41,6 +41,7 @@ class RenderResult(Result):
     object: str
     environment: str
     model: str
+    task: str = "classification"
     spp: int = Field(description="samples a pixel")
     image_formation: Formation
     gain: float = Field(description="as in `image_formation`")

@@ -1,51 +1,26 @@
-"""What counts as success, and by which rule a claim is verified."""
+"""By which rule a claim is verified, on judgements alone."""
 
 from __future__ import annotations
-
-import math
 
 import pytest
 import torch
 from torch import Tensor
 
-from advsearch.attacks import Block, Domain, Ending, Trial, Trials, verdict, verify
-from advsearch.attacks.goal import Goal
+from advsearch.attacks import Block, Domain, Ending, Trials, verify
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
-from advsearch.errors import InputError
+from advsearch.tasks import Answer, Judgement
 
-LOGITS = torch.tensor([[3.0, 1.0, 0.0], [0.0, 2.0, 1.0], [0.0, 1.0, 4.0], [2.0, 2.0, 0.0], [math.nan, 0.0, 1.0]])
 DOMAIN = Domain(torch.zeros(1), (Block(1),))
 
 
-@pytest.mark.parametrize(
-    ("goal", "scores"),
-    [
-        (Goal((0,)), [-2.0, 2.0, 4.0, 0.0]),
-        (Goal((0,), targets=(2,)), [-3.0, -1.0, 3.0, -2.0]),
-        (Goal((0,), minimise=True), [2.0, -2.0, -4.0, 0.0]),
-    ],
-)
-def test_a_score_over_zero_is_a_success(goal: Goal, scores: list[float]) -> None:
-    assert goal.score(LOGITS)[:4].tolist() == scores
-    assert not bool(goal.score(LOGITS)[4] > 0.0)
-    assert goal.right(LOGITS).tolist() == [True, False, False, True, False]
-
-
-def test_a_target_must_be_wrong_and_there_is_none_to_minimise() -> None:
-    with pytest.raises(InputError, match=r"target: expected classes that are not right answers, got \[1\]"):
-        Goal((0, 1), targets=(1, 2))
-    with pytest.raises(InputError, match="minimise"):
-        Goal((0,), targets=(1,), minimise=True)
-
-
-def trials(values: list[tuple[float, bool]]) -> list[Trial]:
-    return [Trial(margin, 0, 1.0, right) for margin, right in values]
+def trials(values: list[tuple[float, bool]]) -> list[Judgement]:
+    return [Judgement(score, -score, right, Answer("")) for score, right in values]
 
 
 def run(rule: Rule, clean: list[tuple[float, bool]], found: list[tuple[float, bool]]) -> tuple[Ending, int, int]:
     answers = iter(trials(found))
 
-    def render(u: Tensor, seed: int, spp: int) -> Trial:
+    def render(u: Tensor, seed: int, spp: int) -> Judgement:
         return next(answers)
 
     result = verify(
@@ -86,4 +61,13 @@ def test_easier_means_right_and_surer_than_the_clean_scene() -> None:
 
 
 def test_no_trial_is_no_proof() -> None:
-    assert verdict(Ending.BUDGET_SPENT, Trials(10, 20, 1), Trials(0, 1, 1), OVER_CONDITIONS) is Ending.BUDGET_SPENT
+    assert OVER_CONDITIONS.verdict(Ending.BUDGET_SPENT, Trials(10, 20, 1), Trials(0, 1, 1)) is Ending.BUDGET_SPENT
+
+
+@pytest.mark.parametrize(
+    ("successes", "decided"), [(20, True), (19, True), (18, None), (2, None), (1, False), (0, False)]
+)
+def test_trials_of_one_configuration_decide_unless_they_depend_on_the_noise(
+    successes: int, decided: bool | None
+) -> None:
+    assert WORST_CASE.decided(successes, 20) is decided

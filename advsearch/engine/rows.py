@@ -1,0 +1,72 @@
+"""Judgements as a run keeps them: rows of its store, there and back, and their counts in a summary."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from advsearch.runs.store import Row
+from advsearch.tasks import Answer, Judgement
+
+
+def trial_row(
+    kind: str,
+    number: int,
+    seed: int,
+    spp: int,
+    trial: Judgement,
+    values: Mapping[str, Any] | None = None,
+    *,
+    sought: bool = True,
+) -> Row:
+    """Return what the store keeps of a trial; arguments as for `Recorder.trial`.
+
+    Args:
+        values: that describe it.
+        sought: whether a search sought some answer there, so that there is a success.
+    """
+    row = Row(
+        kind=kind,
+        step=number,
+        seed=seed,
+        spp=spp,
+        objective=_number(trial.score),
+        success=trial.success if sought else None,
+        values=values or {},
+        renders=1,
+    )
+    return judged(row, trial)
+
+
+def judged(row: Row, judgement: Judgement) -> Row:
+    """Return the row with what a task said of its picture."""
+    answer = judgement.answer
+    return replace(
+        row,
+        correct=judgement.right,
+        margin=_number(judgement.margin),
+        label=answer.label,
+        label_index=answer.index,
+        probability=answer.probability,
+    )
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def judgement_of(row: Row) -> Judgement:
+    """Return what was said of a trial from its row; in an old row, only the score says whether it was right."""
+    score = math.nan if row.objective is None else row.objective
+    margin = math.nan if row.margin is None else row.margin
+    right = score <= 0.0 if row.correct is None else row.correct
+    return Judgement(score, margin, right, Answer(row.label or "", row.label_index, row.probability))
+
+
+def answered(trials: Sequence[Judgement]) -> dict[str, Any]:
+    """Return how often each answer was given that is a success, and the mean score of the trials, in logits."""
+    labels = Counter(trial.answer.label for trial in trials if trial.success)
+    return {"labels": dict(labels.most_common()), "margin": sum(trial.score for trial in trials) / len(trials)}

@@ -1,0 +1,242 @@
+"""The contract of a task, and what it says of a picture.
+
+A task is the only place that knows what a model's output means. The search maximises a number of it, verification
+counts judgements, and store, tables and report print the words: none of them knows of classes.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar, TypeVar
+
+import torch
+from torch import Tensor
+
+from advsearch.errors import InputError
+from advsearch.models import Model
+
+Output = Any
+"""What a model answers to N pictures: a tensor (N, ...), or a list with one thing for each picture."""
+
+Truth = Any
+"""What is true of a scene, as its task needs it: the right classes, a number, boxes."""
+
+Own = TypeVar("Own", bound="Task")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One answer of a model to a picture.
+
+    Attributes:
+        label: in words.
+        index: its number among the model's classes; None where there are no classes.
+        probability: in [0, 1]; None where the model gives none.
+    """
+
+    label: str
+    index: int | None = None
+    probability: float | None = None
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What a task says of a model's output for one picture.
+
+    Attributes:
+        score: over 0 where it is a success, which is what is sought. NaN is none.
+        margin: how wrong the answer is, whatever is sought: over 0 exactly where it is not right.
+        right: whether the answer is right. NaN is not right.
+        answer: what the model says.
+        payload: what else is kept of it, as JSON values (boxes, masks); None where there is nothing.
+    """
+
+    score: float
+    margin: float
+    right: bool
+    answer: Answer
+    payload: Any = None
+
+    @property
+    def success(self) -> bool:
+        """Whether the output is what is sought."""
+        return self.score > 0.0
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a scene gives a task to judge by, in one configuration.
+
+    Attributes:
+        object: what it is called, for messages.
+        label: what was said to be right (the setting `label`); None if nothing was.
+        own_label: what the object says it is; None if it does not.
+        describe: the numbers of the configuration by parameter ("pose.yaw"), in the units that rows have.
+    """
+
+    object: str
+    label: str | None = None
+    own_label: str | None = None
+    describe: Callable[[], Mapping[str, float]] = dict
+
+    @cached_property
+    def numbers(self) -> Mapping[str, float]:
+        """The numbers of the configuration: of everything that varies, and of what the scene was given."""
+        return self.describe()
+
+    def number(self, name: str) -> float:
+        """Return the number that a parameter has in this configuration.
+
+        Raises:
+            InputError: nothing in the scene is called that.
+        """
+        if name not in self.numbers:
+            known = ", ".join(sorted(self.numbers)) or "none"
+            raise InputError(
+                f"the task needs {name}, and the scene has numbers for {known}; add its control or `set` it"
+            )
+        return self.numbers[name]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task(ABC):
+    """How a model's output is judged against what is true of the scene. Write one by the three abstract methods.
+
+    A task is a dataclass; its fields are its options. `on` gives the one that a run works with.
+
+    Attributes:
+        minimise: success is a right answer: the object is to be made easier to recognise.
+        target: what is sought in place of any wrong answer, as if it were the truth; None for any.
+        name: on the command line.
+        objective: name of the objective where none is asked for; "score" is the task's own score.
+        reads_logits: whether its models answer with logits (N, classes). Then their answers are checked as such, and
+            the objectives of classification take them.
+        varies: whether the truth depends on the configuration; it is asked for at each one then.
+    """
+
+    name: ClassVar[str]
+    objective: ClassVar[str] = "score"
+    reads_logits: ClassVar[bool] = False
+    varies: ClassVar[bool] = False
+
+    minimise: bool = False
+    target: Truth = None
+
+    # ---- what a task has to say -------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def truth(self, facts: Facts) -> Truth:
+        """Return what is true of the scene.
+
+        Raises:
+            InputError: the facts do not say it, or the model cannot answer it.
+        """
+
+    @abstractmethod
+    def margin(self, output: Output, truth: Truth) -> Tensor:
+        """Return how wrong each of N outputs is, (N,): over 0 exactly where it is not right; differentiable.
+
+        It is maximised where no other objective is asked for, so it should rise towards a wrong answer from afar.
+        """
+
+    @abstractmethod
+    def answers(self, output: Output, count: int = 1) -> list[tuple[Answer, ...]]:
+        """Return what the model says of each of N pictures: at most `count` answers, the likeliest first."""
+
+    # ---- what it may say --------------------------------------------------------------------------------------------
+
+    def read(self, answer: Any, count: int) -> Output:
+        """Return the output in what a network answered to `count` pictures.
+
+        Not called where the task `reads_logits`. What a network returns for each picture is kept in this order.
+
+        Raises:
+            ValueError: there is none; the text says what was expected.
+        """
+        if isinstance(answer, Tensor) and answer.shape[:1] == (count,):
+            return answer.float()
+        raise ValueError(f"expected a tensor with {count} rows, one for each picture")
+
+    @property
+    def reader(self) -> Callable[[Any, int], Output] | None:
+        """What reads the outputs of its models; None where these are logits."""
+        return None if self.reads_logits else self.read
+
+    def on(self: Own, model: Model, *, target: str | None = None, minimise: bool = False) -> Own:
+        """Return the task for one model and what is sought.
+
+        Args:
+            model: whose output it will judge.
+            target: the answer that the model should give; None for any wrong one.
+            minimise: a right answer is sought.
+
+        Raises:
+            InputError: there is no such target, or the task has none.
+        """
+        if target is not None:
+            raise InputError(f"target: task {self.name} has none; leave it out")
+        return replace(self, minimise=minimise)
+
+    def score(self, output: Output, truth: Truth) -> Tensor:
+        """Return (N,): over 0 exactly where an output is a success; differentiable."""
+        if self.target is not None:
+            return -self.margin(output, self.target)
+        margin = self.margin(output, truth)
+        return -margin if self.minimise else margin
+
+    def payloads(self, output: Output) -> Sequence[Any]:
+        """Return what is kept of each of N outputs beside the words, as JSON values."""
+        return [None] * len(output)
+
+    def average(self, outputs: Sequence[Output]) -> Output:
+        """Return one output for several pictures of a configuration; each is of one picture, as is the result."""
+        return torch.stack(list(outputs)).mean(dim=0)
+
+    @property
+    def goal(self) -> str:
+        """What counts as success, in words."""
+        return "a target answer" if self.target is not None else "a right answer" if self.minimise else "a wrong answer"
+
+    @property
+    def target_names(self) -> tuple[str, ...]:
+        """The answers that are sought; empty where any wrong one is."""
+        return () if self.target is None else self.truth_names(self.target)
+
+    def truth_names(self, truth: Truth) -> tuple[str, ...]:
+        """Return the right answers in words."""
+        return (str(truth),)
+
+    # ---- the judgement ----------------------------------------------------------------------------------------------
+
+    def judge(self, output: Output, truth: Truth) -> list[Judgement]:
+        """Return what is to be said of each of N outputs."""
+        scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
+        answers, payloads = self.answers(output), self.payloads(output)
+        return [
+            Judgement(score, margin, margin <= 0.0, first, payload)
+            for score, margin, (first, *_), payload in zip(scores, margins, answers, payloads, strict=True)
+        ]
+
+
+def typical(judgements: Sequence[Judgement]) -> Judgement:
+    """Return what the model usually says: the most frequent answer (the lowest index of equals), with the mean score,
+    margin and probability of the judgements that have it."""
+    counts: dict[tuple[str, int | None], int] = {}
+    for one in judgements:
+        key = one.answer.label, one.answer.index
+        counts[key] = counts.get(key, 0) + 1
+    label, index = min(counts, key=lambda key: (-counts[key], key[1] or 0))
+    chosen = [one for one in judgements if (one.answer.label, one.answer.index) == (label, index)]
+    sure = [one.answer.probability for one in chosen if one.answer.probability is not None]
+    answer = Answer(label, index, mean(sure) if sure else None)
+    margins, scores = [one.margin for one in chosen], [one.score for one in chosen]
+    return Judgement(mean(scores), mean(margins), chosen[0].right, answer, chosen[0].payload)
+
+
+def mean(values: Sequence[float]) -> float:
+    """Return the mean of at least one number."""
+    return math.fsum(values) / len(values)

@@ -1,0 +1,183 @@
+"""Tasks: what counts as success, what is right, and what is said of an output."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective, get_objective
+from advsearch.errors import InputError, ModelError, UnknownNameError
+from advsearch.models import load_model
+from advsearch.tasks import TASKS, Answer, Classification, Facts, Judgement, Task, make_task
+from advsearch.tasks.base import typical
+
+LOGITS = torch.tensor([[3.0, 1.0, 0.0], [0.0, 2.0, 1.0], [0.0, 1.0, 4.0], [2.0, 2.0, 0.0], [math.nan, 0.0, 1.0]])
+NAMED = Classification(labels=("mug", "bowl", "vase"))
+
+
+# ---- classification -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("task", "scores", "goal"),
+    [
+        (NAMED, [-2.0, 2.0, 4.0, 0.0], "a wrong answer"),
+        (replace(NAMED, target=(2,)), [-3.0, -1.0, 3.0, -2.0], "a target answer"),
+        (replace(NAMED, minimise=True), [2.0, -2.0, -4.0, 0.0], "a right answer"),
+    ],
+)
+def test_a_score_over_zero_is_a_success(task: Classification, scores: list[float], goal: str) -> None:
+    found = task.judge(LOGITS, (0,))
+    assert [one.score for one in found[:4]] == scores and task.score(LOGITS, (0,))[:4].tolist() == scores
+    assert [one.success for one in found] == [score > 0.0 for score in scores] + [False]
+    assert [one.right for one in found] == [True, False, False, True, False]
+    assert [one.margin for one in found[:4]] == [-2.0, 2.0, 4.0, 0.0], "whatever is sought"
+    assert task.goal == goal
+
+
+def test_an_answer_is_the_largest_logit_in_words_with_its_probability() -> None:
+    first, second, *_ = NAMED.answers(LOGITS[:1], 2)[0]
+    shares = LOGITS[0].softmax(dim=0).tolist()
+    assert (first, second) == (Answer("mug", 0, shares[0]), Answer("bowl", 1, shares[1]))
+    judged = NAMED.judge(LOGITS[:4], (0, 1))
+    assert [one.answer.label for one in judged] == ["mug", "bowl", "vase", "mug"]
+    assert [one.right for one in judged] == [True, True, False, True] and judged[0].payload is None
+
+
+def test_a_target_must_be_wrong_and_there_is_none_to_minimise() -> None:
+    with pytest.raises(InputError, match=r"target: expected classes that are not right answers, got \[1\]"):
+        replace(NAMED, target=(1, 2)).truth(Facts("mug", "mug,bowl"))
+    with pytest.raises(InputError, match="minimise"):
+        replace(NAMED, target=(1,), minimise=True)
+
+
+def test_what_is_right_is_what_was_said_or_else_the_objects_own_label() -> None:
+    assert NAMED.truth(Facts("thing", "bowl,vase", "mug")) == (1, 2)
+    assert NAMED.truth(Facts("thing", None, "mug")) == (0,) and NAMED.truth_names((0, 2)) == ("mug", "vase")
+    with pytest.raises(InputError, match=r"^label: expected the right answers for thing, got none$"):
+        NAMED.truth(Facts("thing"))
+    with pytest.raises(InputError, match=r"^label: the label of thing itself does not fit the model"):
+        NAMED.truth(Facts("thing", None, "chair"))
+
+
+def test_the_typical_answer_is_the_most_frequent_one() -> None:
+    def said(margin: float, index: int, probability: float) -> Judgement:
+        return Judgement(margin, margin, margin <= 0.0, Answer(f"class {index}", index, probability))
+
+    answer = typical((said(1.0, 7, 0.5), said(3.0, 7, 0.7), said(2.0, 3, 0.99)))
+    assert answer.answer.index == 7
+    assert (answer.margin, answer.answer.probability) == pytest.approx((2.0, 0.6))
+    assert typical((said(1.0, 9, 0.1), said(1.0, 2, 0.3))).answer.index == 2
+
+
+# ---- another task ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Yaw(Task):
+    """Tell how far the object is turned, within a tolerance in degrees."""
+
+    name = "yaw"
+    varies = True
+    tolerance: float = 10.0
+
+    def truth(self, facts: Facts) -> float:
+        return facts.number("pose.yaw")
+
+    def margin(self, output: Tensor, truth: float) -> Tensor:
+        return (output[:, 0] - truth).abs() - self.tolerance
+
+    def answers(self, output: Tensor, count: int = 1) -> list[tuple[Answer, ...]]:
+        return [(Answer(f"{value:.0f} degrees"),) for value in output[:, 0].tolist()]
+
+    def payloads(self, output: Tensor) -> list[Any]:
+        return output[:, 0].tolist()
+
+
+class Level(nn.Module):
+    """Answers with one number: the mean of the picture times a hundred."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return 100.0 * x.mean(dim=(1, 2, 3))[:, None]
+
+
+def at(numbers: Mapping[str, float]) -> Facts:
+    return Facts("mug", describe=lambda: numbers)
+
+
+def test_three_methods_make_a_task() -> None:
+    task, output = Yaw(), torch.tensor([[32.0], [55.0], [math.nan]])
+    truth = task.truth(at({"pose.yaw": 30.0}))
+    assert truth == 30.0 and task.truth_names(truth) == ("30.0",)
+    near, far, lost = task.judge(output, truth)
+    assert (near.score, near.right, near.answer, near.payload) == (-8.0, True, Answer("32 degrees"), 32.0)
+    assert (far.score, far.success, far.right) == (15.0, True, False)
+    assert not lost.success and not lost.right
+    easier = task.on(load_model(Level(), input_size=8, read=task.reader), minimise=True)
+    assert [one.success for one in easier.judge(output[:2], truth)] == [True, False]
+    assert float(task.average([output[:1], output[1:2]])) == 43.5
+
+
+def test_what_the_scene_does_not_say_is_named() -> None:
+    with pytest.raises(InputError, match=r"the task needs pose\.yaw, and the scene has numbers for camera\.azimuth"):
+        Yaw().truth(at({"camera.azimuth": 3.0}))
+    with pytest.raises(InputError, match="target: task yaw has none"):
+        Yaw().on(load_model(Level(), input_size=8, read=Yaw().reader), target="30")
+
+
+def test_its_score_is_what_is_maximised_where_nothing_else_is_said() -> None:
+    images, output = torch.zeros(1, 4, 4, 3), torch.tensor([[50.0]], requires_grad=True)
+    assert Yaw.objective == "score"
+    value = get_objective("score", Yaw())(output, images, 30.0)
+    value.sum().backward()
+    assert value.tolist() == [10.0] and output.grad is not None and output.grad.tolist() == [[1.0]]
+    assert get_objective("score", Yaw(minimise=True))(output, images, 30.0).tolist() == [-10.0]
+    assert get_objective("score", Yaw(target=45.0))(output, images, 30.0).tolist() == [5.0]
+    assert get_objective("score", NAMED)(LOGITS[:2], images, (0,)).tolist() == [-2.0, 2.0]
+
+
+def test_an_objective_of_another_task_is_refused() -> None:
+    with pytest.raises(
+        InputError, match=r"expected one of task yaw \(score\), got margin, which takes outputs of class"
+    ):
+        check_objective("margin", "yaw")
+    assert {kind.task for kind in OBJECTIVE_KINDS.values()} == {"classification", None}
+
+
+def test_a_model_of_a_task_answers_with_what_the_task_reads() -> None:
+    model = load_model(Level(), input_size=8, read=Yaw().reader)
+    assert model.labels == () and repr(model) == "Model('Level', 8 x 8 pixels)"
+    pictures = torch.rand(70, 8, 8, 3)
+    assert torch.allclose(model(pictures), 100.0 * pictures.mean(dim=(1, 2, 3))[:, None], atol=1e-3)
+    with pytest.raises(ModelError, match="one score is not enough"):
+        load_model(Level(), input_size=8)
+    with pytest.raises(ModelError, match="expected a tensor with 1 rows, one for each picture, got dict"):
+        load_model(Wrapped(), input_size=8, read=Yaw().reader)
+
+
+class Wrapped(nn.Module):
+    """Answers with a list in a dictionary, as detectors do."""
+
+    def forward(self, x: Tensor) -> dict[str, list[Tensor]]:
+        return {"boxes": [image[image > 0.5] for image in x]}
+
+
+def test_an_output_may_be_a_list_with_one_thing_for_each_picture() -> None:
+    model = load_model(Wrapped(), input_size=8, max_batch=2, read=lambda answer, count: answer["boxes"])
+    pictures = torch.rand(3, 8, 8, 3)
+    assert [len(one) for one in model(pictures)] == [int((one > 0.5).sum()) for one in pictures]
+    assert model.differentiable
+
+
+def test_tasks_have_names() -> None:
+    assert list(TASKS) == ["classification"] and make_task("classification") == Classification()
+    mine = Yaw(tolerance=5.0)
+    assert make_task(mine) is mine
+    with pytest.raises(UnknownNameError, match="classification"):
+        make_task("clasification")
