@@ -164,7 +164,7 @@ def _answers(
         "over": [bound.name for bound in problem.space.controls[len(controls) :]],
         "ending": _ending(findings, problem).value,
         "image_formation": problem.renderer.formation.summary(),
-        "gradient_plan": problem.plan_summary(problem.plan),
+        "gradient_plan": problem.plan_summary(problem.plan).to_dict(),
         "light_path_segments": {
             "search": problem.search_depth or problem.renderer.scene.max_depth,
             "verification": problem.renderer.scene.max_depth,
