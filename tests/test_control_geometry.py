@@ -212,8 +212,8 @@ def test_settings_make_the_same_control_again() -> None:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"epsilon": 0.0}, r"geometry.epsilon: expected a length over 0 and up to 0.5 object sizes, got 0.0"),
-        ({"epsilon": "wide"}, r"geometry.epsilon: expected a length"),
+        ({"epsilon": 0.0}, r"geometry.epsilon: expected a number over 0 and up to 0.5, got 0.0"),
+        ({"epsilon": "wide"}, r"geometry.epsilon: expected a number"),
         ({"modes": 0}, r"geometry.modes: expected a whole number from 1 to 200, got 0"),
         ({"form": "mods"}, r"unknown geometry.form 'mods'. Did you mean 'modes'"),
         ({"pushes": 0.1}, r"geometry.pushes: expected no value but \[-1, 1\], got 0.1; set how far"),

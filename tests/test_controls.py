@@ -144,7 +144,7 @@ def test_a_radius_that_is_no_radius_is_refused(epsilon: float) -> None:
 def test_other_settings_out_of_range_are_refused() -> None:
     with pytest.raises(InputError, match="norm: expected one of linf, l2, got 'l1'"):
         TextureControl(norm="l1")
-    with pytest.raises(InputError, match="texture_resolution: expected 2 to 4096"):
+    with pytest.raises(InputError, match=r"texture\.resolution: expected a whole number from 2 to 4096"):
         TextureControl(resolution=1)
 
 
@@ -223,7 +223,7 @@ def test_no_value_of_any_control_ends_in_a_traceback(kind: str) -> None:
             {"yaw": 10**400},
             "pose.yaw: expected a number from -3600 to 3600 (degrees), got a whole number of 1329",
         ),
-        ("texture", {"epsilon": 1e308}, "epsilon: expected a number over 0 and up to 1e+06, got 1e+308"),
+        ("texture", {"epsilon": 1e308}, "texture.epsilon: expected a number over 0 and up to 1e+06, got 1e+308"),
         (
             "patch",
             {"epsilon": 1e308, "norm": "linf"},

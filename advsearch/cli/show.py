@@ -118,6 +118,8 @@ def _show_control(name: str, as_json: bool) -> int:
 
 def _short(declared: Mapping[str, Any]) -> dict[str, Any]:
     """What a person wants to read of a parameter, in few columns; a setting as it is."""
+    if "run_setting" in declared:
+        return _short_choice(declared)
     if "estimators" not in declared:
         return dict(declared)
     one = declared
@@ -134,6 +136,13 @@ def _short(declared: Mapping[str, Any]) -> dict[str, Any]:
         "derivative": ways,
         "description": one["description"],
     }
+
+
+def _short_choice(one: Mapping[str, Any]) -> dict[str, Any]:
+    low, high = one["whole"] or (None, None)
+    allowed = ", ".join(one["options"]) or (f"{low} to {high}" if one["whole"] else "")
+    allowed = allowed or (f"over 0 to {one['most']:g}" if one["most"] else "")
+    return {name: allowed if name == "allowed" else one[name] for name in ("name", "allowed", "default", "description")}
 
 
 def _range(one: Mapping[str, Any]) -> str:

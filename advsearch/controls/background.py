@@ -26,7 +26,6 @@ from advsearch.scene.description import SceneDescription
 
 COLOR = "backdrop.color"
 """The scene input: (3,) display-linear values in [0, 1]."""
-GROUNDS = ("keep", "hide")
 WHAT = ("colour", "environment")
 NUMBERS = ("hue", "saturation", "value")
 
@@ -77,7 +76,9 @@ class BackgroundControl(NumberControl):
         ),
     )
     choices: ClassVar[tuple[Choice, ...]] = (
-        Choice("ground", "hide", "Whether the ground plane stays in the picture: keep or hide."),
+        Choice(
+            "ground", "hide", "Whether the ground plane stays in the picture: keep or hide.", options=("keep", "hide")
+        ),
     )
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
@@ -89,10 +90,6 @@ class BackgroundControl(NumberControl):
                 f"{self.name}.what: environment alone leaves nothing to search; use what=[colour, environment], or "
                 f"leave the control out"
             )
-
-    def check_choices(self) -> None:
-        if self.chosen["ground"] not in GROUNDS:
-            raise InputError(f"{self.name}.ground: expected one of {', '.join(GROUNDS)}, got {self.chosen['ground']!r}")
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
         spec = self.specs.get("what")

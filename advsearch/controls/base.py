@@ -12,7 +12,7 @@ file. `docs/controls/writing.md` has a worked example.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar, TypedDict
@@ -21,6 +21,8 @@ import torch
 from torch import Tensor
 
 from advsearch.controls.clean import Moved
+from advsearch.controls.values import is_number, is_whole
+from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.gradients.group import WHOLE_RANGE as WHOLE_RANGE
 from advsearch.scene.gradients.group import Budget as Budget
@@ -43,6 +45,9 @@ class Choice:
             says something else; empty if there is none.
         bounds: the parameter that it says something about, which is not searched unless asked for; empty if it counts
             always. Where that parameter is not given, the control does not take the setting.
+        options: the names that can be chosen; empty for anything else.
+        whole: the smallest and the largest whole number that can be chosen, or None.
+        most: the largest number that can be chosen, all over 0; None for anything else.
     """
 
     name: str
@@ -50,6 +55,25 @@ class Choice:
     description: str
     run_setting: str = ""
     bounds: str = ""
+    options: tuple[str, ...] = ()
+    whole: tuple[int, int] | None = None
+    most: float | None = None
+
+    def check(self, control: str, given: object) -> None:
+        """Check what was chosen in an instance of a control; None is fine where it is the default.
+
+        Raises:
+            InputError: it cannot be chosen.
+        """
+        allowed, fits = "", True
+        if self.options:
+            allowed, fits = f"one of {', '.join(self.options)}", given in self.options
+        elif self.whole is not None:
+            allowed, fits = "a whole number from {} to {}".format(*self.whole), is_whole(given, *self.whole)
+        elif self.most is not None:
+            allowed, fits = f"a number over 0 and up to {self.most:g}", is_number(given) and 0.0 < given <= self.most
+        if not fits and not (given is None and self.default is None):
+            raise InputError(f"{control}.{self.name}: expected {allowed}, got {given!r}")
 
 
 class Value(TypedDict):
@@ -140,6 +164,32 @@ class Control(ABC):
         """Return what `make_control` needs to make an equal instance, as JSON values."""
         named = {} if self.name == self.kind else {"kind": self.kind}
         return {**named, **{choice.name: getattr(self, choice.name) for choice in self.choices}}
+
+    def chosen_form(self, forms: Sequence[str], form: str | None) -> str:
+        """Return which form of itself a control takes, where each of its parameters stands for one.
+
+        Args:
+            forms: the forms, in the order of the parameters; the first is the default.
+            form: the one that was asked for by name, or None.
+
+        Raises:
+            InputError: two forms are asked for, or a parameter was given a range of its own.
+            UnknownNameError: there is no such form.
+        """
+        named = []
+        for one, stands_for in zip(self.parameters, forms, strict=True):
+            given = getattr(self, one.name)
+            if given not in (None, [one.low, one.high], (one.low, one.high)):
+                raise InputError(
+                    f"{self.name}.{one.name}: expected no value but [{one.low:g}, {one.high:g}], got {given!r}; "
+                    f"set how far it may go with {self.name}.epsilon"
+                )
+            named += [] if given is None else [stands_for]
+        if form is not None and form not in forms:
+            raise UnknownNameError(f"{self.name}.form", str(form), forms)
+        if len({*named, *([form] if form else [])}) > 1:
+            raise InputError(f"{self.name}.form: expected one form, got {', '.join([*named, form or ''])}")
+        return form or (named[0] if named else forms[0])
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         """Return the scene with whatever this control needs to be in it (a light, a medium); by default unchanged.

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from advsearch.controls.base import WHOLE_RANGE, Budget, Choice, Parameter
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Fixed, Number, OneOf, is_number
+from advsearch.controls.values import Fixed, Number, OneOf
 from advsearch.errors import InputError
 from advsearch.scene import library, settings
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
@@ -69,14 +69,17 @@ class EnvironmentControl(NumberControl):
     )
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice(
-            "epsilon", 0.5, "Radius of the ball of `harmonics`: L2 norm of all coefficients.", "epsilon", "harmonics"
+            "epsilon",
+            0.5,
+            "Radius of the ball of `harmonics`: L2 norm of all coefficients.",
+            "epsilon",
+            "harmonics",
+            most=100.0,
         ),
     )
 
     def check_choices(self) -> None:
         given = self.chosen["epsilon"]
-        if not is_number(given) or not 0.0 < given <= 100.0:
-            raise InputError(f"{self.name}.epsilon: expected a number over 0 and at most 100, got {given!r}")
         if "epsilon" in self._given and "harmonics" not in self._given:
             raise InputError(
                 f"{self.name}.epsilon: the radius of the ball of harmonics, which are not there; leave it out, or give "

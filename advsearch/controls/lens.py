@@ -21,8 +21,6 @@ from torch import Tensor
 
 from advsearch.controls.base import Choice, Parameter
 from advsearch.controls.numbers import BoundNumbers, NumberControl, Values
-from advsearch.controls.values import is_whole
-from advsearch.errors import InputError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
 
@@ -82,12 +80,9 @@ class LensControl(NumberControl):
             estimators=("image",),
         ),
     )
-    choices: ClassVar[tuple[Choice, ...]] = (Choice("dots", DOTS, f"How many dots there are, 1 to {MOST_DOTS}."),)
-
-    def check_choices(self) -> None:
-        given = self.chosen["dots"]
-        if not is_whole(given, 1, MOST_DOTS):
-            raise InputError(f"{self.name}.dots: expected a whole number from 1 to {MOST_DOTS}, got {given!r}")
+    choices: ClassVar[tuple[Choice, ...]] = (
+        Choice("dots", DOTS, f"How many dots there are, 1 to {MOST_DOTS}.", whole=(1, MOST_DOTS)),
+    )
 
     @property
     def dots(self) -> int:

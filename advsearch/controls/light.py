@@ -29,7 +29,6 @@ from advsearch.scene.description import SceneDescription
 from advsearch.scene.exposure import WHITE, metered_gain
 from advsearch.scene.parts import BallLamp, PointLamp
 
-TYPES = ("area", "point")
 LIT_WHITE = 0.9
 """Linear display value of a white surface that faces a lamp of power 1 at distance 1."""
 LIT_POWER = 6.0
@@ -103,12 +102,15 @@ class LightControl(NumberControl):
         ),
     )
     choices: ClassVar[tuple[Choice, ...]] = (
-        Choice("type", "area", "area (a ball that glows: soft shadows, visible) or point (sharp shadows, invisible)."),
+        Choice(
+            "type",
+            "area",
+            "area (a ball that glows: soft shadows, visible) or point (sharp shadows, invisible).",
+            options=("area", "point"),
+        ),
     )
 
     def check_choices(self) -> None:
-        if self.chosen["type"] not in TYPES:
-            raise InputError(f"{self.name}.type: expected one of {', '.join(TYPES)}, got {self.chosen['type']!r}")
         if self.chosen["type"] == "point" and "size" in self._given:
             raise InputError(
                 f"{self.name}.size: expected none for a point light, got {self._given['size']!r}; leave it out, or set "

@@ -80,6 +80,8 @@ class NumberControl(Control, ABC):
                 raise UnknownNameError(f"setting of control {self.kind}", setting, known)
         self._given = {setting: value for setting, value in settings.items() if value is not None}
         self.chosen = {choice.name: self._given.get(choice.name, choice.default) for choice in self.choices}
+        for choice in self.choices:
+            choice.check(self.name, self.chosen[choice.name])
         self.check_choices()
         self.specs = {
             one.name: read(f"{self.name}.{one.name}", one, self._given[one.name])
@@ -94,7 +96,7 @@ class NumberControl(Control, ABC):
     # ---- what a subclass says ---------------------------------------------------------------------------------------
 
     def check_choices(self) -> None:
-        """Check `self.chosen`; by default all are fine.
+        """Check what the choices' own declarations do not say of `self.chosen`; by default nothing.
 
         Raises:
             InputError: a choice is out of range.

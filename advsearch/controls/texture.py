@@ -32,8 +32,8 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advsearch.controls.base import NOTHING, BoundControl, Budget, Choice, Control, Group, Parameter, Value
-from advsearch.controls.values import LARGEST_EPSILON, is_number, is_whole
-from advsearch.errors import InputError, UnknownNameError
+from advsearch.controls.values import LARGEST_EPSILON
+from advsearch.errors import UnknownNameError
 from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
@@ -124,60 +124,37 @@ class TextureControl(Control):
     )
     choices: ClassVar[tuple[Choice, ...]] = (
         Choice(
-            "epsilon", DEFAULT_EPSILON, "Radius of the ball around the original texture, display-referred.", "epsilon"
+            "epsilon",
+            DEFAULT_EPSILON,
+            "Radius of the ball around the original texture, display-referred.",
+            "epsilon",
+            most=LARGEST_EPSILON,
         ),
         Choice(
-            "norm", "linf", "Norm of the ball: linf (per texel value) or l2 (Euclidean, over all texel values).", "norm"
+            "norm",
+            "linf",
+            "Norm of the ball: linf (per texel value) or l2 (Euclidean, over all texel values).",
+            "norm",
+            options=NORMS,
         ),
         Choice(
             "resolution",
             None,
             "Side of the searched texture in texels; by default the object's own, 256 to 512.",
             "texture_resolution",
+            whole=(2, 4096),
         ),
         Choice("form", "texels", "What is searched: texels, palette (a few colours) or waves (smooth patterns)."),
-        Choice("colors", 6, "Number of colours of the palette."),
-        Choice("waves", 8, "Number of waves along each side of the texture."),
+        Choice("colors", 6, "Number of colours of the palette.", whole=(1, LARGEST_PALETTE)),
+        Choice("waves", 8, "Number of waves along each side of the texture.", whole=(1, LARGEST_WAVES)),
         Choice("part", OBJECT, "Which mesh of the scene: object, or the name of an instance that put one there."),
     )
 
     def __post_init__(self) -> None:
-        if self.norm not in NORMS:
-            raise InputError(f"norm: expected one of {', '.join(NORMS)}, got {self.norm!r}")
-        if self.epsilon is not None and not (is_number(self.epsilon) and 0.0 < self.epsilon <= LARGEST_EPSILON):
-            raise InputError(f"epsilon: expected a number over 0 and up to {LARGEST_EPSILON:g}, got {self.epsilon!r}")
-        if self.resolution is not None and not is_whole(self.resolution, 2, 4096):
-            raise InputError(f"texture_resolution: expected 2 to 4096 texels, got {self.resolution}")
-        object.__setattr__(self, "form", self._form())
-        for choice, largest in (("colors", LARGEST_PALETTE), ("waves", LARGEST_WAVES)):
-            if not is_whole(getattr(self, choice), 1, largest):
-                raise InputError(
-                    f"{self.name}.{choice}: expected a whole number from 1 to {largest}, got {getattr(self, choice)!r}"
-                )
-
-    def _form(self) -> str:
-        """The form that was asked for, by name or by one of the forms' parameters.
-
-        Raises:
-            InputError: there is no such form, two are asked for, or a parameter was given a range of its own.
-        """
-        asked = dict(zip(FORMS, (self.texels, self.palette, self.amplitudes), strict=True))
-        named = [form for form, given in asked.items() if given is not None]
-        for one, form in zip(self.parameters, FORMS, strict=True):
-            if asked[form] not in (None, [one.low, one.high], (one.low, one.high)):
-                raise InputError(
-                    f"{self.name}.{one.name}: expected no value but [{one.low:g}, {one.high:g}], got {asked[form]!r}; "
-                    f"set how far it may go with {self.name}.epsilon"
-                )
-        if self.form is not None and self.form not in FORMS:
-            raise UnknownNameError(f"{self.name}.form", str(self.form), FORMS)
-        if len({*named, *([self.form] if self.form else [])}) > 1:
-            raise InputError(f"{self.name}.form: expected one form, got {', '.join([*named, self.form or ''])}")
-        return self.form or (named[0] if named else FORMS[0])
-
-    def settings(self) -> dict[str, object]:
-        said = {"kind": self.kind} if self.name != self.kind else {}
-        return {**said, **super().settings()}
+        for choice in self.choices:
+            if getattr(self, choice.name) is not None:  # None is "what the norm, the form or the object says"
+                choice.check(self.name, getattr(self, choice.name))
+        object.__setattr__(self, "form", self.chosen_form(FORMS, self.form))
 
     def bind(self, scene: SceneDescription) -> BoundControl:
         mesh, base_color = self._target(scene)

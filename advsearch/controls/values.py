@@ -17,8 +17,8 @@ from typing import TypeGuard
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Parameter
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.parameters import Parameter
 
 Number = float | str
 

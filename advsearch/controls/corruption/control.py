@@ -31,8 +31,7 @@ from advsearch.controls.corruption.noise import gaussian_noise, impulse_noise, s
 from advsearch.controls.corruption.tools import LEVELS
 from advsearch.controls.corruption.weather import fog, frost, snow
 from advsearch.controls.numbers import NumberControl, Values
-from advsearch.controls.values import Fixed, OneOf, is_whole
-from advsearch.errors import InputError
+from advsearch.controls.values import Fixed, OneOf
 from advsearch.scene.description import SceneDescription
 
 SMOOTH: Mapping[str, Callable[[Tensor, Tensor, int], Tensor]] = {
@@ -95,18 +94,15 @@ class CorruptionControl(NumberControl):
         ),
     )
     choices: ClassVar[tuple[Choice, ...]] = (
-        Choice("seed", 0, "Which draw of the noise, the snow, the wrinkles: a whole number from 0."),
+        Choice(
+            "seed", 0, "Which draw of the noise, the snow, the wrinkles: a whole number from 0.", whole=(0, 2**32 - 1)
+        ),
     )
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         super().__init__(name, **settings)
         # a name without a severity does nothing, and a severity needs a name: what is not given is searched
         self.asked = False
-
-    def check_choices(self) -> None:
-        given = self.chosen["seed"]
-        if not is_whole(given, 0, 2**32 - 1):
-            raise InputError(f"{self.name}.seed: expected a whole number from 0 to {2**32 - 1}, got {given!r}")
 
     def estimators(self, scene: SceneDescription, parameter: Parameter) -> tuple[str, ...]:
         if parameter.name == "severity" and self.possible() <= set(STEPPED):

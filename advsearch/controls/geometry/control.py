@@ -21,8 +21,6 @@ from torch import Tensor
 
 from advsearch.controls.base import NOTHING, BoundControl, Choice, Control, Group, Parameter, Value
 from advsearch.controls.geometry.modes import Limits, Preconditioner, body, shape_modes
-from advsearch.controls.values import is_number, is_whole
-from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assembly import MovingMesh
 from advsearch.scene.assets import Mesh
 from advsearch.scene.description import SceneDescription
@@ -88,42 +86,21 @@ class GeometryControl(Control):
         ),
     )
     choices: ClassVar[tuple[Choice, ...]] = (
-        Choice("epsilon", DEFAULT_EPSILON, "Largest displacement of a vertex, in object sizes.", "epsilon"),
-        Choice("modes", DEFAULT_MODES, "Number of smooth modes (form modes)."),
+        Choice(
+            "epsilon",
+            DEFAULT_EPSILON,
+            "Largest displacement of a vertex, in object sizes.",
+            "epsilon",
+            most=LARGEST_EPSILON,
+        ),
+        Choice("modes", DEFAULT_MODES, "Number of smooth modes (form modes).", whole=(1, LARGEST_MODES)),
         Choice("form", "modes", "What is searched: modes (a few smooth fields) or large-steps (every vertex)."),
     )
 
     def __post_init__(self) -> None:
-        if not is_number(self.epsilon) or not 0.0 < self.epsilon <= LARGEST_EPSILON:
-            raise InputError(
-                f"{self.name}.epsilon: expected a length over 0 and up to {LARGEST_EPSILON:g} object sizes, "
-                f"got {self.epsilon!r}"
-            )
-        if not is_whole(self.modes, 1, LARGEST_MODES):
-            raise InputError(
-                f"{self.name}.modes: expected a whole number from 1 to {LARGEST_MODES}, got {self.modes!r}"
-            )
-        object.__setattr__(self, "form", self._form())
-
-    def _form(self) -> str:
-        """The form that was asked for, by name or by the form's parameter."""
-        asked = dict(zip(FORMS, (self.amplitudes, self.pushes), strict=True))
-        for one, form in zip(self.parameters, FORMS, strict=True):
-            if asked[form] not in (None, [one.low, one.high], (one.low, one.high)):
-                raise InputError(
-                    f"{self.name}.{one.name}: expected no value but [{one.low:g}, {one.high:g}], got {asked[form]!r}; "
-                    f"set how far it may go with {self.name}.epsilon"
-                )
-        named = [form for form, given in asked.items() if given is not None]
-        if self.form is not None and self.form not in FORMS:
-            raise UnknownNameError(f"{self.name}.form", str(self.form), FORMS)
-        if len({*named, *([self.form] if self.form else [])}) > 1:
-            raise InputError(f"{self.name}.form: expected one form, got {', '.join([*named, self.form or ''])}")
-        return self.form or (named[0] if named else FORMS[0])
-
-    def settings(self) -> dict[str, object]:
-        said = {"kind": self.kind} if self.name != self.kind else {}
-        return {**said, **super().settings()}
+        for choice in self.choices:
+            choice.check(self.name, getattr(self, choice.name))
+        object.__setattr__(self, "form", self.chosen_form(FORMS, self.form))
 
     def bind(self, scene: SceneDescription) -> BoundControl:
         mesh = scene.object.mesh

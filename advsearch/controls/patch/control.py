@@ -39,8 +39,6 @@ from advsearch.controls.values import (
     OneOf,
     Range,
     in_words,
-    is_number,
-    is_whole,
     read,
 )
 from advsearch.errors import FileFormatError, InputError
@@ -132,15 +130,22 @@ class PatchControl(Control):
         ),
     )
     choices: ClassVar[tuple[Choice, ...]] = (
-        Choice("resolution", 32, "Side of the patch in pixels."),
+        Choice("resolution", 32, "Side of the patch in pixels.", whole=(2, 512)),
         Choice(
             "norm",
             "box",
             "How far pixels may go: box (anywhere), linf (the default with an epsilon) or l2 (a ball around what is "
             "underneath).",
             "norm",
+            options=NORMS,
         ),
-        Choice("epsilon", None, "Radius of that ball, display-referred; by default 0.1 a pixel value.", "epsilon"),
+        Choice(
+            "epsilon",
+            None,
+            "Radius of that ball, display-referred; by default 0.1 a pixel value.",
+            "epsilon",
+            most=LARGEST_EPSILON,
+        ),
         Choice("picture", None, "A picture file to stick on as it is; the pixels are not searched then."),
     )
 
@@ -167,24 +172,15 @@ class PatchControl(Control):
         given = {one.name: getattr(self, one.name) for one in self.choices if getattr(self, one.name) != one.default}
         if self._pixels_given is not None:
             given["pixels"] = self._pixels_given
-        said = {"kind": self.kind} if self.name != self.kind else {}
-        return {**said, **given, **self._placement.given}
+        named = {"kind": self.kind} if self.name != self.kind else {}
+        return {**named, **given, **self._placement.given}
 
     def _check_choices(self) -> None:
-        side, epsilon = self.resolution, self.epsilon
-        if not is_whole(side, 2, 512):
-            raise InputError(f"{self.name}.resolution: expected a whole number from 2 to 512, got {side!r}")
-        if self.norm not in NORMS:
-            raise InputError(f"{self.name}.norm: expected one of {', '.join(NORMS)}, got {self.norm!r}")
-        if epsilon is None:
-            return
-        if not is_number(epsilon) or not 0.0 < epsilon <= LARGEST_EPSILON:
+        for choice in self.choices:
+            choice.check(self.name, getattr(self, choice.name))
+        if self.norm == "box" and self.epsilon is not None:
             raise InputError(
-                f"{self.name}.epsilon: expected a number over 0 and up to {LARGEST_EPSILON:g}, got {epsilon!r}"
-            )
-        if self.norm == "box":
-            raise InputError(
-                f"{self.name}.epsilon: expected none with norm box, got {epsilon:g}; set norm to linf or l2"
+                f"{self.name}.epsilon: expected none with norm box, got {self.epsilon:g}; set norm to linf or l2"
             )
 
     def _pixel_spec(self) -> Range | Fixed:

@@ -25,12 +25,10 @@ from torch import Tensor
 from advsearch.controls.base import Choice, Parameter
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.sky.dome import TURBIDITIES, Sky
-from advsearch.errors import InputError
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 
-EXPOSURES = ("metered", "fixed")
 METERED_IRRADIANCE = 0.9 * math.pi / 0.8
 """`M`: the irradiance on what faces the sun, the same for every sky that is metered."""
 
@@ -76,14 +74,13 @@ class SkyControl(NumberControl):
         ),
     )
     choices: ClassVar[tuple[Choice, ...]] = (
-        Choice("exposure", "metered", "metered (each sky anew, as an automatic camera does) or fixed (at the start)."),
+        Choice(
+            "exposure",
+            "metered",
+            "metered (each sky anew, as an automatic camera does) or fixed (at the start).",
+            options=("metered", "fixed"),
+        ),
     )
-
-    def check_choices(self) -> None:
-        if self.chosen["exposure"] not in EXPOSURES:
-            raise InputError(
-                f"{self.name}.exposure: expected one of {', '.join(EXPOSURES)}, got {self.chosen['exposure']!r}"
-            )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
         radiance = self.radiance(scene, self.start_values(scene)).numpy().astype(np.float32)
