@@ -36,7 +36,7 @@ from advsearch.settings import Config, all_finite, flag, parse_assignment, read_
 
 WRONG: dict[str, tuple[Any, str]] = {
     "object": ("", "expected the name of an object or a .obj, .ply, .glb, .gltf or .stl file, got ''"),
-    "environment": ([], "expected the name of an environment or a .hdr or .exr file, got "),
+    "environment": ([], "expected the name of an environment, a .hdr or .exr file, or none, got "),
     "up": ("x", "expected y or z, got x"),
     "set_": ({"camera.azimuth": math.nan}, "got camera.azimuth=nan"),
     "exposure": (99, "expected a number from -10 to 10, got 99"),

@@ -130,8 +130,8 @@ def attack(
     options = options_of(locals(), AttackConfig, without=_OWN_ARGUMENTS)
     scene = _scene(scene, options)
     described = {
-        "object": scene.description.object_spec or scene.description.object.name,
-        "environment": scene.description.environment_spec or scene.description.environment.name,
+        "object": scene.description.object_name,
+        "environment": scene.description.environment_name,
         "up": scene.description.up,
         "model": model if isinstance(model, str) else getattr(model, "name", None) or type(model).__name__,
         "controls": settings_of(controls),
@@ -330,7 +330,7 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
     stages.begin("setup", PREPARING)
     problem = _problem(job)
     own = job.scene.description
-    said = [*own.object.notes, *own.environment.warnings, *job.loaded[1], *sentences(problem.space.moved)]
+    said = [*own.notes, *job.loaded[1], *sentences(problem.space.moved)]
     for text in said:
         progress.message(text)
     policy = _policy(job, problem)

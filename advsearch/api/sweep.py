@@ -21,6 +21,7 @@ from advsearch.models import Model
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import CONFIG, RunDirectory, check_free, default_name, find_run, is_run, run_path
 from advsearch.runs.listing import finished
+from advsearch.scene.description import NO_MAP
 from advsearch.settings import split_names
 from advsearch.tasks import Task, make_task
 
@@ -152,8 +153,8 @@ def _model_name(model: AnyModel) -> str:
 
 def _place(scene: Scene) -> Place:
     described = scene.description
-    object_name = described.object_spec or described.object.name
-    return Place(object_name, described.environment_spec or described.environment.name, scene)
+    object_name = described.object_name
+    return Place(object_name, described.environment_name, scene)
 
 
 def _described(places: Sequence[Place]) -> dict[str, Any]:
@@ -197,7 +198,7 @@ def _job(
     own = {place.object: place.scene.description.object.label for place in places}
     said += one_label_for_several(networks, config.label, own)
     for place in places:
-        said += [*place.scene.description.object.notes, *place.scene.description.environment.warnings]
+        said += place.scene.description.notes
     return Job(config, tuple(places), networks, tasks, drawn, axes, samples, tuple(dict.fromkeys(said)))
 
 
@@ -209,7 +210,7 @@ def _places(config: SweepConfig) -> tuple[Place, ...]:
     lights = {environments[0]: firsts[objects[0]].description.environment}
     for name in environments[1:]:
         lights[name] = load_scene(firsts[objects[0]].description.object, name).description.environment
-    asked = {light: lights[light] if config.environment else None for light in environments}
+    asked = {light: (lights[light] or NO_MAP) if config.environment else None for light in environments}
     return tuple(
         Place(name, light, load_scene(firsts[name].description.object, asked[light], settings=given))
         for name in objects

@@ -54,7 +54,7 @@ class SceneConfig(Config):
         None,
         "scene",
         "what lights it",
-        "the name of an environment or a .hdr or .exr file",
+        "the name of an environment, a .hdr or .exr file, or none",
         otherwise=DEFAULT_ENVIRONMENT,
     )
     up: Literal["y", "z"] | None = setting(

@@ -61,7 +61,7 @@ def check_prepared(control: str, before: SceneDescription, after: SceneDescripti
     Raises:
         InputError: it was asked for.
     """
-    if after.environment is not before.environment:
+    if after.environment is not None and after.environment is not before.environment:
         if ENVIRONMENT in before.given:
             raise InputError(
                 f"`environment={before.environment_spec}` and `controls` {control} contradict each other: the control "

@@ -90,6 +90,7 @@ class EnvironmentControl(NumberControl):
         """An environment that is fixed is the scene's."""
         spec = self.specs.get("which")
         if not isinstance(spec, Fixed) or spec.value in (OWN_MAP, scene.bundled_environment):
+            scene.environment_for(f"`controls` {self.name}")
             return scene
         name = str(spec.value)
         return replace(scene, environment=library.load_environment(name), environment_spec=name)
@@ -141,7 +142,7 @@ class EnvironmentControl(NumberControl):
 
 @lru_cache(maxsize=4)
 def _tensor_of(scene: SceneDescription) -> Tensor:
-    return torch.from_numpy(scene.environment.radiance.copy())
+    return torch.from_numpy(scene.environment_for("the environment").radiance.copy())
 
 
 @lru_cache(maxsize=16)

@@ -37,7 +37,6 @@ from advsearch.errors import UnknownNameError
 from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.parts import MeshPart
 from advsearch.scene.surface_map import texel_area
 
 RESOLUTIONS = (256, 512)
@@ -169,12 +168,10 @@ class TextureControl(Control):
         Raises:
             UnknownNameError: the scene has no such mesh.
         """
-        parts = {part.name: part for part in scene.parts if isinstance(part, MeshPart)}
-        if self.part == OBJECT:
-            return scene.object.mesh, scene.object.base_color
-        if self.part not in parts:
-            raise UnknownNameError(f"{self.name}.part", str(self.part), [OBJECT, *parts])
-        return parts[self.part].mesh, parts[self.part].base_color
+        if self.part not in scene.meshes:
+            raise UnknownNameError(f"{self.name}.part", str(self.part), scene.meshes)
+        mesh = scene.meshes[self.part]
+        return mesh.mesh, mesh.base_color
 
     def _painter(self, mesh: Mesh, original: Tensor) -> Painter:
         if self.form == "palette":

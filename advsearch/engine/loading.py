@@ -66,10 +66,9 @@ class Scene:
 
     def __repr__(self) -> str:
         described = self.description
-        object, environment = described.object_spec, described.environment_spec
         names = sorted(described.given & described.values.keys())
         fixed = "".join(f", {name}={described.values[name]!r}" for name in names)
-        return f"Scene({object or described.object.name!r}, {environment or described.environment.name!r}{fixed})"
+        return f"Scene({described.object_name!r}, {described.environment_name!r}{fixed})"
 
     def with_settings(self, given: Mapping[str, float]) -> Scene:
         """Return the scene with some of its parameters fixed to other values.
@@ -123,6 +122,11 @@ def make_renderer(
     """Put a described scene, with what the space's controls need in it, into Mitsuba at one size."""
     size = (resolution, resolution) if isinstance(resolution, int) else resolution
     description = space.scene or description
+    if description.environment is None and not description.lamps:
+        raise InputError(
+            "environment: the scene has neither a map nor a lamp, so that every picture is black; give it one of the "
+            "two, such as `controls=light`"
+        )
     formation = ImageFormation(
         denoiser=denoise,
         sampler=sampler,

@@ -109,8 +109,8 @@ class Rendering:
         return RenderResult(
             out=str(out),
             size=size,
-            object=self.scene.object_spec or self.scene.object.name,
-            environment=self.scene.environment_spec or self.scene.environment.name,
+            object=self.scene.object_name,
+            environment=self.scene.environment_name,
             model=self.model,
             task=self.task,
             spp=self.spp,
@@ -182,7 +182,7 @@ def render(
         progress.advance(1)
     assert formation is not None
     own = scene.description
-    warnings = (*own.object.notes, *own.environment.warnings, *sentences(space.moved))
+    warnings = (*own.notes, *sentences(space.moved))
     shown = replace(own, environment_spec=space.environment or own.environment_spec)
     return Rendering(shown, model.name, made.name, formation, spp, tuple(views), warnings)
 

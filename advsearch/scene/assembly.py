@@ -15,8 +15,6 @@ from torch import Tensor
 
 from advsearch.scene.assets import Mesh
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import object_to_world
-from advsearch.scene.parts import MeshPart
 
 ON_PICTURE = frozenset({"backdrop.color", "camera.exposure"})
 """Inputs that Mitsuba never sees: the renderer applies them to radiance."""
@@ -96,10 +94,7 @@ class Assembly:
     """
 
     def __init__(self, description: SceneDescription) -> None:
-        self.meshes = {"object": MovingMesh(description.object.mesh, object_to_world(description))}
-        for part in description.parts:
-            if isinstance(part, MeshPart):
-                self.meshes[part.name] = MovingMesh(part.mesh, part.to_world)
+        self.meshes = {name: MovingMesh(part.mesh, part.to_world) for name, part in description.meshes.items()}
 
     def __call__(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the inputs with poses, displacements and maps worked out; differentiable torch operations."""

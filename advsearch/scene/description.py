@@ -1,4 +1,4 @@
-"""A scene as data: an object, an environment and the settings, before Mitsuba is asked for anything.
+"""A scene as data: meshes, of which one is the object, lamps, an environment and the settings; nothing of Mitsuba.
 
 Conventions: z up, right-handed, lengths in object sizes (the object's largest extent is 1 before `pose.scale`), angles
 in degrees. The camera at azimuth 0 and elevation 0 looks from +x towards the object.
@@ -18,15 +18,19 @@ from advsearch.errors import InputError
 from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.parts import ScenePart
+from advsearch.scene.parts import BallLamp, MeshPart, PointLamp, ScenePart
 
 Doubles = npt.NDArray[np.float64]
 
 DEFAULT_ENVIRONMENT = "studio"
+OBJECT = "object"
+"""The name of the mesh under test."""
 ENVIRONMENT = "environment"
 """What stands for the environment among the settings that were asked for."""
 FRAME_FILL = 0.86
 """Share of the picture's half-width that the object's outline may reach when the distance is worked out."""
+NO_MAP = "none"
+"""What the environment of a scene without a map is called."""
 OWN_MAP = "own"
 """What the scene's own environment is called where another may be chosen."""
 
@@ -37,20 +41,20 @@ class SceneDescription:
 
     Attributes:
         object: the thing to recognise.
-        environment: what lights it.
+        environment: the map that lights it; None where only lamps do.
         values: every setting of `advsearch.scene.settings` by name; None where the scene works the value out.
         object_spec: how the object was asked for: a bundled name, a path, or an asset's own name.
         environment_spec: how the environment was asked for, likewise.
         up: the up axis that was given for a mesh file, or None.
         given: what was asked for: names of settings, and "environment".
-        parts: what controls have put into the scene beside the object, the environment and the ground.
+        parts: what is in the scene beside the object, the environment and the ground: further meshes, lamps, haze.
         thin_lens: the camera has an aperture and a focus distance.
         backdrop: the environment may be hidden behind a plain colour (`backdrop.color`).
         aspect: width over height of the picture.
     """
 
     object: ObjectAsset
-    environment: EnvironmentAsset
+    environment: EnvironmentAsset | None
     values: Mapping[str, float | None] = field(default_factory=dict)
     object_spec: str = ""
     environment_spec: str = ""
@@ -67,7 +71,7 @@ class SceneDescription:
         Raises:
             InputError: its name is taken.
         """
-        if part.name in ("object", "environment", "ground", "camera", *(one.name for one in self.parts)):
+        if part.name in (OBJECT, "environment", "ground", "camera", *(one.name for one in self.parts)):
             raise InputError(f"`controls` {part.name}: the scene has something of that name already; choose another")
         return replace(self, parts=(*self.parts, part))
 
@@ -76,9 +80,49 @@ class SceneDescription:
         return replace(self, values={**self.values, **{name.replace("__", "."): v for name, v in given.items()}})
 
     @property
+    def meshes(self) -> Mapping[str, MeshPart]:
+        """Every mesh by name; the one under test is `OBJECT`, in its base pose."""
+        from advsearch.scene.geometry import object_to_world
+
+        own = self.object
+        under_test = MeshPart(OBJECT, own.mesh, object_to_world(self), own.base_color, self.material)
+        return {OBJECT: under_test, **{one.name: one for one in self.parts if isinstance(one, MeshPart)}}
+
+    @property
+    def lamps(self) -> Mapping[str, PointLamp | BallLamp]:
+        """Every light beside the environment, by name."""
+        return {one.name: one for one in self.parts if isinstance(one, (PointLamp, BallLamp))}
+
+    @property
+    def object_name(self) -> str:
+        """How the object was asked for, or else its own name."""
+        return self.object_spec or self.object.name
+
+    @property
+    def environment_name(self) -> str:
+        """How the environment was asked for, or else its own name; `NO_MAP` where there is none."""
+        return self.environment_spec or (NO_MAP if self.environment is None else self.environment.name)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a user should know of how object and environment were read."""
+        return (*self.object.notes, *(() if self.environment is None else self.environment.warnings))
+
+    @property
     def bundled_environment(self) -> str | None:
         """Name of the environment if it is a bundled one."""
-        return self.environment.name if self.environment.source == library.BUNDLED_ENVIRONMENT else None
+        own = self.environment
+        return own.name if own is not None and own.source == library.BUNDLED_ENVIRONMENT else None
+
+    def environment_for(self, who: str) -> EnvironmentAsset:
+        """Return the environment for what cannot do without a map.
+
+        Raises:
+            InputError: the scene has none.
+        """
+        if self.environment is None:
+            raise InputError(f"{who}: the scene has no environment map; give it one, or leave {who} out")
+        return self.environment
 
     @property
     def base_vertices(self) -> Doubles:
@@ -122,7 +166,8 @@ def describe(
 
     Args:
         object_spec: a bundled name, a path to a mesh, or an asset.
-        environment_spec: a bundled name, a path to an .hdr or .exr file, an asset, or None for the default.
+        environment_spec: a bundled name, a path to an .hdr or .exr file, an asset, `NO_MAP` for no map at all, or None
+            for the default.
         given: settings to fix, by name.
         up: "y" or "z", the up axis of a mesh file; None takes what its format or else its shape says.
 
@@ -154,9 +199,11 @@ def _object(spec: str | Path | ObjectAsset, up: str | None) -> ObjectAsset:
     return library.load_object(str(spec))
 
 
-def _environment(spec: str | Path | EnvironmentAsset) -> EnvironmentAsset:
+def _environment(spec: str | Path | EnvironmentAsset) -> EnvironmentAsset | None:
     if isinstance(spec, EnvironmentAsset):
         return spec
+    if spec == NO_MAP:
+        return None
     if _is_path(spec):
         return environments.import_environment(Path(spec))
     return library.load_environment(str(spec))

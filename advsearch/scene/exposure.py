@@ -86,7 +86,13 @@ def irradiance(scene: SceneDescription, normals: Doubles) -> Doubles:
     hits = ~upper & (reach <= scene.number("ground.size") / 2.0).all(axis=1)
     power = np.where(hits[:, None], bounced * solid[:, None], power)
     facing = np.maximum(np.einsum("nk,wk->nw", normals, directions), 0.0)
-    return np.asarray(np.einsum("nw,wc->nc", facing, power))  # no BLAS, whose last bits depend on its threads
+    found = np.asarray(np.einsum("nw,wc->nc", facing, power))  # no BLAS, whose last bits depend on its threads
+    for lamp in scene.lamps.values():
+        way, faced = lamp.lighting(middle)
+        if faced.any():  # the lamps of controls are dark as they come
+            length = max(float(np.linalg.norm(way)), 1e-12)
+            found = found + np.maximum(normals @ (way / length), 0.0)[:, None] * faced
+    return found
 
 
 def visible_normals(scene: SceneDescription) -> Doubles:
@@ -113,8 +119,10 @@ def visible_normals(scene: SceneDescription) -> Doubles:
 
 
 @lru_cache(maxsize=8)
-def _arriving(environment: EnvironmentAsset) -> tuple[Doubles, Doubles, Doubles]:
+def _arriving(environment: EnvironmentAsset | None) -> tuple[Doubles, Doubles, Doubles]:
     """Unit directions (N, 3) of a coarse map's texels, z up; their solid angles (N,); radiance times these (N, 3)."""
+    if environment is None:
+        return np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3))
     height, width = environment.radiance.shape[:2]
     rows, columns = _edges(height, ROWS), _edges(width, 2 * ROWS)
     polar = np.clip((np.arange(height + 1) - 0.5) / (height - 1), 0.0, 1.0) * math.pi  # rows 0 and -1 are the poles

@@ -1,4 +1,4 @@
-"""What controls may put into a scene beside the object and its environment, as data: meshes, lamps, haze.
+"""What may be in a scene beside its environment map, as data: meshes, lamps, haze, each under a name.
 
 A part says what it is and which scene inputs it takes, torch tensors under names of ours; `mitsuba_backend` translates
 it. A part of another kind is a subclass, with a translation registered in `mitsuba_backend.parts.translation`.
@@ -6,6 +6,7 @@ it. A part of another kind is a subclass, with a translation registered in `mits
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -13,6 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.scene.assets import Floats, Material, Mesh
+
+Doubles = npt.NDArray[np.float64]
+Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +49,7 @@ class MeshPart(ScenePart):
     """
 
     mesh: Mesh
-    to_world: npt.NDArray[np.float64]
+    to_world: Doubles
     base_color: Floats
     material: Material = field(default_factory=Material)
 
@@ -60,9 +64,18 @@ class PointLamp(ScenePart):
     Attributes:
         name: of the lamp.
         dark: its intensity is 0 whatever happens.
+        position: base value, object sizes.
+        intensity: base value, linear radiant intensity for each colour channel.
     """
 
     dark: bool = False
+    position: Triple = (0.0, 0.0, 2.0)
+    intensity: Triple = (0.0, 0.0, 0.0)
+
+    def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
+        """Return the way from a place (3,) to the lamp, and the irradiance (3,) where that is faced; base values."""
+        way = np.array(self.position) - place
+        return way, np.array(self.intensity) / max(float(way @ way), 1e-12)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +91,20 @@ class BallLamp(ScenePart):
     Attributes:
         name: of the lamp.
         dark: its radiance is 0 whatever happens.
+        place: base value of the ball's middle, object sizes.
+        radius: base value, object sizes.
+        radiance: base value, linear, for each colour channel.
     """
 
     dark: bool = False
+    place: Triple = (0.0, 0.0, 2.0)
+    radius: float = 0.1
+    radiance: Triple = (0.0, 0.0, 0.0)
+
+    def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
+        """As of a point; the irradiance of a uniform ball is `pi L r^2 / d^2` (see the `light` control)."""
+        intensity = tuple(math.pi * self.radius**2 * one for one in self.radiance)
+        return PointLamp(self.name, position=self.place, intensity=intensity).lighting(place)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, eq=False)

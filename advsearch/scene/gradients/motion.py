@@ -50,7 +50,7 @@ class Motion:
         self._fov = description.number("camera.fov")
         self._ground = description.number("ground.size") / 2.0
         self._edge = _edge_points(self._ground)
-        self._far = _far_points(description.backdrop)
+        self._far = _far_points(description.backdrop or description.environment is None)
         self._picks = {
             name: torch.from_numpy(np.linspace(0, len(mesh.vertices) - 1, min(POINTS, len(mesh.vertices))).astype(int))
             for name, mesh in assembly.meshes.items()
@@ -117,9 +117,9 @@ def _edge_points(half: float) -> Tensor:
     return torch.cat([torch.stack([x, y, zero], dim=1) for x, y in sides])
 
 
-def _far_points(backdrop: bool) -> Tensor:
-    """(N, 3) points of the environment, evenly spread (Fibonacci spiral); none where a plain colour hides them."""
-    number = torch.arange(0 if backdrop else DIRECTIONS, dtype=torch.float64)
+def _far_points(hidden: bool) -> Tensor:
+    """(N, 3) points of the environment, evenly spread (Fibonacci spiral); none where nothing shows them."""
+    number = torch.arange(0 if hidden else DIRECTIONS, dtype=torch.float64)
     height = 1.0 - (2.0 * number + 1.0) / DIRECTIONS
     turn = number * torch.pi * (3.0 - 5.0**0.5)
     radius = (1.0 - height**2).sqrt()

@@ -21,13 +21,14 @@ def scene_dict(description: SceneDescription, resolution: tuple[int, int], filte
     scene: dict[str, Any] = {
         "type": "scene",
         "camera": _camera(description, resolution, filter, sampler),
-        "environment": {
+    }
+    if description.environment is not None:
+        scene["environment"] = {
             "type": "envmap",
             "bitmap": mi.Bitmap(np.ascontiguousarray(description.environment.radiance, dtype=np.float32)),
             "scale": 2.0 ** number("environment.exposure"),
             "to_world": place().rotate([0, 0, 1], number("environment.rotation")).rotate([1, 0, 0], 90),
-        },
-    }
+        }
     if number("ground.size") > 0.0:
         color = [number(f"ground.{channel}") for channel in ("red", "green", "blue")]
         reflectance = srgb_to_linear(np.array(color, np.float32)).tolist()

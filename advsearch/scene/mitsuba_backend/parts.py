@@ -12,7 +12,6 @@ from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, mitsuba_m
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.parts import BallLamp, HazePart, MeshPart, PointLamp, ScenePart
 
-BLACK = {"type": "rgb", "value": [0.0, 0.0, 0.0]}
 ABSENT = {"type": "uniform", "value": 0.0}
 IDLE_LOBES: Mapping[str, Any] = {name: ABSENT for name in ("clearcoat", "sheen")}
 """Entries of the principled surface that give it lobes of strength 0."""
@@ -69,7 +68,8 @@ def _point(part: PointLamp) -> Translation:
         SceneInput(f"{name}.position", f"{name}.position", point, shape=(3,)),
         SceneInput(f"{name}.intensity", f"{name}.intensity.value", color, interior=True, shape=(3,)),
     )
-    return Translation({name: {"type": "point", "position": [0.0, 0.0, 2.0], "intensity": BLACK}}, inputs)
+    lamp = {"type": "point", "position": list(part.position), "intensity": _rgb(part.intensity)}
+    return Translation({name: lamp}, inputs)
 
 
 @translation.register
@@ -77,9 +77,9 @@ def _ball(part: BallLamp) -> Translation:
     name = part.name
     ball = {
         "type": "sphere",
-        "to_world": mitsuba().ScalarTransform4f().translate([0.0, 0.0, 2.0]).scale(0.1),
+        "to_world": mitsuba().ScalarTransform4f().translate(list(part.place)).scale(part.radius),
         "bsdf": {"type": "null"},
-        "emitter": {"type": "area", "radiance": BLACK},
+        "emitter": {"type": "area", "radiance": _rgb(part.radiance)},
     }
     inputs = (
         SceneInput(f"{name}.ball", f"{name}.to_world", transform, shape=(4, 4)),
@@ -93,13 +93,17 @@ def _haze(part: HazePart) -> Translation:
     """Mitsuba's medium only holds density and albedo for the integrator: no shape refers to it."""
     import advsearch.scene.mitsuba_backend.haze_path  # noqa: F401  (registers the integrator)
 
-    name, albedo = part.name, {"type": "rgb", "value": [1.0, 1.0, 1.0]}
+    name, albedo = part.name, _rgb((1.0, 1.0, 1.0))
     medium = mitsuba().load_dict({"type": "homogeneous", "albedo": albedo, "sigma_t": 0.0})
     inputs = (
         SceneInput(f"{name}.density", f"{name}.sigma_t.value.value", number, True, (1,)),
         SceneInput(f"{name}.albedo", f"{name}.albedo.value.value", color, True, (3,)),
     )
     return Translation({name: medium}, inputs, {"type": "advsearch_haze", "medium": medium, "radius": part.radius})
+
+
+def _rgb(value: Sequence[float]) -> dict[str, Any]:
+    return {"type": "rgb", "value": list(value)}
 
 
 def leave_dark_lamps_out(plugins: MutableMapping[str, Any], parts: Sequence[ScenePart]) -> None:

@@ -17,8 +17,7 @@ from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.scene.assembly import Assembly
-from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import object_to_world
+from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.dictionary import camera_inputs, scene_dict
 from advsearch.scene.mitsuba_backend.inputs import SceneInput, as_is, key_of
@@ -27,7 +26,6 @@ from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, leave_dark_lamps_o
 from advsearch.scene.mitsuba_backend.population import population
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER, next_count
 from advsearch.scene.mitsuba_backend.variant import mitsuba
-from advsearch.scene.parts import MeshPart
 
 MAX_DEPTH = 6
 """Longest light path in segments: five bounces off surfaces."""
@@ -84,16 +82,9 @@ class MitsubaScene:
         self._freeze = "tracing" in leave_out and not description.thin_lens  # Dr.Jit cannot record Mitsuba's thin lens
         self._thin_lens = description.thin_lens
         self._backdrop = description.backdrop
-        object_part = MeshPart(
-            "object",
-            description.object.mesh,
-            object_to_world(description),
-            description.object.base_color,
-            description.material,
-        )
         self.volumetric = any(part.volumetric for part in description.parts)
         plugins = scene_dict(description, resolution, filter, sampler)
-        translated = [mesh_translation(object_part, None if "lobes" in leave_out else IDLE_LOBES)]
+        translated = [mesh_translation(description.meshes[OBJECT], None if "lobes" in leave_out else IDLE_LOBES)]
         translated += [translation(part) for part in description.parts]
         self._path: dict[str, Any] = {"type": integrator}
         for one in translated:

@@ -1,0 +1,63 @@
+"""A scene's named meshes and lamps, and scenes without an environment map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from advsearch.engine.loading import Scene, load_scene
+from advsearch.errors import InputError
+from advsearch.scene.description import describe
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.parts import BallLamp, PointLamp
+
+
+def picture(scene: Scene, controls: str | dict[str, dict[str, object]] = "pose") -> torch.Tensor:
+    render = scene.renderer(controls, resolution=24)
+    with torch.no_grad():
+        return render(render.start, seed=0, spp=16)
+
+
+@pytest.mark.parametrize(
+    "lamp",
+    [
+        PointLamp("key", position=(1.5, -1.0, 2.5), intensity=(1.0, 1.0, 1.0)),
+        BallLamp("key", place=(1.5, -1.0, 2.5), radius=0.1, radiance=(31.8, 31.8, 31.8)),
+    ],
+)
+def test_a_scene_without_a_map_is_lit_and_metered_by_its_lamps(lamp: PointLamp | BallLamp) -> None:
+    scene = describe("mug", "none").with_part(lamp)
+    assert scene.environment is None and set(scene.lamps) == {"key"} and set(scene.meshes) == {"object"}
+    assert Scene(scene).description.gain == pytest.approx(61.2, rel=0.01)
+    seen = picture(Scene(scene))
+    assert 0.2 < float(seen.mean()) < 0.6 and float(seen.max()) > 0.6
+    twice = replace(scene, parts=(PointLamp("key", position=(1.5, -1.0, 2.5), intensity=(2.0, 2.0, 2.0)),))
+    assert twice.gain == pytest.approx(scene.gain / 2.0, rel=0.01), "an automatic exposure"
+
+
+def test_the_light_control_lights_a_scene_without_a_map() -> None:
+    assert float(picture(load_scene("mug", "none"), {"light": {"power": 6.0, "x": [0.0, 1.0]}}).mean()) > 0.1
+
+
+@pytest.mark.parametrize(
+    ("control", "message"),
+    [
+        ("environment", "`controls` environment: the scene has no environment map; give it one"),
+        ("sky", "`environment=none` and `controls` sky contradict each other"),
+        ("pose", "environment: the scene has neither a map nor a lamp, so that every picture is black"),
+    ],
+)
+def test_what_needs_a_map_says_so(control: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        load_scene("mug", "none").renderer(control, resolution=24)
+
+
+def test_meshes_have_names_and_one_of_them_is_the_object() -> None:
+    scene = describe("mug")
+    scene = scene.with_part(replace(scene.meshes["object"], name="second"))
+    assert list(scene.meshes) == ["object", "second"] and scene.meshes["object"].mesh is scene.object.mesh
+    assert {"object.vertices", "second.vertices"} <= MitsubaScene(scene, (8, 8)).names
+    with pytest.raises(InputError, match="the scene has something of that name already"):
+        scene.with_part(scene.meshes["object"])
