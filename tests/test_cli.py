@@ -239,6 +239,59 @@ def test_what_the_api_raises_becomes_a_status(
     assert capsys.readouterr() == ("", message)
 
 
+SWALLOWING = """
+import importlib.abc, importlib.util, os, signal, sys
+
+class Done:
+    summary = {'ending': 'found'}
+
+def interrupted():
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        while True:
+            pass
+    except KeyboardInterrupt:
+        print("swallowed", flush=True)
+
+def attack_from_config(config, *, progress):
+    {loading}
+    print("searched", flush=True)
+    sys.exit("expected nothing to be searched")
+
+class Swallows(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    def find_spec(self, name, path, target=None):
+        return importlib.util.spec_from_loader(name, self) if name.startswith("advsearch.api") else None
+
+    def exec_module(self, module):
+        names = "attack_from_config", "resume_attack", "curve_from_config"
+        vars(module).update(dict.fromkeys(names, attack_from_config), __path__=[])
+        {importing}
+
+sys.meta_path.insert(0, Swallows())
+sys.argv[1:] = ["attack", "--object", "mug", "--json", *sys.argv[1:]]
+from advsearch.cli.main import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("quiet", [[], ["--quiet"]])
+@pytest.mark.parametrize(
+    "where",
+    [
+        {"importing": "interrupted()", "loading": "progress.stage('loading')"},
+        {"importing": "pass", "loading": "progress.stage('loading'); interrupted(); progress.stage('searching', 9)"},
+        {"importing": "pass", "loading": "interrupted(); return Done"},
+    ],
+    ids=["importing", "loading", "without a stage"],
+)
+def test_an_interrupt_that_an_import_swallows_is_not_lost(where: dict[str, str], quiet: list[str]) -> None:
+    """Imports of others catch everything, so that what came meanwhile is raised when the stage ends."""
+    code = SWALLOWING.replace("{importing}", where["importing"]).replace("{loading}", where["loading"])
+    done = subprocess.run([sys.executable, "-c", code, *quiet], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 130 and "searched" not in done.stdout + done.stderr
+    assert "swallowed" in done.stdout + done.stderr and done.stderr.endswith("advsearch: interrupted\n")
+
+
 def test_a_reader_that_goes_away_is_no_error() -> None:
     code = "import sys; from advsearch.cli.main import main; sys.stdin.read(); sys.exit(main(['--help']))"
     with subprocess.Popen(
@@ -332,7 +385,7 @@ def test_run_reads_a_file_and_puts_changes_over_it(asked: list[AttackConfig], tm
         (
             "object: mug\ncommand: atack\n",
             [],
-            "unknown command 'atack'. Did you mean 'attack'? Known: attack, check, gap, precision, region, sweep. It ",
+            "unknown command 'atack'. Did you mean 'attack'? Known: attack, check, gap, precision, region, stability, sweep. It ",
         ),
         ("object: mug\n", ["steps"], "change 'steps': expected NAME=VALUE such as camera.azimuth=130, got 'steps'"),
         ("object: mug\n", ["step=3"], "unknown setting 'step'. Did you mean 'steps'"),

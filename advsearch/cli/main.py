@@ -15,10 +15,11 @@ import signal
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
-from types import FrameType, ModuleType
+from types import ModuleType
 from typing import NoReturn
 
 from advsearch import __version__
+from advsearch.cli.interrupts import INTERRUPTS
 from advsearch.cli.screen import end_output, open_descriptors, screens, shortened
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 
@@ -63,37 +64,27 @@ class Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. An exception that is a bug of ours passes through."""
-    interrupts = Interrupts()
     if argv is None:  # this process is ours
         open_descriptors()
-        signal.signal(signal.SIGINT, interrupts)
+        signal.signal(signal.SIGINT, INTERRUPTS)
     with screens():
-        status = _status(list(sys.argv[1:] if argv is None else argv), interrupts)
+        status = _status(list(sys.argv[1:] if argv is None else argv))
         if argv is None:  # what is left is the end of the process, which no further Ctrl-C hastens
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         end_output()
     return status
 
 
-class Interrupts:
-    """A handler of Ctrl-C as Python's own, which counts."""
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Take a signal."""
-        self.count += 1
-        raise KeyboardInterrupt
-
-
-def _status(given: list[str], interrupts: Interrupts) -> int:
+def _status(given: list[str]) -> int:
     """Run one command, print what went wrong, and return the exit status."""
     try:
-        return _run_and_tell(given)
+        status = _run_and_tell(given)
+        if status != INTERRUPTED:
+            INTERRUPTS.check()  # whatever has swallowed one: it was asked to stop
+        return status
     except BaseException as error:
         # Modules that are being imported, and native code, make other errors of an interrupt.
-        if not interrupts.count and not isinstance(error, KeyboardInterrupt):
+        if not INTERRUPTS.count and not isinstance(error, KeyboardInterrupt):
             raise
         with suppress(KeyboardInterrupt):  # one more
             print("advsearch: interrupted", file=sys.stderr)

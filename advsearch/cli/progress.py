@@ -10,6 +10,7 @@ from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, TextIO
 
 from advsearch.cli.flags import with_flags
+from advsearch.cli.interrupts import LoadingProgress
 from advsearch.cli.output import output_kept_clean
 from advsearch.cli.screen import printable, raw
 from advsearch.progress import NullProgress, Progress
@@ -32,9 +33,11 @@ MOST_BARS = 5
 @contextmanager
 def at_work(*, as_json: bool, quiet: bool) -> Iterator[Progress]:
     """Watch a command's work; where JSON is to be printed, keep everything else off standard output meanwhile."""
-    with output_kept_clean() if as_json else nullcontext(), watching(quiet=quiet) as progress:
+    with output_kept_clean() if as_json else nullcontext(), watching(quiet=quiet) as watcher:
+        progress = LoadingProgress(watcher)
         progress.stage("starting: PyTorch and Mitsuba are loaded")
         yield progress
+        progress.end()
 
 
 @contextmanager
