@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import random
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -24,8 +26,9 @@ from advsearch.config import AttackConfig
 from advsearch.engine.memory import Memory
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.stages import Attack
-from advsearch.errors import FileFormatError, InputError
+from advsearch.errors import FileFormatError, InputError, RunExistsError
 from advsearch.progress import NullProgress
+from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.replay import Entry, ReplayLog
 from advsearch.runs.store import Row
@@ -157,7 +160,9 @@ def kill_and_resume(folder: Path, policy: str) -> int:
             carry_out(folder, configuration(policy), pause=0.003, resume=begun)
             os._exit(0)
         time.sleep(moments.uniform(0.002, 0.06) * (1.0 + kills / 4))  # a policy thinks again: that takes its time
-        if os.waitpid(child, os.WNOHANG) != (0, 0):
+        ended, status = os.waitpid(child, os.WNOHANG)
+        if ended:
+            assert status == 0, "it ended by itself, and not well"
             return kills
         os.kill(child, signal.SIGKILL)
         os.waitpid(child, 0)
@@ -346,3 +351,19 @@ def test_a_kill_while_the_results_were_made_leaves_a_folder_that_a_run_can_take(
     with RunDirectory.create(folder) as run:
         run.write_config(configuration())
     assert (folder / "run.yaml").is_file()
+
+
+def test_a_kill_before_the_results_had_tables_leaves_a_folder_that_a_run_can_take(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    with closing(sqlite3.connect(folder / "results.sqlite")) as made:
+        store._make(made)
+    with RunDirectory.create(folder) as run:
+        run.write_config(configuration())
+    with closing(sqlite3.connect(tmp_path / "results.sqlite")) as made:
+        store._make(made)
+        made.execute("CREATE TABLE others (text)")
+    folder.joinpath("run.yaml").unlink()
+    (tmp_path / "results.sqlite").replace(folder / "results.sqlite")
+    with pytest.raises(RunExistsError):  # what somebody else made is not thrown away
+        RunDirectory.create(folder)

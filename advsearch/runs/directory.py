@@ -387,8 +387,13 @@ def _never_began(path: Path) -> bool:
     """Whether a run was killed before its settings were written: there is nothing in it to lose."""
     if (path / CONFIG).exists() or not store.is_ours(path / store.NAME):
         return False
-    with suppress(AdvsearchError), store.Store(path / store.NAME, read_only=True) as results:
-        return results.count() == 0 and not (path / summary.NAME).exists()
+    with suppress(AdvsearchError):
+        if (path / summary.NAME).exists():
+            return False
+        if store.is_bare(path / store.NAME):
+            return True
+        with store.Store(path / store.NAME, read_only=True) as results:
+            return results.count() == 0
     return False
 
 

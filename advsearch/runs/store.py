@@ -246,6 +246,12 @@ def is_ours(path: Path) -> bool:
     return header[:15] == b"SQLite format 3" and header[68:72] == APPLICATION_ID.to_bytes(4, "big")
 
 
+def is_bare(path: Path) -> bool:
+    """Return whether the file at `path`, which is ours, has no tables yet: its process was killed as it made them."""
+    with _readable(path), closing(_connect_to_read(path)) as db:
+        return _version(db) == 0 and not _schema(db)
+
+
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
     """Turn what SQLite says of a damaged file inside the block into an error that names it."""
