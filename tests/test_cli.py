@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import resource
 import subprocess
 import sys
 import time
@@ -113,9 +114,10 @@ def test_help_is_quick_and_imports_nothing_heavy() -> None:
     )
     seconds = []
     for _ in range(3):
-        began = time.perf_counter()
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
         done = python(code)
-        seconds.append(time.perf_counter() - began)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)  # CPU seconds: what others do on the machine takes none
+        seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
     assert (done.returncode, done.stderr) == (0, "[]\n")
     assert all(name in done.stdout for name in COMMANDS)
     assert min(seconds) < 0.5
@@ -320,7 +322,7 @@ def test_attack_builds_its_configuration_from_flags(asked: list[AttackConfig]) -
         AttackConfig(
             object="mug.obj", up="y", environment="room.hdr", model="net.pt2", labels="l.json", label="cup",
             controls={"texture": {}, "pose": {}, "light": {}, "patch": {"size": 0.3}},
-            set={"camera.azimuth": 130, "a.b": [0, 1]}, epsilon=0.1, norm="l2", texture_resolution=64, policy="random",
+            set_={"camera.azimuth": 130, "a.b": [0, 1]}, epsilon=0.1, norm="l2", texture_resolution=64, policy="random",
             steps=3, step_size=0.5, objective="margin", spp=4, verify_spp=32, trials=7, denoise="none",
             resolution=(64, 96), exposure=-1, baseline=False, seed=9, threads=1, run="x", overwrite=True,
             deterministic=True,
@@ -375,7 +377,7 @@ def test_run_reads_a_file_and_puts_changes_over_it(asked: list[AttackConfig], tm
         main(["run", str(path), "steps=80", "set.camera.azimuth=130", "--run", "again", "--overwrite", "--quiet"]) == 0
     )
     assert asked == [
-        AttackConfig(object="mug", steps=80, seed=4, set={"camera.azimuth": 130}, run="again", overwrite=True)
+        AttackConfig(object="mug", steps=80, seed=4, set_={"camera.azimuth": 130}, run="again", overwrite=True)
     ]
 
 
@@ -516,7 +518,7 @@ def test_region_takes_scene_and_controls_from_the_run_that_it_goes_around(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     theirs = AttackConfig(
-        object="bowl", controls={"pose": {"yaw": [0, 90]}}, spp=4, seed=7, set={"camera.azimuth": 20}, run="runs/first"
+        object="bowl", controls={"pose": {"yaw": [0, 90]}}, spp=4, seed=7, set_={"camera.azimuth": 20}, run="runs/first"
     )
     with RunDirectory.create_for(theirs):
         pass
