@@ -314,6 +314,13 @@ def test_settings_make_the_same_control_again(scene: SceneDescription) -> None:
         ({"size": 2.0}, r"patch.size: expected a number from 0.05 to 0.6 \(object sizes\), got 2"),
         ({"pixels": [0.1, 0.2, 0.3]}, r"patch.pixels: expected \[low, high\] or one number, got a list of 3"),
         ({"pixels": 0.5, "picture": "a.png"}, r"patch.pixels: expected none beside patch.picture"),
+        (
+            {"picture": "a.png", "epsilon": 0.1},
+            r"patch.epsilon: is of the ball that searched pixels stay in, and these are fixed; leave it out, or leave "
+            r"out patch.picture",
+        ),
+        ({"pixels": 0.5, "epsilon": 0.1}, r"patch.epsilon: is of the ball .* leave out patch.pixels"),
+        ({"pixels": 0.5, "norm": "l2"}, r"patch.norm: is of the ball that searched pixels stay in"),
         ({"pixels": 0.5}, r"`controls` patch: the pixels are fixed, so there is nothing to search"),
     ],
 )

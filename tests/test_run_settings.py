@@ -147,9 +147,22 @@ def _seen(config: AttackConfig, seen: list[Any]) -> None:
         ("texture,environment", {"epsilon": "environment=1"}, "--epsilon environment: the control has ranges"),
         ("environment.rotation", {"epsilon": 0.1}, "--epsilon environment: the control has ranges"),
         ("texture,pose", {"epsilon": (0.1, 0.2)}, "--epsilon pose: the control has ranges and no epsilon"),
+        (
+            {"patch": {"picture": "a.png", "azimuth": [0, 360]}},
+            {"epsilon": 0.1},
+            "--epsilon patch: the control has ranges and no epsilon; give its ranges, as in --control "
+            "'patch={PARAMETER: [LOW, HIGH]}', or search pixels with it",
+        ),
+        ({"patch": {"pixels": 0.5, "size": [0.1, 0.3]}}, {"epsilon": 0.1}, "--epsilon patch: the control has ranges"),
+        ({"patch": {"picture": "a.png", "size": [0.1, 0.3]}}, {"norm": "l2"}, "--norm: patch has none"),
+        (
+            {"texture": {}, "sign": {"kind": "patch", "pixels": 0, "size": [0.1, 0.3]}},
+            {"epsilon": "sign=0.1"},
+            "--epsilon sign: the control has ranges and no epsilon",
+        ),
     ],
 )
-def test_a_setting_that_no_control_takes_is_refused(controls: str, options: dict[str, Any], message: str) -> None:
+def test_a_setting_that_no_control_takes_is_refused(controls: Any, options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError) as error:
         check_run_settings(AttackConfig(object="mug", controls=controls, **options))
     assert with_flags(str(error.value)).startswith(message)
@@ -174,6 +187,23 @@ def test_an_environment_takes_an_epsilon_for_its_harmonics(controls: Any) -> Non
 def test_an_environment_without_harmonics_refuses_an_epsilon_of_its_own() -> None:
     with pytest.raises(InputError, match=r"environment\.epsilon: the radius of the ball of harmonics, which are not"):
         make_control("environment", {"epsilon": 0.3})
+
+
+@pytest.mark.parametrize("controls", ["patch", "patch.size", {"patch": {"pixels": [0.1, 0.9]}}])
+def test_a_patch_takes_an_epsilon_for_searched_pixels(controls: Any) -> None:
+    config = AttackConfig(object="mug", controls=controls, epsilon=0.07)
+    check_run_settings(config)
+    (control,) = controls_of(config.controls, config)
+    assert control.settings()["epsilon"] == 0.07
+
+
+def test_an_epsilon_that_another_control_takes_leaves_a_fixed_patch() -> None:
+    config = AttackConfig(
+        object="mug", controls={"texture": {}, "patch": {"pixels": 0.5, "size": [0.1, 0.3]}}, epsilon=0.07
+    )
+    check_run_settings(config)
+    texture, patch = controls_of(config.controls, config)
+    assert texture.settings()["epsilon"] == 0.07 and "epsilon" not in patch.settings()
 
 
 def test_an_epsilon_that_another_control_takes_leaves_an_environment_as_it_is() -> None:

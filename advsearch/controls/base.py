@@ -43,8 +43,9 @@ class Choice:
         description: one sentence.
         run_setting: the setting of a whole run that says it for all controls ("epsilon"), unless the control itself
             says something else; empty if there is none.
-        bounds: the parameter that it says something about, which is not searched unless asked for; empty if it counts
-            always. Where that parameter is not given, the control does not take the setting.
+        bounds: the parameter that it says something about; empty if it counts always. Where that parameter is not
+            searched, the control does not take the setting.
+        fixes: the parameter that is not searched where this is chosen; empty if there is none.
         options: the names that can be chosen; empty for anything else.
         whole: the smallest and the largest whole number that can be chosen, or None.
         most: the largest number that can be chosen, all over 0; None for anything else.
@@ -55,6 +56,7 @@ class Choice:
     description: str
     run_setting: str = ""
     bounds: str = ""
+    fixes: str = ""
     options: tuple[str, ...] = ()
     whole: tuple[int, int] | None = None
     most: float | None = None

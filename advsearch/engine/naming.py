@@ -9,6 +9,7 @@ from typing import Any
 from advsearch import threads
 from advsearch.config import SceneConfig
 from advsearch.controls import CONTROLS, Choice, Control, gathered, names_of
+from advsearch.controls.values import is_number
 from advsearch.engine.loading import Controls, as_controls, settings_of
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.models import Model, ModelWarning, load_model
@@ -97,8 +98,17 @@ def _choices(asked: str, given: Mapping[str, Any]) -> list[Choice]:
 
 
 def _counting(kind: type[Control], given: Mapping[str, object]) -> list[Choice]:
-    """The choices that count beside the parameters that are given."""
-    return [choice for choice in kind.choices if not choice.bounds or given.get(choice.bounds) is not None]
+    """The choices that count beside the settings that are given: what they are about is searched."""
+    return [choice for choice in kind.choices if not choice.bounds or _is_searched(kind, choice.bounds, given)]
+
+
+def _is_searched(kind: type[Control], parameter: str, given: Mapping[str, object]) -> bool:
+    """Whether a parameter of a control is searched beside the settings that are given."""
+    if any(choice.fixes == parameter and given.get(choice.name) is not None for choice in kind.choices):
+        return False
+    if given.get(parameter) is not None:
+        return not is_number(given[parameter])
+    return any(one.name == parameter and one.search is not None for one in kind.parameters)
 
 
 def run_settings_for(config: SceneConfig, asked: str, given: Mapping[str, Any]) -> dict[str, Any]:

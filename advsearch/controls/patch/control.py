@@ -137,6 +137,7 @@ class PatchControl(Control):
             "How far pixels may go: box (anywhere), linf (the default with an epsilon) or l2 (a ball around what is "
             "underneath).",
             "norm",
+            "pixels",
             options=NORMS,
         ),
         Choice(
@@ -144,9 +145,10 @@ class PatchControl(Control):
             None,
             "Radius of that ball, display-referred; by default 0.1 a pixel value.",
             "epsilon",
+            "pixels",
             most=LARGEST_EPSILON,
         ),
-        Choice("picture", None, "A picture file to stick on as it is; the pixels are not searched then."),
+        Choice("picture", None, "A picture file to stick on as it is; then pixels are not searched.", fixes="pixels"),
     )
 
     def __init__(
@@ -167,6 +169,12 @@ class PatchControl(Control):
         self._placement = _Placement(self.name, **numbers)
         self._pixels_given = pixels
         self._pixels = self._pixel_spec()
+        ball = "epsilon" if epsilon is not None else "norm" if self.norm != "box" else None
+        if ball and isinstance(self._pixels, Fixed):
+            raise InputError(
+                f"{self.name}.{ball}: is of the ball that searched pixels stay in, and these are fixed; leave it out, "
+                f"or leave out {self.name}.{'picture' if picture is not None else 'pixels'}"
+            )
 
     def settings(self) -> dict[str, object]:
         given = {one.name: getattr(self, one.name) for one in self.choices if getattr(self, one.name) != one.default}
