@@ -10,16 +10,16 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from PIL import Image, ImageDraw, ImageFont
 
 from advsearch.cli.table import answer
 from advsearch.report.wording import percent
 from advsearch.runs.directory import default_name
-from advsearch.runs.summary import read_summary
+from advsearch.runs.results.attack import AttackSummary, UsualAnswer
+from advsearch.runs.summary import attack_of
 
 ROOT = Path(__file__).resolve().parent.parent
 PICTURE = ROOT / "docs" / "images" / "attack-mug.png"
@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("run", type=Path, help="folder of a finished run with the control texture")
     run = parser.parse_args(argv).run
-    summary = read_summary(run)
+    summary = attack_of(run)
     side_by_side(run, summary).save(PICTURE, optimize=True)
     readme = ROOT / "README.md"
     readme.write_text(with_answer(readme.read_text(encoding="utf-8"), summary), encoding="utf-8")
@@ -40,11 +40,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def side_by_side(run: Path, summary: Mapping[str, Any]) -> Image.Image:
+def side_by_side(run: Path, summary: AttackSummary) -> Image.Image:
     """Return the clean and the adversarial picture with the model's answers, and the texture, on white."""
     panels = [
-        ("images/clean.png", f"clean: {_said(summary['clean'])}"),
-        ("images/adversarial.png", f"adversarial: {_said(summary['adversarial'])}"),
+        ("images/clean.png", f"clean: {_said(summary.clean)}"),
+        ("images/adversarial.png", f"adversarial: {_said(summary.adversarial)}"),
         ("artifacts/texture.png", "the texture"),
     ]
     sheet = Image.new("RGB", (len(panels) * SIDE + (len(panels) - 1) * GAP, SIDE + CAPTION), "white")
@@ -67,11 +67,11 @@ def _fitted(picture: Image.Image) -> Image.Image:
     return square
 
 
-def _said(told: Mapping[str, Any]) -> str:
-    return f"{told['label']}, {percent(told['probability'])}"
+def _said(answer: UsualAnswer | None) -> str:
+    return f"{answer.label}, {percent(answer.probability)}" if answer else "no answer"
 
 
-def with_answer(readme: str, summary: Mapping[str, Any]) -> str:
+def with_answer(readme: str, summary: AttackSummary) -> str:
     """Return the text of README.md with the run's answer in the marked place; the run gets its usual name in `runs/`.
 
     Raises:
@@ -79,9 +79,9 @@ def with_answer(readme: str, summary: Mapping[str, Any]) -> str:
     """
     if readme.count(BEGIN) != 1 or readme.count(END) != 1:
         raise ValueError("README.md: expected one part made by docs/make_images.py")
-    place = f"runs/{default_name(str(summary['object']), summary['controls'])}-001"
+    place = f"runs/{default_name(summary.object, summary.controls)}-001"
     before, rest = readme.split(BEGIN)
-    block = f"```text\n{answer({**summary, 'run': place})}\n```\n"
+    block = f"```text\n{answer(summary.model_copy(update={'run': place}))}\n```\n"
     return f"{before}{BEGIN}{block}{END}{rest.split(END)[1]}"
 
 

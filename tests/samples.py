@@ -4,26 +4,106 @@ from __future__ import annotations
 
 from typing import Any
 
+from advsearch.runs.results.attack import AttackSummary
+from advsearch.runs.results.gap import CurveResult, GapResult
 from advsearch.runs.results.region import RegionResult
+from advsearch.runs.results.sweep import SweepSummary
 
 FORMATION: dict[str, Any] = {
     "denoiser": "oidn", "filter": "box", "sampler": "multijitter", "exposure": 0.0, "resolution": [128, 128],
     "gain": 1.0,
 }  # fmt: skip
 RUN: dict[str, Any] = {
-    "environment": "studio",
-    "ending": "done",
-    "seconds": {"total": 9.0},
-    "seed": 0,
-    "command_line": "",
+    "environment": "studio", "ending": "done", "seconds": {"total": 9.0}, "seed": 0, "command_line": "", "warnings": [],
+}  # fmt: skip
+ACCURACY = {"accuracy": 0.75, "interval": [0.35, 0.97]}
+AVERAGE = {"configurations": 200, "correct": 150, "accuracy": 0.75, "interval": [0.684, 0.8084], "margin": -1.0,
+           "worst_margin": 2.5}  # fmt: skip
+
+
+def rated(successes: int = 20, low: float = 0.8316, high: float = 1.0, **changes: Any) -> dict[str, Any]:
+    """Return a rate over 20 trials, without the answers that were given."""
+    own = {"successes": successes, "trials": 20, "rate": successes / 20, "interval": [low, high], "spp": 64}
+    return {**own, "labels": {}, "margin": 1.0, **changes}
+
+
+ATTACK: dict[str, Any] = {
+    **RUN, "schema": 1, "command": "attack", "run": "runs/mug-texture-001", "object": "mug", "model": "reference",
+    "task": "classification", "controls": ["texture"], "epsilon": 0.1, "norm": "linf", "objective": "margin", "policy": "pgd", "ending": "found",
+    "label_set": ["mug"], "goal": "a wrong answer", "target": None, "over": [], "image_formation": FORMATION,
+    "gradient_plan": {"renders_per_gradient": 0, "spp": None, "groups": []},
+    "light_path_segments": {"search": 6, "verification": 6},
+    "clean": {"label": "mug", "index": 0, "probability": 0.98, "correct": True, "moved": [],
+              "control": {"correct": 20, "trials": 20, "rate": 1.0, "interval": [0.8316, 1.0]}},
+    "adversarial": {"label": "vase", "index": 7, "probability": 0.913},
+    "verified": rated(labels={"vase": 20}),
+    "baseline": {"policy": "random", "renders": 40, "verified": rated(1, 0.0013, 0.249)},
+    "renders": {"search": 40, "gradient": 40, "verification": 21}, "steps": 40,
+    "non_finite": {"objectives": 0, "gradient_elements": 0},
+    "seconds": {"setup": 3.1, "search": 9.0, "verification": 2.2, "total": 14.6},
+}  # fmt: skip
+SWEEP: dict[str, Any] = {
+    **RUN, "schema": 1, "command": "sweep", "run": "runs/mug-sweep-001", "object": "mug", "model": "reference",
+    "task": "classification",
+    "controls": [], "ending": "finished", "image_formation": FORMATION, "configurations": 8, "planned": 8, "correct": 6,
+    **ACCURACY, "not_finite": 0, "answers": {}, "axes": [], "cells": None, "worst": None, "grid": {}, "samples": 1,
+    "sampler": None, "spp": 16, "renders": {"sweep": 8, "verification": 0}, "renders_per_second": None,
+}  # fmt: skip
+STUDY: dict[str, Any] = {
+    **RUN,
+    "schema": 1,
+    "model": "reference",
+    "task": "classification",
+    "policy": "auto",
+    "parts": ["a"],
 }
+CURVE: dict[str, Any] = {
+    **STUDY, "command": "attack", "run": "runs/mug-texture-001", "objects": ["mug", "bowl"], "controls": ["texture"],
+    "epsilons": [0.01, 0.1],
+    "table": [
+        {"object": "mug", "clean": ATTACK["clean"]["control"], "ending": "found", "epsilon": 0.1, "flips_at": 0.1,
+         "verified": rated(19), "margin": 1.5},
+        {"object": "bowl", "clean": None, "flips_at": None},
+    ],
+    "curve": [
+        {"epsilon": 0.01, "objects": 4, "robust": 3, "found": 0, "already_wrong": 1, **ACCURACY},
+        {"epsilon": 0.1, "objects": 0, "robust": 0, "found": 0, "already_wrong": 0, "accuracy": None,
+         "interval": [0.0, 1.0]},
+    ],
+}  # fmt: skip
+GAP: dict[str, Any] = {
+    **STUDY, "command": "gap", "run": "runs/mug-pose-001", "objects": ["mug"], "controls": ["pose"],
+    "table": [
+        {"object": "mug", "control": "pose", "average": {**AVERAGE, **ACCURACY}, "worst": rated(), "ending": "found",
+         "margin": 3.25, "renders": {"search": 40}, "run": None},
+    ],
+}  # fmt: skip
 REGION: dict[str, Any] = {
     **RUN, "schema": 1, "command": "region", "run": "runs/mug-pose-002", "object": "mug", "controls": ["pose"],
     "model": "reference", "verdict": "wrong", "same": 200, "samples": 200, "rate": 1.0, "interval": [0.982, 1.0],
-    "volume": 0.12, "spp": 64,
+    "volume": 0.12, "spp": 64, "image_formation": FORMATION, "clean": {"moved": []}, "renders": {"verification": 300},
     "box": [{"name": "pose.yaw", "unit": "degrees", "low": 10.0, "high": 55.5, "centre": 30.0}],
-    "image_formation": FORMATION, "clean": {"moved": []}, "warnings": [], "renders": {"verification": 300},
 }  # fmt: skip
+
+
+def attack(**changes: Any) -> AttackSummary:
+    """Return an attack's result with other fields."""
+    return AttackSummary.of({**ATTACK, **changes})
+
+
+def sweep(**changes: Any) -> SweepSummary:
+    """Return a sweep's result with other fields."""
+    return SweepSummary.of({**SWEEP, **changes})
+
+
+def curve(**changes: Any) -> CurveResult:
+    """Return a curve's result with other fields."""
+    return CurveResult.of({**CURVE, **changes})
+
+
+def gap(**changes: Any) -> GapResult:
+    """Return a gap's result with other fields."""
+    return GapResult.of({**GAP, **changes})
 
 
 def region(**changes: Any) -> RegionResult:

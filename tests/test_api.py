@@ -56,12 +56,12 @@ def level(scene: advsearch.Scene) -> float:
 def test_a_weakness_is_found_verified_and_kept(scene: advsearch.Scene, level: float, tmp_path: Path) -> None:
     result = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", **FAST)
     summary = result.summary
-    assert result.found and summary["ending"] == "found"
-    assert summary["verified"]["successes"] == summary["verified"]["trials"] == 6
-    assert summary["clean"]["control"]["correct"] == 6 and summary["clean"]["label"] == "mug"
-    assert summary["adversarial"]["label"] == "vase" and summary["verified"]["labels"] == {"vase": 6}
-    assert summary["renders"]["search"] == summary["baseline"]["renders"]
-    assert json.loads((tmp_path / "run" / "summary.json").read_text("utf-8")) == json.loads(json.dumps(summary))
+    assert result.found and summary.ending == "found"
+    assert summary.verified.successes == summary.verified.trials == 6
+    assert summary.clean.control.correct == 6 and summary.clean.label == "mug"
+    assert summary.adversarial.label == "vase" and summary.verified.labels == {"vase": 6}
+    assert summary.renders["search"] == summary.baseline.renders
+    assert json.loads((tmp_path / "run" / "summary.json").read_text("utf-8")) == summary.to_dict()
     for name in ("clean.png", "clean.exr", "adversarial.png", "adversarial.exr", "difference.png", "search.gif"):
         assert (tmp_path / "run" / "images" / name).stat().st_size > 0, name
     for name in ("texture.png", "texture.exr", "texture-original.png"):
@@ -78,7 +78,7 @@ def test_the_answer_stays_in_its_budget_and_beats_its_start(scene: advsearch.Sce
     assert float((result.u - start).abs().max()) <= 0.05 + 1e-6
     assert float(result.u.min()) >= 0.0 and float(result.u.max()) <= 1.0
     assert float(result.adversarial.mean()) > float(result.clean.mean())
-    assert result.run is None and "baseline" not in result.summary
+    assert result.run is None and result.summary.baseline is None
 
 
 def test_an_l2_budget_is_kept(scene: advsearch.Scene, level: float) -> None:
@@ -91,16 +91,16 @@ def test_an_l2_budget_is_kept(scene: advsearch.Scene, level: float) -> None:
 def test_a_start_that_is_already_wrong_is_said_and_not_counted(scene: advsearch.Scene, level: float) -> None:
     result = advsearch.attack(scene, model(level - 0.1), **FAST)
     summary = result.summary
-    assert summary["ending"] == "already wrong" and not result.found
-    assert summary["verified"] is None and summary["adversarial"] is None
-    assert summary["clean"]["label"] == "vase" and summary["clean"]["control"]["correct"] == 0
-    assert summary["renders"]["search"] == summary["renders"]["gradient"] == 0
+    assert summary.ending == "already wrong" and not result.found
+    assert summary.verified is None and summary.adversarial is None
+    assert summary.clean.label == "vase" and summary.clean.control.correct == 0
+    assert summary.renders["search"] == summary.renders["gradient"] == 0
 
 
 def test_what_cannot_be_found_is_not_claimed(scene: advsearch.Scene) -> None:
     summary = advsearch.attack(scene, model(0.98), **FAST).summary
-    assert summary["ending"] == "budget spent"
-    assert summary["verified"]["successes"] == 0 and summary["clean"]["control"]["correct"] == 6
+    assert summary.ending == "budget spent"
+    assert summary.verified.successes == 0 and summary.clean.control.correct == 6
 
 
 def test_the_same_seed_gives_the_same_numbers_when_deterministic(scene: advsearch.Scene, level: float) -> None:
@@ -120,7 +120,7 @@ def test_a_custom_objective_is_an_ordinary_function(scene: advsearch.Scene, leve
     result = advsearch.attack(scene, model(level + 0.03), objective=darkest, baseline=False, **FAST)
     assert seen[0] == ((1, 2), (1, SIZE, SIZE, 3), (0,))
     assert float(result.adversarial.mean()) < float(result.clean.mean())
-    assert result.summary["objective"] == "darkest"
+    assert result.summary.objective == "darkest"
 
 
 def test_render_runs_in_ordinary_autograd(scene: advsearch.Scene, level: float) -> None:
@@ -149,9 +149,9 @@ def test_ctrl_c_keeps_the_run_so_far(
 
     monkeypatch.setattr(Problem, "evaluator", interrupted)
     result = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", **FAST)
-    assert result.summary["ending"] == "interrupted" and result.summary["verified"] is None
+    assert result.summary.ending == "interrupted" and result.summary.verified is None
     assert json.loads((tmp_path / "run" / "summary.json").read_text("utf-8"))["ending"] == "interrupted"
-    assert result.summary["steps"] == 3
+    assert result.summary.steps == 3
 
 
 def test_a_stopped_run_goes_on_where_it_was(
@@ -174,9 +174,9 @@ def test_a_stopped_run_goes_on_where_it_was(
 
         patch.setattr(Problem, "evaluator", interrupted)
         stopped = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", **options)
-    assert stopped.summary["ending"] == "interrupted" and (tmp_path / "run" / "replay.bin").exists()
+    assert stopped.summary.ending == "interrupted" and (tmp_path / "run" / "replay.bin").exists()
     again = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", resume=True, **options)
-    assert torch.equal(again.u, whole.u) and again.summary["verified"] == whole.summary["verified"]
+    assert torch.equal(again.u, whole.u) and again.summary.verified == whole.summary.verified
     assert rows_of(tmp_path / "run") == rows_of(tmp_path / "whole")
     assert not (tmp_path / "run" / "replay.bin").exists()
 
@@ -190,19 +190,19 @@ def rows_of(run: Path) -> list[Row]:
 def test_a_target_and_the_average_are_in_the_summary(scene: advsearch.Scene, level: float) -> None:
     result = advsearch.attack(scene, model(level + 0.03), target="vase", average=5, baseline=False, **FAST)
     summary = result.summary
-    assert (summary["goal"], summary["target"], summary["ending"]) == ("a target answer", ["vase"], "found")
-    average = summary["average"]
-    assert average["configurations"] == 5 and 0 <= average["correct"] <= 5
-    assert average["accuracy"] == average["correct"] / 5 and len(average["interval"]) == 2
-    assert average["margin"] <= average["worst_margin"]
+    assert (summary.goal, summary.target, summary.ending) == ("a target answer", ["vase"], "found")
+    average = summary.average
+    assert average is not None and average.configurations == 5 and 0 <= average.correct <= 5
+    assert average.accuracy == average.correct / 5 and len(average.interval) == 2
+    assert average.margin <= average.worst_margin
 
 
 def test_the_smallest_epsilon_is_bracketed_and_verified(scene: advsearch.Scene, level: float) -> None:
     summary = advsearch.attack(scene, model(level + 0.03), smallest=True, **FAST).summary
-    bracket = summary["smallest"]
-    assert summary["ending"] == "found" and "baseline" not in summary
-    assert 0.0 < bracket["epsilon"]["texture"] < 0.1
-    assert bracket["not_found_at"] is None or bracket["not_found_at"]["texture"] < bracket["epsilon"]["texture"]
+    bracket = summary.smallest
+    assert summary.ending == "found" and summary.baseline is None
+    assert bracket is not None and bracket.epsilon is not None and 0.0 < bracket.epsilon["texture"] < 0.1
+    assert bracket.not_found_at is None or bracket.not_found_at["texture"] < bracket.epsilon["texture"]
 
 
 def test_conditions_are_other_ones_in_every_trial_and_the_same_for_both_groups(
@@ -210,7 +210,7 @@ def test_conditions_are_other_ones_in_every_trial_and_the_same_for_both_groups(
 ) -> None:
     run = tmp_path / "run"
     summary = advsearch.attack(scene, model(level + 0.1), over=["camera"], draws=2, run=run, **FAST).summary
-    assert summary["over"] == ["camera"] and summary["controls"] == ["texture"]
+    assert summary.over == ["camera"] and summary.controls == ["texture"]
     with Store(run / "results.sqlite", read_only=True) as store:
         clean, adversarial = (
             [row.values["camera.azimuth"]["value"] for row in store.rows(kind)] for kind in ("control", "verification")
@@ -232,8 +232,8 @@ def test_nan_logits_during_the_search_end_it_and_are_counted(
 
     victim = advsearch.load_model(Fails(level + 0.03), labels=LABELS, input_size=SIZE)
     summary = advsearch.attack(scene, victim, baseline=False, **FAST).summary
-    assert summary["ending"] == "non-finite objective"
-    assert summary["non_finite"]["objectives"] == 3
+    assert summary.ending == "non-finite objective"
+    assert summary.non_finite.objectives == 3
 
 
 def test_rows_keep_what_is_right_apart_from_what_the_attack_wants(
@@ -282,6 +282,6 @@ def test_auto_takes_half_of_the_samples_and_looks_again_where_it_is_close(
     summary = advsearch.attack(scene, model(level + 0.03), **more).summary
     with Store(run / "results.sqlite", read_only=True) as store:
         rows = list(store.rows("search"))
-    looks = [row for row in rows if row.step >= summary["steps"]]
+    looks = [row for row in rows if row.step >= summary.steps]
     assert len(rows) - len(looks) == 12 and {row.spp for row in rows} == {4}
-    assert 8 <= len(looks) <= 4 * (2 + 4) and len(rows) == summary["renders"]["search"]
+    assert 8 <= len(looks) <= 4 * (2 + 4) and len(rows) == summary.renders["search"]

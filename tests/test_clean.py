@@ -19,6 +19,7 @@ from advsearch.controls.clean import sentences
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
+from advsearch.runs.results.base import plain
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.description import DEFAULT_ENVIRONMENT, SceneDescription, describe
 
@@ -183,9 +184,9 @@ def test_what_moved_is_in_the_summary_in_the_report_and_on_the_screen(tmp_path: 
         verify_spp=1, baseline=False, run=tmp_path / "run", progress=screen,
     )  # fmt: skip
     summary = result.summary
-    assert summary["clean"]["moved"] == [{"parameter": "pose.yaw", "unit": "degrees", "scene": 0.0, "used": 90.0}]
+    assert plain(summary.clean.moved) == [{"parameter": "pose.yaw", "unit": "degrees", "scene": 0.0, "used": 90.0}]
     said = "The clean scene has pose.yaw 90 degrees instead of 0, which the control pose leaves out."
-    assert said in summary["warnings"] and said in screen.said
+    assert said in summary.warnings and said in screen.said
     assert said in (tmp_path / "run" / "report.html").read_text("utf-8")
 
 
@@ -269,7 +270,7 @@ def test_a_row_names_the_environment_that_lights_it() -> None:
     def lit_by(**options: Any) -> list[Any]:
         found = advsearch.sweep("mug", **options, **plain)
         named = [row.values["environment"]["value"] for row in found.rows()]
-        assert found.summary["environment"] == (named[0] if len(set(named)) == 1 else "studio")
+        assert found.summary.environment == (named[0] if len(set(named)) == 1 else "studio")
         return named
 
     assert lit_by(grid={"environment.which": ["noon", "own"]}) == ["noon", "studio"]

@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import samples
 from rich.console import Console
 from rich.progress import Progress as Bars
 from rich.progress import TextColumn
-from samples import region
-from test_report import AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, changed, make_run
+from samples import ATTACK, AVERAGE, rated
+from test_report import BRACKET, EASIER, SUMMARY, TARGET, make_run
 
 import advsearch
 from advsearch import __version__
@@ -48,7 +49,7 @@ Api = Callable[..., Any]
 class Result:
     """What the API returns, as far as the command line looks at it."""
 
-    summary: dict[str, Any]
+    summary: Any
     run: Path = Path("runs/x")
 
 
@@ -350,13 +351,13 @@ def test_json_is_all_that_stands_on_standard_output(
         os.write(1, b"so does a native library\n")
         ctypes.CDLL(None).puts(b"and one that buffers")
         progress.message("a warning")
-        return Result(changed(seed=float("nan")))
+        return Result(samples.attack(seconds={"total": float("nan")}))
 
     api(attack)
     assert main(["attack", "--object", "mug", "--json"]) == 0
     out, err = capfd.readouterr()
     found = json.loads(out, parse_constant=lambda text: pytest.fail(f"{text} is not JSON"))
-    assert found == changed(seed=None)
+    assert found == samples.attack(seconds={"total": None}).to_dict()
     for text in ("an objective of the user prints", "so does a native library", "and one that buffers", "a warning"):
         assert text in err
 
@@ -365,7 +366,7 @@ def test_json_is_all_that_stands_on_standard_output(
     ("ending", "status"), [("found", 0), ("budget spent", 0), ("already wrong", 0), ("interrupted", 130)]
 )
 def test_the_status_of_an_attack(api: Callable[..., None], ending: str, status: int) -> None:
-    api(lambda config, progress: Result(changed(ending=ending)))
+    api(lambda config, progress: Result(samples.attack(ending=ending)))
     assert main(["attack", "--object", "mug"]) == status
     assert main(["attack", "--object", "mug", "--json"]) == status
 
@@ -410,33 +411,12 @@ def test_a_bad_file_or_change_is_told(
 
 # ---- studies, regions and sweeps ----
 
-RATE = {"accuracy": 0.75, "interval": [0.35, 0.97]}
-CURVE: dict[str, Any] = {
-    "schema": 1, "command": "attack", "run": "runs/mug-texture-001", "objects": ["mug", "bowl"], "ending": "done",
-    "controls": ["texture"], "epsilons": [0.01, 0.1], "parts": ["mug-epsilon-0-01"], "seconds": {"total": 9.0},
-    "table": [
-        {"object": "mug", "clean": {"correct": 20, "trials": 20}, "ending": "found", "epsilon": 0.1, "flips_at": 0.1,
-         "verified": {"successes": 19, "trials": 20}, "margin": 1.5},
-        {"object": "bowl", "clean": None, "flips_at": None, "margins": {}},
-    ],
-    "curve": [
-        {"epsilon": 0.01, "objects": 4, "robust": 3, "found": 0, "already_wrong": 1, **RATE},
-        {"epsilon": 0.1, "objects": 0, "robust": 0, "found": 0, "already_wrong": 0, "accuracy": None,
-         "interval": [0.0, 1.0]},
-    ],
-}  # fmt: skip
-GAP: dict[str, Any] = {
-    "schema": 1, "command": "gap", "run": "runs/mug-pose-001", "objects": ["mug"], "controls": ["pose"], "parts": ["a"],
-    "ending": "done", "seconds": {"total": 9.0},
-    "table": [
-        {"object": "mug", "control": "pose", "average": {"configurations": 200, "correct": 150, **RATE},
-         "worst": {"successes": 20, "trials": 20}, "ending": "found", "margin": 3.25},
-    ],
-}  # fmt: skip
-SWEEP: dict[str, Any] = {
-    "schema": 1, "command": "sweep", "run": "runs/mug-sweep-001", "configurations": 8, "planned": 8, "correct": 6,
-    "ending": "finished", "axes": [], "renders": {"sweep": 8}, "seconds": {"total": 9.0}, **RATE,
-}  # fmt: skip
+
+STUDIES: dict[str, Any] = {
+    "curve_from_config": samples.curve(),
+    "gap_from_config": samples.gap(),
+    "region_from_config": samples.region(),
+}
 
 
 @pytest.mark.parametrize("line", ["--object mug,bowl", "--object mug --epsilon 0.01,0.1"])
@@ -444,7 +424,7 @@ def test_several_objects_or_epsilons_are_a_curve(
     api: Callable[..., None], capsys: pytest.CaptureFixture[str], line: str
 ) -> None:
     given: list[Any] = []
-    api(curve_from_config=lambda config, progress, resumed: given.append((config, resumed)) or CURVE)
+    api(curve_from_config=lambda config, progress, resumed: given.append((config, resumed)) or samples.curve())
     assert main(["attack", *line.split(), "--quiet"]) == 0
     assert given[0][0].is_study and given[0][1] is None
     assert capsys.readouterr().out == (
@@ -458,14 +438,14 @@ def test_several_objects_or_epsilons_are_a_curve(
         "  run    runs/mug-texture-001\n"
     )
     assert main(["attack", *line.split(), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == CURVE
+    assert json.loads(capsys.readouterr().out) == samples.curve().to_dict()
 
 
 def test_gap_builds_its_configuration_and_prints_a_row_for_each_control(
     api: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     given: list[Any] = []
-    api(gap_from_config=lambda config, progress, resumed: given.append(config) or GAP)
+    api(gap_from_config=lambda config, progress, resumed: given.append(config) or samples.gap())
     argv = ["gap", "--object", "mug,bowl", "--control", "pose,light", "--average", "50", "--run", "x", "--quiet"]
     assert main(argv) == 0
     assert given == [GapConfig(object="mug,bowl", controls={"pose": {}, "light": {}}, average=50, run="x")]
@@ -478,15 +458,15 @@ def test_gap_builds_its_configuration_and_prints_a_row_for_each_control(
     )
 
 
-@pytest.mark.parametrize(("command", "summary"), [("gap", GAP), ("attack", CURVE)])
+@pytest.mark.parametrize(("command", "summary"), [("gap", samples.gap), ("attack", samples.curve)])
 def test_an_interrupted_study_says_how_to_go_on(
-    api: Callable[..., None], capsys: pytest.CaptureFixture[str], command: str, summary: dict[str, Any]
+    api: Callable[..., None], capsys: pytest.CaptureFixture[str], command: str, summary: Any
 ) -> None:
-    answer = {**summary, "ending": "interrupted"}
+    answer = summary(ending="interrupted")
     api(**{name: lambda config, progress, resumed: answer for name in ("gap_from_config", "curve_from_config")})
     assert main([command, "--object", "mug,bowl"]) == 130
     assert capsys.readouterr().out.endswith(
-        f"\n\nInterrupted.\n\nGo on with: advsearch resume {Path(answer['run']).name}\n"
+        f"\n\nInterrupted.\n\nGo on with: advsearch resume {Path(answer.run).name}\n"
     )
 
 
@@ -494,7 +474,7 @@ def test_region_builds_its_configuration_and_prints_the_box(
     api: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     given: list[Any] = []
-    api(region_from_config=lambda config, progress, resumed: given.append(config) or region())
+    api(region_from_config=lambda config, progress, resumed: given.append(config) or samples.region())
     argv = "region --object mug --control pose.yaw,pose.pitch --vary pose.yaw,pose.pitch --map 24 --samples 50 --quiet"
     assert main(argv.split()) == 0
     assert given == [
@@ -523,7 +503,7 @@ def test_region_takes_scene_and_controls_from_the_run_that_it_goes_around(
     with RunDirectory.create_for(theirs):
         pass
     given: list[Any] = []
-    api(region_from_config=lambda config, progress, resumed: given.append(config) or region())
+    api(region_from_config=lambda config, progress, resumed: given.append(config) or samples.region())
     assert main("region --around first --vary pose.yaw --seed 9 --quiet".split()) == 0
     (config,) = given
     assert (config.object, config.controls, config.spp) == ("bowl", {"pose": {"yaw": [0, 90]}}, 4)
@@ -539,13 +519,13 @@ def test_sweep_builds_its_configuration_and_passes_its_ending_on(
     api: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     given: list[Any] = []
-    api(sweep_from_config=lambda config, progress: given.append(config) or Result(SWEEP))
+    api(sweep_from_config=lambda config, progress: given.append(config) or Result(samples.sweep()))
     assert main("sweep --object mug --grid pose.yaw=5:50:8 --grid camera.elevation=10,30 --quiet".split()) == 0
     assert given == [SweepConfig(object="mug", grid={"pose.yaw": "5:50:8", "camera.elevation": [10, 30]})]
     assert capsys.readouterr().out.startswith(
         "The model is right in 6 of 8 configurations (75 %, 95 % interval 35-97 %)."
     )
-    api(sweep_from_config=lambda config, progress: Result({**SWEEP, "ending": "interrupted"}))
+    api(sweep_from_config=lambda config, progress: Result(samples.sweep(ending="interrupted")))
     assert main("sweep --object mug --grid pose.yaw=5:50:8 --json".split()) == 130
 
 
@@ -566,8 +546,12 @@ def test_run_does_what_the_command_of_a_file_says(
     path = tmp_path / "run.yaml"
     path.write_text(config.to_yaml())
     given: list[Any] = []
-    summaries = {"curve_from_config": CURVE, "gap_from_config": GAP, "region_from_config": region()}
-    answer = summaries.get(called) or Result(SWEEP if called == "sweep_from_config" else SUMMARY)
+    summaries = {
+        "curve_from_config": samples.curve(),
+        "gap_from_config": samples.gap(),
+        "region_from_config": samples.region(),
+    }
+    answer = summaries.get(called) or Result(samples.sweep() if called == "sweep_from_config" else SUMMARY)
     api(**{called: lambda config, **named: given.append(config) or answer})
     assert main(["run", str(path), "seed=8", "--quiet"]) == 0
     assert given == [config.model_copy(update={"seed": 8})]
@@ -602,8 +586,12 @@ def test_resume_goes_on_with_what_was_stopped(api: Callable[..., None], runs: Pa
     with RunDirectory.create_for(config) as run:
         run.record(Row("search", 0))
     resumed: list[Path] = []
-    summaries = {"curve_from_config": CURVE, "gap_from_config": GAP, "region_from_config": region()}
-    answer = summaries.get(called) or Result(SWEEP if called == "resume_sweep" else SUMMARY)
+    summaries = {
+        "curve_from_config": samples.curve(),
+        "gap_from_config": samples.gap(),
+        "region_from_config": samples.region(),
+    }
+    answer = summaries.get(called) or Result(samples.sweep() if called == "resume_sweep" else SUMMARY)
 
     def goes_on(first: Any, *, progress: Progress, resumed: Path | None = None) -> Any:
         found.append(resumed or first)
@@ -673,7 +661,7 @@ def test_a_run_that_was_stopped_says_how_far_it_came_and_how_to_go_on(
 
 def test_an_interrupted_run_says_how_to_go_on(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with RunDirectory.resume("killed") as run:
-        run.write_summary(changed(ending="interrupted", run="runs/killed"))
+        run.write_summary(samples.attack(ending="interrupted", run="runs/killed"))
     assert main(["show", "killed"]) == 0
     assert capsys.readouterr().out.endswith("\n\nGo on with: advsearch resume killed\n")
 
@@ -809,16 +797,16 @@ def test_show_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert main(["show", "first"]) == 0
     assert capsys.readouterr().out == answer(SUMMARY) + "\n"
     assert main(["show", "runs/first", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"schema": 1, **SUMMARY}
+    assert json.loads(capsys.readouterr().out) == SUMMARY.to_dict()
 
 
 @pytest.mark.parametrize(
     ("summary", "first"),
     [
-        (GAP, "  object   control   right on average"),
-        (CURVE, "  object   clean right   ending"),
-        (region(), "The model is wrong in 200 of 200 fresh samples of this box"),
-        (SWEEP, "The model is right in 6 of 8 configurations"),
+        (samples.gap(), "  object   control   right on average"),
+        (samples.curve(), "  object   clean right   ending"),
+        (samples.region(), "The model is wrong in 200 of 200 fresh samples of this box"),
+        (samples.sweep(), "The model is right in 6 of 8 configurations"),
     ],
     ids=["gap", "curve", "region", "sweep"],
 )
@@ -862,12 +850,14 @@ def test_the_table_is_read_in_five_seconds() -> None:
 
 
 def test_the_table_says_what_matters_beside_the_verdict() -> None:
-    text = answer(changed(warnings=["A texture is missing."], baseline={"verified": SUMMARY["verified"]}))
+    text = answer(
+        samples.attack(warnings=["A texture is missing."], baseline={**ATTACK["baseline"], "verified": rated()})
+    )
     assert text.endswith("adds nothing here.\n\nNote: A texture is missing.")
 
 
 def test_the_table_has_the_average_the_bracket_the_target_and_the_conditions() -> None:
-    summary = changed(**TARGET, over=["camera"], average=AVERAGE, smallest=BRACKET)
+    summary = samples.attack(**TARGET, over=["camera"], average=AVERAGE, smallest=BRACKET)
     assert answer(summary) == (
         "The model calls this mug a vase in 20 of 20 fresh renders (95 % interval 83-100 %), each with another"
         " camera.\n\n"
@@ -887,13 +877,14 @@ def test_the_table_has_the_average_the_bracket_the_target_and_the_conditions() -
 
 
 def test_easier_to_recognise_is_not_called_wrong() -> None:
-    text = answer(changed(**EASIER))
+    text = answer(samples.attack(**EASIER))
     assert "wanted     easier to recognise\n" in text
     assert "easier in 20 of 20" in text and "wrong in" not in text
 
 
 def test_a_table_of_almost_nothing() -> None:
-    text = answer({"object": "mug", "ending": "already wrong", "clean": {"label": "vase", "probability": None}})
+    clean = {**ATTACK["clean"], "label": "vase", "probability": None, "control": None}
+    text = answer(samples.attack(ending="already wrong", clean=clean, adversarial=None, verified=None, baseline=None))
     assert text.startswith("The model already calls this mug a vase")
     assert "  clean   vase      not verified\n" in text
 

@@ -18,6 +18,7 @@ from xml.etree import ElementTree
 import pytest
 import torch
 from PIL import Image
+from samples import attack
 
 import advsearch
 import advsearch.config
@@ -547,14 +548,7 @@ def test_the_picture_and_the_answer_in_the_readme_are_made_from_a_run(tmp_path: 
     for name, grey in (("images/clean", 40), ("images/adversarial", 120), ("artifacts/texture", 200)):
         (run / name).parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", (16, 16), (grey, grey, grey)).save(run / f"{name}.png")
-    summary = {
-        "object": "path/to/mug.obj",
-        "controls": ["texture"],
-        "ending": "found",
-        "clean": {"label": "mug", "probability": 0.98},
-        "adversarial": {"label": "vase", "probability": 0.91},
-        "verified": {"successes": 20, "trials": 20, "interval": [0.83, 1.0], "labels": {"vase": 20}},
-    }
+    summary = attack(object="path/to/mug.obj")
     images = script("make_images")
     sheet = images.side_by_side(run, summary)
     centres = [sheet.getpixel((images.SIDE // 2 + number * (images.SIDE + images.GAP), 9)) for number in range(3)]

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from samples import attack, rated
 
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig
@@ -123,9 +124,9 @@ def test_runs_says_how_each_ended(run: Path, capsys: pytest.CaptureFixture[str])
         assert listed(run.parent)[0].state == "running"
     with RunDirectory.create("two") as other:
         other.write_config(AttackConfig(object="bowl", controls="texture"))
-        other.write_summary({"command": "attack", "ending": "found", "verified": {"successes": 19, "trials": 20}})
+        other.write_summary(attack(verified=rated(19)))
     with RunDirectory.create("three") as third:
-        third.write_summary({"command": "attack", "ending": "interrupted"})
+        third.write_summary(attack(ending="interrupted", verified=None))
     assert main(["runs", "--json"]) == 0
     found = {one["name"]: one for one in json.loads(capsys.readouterr().out)["runs"]}
     assert (found["two"]["state"], found["two"]["answer"], found["two"]["object"]) == ("found", "19/20", "bowl")
@@ -143,7 +144,7 @@ def test_no_runs_and_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
 
 def test_resume_of_a_run_that_is_done_shows_its_answer(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with RunDirectory.resume("one") as again:
-        again.write_summary({"command": "attack", "ending": "found"})
+        again.write_summary(attack(verified=None))
     assert main(["resume", "one", "--json"]) == 0
     out, err = capsys.readouterr()
     assert json.loads(out)["ending"] == "found" and "is done already" in err

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from samples import GAP, REGION, SWEEP, attack, rated
 
 from advsearch.cli.main import main
 from advsearch.errors import AdvsearchError, FileFormatError
@@ -22,14 +23,7 @@ from advsearch.runs.replay import ReplayLog
 from advsearch.runs.store import Row, Store
 from advsearch.settings import HEADER
 
-SUMMARY = {
-    "schema": 1,
-    "command": "attack",
-    "object": "mug",
-    "controls": ["pose"],
-    "ending": "interrupted",
-    "verified": {"successes": 3, "trials": 4},
-}
+SUMMARY = attack(ending="interrupted", verified=rated(3)).to_dict()
 
 
 @pytest.fixture
@@ -123,27 +117,21 @@ def test_summaries_that_are_none_are_named(text: str, run: Path, capsys: pytest.
     assert main(["runs"]) == 0
 
 
-@pytest.mark.parametrize("value", [None, 3, "text", [], [1], {}, {"a": [1]}, True, float("inf")])
-def test_summaries_of_other_types_are_named(value: Any, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Whatever part of it is of another type: shown as far as it goes, or refused with the file's name."""
-    for command in ("attack", "sweep", "gap", "region", "precision"):
-        for name in (
-            *SUMMARY,
-            "parts",
-            "clean",
-            "adversarial",
-            "box",
-            "rows",
-            "axes",
-            "seconds",
-            "renders",
-            "interval",
-        ):
-            (run / "summary.json").write_text(json.dumps({**SUMMARY, "command": command, name: value}))
-            status = main(["show", "it"])
-            captured = capsys.readouterr()
-            assert status == 0 or (status == 2 and "summary.json: expected the summary" in captured.err)
-            assert main(["runs"]) == 0
+@pytest.mark.parametrize(
+    "value", [None, 3, "text", [], [1], {}, {"a": [1]}, True, float("inf"), {"a\u001b[2J": "\u001b"}]
+)
+@pytest.mark.parametrize("summary", [SUMMARY, SWEEP, GAP, REGION], ids=lambda one: one["command"])
+def test_summaries_of_other_types_are_named(
+    summary: dict[str, Any], value: Any, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever part of it is of another type: shown, or refused in one sentence with the file's name."""
+    for name in summary:
+        (run / "summary.json").write_text(json.dumps({**summary, name: value}))
+        status = main(["show", "it"])
+        captured = capsys.readouterr()
+        assert status == 0 or (status == 2 and "summary.json: expected the summary" in captured.err)
+        assert captured.err.count("\n") == (status == 2) and len(captured.err) < 600 and "\x1b" not in captured.err
+        assert main(["runs"]) == 0
     capsys.readouterr()
 
 

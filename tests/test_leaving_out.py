@@ -132,10 +132,10 @@ def test_a_long_search_says_what_paths_it_rendered() -> None:
     options |= {"resolution": SIZE}
     options |= {"environment": "noon", "baseline": False, "measure": "full", "denoise": "none", "spp": 2}
     found = attack("bottle", **options)
-    segments = found.summary["light_path_segments"]
-    assert 2 <= segments["search"] < segments["verification"] == 6
+    segments = found.summary.light_path_segments
+    assert 2 <= segments.search < segments.verification == 6
     whole = attack("bottle", **{**options, "specialise": False})
-    assert whole.summary["light_path_segments"] == {"search": 6, "verification": 6}
+    assert whole.summary.light_path_segments.to_dict() == {"search": 6, "verification": 6}
 
 
 def test_texels_beyond_what_a_pixel_shows_are_counted() -> None:

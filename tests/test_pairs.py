@@ -21,6 +21,7 @@ from advsearch.engine.domains import domain_of
 from advsearch.engine.loading import framed, make_renderer
 from advsearch.engine.sweeps.axes import on_grid, read_axes
 from advsearch.engine.sweeps.points import Points
+from advsearch.runs.results.base import plain
 from advsearch.scene.description import describe
 from advsearch.scene.formation import to_8_bit
 from advsearch.tasks import Classification
@@ -103,8 +104,8 @@ def test_a_row_of_a_sweep_is_true_of_its_own_picture(pair: tuple[str, ...], mode
     drawn = tuple(make_control(kind, given) for kind, given in controls.items())
     axes = read_axes(grid, drawn)
     rows = {row.step: row for row in found.rows()}
-    worst = found.summary["worst"]
-    assert worst["values"] == rows[worst["configuration"]].values
+    worst = found.summary.worst
+    assert worst is not None and plain(worst.values) == rows[worst.configuration].values
     for row in rows.values():
         space = make_space(on_grid(drawn, axes, description), description)
         points = Points(space, domain_of(space.controls), axes, samples, "sobol", 3)

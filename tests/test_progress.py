@@ -281,11 +281,11 @@ def test_a_resumed_sweep_takes_the_probes_of_its_worst_configuration_from_the_st
 
     monkeypatch.setattr(View, "trial", trial)
     cut = sweep_from_config(config.model_copy(update={"run": str(tmp_path / "run")}))
-    assert cut.summary["ending"] == "interrupted"
+    assert cut.summary.ending == "interrupted"
     stop, rendered = 0, 0
     resumed = resume_sweep(tmp_path / "run")
-    assert rendered + 4 == whole.summary["renders"]["verification"] == resumed.summary["renders"]["verification"]
-    assert resumed.summary["worst"] == whole.summary["worst"]
+    assert rendered + 4 == whole.summary.renders["verification"] == resumed.summary.renders["verification"]
+    assert resumed.summary.worst == whole.summary.worst
     with RunDirectory.resume(tmp_path / "run") as run, RunDirectory.resume(tmp_path / "whole") as other:
         counts = run.store.counts()
         assert counts == other.store.counts() and counts["sample count worst"] + 14 == rendered + 4

@@ -87,7 +87,7 @@ def test_texts_are_short(model: advsearch.Model, attacked: Any, swept: advsearch
     assert repr(scene) == "Scene('mug', 'loft', camera.azimuth=60.0)"
     assert repr(model) == "Model('middle', 2 classes, 16 x 16 pixels)"
     assert repr(attacked).startswith("AttackResult('mug', 'texture', ") and len(repr(attacked)) < 250
-    right = swept.summary["correct"]
+    right = swept.summary.correct
     assert repr(swept) == f"SweepResult('mug', 'middle', {right} of 4 right, run=None)"
 
 
@@ -125,7 +125,7 @@ def test_the_gap_is_asked_for_by_name(tmp_path: Path) -> None:
     found = advsearch.gap(
         "mug", controls=["camera"], policy="random", baseline=False, run=tmp_path / "run", threads=1, **quick
     )
-    assert [(row["object"], row["control"]) for row in found["table"]] == [("mug", "camera")]
-    assert found["table"][0]["average"]["configurations"] == 6
+    assert [(row.object, row.control) for row in found.table] == [("mug", "camera")]
+    assert found.table[0].average.configurations == 6
     with pytest.raises(InputError, match=r"^map: expected a whole number from 0 to 512, got 600"):
         advsearch.region("mug", controls="camera", map=600)

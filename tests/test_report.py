@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import io
 import re
 from html.parser import HTMLParser
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from samples import ATTACK, AVERAGE, FORMATION, GAP, attack, gap, rated
 
 from advsearch.config import AttackConfig
 from advsearch.errors import FileFormatError
@@ -23,22 +23,10 @@ from advsearch.report.studies import gap_figure
 from advsearch.report.style import CSS
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.images import read_png
+from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.store import Row
 
-SUMMARY: dict[str, Any] = {
-    "command": "attack", "run": "runs/mug-texture-001", "object": "mug", "model": "reference", "environment": "studio",
-    "controls": ["texture"], "epsilon": 0.1, "norm": "linf", "objective": "margin", "policy": "pgd", "ending": "found",
-    "image_formation": {"denoiser": "oidn", "filter": "box", "exposure": 0.0, "resolution": [128, 128]},
-    "clean": {"label": "mug", "index": 0, "probability": 0.98, "correct": True,
-              "control": {"correct": 20, "trials": 20, "rate": 1.0, "interval": [0.8316, 1.0]}},
-    "adversarial": {"label": "vase", "index": 7, "probability": 0.913},
-    "verified": {"successes": 20, "trials": 20, "rate": 1.0, "interval": [0.8316, 1.0], "spp": 64,
-                 "labels": {"vase": 20}},
-    "baseline": {"policy": "random", "renders": 40,
-                 "verified": {"successes": 1, "trials": 20, "rate": 0.05, "interval": [0.0013, 0.249]}},
-    "renders": {"search": 40, "gradient": 40, "verification": 21}, "steps": 40,
-    "seconds": {"setup": 3.1, "search": 9.0, "verification": 2.2, "total": 14.6}, "seed": 0,
-}  # fmt: skip
+SUMMARY = attack()
 
 VOID = {"meta", "img", "br", "hr"}
 
@@ -77,10 +65,10 @@ class Page(HTMLParser):
         return [attributes for name, attributes in self.tags if name == tag]
 
 
-def make_run(path: Path, summary: dict[str, Any] = SUMMARY, *, pictures: bool = True, rows: bool = True) -> Path:
+def make_run(path: Path, summary: AttackSummary = SUMMARY, *, pictures: bool = True, rows: bool = True) -> Path:
     """Return a run directory with stand-in pictures and results."""
     grey = np.full((8, 8, 3), 0.5)
-    with RunDirectory.create_for(AttackConfig(object=str(summary["object"]), run=str(path))) as run:
+    with RunDirectory.create_for(AttackConfig(object=summary.object, run=str(path))) as run:
         for name in ("clean", "adversarial", "difference", "verification-00", "verification-01") if pictures else ():
             run.save_image(name, grey)
         for name in ("texture", "texture-original") if pictures else ():
@@ -98,17 +86,12 @@ def page_of(run: Path) -> Page:
     return Page(write_report(run).read_text(encoding="utf-8"))
 
 
-def changed(**fields: Any) -> dict[str, Any]:
-    """Return the summary with other fields."""
-    return {**copy.deepcopy(SUMMARY), **fields}
-
-
 # ---- the page ----
 
 
 def test_the_page_says_it_all(tmp_path: Path) -> None:
     page = page_of(
-        make_run(tmp_path / "run", changed(warnings=["A texture is missing."], command_line="advsearch attack"))
+        make_run(tmp_path / "run", attack(warnings=["A texture is missing."], command_line="advsearch attack"))
     )
     for text in (
         "The model calls this mug a vase in 20 of 20 fresh renders (95 % interval 83-100 %).",
@@ -137,17 +120,15 @@ def test_the_page_says_it_all(tmp_path: Path) -> None:
     assert not re.search(r"None|nan|\{|\}|\$", text)
 
 
-AVERAGE = {"configurations": 200, "correct": 150, "accuracy": 0.75, "interval": [0.684, 0.8084], "margin": -1.0,
-           "worst_margin": 2.5}  # fmt: skip
-BRACKET = {"epsilon": {"texture": 0.01234}, "not_found_at": {"texture": 0.0118}, "closed": True, "searches": 7,
-           "checks": 40}  # fmt: skip
-TARGET = {"goal": "a target answer", "target": ["vase"]}
-EASIER = {"goal": "a right answer", "target": None}
-ANY = {"goal": "a wrong answer", "target": None, "over": []}
+BRACKET = {"epsilon": {"texture": 0.01234}, "not_found_at": {"texture": 0.0118}, "closed": True, "confirmed": True,
+           "searches": 7, "checks": 40}  # fmt: skip
+TARGET: dict[str, Any] = {"goal": "a target answer", "target": ["vase"]}
+EASIER: dict[str, Any] = {"goal": "a right answer", "target": None}
+ANY: dict[str, Any] = {"goal": "a wrong answer", "target": None, "over": []}
 
 
 def test_the_page_says_what_was_asked_beside_the_worst_case(tmp_path: Path) -> None:
-    summary = changed(**TARGET, over=["camera", "environment"], average=AVERAGE, smallest=BRACKET)
+    summary = attack(**TARGET, over=["camera", "environment"], average=AVERAGE, smallest=BRACKET)
     page = page_of(make_run(tmp_path / "run", summary))
     for text in (
         "in 20 of 20 fresh renders (95 % interval 83-100 %), each with another camera and environment.",
@@ -165,7 +146,7 @@ def test_the_page_says_what_was_asked_beside_the_worst_case(tmp_path: Path) -> N
 
 
 def test_the_page_does_not_say_what_was_not_asked(tmp_path: Path) -> None:
-    text = page_of(make_run(tmp_path / "run", changed(**ANY))).text
+    text = page_of(make_run(tmp_path / "run", attack(**ANY))).text
     assert not re.search(r"Goal|Over |Smallest epsilon|Average case", text)
 
 
@@ -204,23 +185,22 @@ def test_a_phone_gets_a_chart_that_fits_with_letters_that_can_be_read(tmp_path: 
 
 
 def test_numbers_have_the_digits_that_mean_something(tmp_path: Path) -> None:
-    formation = {**SUMMARY["image_formation"], "gain": 0.41234567890123456, "exposure": 1 / 3}
-    verified = {**SUMMARY["verified"], "margin": 1.2345678901234567}
+    formation = {**FORMATION, "gain": 0.41234567890123456, "exposure": 1 / 3}
+    verified = rated(margin=1.2345678901234567)
     page = page_of(
-        make_run(tmp_path / "run", changed(image_formation=formation, epsilon=1 / 3, verified=verified), rows=False)
+        make_run(tmp_path / "run", attack(image_formation=formation, epsilon=1 / 3, verified=verified), rows=False)
     )
     assert "gain 0.4123" in page.text and not re.findall(r"\d\.\d{7,}", page.text)
 
 
 def test_names_cannot_become_markup(tmp_path: Path) -> None:
     evil = "\"><script>alert('x')</script>&lt;"
-    answer = {"label": evil, "probability": 0.5}
-    summary = changed(
+    answer = {"label": evil, "index": 3, "probability": 0.5}
+    summary = attack(
         object=evil, model=evil, environment=evil, controls=[evil], policy=evil, objective=evil, norm=evil,
-        warnings=[evil], adversarial=answer, run=evil, command_line=evil,
-        clean={**answer, "control": SUMMARY["clean"]["control"]},
-        verified={**SUMMARY["verified"], "labels": {evil: 20}}, baseline={**SUMMARY["baseline"], "policy": evil},
-        image_formation={evil: evil}, renders={evil: 1}, seconds={evil: 1.0, "total": 2.0}, seed=evil,
+        warnings=[evil], adversarial=answer, run=evil, command_line=evil, clean={**ATTACK["clean"], **answer},
+        verified=rated(labels={evil: 20}), baseline={**ATTACK["baseline"], "policy": evil},
+        image_formation={**FORMATION, "filter": evil}, renders={evil: 1}, seconds={evil: 1.0, "total": 2.0},
     )  # fmt: skip
     make_run(tmp_path / "run", summary)
     page = page_of(tmp_path / "run")
@@ -234,7 +214,8 @@ def test_names_cannot_become_markup(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ending", ["interrupted", "already wrong"])
 def test_a_run_that_has_little_still_has_a_page(tmp_path: Path, ending: str) -> None:
-    summary = {"command": "attack", "object": "mug", "ending": ending, "steps": 3}
+    clean = {**ATTACK["clean"], "control": None}
+    summary = attack(ending=ending, steps=3, clean=clean, adversarial=None, verified=None, baseline=None)
     page = page_of(make_run(tmp_path / "run", summary, pictures=False, rows=False))
     assert wording.verdict(summary) in page.text
     assert not page.all("img") and "Verified rates" not in page.text
@@ -299,20 +280,15 @@ def test_a_chart_of_any_values_is_drawn_inside_its_frame(values: list[float | No
     assert heights[1] - heights[0] >= 16 - 0.11  # the two labels do not lie on each other
 
 
-def test_an_interval_is_drawn_only_where_there_is_one() -> None:
-    assert interval_bar({}) == ""
-    bar = Page(interval_bar({"rate": 1.0, "interval": [0.5, 1.0]})).all("rect")
+def test_an_interval_is_drawn_as_a_bar() -> None:
+    bar = Page(interval_bar(1.0, (0.5, 1.0))).all("rect")
     assert (bar[1]["x"], bar[1]["width"]) == ("50.0", "48.0")
 
 
 def test_the_worst_case_of_a_gap_does_not_hide_an_average_that_is_equal_to_it() -> None:
-    row = {
-        "object": "mug",
-        "control": "pose",
-        "average": {"accuracy": 1.0, "interval": [1.0, 1.0]},
-        "worst": {"rate": 0},
-    }
-    figure = gap_figure({"table": [{**row, "ending": "budget spent"}], "model": "m"})["png"]
+    average = {**AVERAGE, "accuracy": 1.0, "interval": [1.0, 1.0]}
+    row = {**GAP["table"][0], "average": average, "worst": rated(0), "ending": "budget spent"}
+    figure = gap_figure(gap(table=[row]))["png"]
     pixels = np.asarray(Image.open(io.BytesIO(figure)).convert("RGB")).astype(int)
     pixels = pixels[: int(0.55 * len(pixels))]  # without the axis and the legend
     for colour in ((0x1D, 0x5F, 0xD0), (0xB3, 0x26, 0x1E)):
@@ -320,11 +296,6 @@ def test_the_worst_case_of_a_gap_does_not_hide_an_average_that_is_equal_to_it() 
 
 
 # ---- words ----
-
-
-def rated(successes: int, low: float, high: float) -> dict[str, Any]:
-    """Return a rate over 20 trials."""
-    return {"successes": successes, "trials": 20, "rate": successes / 20, "interval": [low, high]}
 
 
 ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
@@ -335,7 +306,7 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
     [
         ({}, f"The model calls this mug a vase in {ALL}"),
         (
-            {"verified": {**SUMMARY["verified"], "labels": {"iron": 12, "vase": 8}}},
+            {"verified": rated(labels={"iron": 12, "vase": 8})},
             f"The model is wrong about this mug, most often calling it an iron, in {ALL}",
         ),
         (
@@ -354,18 +325,18 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
             " renders (95 % interval 3-38 %).",
         ),
         (
-            {"ending": "already wrong", "clean": {"label": "vase"}},
+            {"ending": "already wrong", "clean": {**ATTACK["clean"], "label": "vase"}},
             "The model already calls this mug a vase: nothing was changed and nothing counts as found.",
         ),
         ({"ending": "interrupted", "verified": None}, "Interrupted after 40 steps; nothing is verified."),
         ({"ending": "interrupted", "steps": 1}, f"Interrupted; so far the model is wrong about this mug in {ALL}"),
-        ({"ending": "stalled", "verified": {}, "steps": 1}, "Stalled after 1 step; nothing is verified."),
+        ({"ending": "stalled", "verified": None, "steps": 1}, "Stalled after 1 step; nothing is verified."),
         (TARGET, f"The model calls this mug a vase in {ALL}"),
         (
             {
                 **TARGET,
                 "target": ["vase", "iron"],
-                "verified": {**SUMMARY["verified"], "labels": {"iron": 12, "vase": 8}},
+                "verified": rated(labels={"iron": 12, "vase": 8}),
             },
             f"The model takes this mug for one of the targets, most often calling it an iron, in {ALL}",
         ),
@@ -380,7 +351,7 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
             " renders (95 % interval 3-38 %).",
         ),
         (
-            {**EASIER, "verified": {**SUMMARY["verified"], "labels": {"mug": 20}}},
+            {**EASIER, "verified": rated(labels={"mug": 20})},
             f"The model recognises this mug, more surely than in the clean scene, in {ALL}",
         ),
         (
@@ -397,14 +368,14 @@ ALL = "20 of 20 fresh renders (95 % interval 83-100 %)."
     ],
 )
 def test_the_verdict_says_what_is_known_and_no_more(fields: dict[str, Any], sentence: str) -> None:
-    assert wording.verdict(changed(**fields)) == sentence
+    assert wording.verdict(attack(**fields)) == sentence
 
 
 @pytest.mark.parametrize("goal", [ANY, TARGET, EASIER], ids=["wrong", "target", "easier"])
 def test_every_ending_has_a_verdict(goal: dict[str, Any]) -> None:
     from advsearch.attacks.ending import Ending
 
-    said = [wording.verdict(changed(ending=ending.value, **goal)) for ending in Ending]
+    said = [wording.verdict(attack(ending=ending.value, **goal)) for ending in Ending]
     assert len(set(said)) == len(said)
     assert all("mug" in text for text in said)
 
@@ -424,36 +395,36 @@ def test_every_ending_has_a_verdict(goal: dict[str, Any]) -> None:
     ],
 )  # fmt: skip
 def test_a_bracket_says_what_is_known_of_both_ends(bracket: dict[str, Any], text: str) -> None:
-    assert wording.smallest_text(changed(smallest={**BRACKET, **bracket})) == text
+    assert wording.smallest_text(attack(smallest={**BRACKET, **bracket})) == text
     assert wording.smallest_text(SUMMARY) == ""
 
 
 def test_several_controls_have_a_budget_each() -> None:
-    several = changed(
+    several = attack(
         controls=["texture", "pose"], epsilon={"texture": 0.05, "pose": None}, norm={"texture": "l2", "pose": None}
     )
     assert wording.budget_text(several) == "texture within 0.05 (l2) and pose"
-    assert wording.renders_text({"renders": {"search": 8, "gradient": 0}}) == "8 of the search"
-    assert (wording.renders_text({"renders": {"search": 0}}), wording.renders_text({})) == ("none", "unknown")
+    assert wording.renders_text(attack(renders={"search": 8, "gradient": 0})) == "8 of the search"
+    assert wording.renders_text(attack(renders={"search": 0})) == "none"
     assert (
         wording.changed_text(several) == "texture within 0.05 (l2: the root of the sum of all squared changes) and pose"
     )
-    third = changed(
+    third = attack(
         controls=["texture", "patch"],
         epsilon={"texture": 1 / 3, "patch": 1.0},
         norm={"texture": "linf", "patch": "linf"},
     )
     meant = "texture within 0.3333 (linf: the largest change of any value) and patch within 1 (linf)"
     assert wording.changed_text(third) == meant
-    assert wording.budget_text(changed(controls=["pose", "light"], epsilon=None)) == "pose and light"
+    assert wording.budget_text(attack(controls=["pose", "light"], epsilon=None)) == "pose and light"
 
 
 def test_conditions_that_the_clean_scene_fails_are_said_not_to_count() -> None:
-    clean = {"control": {"correct": 188, "trials": 200}}
+    clean = {**ATTACK["clean"], "control": {"correct": 188, "trials": 200, "rate": 0.94, "interval": [0.9, 0.97]}}
     said = "The clean scene itself fails 12 of its 200 trials."
-    assert wording.remarks(changed(clean=clean, baseline={}, over=["camera"])) == [f"{said} They do not count."]
-    assert wording.remarks(changed(clean=clean, baseline={})) == [said]
-    assert wording.remarks(changed(clean=clean, baseline={}, **EASIER)) == []
+    assert wording.remarks(attack(clean=clean, baseline=None, over=["camera"])) == [f"{said} They do not count."]
+    assert wording.remarks(attack(clean=clean, baseline=None)) == [said]
+    assert wording.remarks(attack(clean=clean, baseline=None, **EASIER)) == []
 
 
 @pytest.mark.parametrize(
@@ -464,12 +435,12 @@ def test_conditions_that_the_clean_scene_fails_are_said_not_to_count() -> None:
     ],
 )
 def test_a_random_search_that_does_as_well_is_said(successes: int, remark: list[str]) -> None:
-    assert wording.remarks(changed(baseline={"verified": {"successes": successes, "trials": 20}})) == remark
+    assert wording.remarks(attack(baseline={**ATTACK["baseline"], "verified": rated(successes)})) == remark
 
 
 def test_a_better_random_search_and_a_failing_control_group_are_said() -> None:
-    clean, baseline = {"control": {"correct": 18, "trials": 20}}, {"verified": {"successes": 5, "trials": 20}}
-    summary = changed(verified={"successes": 3, "trials": 20}, baseline=baseline, clean=clean)
+    clean = {**ATTACK["clean"], "control": {"correct": 18, "trials": 20, "rate": 0.9, "interval": [0.7, 0.99]}}
+    summary = attack(verified=rated(3), baseline={**ATTACK["baseline"], "verified": rated(5)}, clean=clean)
     assert wording.remarks(summary) == [
         "The clean scene itself fails 2 of its 20 trials.",
         "Random search with as many renders does better: 5 of 20.",
@@ -501,10 +472,6 @@ def test_times(seconds: float | None, text: str) -> None:
 
 
 def test_where_random_search_won_it_is_said() -> None:
-    own = {"successes": 3, "trials": 20, "margin": -1.25, "interval": [0.03, 0.4]}
-    (said,) = [
-        text
-        for text in wording.remarks({**SUMMARY, "answer_from": "random", "policy_verified": own})
-        if "random" in text
-    ]
+    own = rated(3, margin=-1.25)
+    (said,) = [text for text in wording.remarks(attack(answer_from="random", policy_verified=own)) if "random" in text]
     assert "worse configuration than the policy did (3 of 20 with a margin of -1.25)" in said

@@ -25,6 +25,7 @@ import pyarrow.parquet
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from samples import attack, rated, sweep
 
 from advsearch.config import AttackConfig
 from advsearch.errors import FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
@@ -34,9 +35,9 @@ from advsearch.runs.export import FORMATS, export
 from advsearch.runs.files import PART, replacing, write_bytes, write_text
 from advsearch.runs.listing import finished, listed
 from advsearch.runs.lock import RunLock
-from advsearch.runs.results.base import plain
+from advsearch.runs.results.base import Result, plain
 from advsearch.runs.store import MIGRATIONS, Row, Store
-from advsearch.runs.summary import read_summary, to_json
+from advsearch.runs.summary import read_result
 
 WRITER = """
 import sys
@@ -328,7 +329,7 @@ def test_an_existing_run_is_refused_and_overwritten_on_request(tmp_path: Path) -
     with RunDirectory.create(path) as run:
         run.record(Row("search", 0))
         run.save_image("clean", np.zeros((4, 4, 3)))
-        run.write_summary({"ending": "found"})
+        run.write_summary(attack())
     (path / "notes.txt").write_text("mine")
     with pytest.raises(
         RunExistsError, match="the run exists already; add `overwrite=True` or choose another name with `run`"
@@ -369,7 +370,7 @@ def test_a_run_that_fails_before_any_result_leaves_nothing(home: Path) -> None:
 @pytest.mark.parametrize("keep", ["row", "summary"])
 def test_a_run_that_fails_later_keeps_what_it_has(tmp_path: Path, keep: str) -> None:
     with pytest.raises(KeyboardInterrupt), RunDirectory.create(tmp_path / "run") as run:
-        run.record(Row("search", 0)) if keep == "row" else run.write_summary({"ending": "interrupted"})
+        run.record(Row("search", 0)) if keep == "row" else run.write_summary(attack(ending="interrupted"))
         raise KeyboardInterrupt
     assert (tmp_path / "run" / "results.sqlite").exists()
     with RunDirectory.create(tmp_path / "run", overwrite=True):
@@ -427,20 +428,20 @@ def test_a_file_is_replaced_only_when_all_went_well(tmp_path: Path) -> None:
 def test_a_bad_disk_is_said_and_leaves_nothing(
     run: RunDirectory, monkeypatch: pytest.MonkeyPatch, number: int, advice: str
 ) -> None:
-    run.write_summary({"ending": "old"})
+    run.write_summary(attack(ending="old"))
     with monkeypatch.context() as broken:
         broken.setattr("os.replace", _raises(number))
         for write in (
             lambda: run.save_image("clean", np.zeros((4, 4, 3))),
             lambda: run.save_exr("clean", np.zeros((4, 4, 3))),
             lambda: run.save_animation("search", [np.zeros((4, 4, 3))]),
-            lambda: run.write_summary({"ending": "new"}),
+            lambda: run.write_summary(attack(ending="new")),
         ):
             with pytest.raises(StorageError, match=f"cannot write .*run/.*: {advice}"):
                 write()
     assert not list((run.path / "images").iterdir())
     assert not list(run.path.glob(PART + "*"))
-    assert read_summary(run.path)["ending"] == "old"
+    assert getattr(read_result(run.path), "ending", "") == "old"
 
 
 @pytest.mark.parametrize("number", [errno.EROFS, errno.EACCES, errno.ENOSPC])
@@ -587,37 +588,30 @@ class Colour(enum.Enum):
     RED = "red"
 
 
-def test_the_summary_is_plain_json_in_the_order_of_the_design(run: RunDirectory) -> None:
-    answer = {
-        "seed": np.int64(3),
-        "warnings": ("one",),
-        "clean": {"probability": np.float64(0.5), "index": np.array(2)},
-        "ending": Colour.RED,
-        "run": Path("runs/x"),
-        "bad": [math.nan, math.inf, np.float32("nan")],
-        "command": "attack",
-    }
-    path = run.write_summary(answer)
+def test_the_summary_is_plain_json(run: RunDirectory) -> None:
+    result = attack(verified=rated(margin=math.nan), warnings=["one"])
+    path = run.write_summary(result)
     found = json.loads(path.read_text(), parse_constant=lambda text: pytest.fail(f"{text} is not JSON"))
-    assert list(found) == ["schema", "command", "run", "ending", "clean", "seed", "warnings", "bad"]
-    assert found["clean"] == {"probability": 0.5, "index": 2}
-    assert (found["schema"], found["ending"], found["bad"]) == (1, "red", [None] * 3)
-    assert found == read_summary(run.path)
+    assert list(found)[:3] == ["schema", "command", "run"] and list(found)[-1] == "command_line"
+    assert found["verified"]["margin"] is None and found["warnings"] == ["one"]
+    assert read_result(run.path).to_dict() == result.to_dict() == found
 
 
-def test_what_json_cannot_hold_is_a_bug() -> None:
-    with pytest.raises(TypeError, match="expected something that JSON can hold, got set"):
-        to_json({"x": {1}})
+def test_numbers_of_any_kind_become_json() -> None:
+    values = {"a": np.float64(0.5), "b": np.array(2), "c": Colour.RED, "d": Path("x"), "e": np.float32("nan")}
+    assert plain(values) == {"a": 0.5, "b": 2, "c": "red", "d": "x", "e": None}
     assert plain({"x": (1, Row("search", 0).kind)}) == {"x": [1, "search"]}
+    with pytest.raises(TypeError, match="expected something that JSON can hold, got set"):
+        plain({"x": {1}})
 
 
 def test_a_summary_that_is_not_there_or_damaged_is_said(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"expected the summary of a run, got no such file; did the run end\?"):
-        read_summary(tmp_path)
+        read_result(tmp_path)
     for text in ("{", "[1]"):
         write_bytes(tmp_path / "summary.json", text.encode())
         with pytest.raises(FileFormatError, match=r"summary\.json: expected the summary of a run, got"):
-            read_summary(tmp_path)
+            read_result(tmp_path)
 
 
 def test_all_that_a_run_writes_is_known_to_overwrite(home: Path) -> None:
@@ -627,7 +621,7 @@ def test_all_that_a_run_writes_is_known_to_overwrite(home: Path) -> None:
         run.save_exr("texture", np.zeros((4, 4, 3)), folder="artifacts")
         with run.replacing("artifacts/mesh.obj") as part:
             part.write_text("v 0 0 0")
-        run.write_summary({})
+        run.write_summary(attack())
         assert {path.name for path in run.path.iterdir()} - {".lock"} <= set(directory.CONTENTS)
 
 
@@ -650,7 +644,7 @@ def test_text_is_on_the_disk_when_it_is_written_and_pictures_do_not_wait(
     monkeypatch.setattr("os.fsync", forced.append)
     run.save_image("clean", np.zeros((4, 4, 3)))
     assert len(forced) == 0
-    run.write_summary({})
+    run.write_summary(attack())
     assert len(forced) == 2  # the file and its folder
 
 
@@ -754,16 +748,16 @@ def test_parquet_takes_more_rows_than_one_group(
 
 
 def test_runs_are_listed_with_their_state(home: Path) -> None:
-    def make(name: str, summary: dict[str, Any] | None, rows: int = 2) -> None:
+    def make(name: str, summary: Result | None, rows: int = 2) -> None:
         with RunDirectory.create_for(AttackConfig(object="mug", controls=["pose"], run=name)) as run:
             run.record(*(Row("search", step) for step in range(rows)))
             if summary is not None:
                 run.write_summary(summary)
 
-    make("b-found", {"ending": "found", "verified": {"successes": 19, "trials": 20}, "controls": ["pose", "light"]})
+    make("b-found", attack(verified=rated(19), controls=["pose", "light"]))
     make("a-killed", None, rows=3)
-    make("c-ctrl-c", {"ending": "interrupted"})
-    make("d-sweep", {"ending": "finished", "accuracy": 0.875})
+    make("c-ctrl-c", attack(ending="interrupted", verified=None))
+    make("d-sweep", sweep(accuracy=0.875))
     Path("runs/e-damaged").mkdir()
     Path("runs/e-damaged/results.sqlite").write_bytes(Path("runs/a-killed/results.sqlite").read_bytes()[:100])
     Path("runs/not-a-run").mkdir()

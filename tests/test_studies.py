@@ -10,6 +10,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from samples import ATTACK, AVERAGE, rated
+from samples import attack as attacked
 
 import advsearch
 from advsearch.api import gap as studies
@@ -21,6 +23,7 @@ from advsearch.config import AttackConfig, GapConfig, RegionConfig
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed
+from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.summary import read_result
 
 FLIPS = {"mug": 0.02, "bowl": 0.1, "vase": 0.0, "pan": 9.0}
@@ -45,49 +48,47 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[AttackConfig]
     return done
 
 
-def summary_of(config: AttackConfig, run: str) -> dict[str, Any]:
+def summary_of(config: AttackConfig, run: str) -> AttackSummary:
     epsilon, flips = config.epsilon if isinstance(config.epsilon, float) else 0.1, FLIPS[config.object]
     ending = "already wrong" if flips == 0.0 else "found" if flips <= epsilon else "budget spent"
-    rated = {"successes": 20 * (ending == "found"), "trials": 20, "rate": float(ending == "found")}
-    return {
-        "command": "attack",
-        "run": run,
-        "ending": ending,
-        "epsilon": epsilon,
-        "clean": {"control": {"correct": 0 if flips == 0.0 else 20, "trials": 20}},
-        "verified": {} if flips == 0.0 else {**rated, "margin": 1.0, "interval": [0.8, 1.0]},
-        "average": {"configurations": 50, "correct": 45, "accuracy": 0.9, "interval": [0.78, 0.97]},
-        "renders": {"search": 3},
-    }
+    control = {"correct": 0 if flips == 0.0 else 20, "trials": 20, "rate": float(flips > 0.0), "interval": [0.8, 1.0]}
+    return attacked(
+        run=run,
+        ending=ending,
+        epsilon=epsilon,
+        clean={**ATTACK["clean"], "control": control},
+        verified=None if flips == 0.0 else rated(20 * (ending == "found")),
+        average={**AVERAGE, "configurations": 50, "correct": 45, "accuracy": 0.9, "interval": [0.78, 0.97]},
+    )
 
 
 def test_a_curve_counts_robust_objects_at_each_epsilon(asked: list[AttackConfig]) -> None:
     config = AttackConfig(object="mug,bowl,vase,pan", epsilon="0.1,0.01,0.05", run="study")
     summary = studies.curve_from_config(config)
-    told = [(one["epsilon"], one["robust"], one["found"], one["already_wrong"]) for one in summary["curve"]]
+    told = [(one.epsilon, one.robust, one.found, one.already_wrong) for one in summary.curve]
     assert told == [(0.01, 3, 0, 1), (0.05, 2, 1, 1), (0.1, 1, 2, 1)]
-    low, high = summary["curve"][1]["interval"]
-    assert summary["curve"][1]["accuracy"] == 0.5 and 0.06 < low < 0.07 and 0.93 < high < 0.94
-    assert [row["flips_at"] for row in summary["table"]] == [0.05, 0.1, None, None]
+    low, high = summary.curve[1].interval
+    assert summary.curve[1].accuracy == 0.5 and 0.06 < low < 0.07 and 0.93 < high < 0.94
+    assert [row.flips_at for row in summary.table] == [0.05, 0.1, None, None]
     tried = [(one.object, one.epsilon) for one in asked]  # none beyond the epsilon at which an object flips
     assert tried == [
         ("mug", 0.01), ("mug", 0.05), ("bowl", 0.01), ("bowl", 0.05), ("bowl", 0.1), ("vase", 0.01),
         ("pan", 0.01), ("pan", 0.05), ("pan", 0.1),
     ]  # fmt: skip
     assert (Path("runs/study/images") / "attack.svg").is_file()
-    assert json.loads(Path("runs/study/summary.json").read_text())["curve"] == summary["curve"]
+    assert json.loads(Path("runs/study/summary.json").read_text())["curve"] == summary.to_dict()["curve"]
     assert "2/4" in answer(summary) and "already wrong" in answer(summary)
 
 
 def test_a_label_for_several_objects_says_whose_own_it_is_not(asked: list[AttackConfig]) -> None:
     summary = studies.curve_from_config(AttackConfig(object="mug,bowl", label="mug", run="curve"))
-    assert any("also for bowl (its own is 'bowl')" in text for text in summary["warnings"])
+    assert any("also for bowl (its own is 'bowl')" in text for text in summary.warnings)
 
 
 def test_several_objects_and_one_budget_make_one_row_each(asked: list[AttackConfig]) -> None:
     summary = studies.curve_from_config(AttackConfig(object="mug,pan", run="study"))
-    assert [row["ending"] for row in summary["table"]] == ["found", "budget spent"]
-    assert [one["robust"] for one in summary["curve"]] == [1] and len(asked) == 2
+    assert [row.ending for row in summary.table] == ["found", "budget spent"]
+    assert [one.robust for one in summary.curve] == [1] and len(asked) == 2
 
 
 def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
@@ -107,7 +108,7 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
     assert Path("runs/study/parts/00-00-mug-texture/summary.json").is_file()
     monkeypatch.setattr(studies, "attack_from_config", carry_out)
     summary = studies.gap_from_config(config, resumed=Path("runs/study"))
-    assert [(row["object"], row["control"]) for row in summary["table"]] == [
+    assert [(row.object, row.control) for row in summary.table] == [
         ("mug", "texture"), ("mug", "geometry"), ("bowl", "texture"), ("bowl", "geometry"),
     ]  # fmt: skip
     assert len(asked) == 4, "two before the stop, two after it"
@@ -191,9 +192,9 @@ def test_one_texture_for_many_conditions(tmp_path: Path) -> None:
         draws=2, trials=6, verify_spp=2, average=3, baseline=False, run=tmp_path / "run",
     )  # fmt: skip
     summary = result.summary
-    assert summary["over"] == ["camera"] and summary["controls"] == ["texture"]
-    assert len(summary["configuration"]) and all(name.startswith("texture") for name in summary["configuration"])
-    assert summary["verified"] is None or summary["verified"]["trials"] <= 6
+    assert summary.over == ["camera"] and summary.controls == ["texture"]
+    assert summary.configuration and all(name.startswith("texture") for name in summary.configuration)
+    assert summary.verified is None or summary.verified.trials <= 6
     with RunDirectory.resume(tmp_path / "run") as run:
         trials = list(run.store.rows("control"))
         searched = list(run.store.rows("search"))

@@ -21,6 +21,7 @@ import torch
 from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
+from samples import sweep as swept
 from torch import Tensor, nn
 
 import advsearch
@@ -44,6 +45,8 @@ from advsearch.engine.sweeps.points import BINS, Points
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
 from advsearch.progress import NullProgress
 from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results.base import plain
+from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
 from advsearch.scene.formation import ImageFormation
 from advsearch.settings import settings
@@ -132,8 +135,8 @@ COMPARED = (
 TIMES = ("seconds", "renders_per_second", "run", "command_line")
 
 
-def timeless(summary: dict[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in summary.items() if name not in TIMES}
+def timeless(summary: SweepSummary) -> dict[str, Any]:
+    return {name: value for name, value in summary.to_dict().items() if name not in TIMES}
 
 
 GRID = {"pose.yaw": "0:360:6", "camera.elevation": [5, 20, 35]}
@@ -394,7 +397,7 @@ def test_a_label_for_several_objects_says_whose_own_it_is_not(
     objects: list[str], label: str | None, said: str | None
 ) -> None:
     grid = {"pose.yaw": [0, 90]}
-    found = advsearch.sweep(objects, model(), grid, trials=0, resolution=SIZE, label=label).summary["warnings"]
+    found = advsearch.sweep(objects, model(), grid, trials=0, resolution=SIZE, label=label).summary.warnings
     assert found == [] if said is None else len(found) == 1 and said in found[0]
 
 
@@ -404,7 +407,8 @@ def test_what_a_row_says_of_an_occluder_is_true_of_its_own_camera() -> None:
     near, far = (float(row.values["occlusion.true_distance"]["value"]) for row in found.rows())
     assert near == pytest.approx(1.0, abs=0.1) and far == pytest.approx(2.0, abs=0.1)
     rows = {row.step: row for row in found.rows()}
-    assert found.summary["worst"]["values"] == rows[found.summary["worst"]["configuration"]].values
+    assert (worst := found.summary.worst) is not None
+    assert plain(worst.values) == rows[worst.configuration].values
 
 
 def test_what_a_row_says_is_true_of_the_picture_that_its_model_was_shown() -> None:
@@ -459,8 +463,8 @@ def test_ten_million_draws_start_at_once() -> None:
     began = time.perf_counter()
     result = advsearch.sweep("mug", model(), controls="pose", samples=10_000_000)
     assert time.perf_counter() - began < 10.0
-    assert result.summary["ending"] == "interrupted" and result.summary["planned"] == 10_000_000
-    assert result.summary["configurations"] == 64
+    assert result.summary.ending == "interrupted" and result.summary.planned == 10_000_000
+    assert result.summary.configurations == 64
 
 
 # ---- what a sweep says ----------------------------------------------------------------------------------------------
@@ -470,41 +474,43 @@ def test_counts_are_those_of_the_rows(tmp_path: Path) -> None:
     result = advsearch.sweep("mug", model(), GRID, controls="camera.azimuth", samples=10, run=tmp_path / "run")
     summary = result.summary
     rows = list(result.rows())
-    assert len(rows) == summary["configurations"] == summary["planned"] == 6 * 3 * 10
+    assert len(rows) == summary.configurations == summary.planned == 6 * 3 * 10
     right = [row for row in rows if row.margin is not None and row.margin <= 0.0]
     assert [row.correct for row in rows] == [row in right for row in rows]
     assert all(row.success is None for row in rows)
     assert 0 < len(right) < len(rows)
-    assert summary["correct"] == len(right) and summary["accuracy"] == len(right) / len(rows)
-    assert summary["interval"] == list(clopper_pearson(len(right), len(rows)))
-    assert summary["answers"] == {"vase": len(rows) - len(right)}
-    by_axis = {(row["axis"], str(row["value"])): row for row in summary["axes"]}
-    assert len(by_axis) == len(summary["axes"]) == 6 + 3 + BINS
+    assert summary.correct == len(right) and summary.accuracy == len(right) / len(rows)
+    assert summary.interval == clopper_pearson(len(right), len(rows))
+    assert summary.answers == {"vase": len(rows) - len(right)}
+    by_axis = {(row.axis, str(row.value)): row for row in summary.axes}
+    assert len(by_axis) == len(summary.axes) == 6 + 3 + BINS
     for name in GRID:
         for value in {row.values[name]["value"] for row in rows}:
             mine = [row for row in rows if row.values[name]["value"] == value]
             good = sum(row in right for row in mine)
             found = by_axis[name, str(value)]
-            assert (found["configurations"], found["correct"]) == (len(mine), good)
-            assert found["interval"] == list(clopper_pearson(good, len(mine)))
-    for row in summary["axes"]:
-        if row["axis"] == "camera.azimuth":
-            low, high = row["value"]
+            assert (found.configurations, found.correct) == (len(mine), good)
+            assert found.interval == clopper_pearson(good, len(mine))
+    for row in summary.axes:
+        if row.axis == "camera.azimuth":
+            assert isinstance(row.value, tuple)
+            low, high = row.value
             inside = [one for one in rows if low <= one.values["camera.azimuth"]["value"] < high]
-            assert row["unit"] == "degrees" and row["configurations"] == len(inside) > 15
-            assert row["correct"] == sum(one in right for one in inside)
-    assert json.loads((tmp_path / "run" / "summary.json").read_text("utf-8")) == json.loads(json.dumps(summary))
+            assert row.unit == "degrees" and row.configurations == len(inside) > 15
+            assert row.correct == sum(one in right for one in inside)
+    assert json.loads((tmp_path / "run" / "summary.json").read_text("utf-8")) == summary.to_dict()
 
 
 def test_the_worst_is_the_largest_margin_and_is_rendered_again(tmp_path: Path) -> None:
     result = advsearch.sweep("mug", model(), GRID, run=tmp_path / "run", trials=7, verify_spp=36)
     rows = list(result.rows())
-    worst = result.summary["worst"]
+    worst = result.summary.worst
+    assert worst is not None and worst.verified is not None
     best = max(rows, key=lambda row: row.objective or -math.inf)
-    assert worst["configuration"] == best.step and worst["claimed"]["margin"] == best.objective
-    assert worst["values"] == best.values and worst["seed"] == best.seed and worst["claimed"]["label"] == "vase"
-    checked = worst["verified"]
-    assert (checked["successes"], checked["trials"], checked["spp"]) == (7, 7, 36) and checked["labels"] == {"vase": 7}
+    assert worst.configuration == best.step and worst.claimed.margin == best.objective
+    assert plain(worst.values) == best.values and worst.seed == best.seed and worst.claimed.label == "vase"
+    checked = worst.verified
+    assert (checked.successes, checked.trials, checked.spp) == (7, 7, 36) and checked.labels == {"vase": 7}
     with RunDirectory.resume(tmp_path / "run") as run:
         trials = list(run.store.rows("verification"))
     assert [row.step for row in trials] == list(range(7)) and len({row.seed for row in trials}) == 7
@@ -513,7 +519,7 @@ def test_the_worst_is_the_largest_margin_and_is_rendered_again(tmp_path: Path) -
     at = renderer.seen[best.step][0]
     assert all(torch.equal(u, at) and spp == 36 for u, _, spp in renderer.seen[18:25])
     assert (tmp_path / "run" / "images" / "worst.png").is_file()
-    assert result.summary["renders"] == {"sweep": 18, "verification": 7}
+    assert result.summary.renders == {"sweep": 18, "verification": 7}
 
 
 def test_objects_environments_and_models_are_outer_axes(tmp_path: Path) -> None:
@@ -538,23 +544,24 @@ def test_objects_environments_and_models_are_outer_axes(tmp_path: Path) -> None:
         assert first.seed == second.seed and (first.renders, second.renders) == (1, 0)
         assert first.values["pose.yaw"] == second.values["pose.yaw"]
     assert len(FakeRenderer.made) == 4 or len(FakeRenderer.made) == 5  # the worst one may be loaded again
-    assert result.summary["renders"]["sweep"] == 12
-    accuracy = {row["value"]: row["accuracy"] for row in result.summary["axes"] if row["axis"] == "model"}
-    assert accuracy["easy"] == 1.0 > accuracy["strict"]
-    assert {row["axis"] for row in result.summary["axes"]} == {"object", "environment", "model", "pose.yaw"}
+    assert result.summary.renders["sweep"] == 12
+    accuracy = {row.value: row.accuracy for row in result.summary.axes if row.axis == "model"}
+    assert accuracy["easy"] == 1.0 > (accuracy["strict"] or 0.0)
+    assert {row.axis for row in result.summary.axes} == {"object", "environment", "model", "pose.yaw"}
 
 
 def test_a_grid_is_drawn_as_a_map_of_its_cells(tmp_path: Path) -> None:
     grid = {"pose.yaw": "0:360:12", "camera.elevation": "5:60:4"}
     result = advsearch.sweep("mug", model(), grid, trials=0, run=tmp_path / "run")
-    cells, rows = result.summary["cells"], list(result.rows())
-    yaw, elevation = cells["axes"]
-    assert (yaw["axis"], yaw["unit"], len(yaw["values"])) == ("pose.yaw", "degrees", 12)
-    assert cells["over"] == [] and cells["configurations"] == [[1] * 12] * 4
+    cells, rows = result.summary.cells, list(result.rows())
+    assert cells is not None
+    yaw, elevation = cells.axes
+    assert (yaw.axis, yaw.unit, len(yaw.values)) == ("pose.yaw", "degrees", 12)
+    assert cells.over == [] and cells.configurations == [[1] * 12] * 4
     for row in rows:
-        across = yaw["values"].index(row.values["pose.yaw"]["value"])
-        up = elevation["values"].index(row.values["camera.elevation"]["value"])
-        assert cells["correct"][up][across] == row.correct and cells["margin"][up][across] == row.margin
+        across = yaw.values.index(row.values["pose.yaw"]["value"])
+        up = elevation.values.index(row.values["camera.elevation"]["value"])
+        assert cells.correct[up][across] == row.correct and cells.margin[up][across] == row.margin
     drawn = (tmp_path / "run" / "images" / "sweep.svg").read_text("utf-8")
     assert (tmp_path / "run" / "images" / "sweep.png").read_bytes().startswith(b"\x89PNG")
     for text in ("pose.yaw [degrees]", "camera.elevation [degrees]", "330", "23.33", "margin [logits]; above 0: wrong"):
@@ -567,26 +574,27 @@ def test_cells_with_several_configurations_show_their_accuracy(tmp_path: Path) -
     result = advsearch.sweep(
         names, model(), grid, label="mug", controls="camera.azimuth", samples=3, trials=0, run=tmp_path / "run"
     )
-    cells = result.summary["cells"]
-    assert cells["configurations"] == [[6, 6], [6, 6]] and cells["over"] == ["object"]
+    cells = result.summary.cells
+    assert cells is not None
+    assert cells.configurations == [[6, 6], [6, 6]] and cells.over == ["object"]
     drawn = (tmp_path / "run" / "images" / "sweep.svg").read_text("utf-8")
     assert ">accuracy</text>" in drawn and "over 1 more axis</text>" in drawn
 
 
 def test_one_axis_is_drawn_with_its_intervals(tmp_path: Path) -> None:
     result = advsearch.sweep("mug", model(), {"pose.yaw": [0, 90]}, controls="camera", trials=0, run=tmp_path / "run")
-    assert result.summary["cells"] is None
+    assert result.summary.cells is None
     assert ">95 % interval</text>" in (tmp_path / "run" / "images" / "sweep.svg").read_text("utf-8")
 
 
 def test_models_of_several_sizes_get_pictures_of_their_size() -> None:
     result = advsearch.sweep("mug", [model(0.5, "a", 16), model(0.5, "b", 24)], {"pose.yaw": [0, 90]}, trials=0)
     assert {renderer.size for renderer in FakeRenderer.made} == {(16, 16), (24, 24)}
-    assert [row.renders for row in result.rows()] == [1, 1, 1, 1] and result.summary["renders"]["sweep"] == 4
+    assert [row.renders for row in result.rows()] == [1, 1, 1, 1] and result.summary.renders["sweep"] == 4
 
 
 def test_nothing_but_outer_axes_is_fine_and_one_configuration_is_refused() -> None:
-    assert advsearch.sweep("mug,bowl", model(), label="mug", trials=0).summary["configurations"] == 2
+    assert advsearch.sweep("mug,bowl", model(), label="mug", trials=0).summary.configurations == 2
     with pytest.raises(InputError, match=r"grid: expected something that varies, got nothing; add an axis such as"):
         advsearch.sweep("mug", model())
 
@@ -601,9 +609,9 @@ def test_answers_that_are_not_finite_are_counted_and_not_right() -> None:
     result = advsearch.sweep("mug", victim, {"pose.yaw": "0:360:40"}, trials=0)
     bad = [row for row in result.rows() if row.objective is None]
     assert bad and all((row.correct, row.margin) == (False, None) for row in bad)
-    assert result.summary["not_finite"] == len(bad)
-    assert any("not finite; they count as not right" in text for text in result.summary["warnings"])
-    assert result.summary["worst"]["claimed"]["margin"] is not None
+    assert result.summary.not_finite == len(bad)
+    assert any("not finite; they count as not right" in text for text in result.summary.warnings)
+    assert result.summary.worst is not None and math.isfinite(result.summary.worst.claimed.margin)
 
 
 # ---- what survives --------------------------------------------------------------------------------------------------
@@ -642,8 +650,8 @@ def test_a_sweep_that_was_stopped_ends_as_one_that_was_not(
     FakeRenderer.stops_at, FakeRenderer.stops_with = stops_at, kind
     if kind is KeyboardInterrupt:
         first = advsearch.sweep("mug", model(), run=path, **SURVIVES).summary
-        assert first["ending"] == "interrupted" and first["configurations"] <= stops_at
-        assert first["configurations"] == len([row for row in rows_of(path) if row[0] == KIND])
+        assert first.ending == "interrupted" and first.configurations <= stops_at
+        assert first.configurations == len([row for row in rows_of(path) if row[0] == KIND])
     else:
         with pytest.raises(kind):
             advsearch.sweep("mug", model(), run=path, **SURVIVES)
@@ -673,10 +681,10 @@ def test_resume_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.chdir(tmp_path)
     config = SweepConfig(object="mug", grid={"pose.yaw": "0:360:40"}, resolution=32, run="mine", trials=6)
     FakeRenderer.stops_at = 20
-    assert sweep_from_config(config).summary["configurations"] == 16
+    assert sweep_from_config(config).summary.configurations == 16
     FakeRenderer.stops_at = None
     summary = resume_sweep("mine").summary
-    assert summary["configurations"] == 40 and summary["ending"] == "finished"
+    assert summary.configurations == 40 and summary.ending == "finished"
     other = sweep_from_config(config.model_copy(update={"run": "other"}))
     assert rows_of(tmp_path / "runs" / "mine") == rows_of(tmp_path / "runs" / "other")
     assert timeless(other.summary) == timeless(summary)
@@ -694,7 +702,7 @@ def test_any_configuration_can_be_the_first() -> None:
 def test_without_a_run_directory_the_rows_are_in_memory() -> None:
     result = advsearch.sweep("mug", model(), {"pose.yaw": [0, 90]}, trials=0)
     assert result.run is None and [row.values["pose.yaw"]["value"] for row in result.rows()] == [0.0, 90.0]
-    assert result.accuracy == result.summary["accuracy"]
+    assert result.accuracy == result.summary.accuracy
     assert isinstance(next(iter(result.rows())), Row)
 
 
@@ -770,7 +778,7 @@ def test_the_command_prints_json(
         capsys, "--grid", "camera.elevation=5:50:4", "--trials", "6", "--verify-spp", "4", "--json"
     )
     summary = json.loads(out)
-    assert status == 0 and summary["schema"] == 1 and summary["command"] == "sweep"
+    assert status == 0 and (summary["schema"], summary["command"]) == (1, "sweep")
     assert [row["value"] for row in summary["axes"]] == [5.0, 20.0, 35.0, 50.0]
     wanted = {"configurations", "correct", "accuracy", "interval", "renders_per_second", "worst", "run", "seconds"}
     assert wanted <= set(summary) and summary["run"] == "runs/mug-sweep-001"
@@ -853,14 +861,7 @@ def test_ctrl_c_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys:
 
 
 def test_the_table_of_nothing() -> None:
-    summary = {
-        "command": "sweep",
-        "ending": "interrupted",
-        "configurations": 0,
-        "planned": 5,
-        "axes": [],
-        "worst": None,
-    }
+    summary = swept(ending="interrupted", configurations=0, planned=5, accuracy=None, interval=None)
     assert answer(summary).startswith("Interrupted before the first configuration.")
 
 

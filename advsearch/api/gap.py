@@ -7,9 +7,9 @@ the part at which it was stopped.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from advsearch.api.attack import attack_from_config, resume_attack
 from advsearch.attacks import clopper_pearson
@@ -17,20 +17,22 @@ from advsearch.attacks.verification import WORST_CASE
 from advsearch.config import AttackConfig, GapConfig
 from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.naming import check_run_settings, different, load_models, run_settings_for
+from advsearch.files import Json
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.studies import curve_figure, gap_figure
 from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, default_name, is_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.listing import finished
-from advsearch.runs.summary import read_summary
+from advsearch.runs.results.attack import AttackSummary, AverageCase
+from advsearch.runs.results.base import INTERRUPTED
+from advsearch.runs.results.gap import CurvePoint, CurveResult, GapResult, GapRow, ObjectRow
+from advsearch.runs.summary import attack_of
 from advsearch.scene.library import list_objects, load_object
-
-Summary = dict[str, Any]
 
 
 def curve_from_config(
     config: AttackConfig, *, progress: Progress | None = None, resumed: Path | None = None
-) -> Summary:
+) -> CurveResult:
     """Robust accuracy against epsilon, over objects.
 
     The epsilons are tried from the smallest. An object that flips at one of them flips at every larger one, whose ball
@@ -41,28 +43,33 @@ def curve_from_config(
         config: with one or several objects and epsilons.
         progress: told how far it is.
         resumed: folder of the run to go on with.
-
-    Returns:
-        What `summary.json` holds: `curve` with the accuracy and its 95 % interval (Clopper-Pearson, over objects) at
-        each epsilon, and one row of `table` for each object.
     """
-    return _study(config, _curve, progress or NullProgress(), resumed)
+
+    def body(parts: _Parts) -> Json:
+        return _curve(config, parts)
+
+    return _study(config, CurveResult, body, progress or NullProgress(), resumed)
 
 
-def gap_from_config(config: GapConfig, *, progress: Progress | None = None, resumed: Path | None = None) -> Summary:
-    """The worst case beside the average, over the same space and budget, for each object and each control.
+def gap_from_config(config: GapConfig, *, progress: Progress | None = None, resumed: Path | None = None) -> GapResult:
+    """The worst case beside the average, over the same space and budget, for each object and each control."""
 
-    Returns:
-        What `summary.json` holds: one row of `table` for each object and control, with the accuracy over random
-        configurations, its interval, and the verified rate and margin of the worst configuration.
-    """
-    return _study(config, _gap, progress or NullProgress(), resumed)
+    def body(parts: _Parts) -> Json:
+        return {"table": _gap(config, parts)}
+
+    return _study(config, GapResult, body, progress or NullProgress(), resumed)
 
 
 # ---- one study ------------------------------------------------------------------------------------------------------
 
 
-def _study(config: Any, body: Callable[[Any, _Parts], Summary], progress: Progress, resumed: Path | None) -> Summary:
+Study = TypeVar("Study", bound=CurveResult | GapResult)
+
+
+def _study(
+    config: AttackConfig, kind: type[Study], body: Callable[[_Parts], Json], progress: Progress, resumed: Path | None
+) -> Study:
+    """Carry out the attacks of a study in its run; `body` returns what is its own in the result."""
     begun = time.perf_counter()
     opened = RunDirectory.resume(resumed, config) if resumed is not None else RunDirectory.create_for(config)
     with opened as run:
@@ -71,29 +78,28 @@ def _study(config: Any, body: Callable[[Any, _Parts], Summary], progress: Progre
             progress.message(text)
         each = len(config.controls) if isinstance(config, GapConfig) else max(1, len(config.epsilons))
         parts = _Parts(run.path / PARTS, progress, len(config.objects) * each)
-        answer = {
-            "schema": 1,
-            "command": config.command,
-            "run": str(run.path),
-            "objects": list(config.objects),
-            "controls": list(config.controls),
-            "environment": config.lit_by,
-            "model": config.model,
-            "task": config.task,
-            "policy": config.policy_name,
-            **body(config, parts),
-            "warnings": [*said, *parts.warnings],
-            "parts": parts.names,
-            "ending": "interrupted" if parts.interrupted else "done",
-            "seconds": {"total": time.perf_counter() - begun},
-            "seed": config.seed,
-            "command_line": config.command_line(),
-        }
-        figure = gap_figure(answer) if isinstance(config, GapConfig) else curve_figure(answer)
+        own = body(parts)
+        result = kind(
+            run=str(run.path),
+            objects=list(config.objects),
+            controls=list(config.controls),
+            environment=config.lit_by,
+            model=config.model,
+            task=config.task,
+            policy=config.policy_name,
+            **own,
+            warnings=[*said, *parts.warnings],
+            parts=parts.names,
+            ending=INTERRUPTED if parts.interrupted else "done",
+            seconds={"total": time.perf_counter() - begun},
+            seed=config.seed,
+            command_line=config.command_line(),
+        )
+        figure = gap_figure(result) if isinstance(result, GapResult) else curve_figure(result)
         for suffix, data in figure.items():
             write_bytes(run.path / "images" / f"{config.command}.{suffix}", data)
-        run.write_summary(answer)
-        return answer
+        run.write_summary(result)
+        return result
 
 
 def _label_for_all(config: AttackConfig) -> list[str]:
@@ -121,7 +127,7 @@ class _Parts:
         self.interrupted = False
         self._folder, self._progress, self._most = folder, progress, most
 
-    def attack(self, config: AttackConfig, name: str) -> Summary | None:
+    def attack(self, config: AttackConfig, name: str) -> AttackSummary | None:
         """Return the summary of one attack, or None if there was an interrupt."""
         if self.interrupted:
             return None
@@ -131,12 +137,12 @@ class _Parts:
         what = f"{config.object}, {' and '.join(config.controls)}{budget}"
         self._progress.message(f"attack {len(self.names)} of at most {self._most}: {what}")
         if is_run(path) and (path / CONFIG).is_file():
-            summary = read_summary(path) if finished(path) else resume_attack(path, progress=self._progress).summary
+            summary = attack_of(path) if finished(path) else resume_attack(path, progress=self._progress).summary
         else:
             own = config.model_copy(update={"run": str(path), "overwrite": True})
             summary = attack_from_config(own, progress=self._progress).summary
-        self.warnings += [text for text in summary.get("warnings") or () if text not in self.warnings]
-        self.interrupted = summary["ending"] == "interrupted"
+        self.warnings += [text for text in summary.warnings if text not in self.warnings]
+        self.interrupted = summary.ending == INTERRUPTED
         return None if self.interrupted else summary
 
 
@@ -149,11 +155,11 @@ def _as_attack(config: AttackConfig, **update: Any) -> AttackConfig:
 # ---- robust accuracy against epsilon --------------------------------------------------------------------------------
 
 
-def _curve(config: AttackConfig, parts: _Parts) -> Summary:
+def _curve(config: AttackConfig, parts: _Parts) -> Json:
     epsilons: Sequence[float | None] = sorted(config.epsilons) or [None]
     rows = []
     for place, name in enumerate(different(config.objects, "object")):
-        row: Summary = {"object": name, "clean": None, "flips_at": None}
+        row = ObjectRow(object=name, clean=None, flips_at=None)
         for epsilon in epsilons:
             label = f"{place:02d}-" + default_name(
                 name, [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")]
@@ -162,66 +168,67 @@ def _curve(config: AttackConfig, parts: _Parts) -> Summary:
             summary = parts.attack(one, label)
             if summary is None:
                 break
-            row |= _seen(summary, epsilon) | {"tried": epsilon}
-            if row["ending"] in ("found", "already wrong"):
+            row = _seen(name, summary, epsilon)
+            if row.ending in ("found", "already wrong"):
                 break
         rows.append(row)
     return {"epsilons": list(epsilons), "table": rows, "curve": [_accuracy(rows, epsilon) for epsilon in epsilons]}
 
 
-def _seen(summary: Mapping[str, Any], epsilon: float | None) -> Summary:
-    verified = summary.get("verified") or {}
-    return {
-        "clean": summary["clean"]["control"],
-        "ending": summary["ending"],
-        "epsilon": summary.get("epsilon") if epsilon is None else epsilon,
-        "flips_at": (epsilon if epsilon is not None else summary.get("epsilon"))
-        if summary["ending"] == "found"
-        else None,
-        "verified": verified,
-        "margin": verified.get("margin"),
-        "run": summary["run"],
-    }
+def _seen(name: str, summary: AttackSummary, tried: float | None) -> ObjectRow:
+    epsilon = summary.epsilon if tried is None else tried
+    return ObjectRow(
+        object=name,
+        clean=summary.clean.control,
+        ending=summary.ending,
+        epsilon=epsilon,
+        flips_at=epsilon if summary.ending == "found" else None,
+        verified=summary.verified,
+        margin=summary.verified.margin if summary.verified else None,
+        run=summary.run,
+        tried=tried,
+    )
 
 
-def _known(row: Summary, epsilon: float | None) -> bool:
+def _known(row: ObjectRow, epsilon: float | None) -> bool:
     """Whether a row says anything about an epsilon: it was tried there, or had flipped before.
 
     What ended without a number says nothing, and neither does an object that its own noise makes wrong too often for
     any answer to be verified.
     """
-    ending = row.get("ending")
-    if ending in (None, "non-finite objective"):
+    if row.ending in (None, "non-finite objective"):
         return False
-    if ending in ("found", "already wrong"):
+    if row.ending in ("found", "already wrong"):
         return True
-    clean = row["clean"]
-    steady = clean is not None and clean["correct"] >= WORST_CASE.needed(clean["trials"])
-    return steady and (epsilon is None or row["tried"] >= epsilon)
+    steady = row.clean is not None and row.clean.correct >= WORST_CASE.needed(row.clean.trials)
+    return steady and (epsilon is None or (row.tried is not None and row.tried >= epsilon))
 
 
-def _accuracy(rows: Sequence[Summary], epsilon: float | None) -> Summary:
+def _accuracy(rows: Sequence[ObjectRow], epsilon: float | None) -> CurvePoint:
     """How many objects are still recognised at an epsilon."""
     known = [row for row in rows if _known(row, epsilon)]
-    wrong = sum(row["ending"] == "already wrong" for row in known)
-    found = sum(row["ending"] == "found" and (epsilon is None or float(row["flips_at"]) <= epsilon) for row in known)
+    wrong = sum(row.ending == "already wrong" for row in known)
+    found = sum(row.ending == "found" and _flips_within(row, epsilon) for row in known)
     robust = len(known) - wrong - found
-    low, high = clopper_pearson(robust, len(known)) if known else (0.0, 1.0)
-    return {
-        "epsilon": epsilon,
-        "objects": len(known),
-        "robust": robust,
-        "found": found,
-        "already_wrong": wrong,
-        "accuracy": robust / len(known) if known else None,
-        "interval": [low, high],
-    }
+    return CurvePoint(
+        epsilon=epsilon,
+        objects=len(known),
+        robust=robust,
+        found=found,
+        already_wrong=wrong,
+        accuracy=robust / len(known) if known else None,
+        interval=clopper_pearson(robust, len(known)) if known else (0.0, 1.0),
+    )
+
+
+def _flips_within(row: ObjectRow, epsilon: float | None) -> bool:
+    return epsilon is None or (isinstance(row.flips_at, float) and row.flips_at <= epsilon)
 
 
 # ---- worst case beside the average ----------------------------------------------------------------------------------
 
 
-def _gap(config: GapConfig, parts: _Parts) -> Summary:
+def _gap(config: GapConfig, parts: _Parts) -> list[GapRow]:
     check_run_settings(config)
     rows = []
     for place, name in enumerate(different(config.objects, "object")):
@@ -229,20 +236,19 @@ def _gap(config: GapConfig, parts: _Parts) -> Summary:
             shared = run_settings_for(config, control, settings)
             one = _as_attack(config, object=name, controls={control: settings}, **shared)
             summary = parts.attack(one, f"{place:02d}-{number:02d}-" + default_name(name, [control]))
-            if summary is not None:
-                rows.append(_compared(name, control, summary))
-    return {"table": rows}
+            if summary is not None and summary.average is not None:
+                rows.append(_compared(name, control, summary, summary.average))
+    return rows
 
 
-def _compared(name: str, control: str, summary: Mapping[str, Any]) -> Summary:
-    verified = summary.get("verified") or {}
-    return {
-        "object": name,
-        "control": control,
-        "average": summary["average"],
-        "worst": verified or None,
-        "ending": summary["ending"],
-        "margin": verified.get("margin"),
-        "renders": summary["renders"],
-        "run": summary["run"],
-    }
+def _compared(name: str, control: str, summary: AttackSummary, average: AverageCase) -> GapRow:
+    return GapRow(
+        object=name,
+        control=control,
+        average=average,
+        worst=summary.verified,
+        ending=summary.ending,
+        margin=summary.verified.margin if summary.verified else None,
+        renders=summary.renders,
+        run=summary.run,
+    )

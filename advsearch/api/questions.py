@@ -11,6 +11,7 @@ from advsearch.api.region import region_from_config
 from advsearch.config import GapConfig, RegionConfig
 from advsearch.engine.naming import options_of
 from advsearch.progress import Progress
+from advsearch.runs.results.gap import GapResult
 from advsearch.runs.results.region import RegionResult
 
 Named = str | Sequence[str] | Mapping[str, Mapping[str, Any] | None]
@@ -59,13 +60,10 @@ def gap(
     verify_spp: int | None = None,
     trials: int | None = None,
     progress: Progress | None = None,
-) -> Mapping[str, Any]:
+) -> GapResult:
     """Compare the worst configuration with the average, for each object and each control (docs/questions.md).
 
     The arguments are the settings of `advsearch gap` by the same names. The run is kept, in `run` or under runs/.
-
-    Returns:
-        What `summary.json` holds: `table` has a row for each object and control.
 
     Raises:
         InputError: anything that the caller can put right.

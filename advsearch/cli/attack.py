@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from advsearch.config import AttackConfig
+    from advsearch.runs.results.attack import AttackSummary
+    from advsearch.runs.results.gap import CurveResult
 
 HELP = "find the configuration of a scene that the model gets wrong most badly"
 
@@ -52,12 +54,13 @@ def carry_out(config: AttackConfig, *, as_json: bool, quiet: bool, resumed: Path
         from advsearch.api.attack import attack_from_config, resume_attack
         from advsearch.api.gap import curve_from_config
 
+        result: CurveResult | AttackSummary
         if config.is_study:
-            summary = curve_from_config(config, progress=progress, resumed=resumed)
+            result = curve_from_config(config, progress=progress, resumed=resumed)
         elif resumed is not None:
-            summary = resume_attack(resumed, progress=progress).summary
+            result = resume_attack(resumed, progress=progress).summary
         else:
-            summary = attack_from_config(config, progress=progress).summary
+            result = attack_from_config(config, progress=progress).summary
     from advsearch.cli import studies, table
 
-    return output.finish(summary, (studies if config.is_study else table).answer, as_json=as_json)
+    return output.finish(result, (studies if config.is_study else table).answer, as_json=as_json)

@@ -8,7 +8,7 @@ import json
 import os
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -50,33 +50,27 @@ def _json_escape(sign: str) -> str:
     return "\\u007f" if sign == "\x7f" else json.dumps(sign)[1:-1]
 
 
-def finish(summary: Result | Mapping[str, Any], answer: Callable[[Any], str], *, as_json: bool) -> int:
+def finish(result: Result, answer: Callable[[Any], str], *, as_json: bool) -> int:
     """Print the last word of a command, and return its exit status.
 
     Args:
-        summary: what came out; its `ending` says whether it was interrupted.
+        result: what came out.
         answer: makes a text for a person of it.
-        as_json: print the summary itself instead.
+        as_json: print the result itself instead.
     """
     from advsearch.cli.main import INTERRUPTED, OK
 
     if as_json:
-        print_json(summary)
+        print_json(result)
     else:
-        print(answer(summary) + go_on_text(summary))
-    ending = summary.get("ending") if isinstance(summary, Mapping) else getattr(summary, "ending", None)
-    return INTERRUPTED if ending == "interrupted" else OK
+        print(answer(result) + go_on_text(result))
+    return INTERRUPTED if getattr(result, "ending", None) == "interrupted" else OK
 
 
-def go_on_text(summary: Result | Mapping[str, Any]) -> str:
+def go_on_text(result: Result) -> str:
     """Return how to go on with a run that was stopped; nothing of one that was not, or that is kept nowhere."""
-    from advsearch.runs.summary import goes_on
-
-    if isinstance(summary, Mapping):
-        run, stopped = summary.get("run"), goes_on(summary)
-    else:
-        run, stopped = getattr(summary, "run", None), summary.goes_on
-    return f"\n\nGo on with: {go_on_command(run)}" if run and stopped else ""
+    run = getattr(result, "run", None)
+    return f"\n\nGo on with: {go_on_command(run)}" if run and result.goes_on else ""
 
 
 def go_on_command(run: str | Path) -> str:

@@ -43,32 +43,20 @@ def show_run(name: str, as_json: bool) -> int:
 
     from advsearch.runs.directory import find_run
     from advsearch.runs.listing import described
-    from advsearch.runs.results import KEPT
-    from advsearch.runs.summary import NAME, of_a_file, read_result, read_summary
+    from advsearch.runs.results.gap import CurveResult
+    from advsearch.runs.summary import NAME, read_result
 
     path = find_run(name)
     if not (path / NAME).is_file():
         return _show_unfinished(described(path), as_json)
-    summary = read_summary(path)
-    tables = {
-        "sweep": "advsearch.cli.sweep_table",
-        "gap": "advsearch.cli.studies",
-        "region": "advsearch.cli.region",
-        "precision": "advsearch.cli.precision",
-        "check": "advsearch.cli.check",
-        "stability": "advsearch.cli.stability",
-    }
-    kind = "gap" if "parts" in summary else summary.get("command")
-    answer = importlib.import_module(tables.get(str(kind), "advsearch.cli.table")).answer
+    result = read_result(path)
+    tables = {"attack": "table", "sweep": "sweep_table", "gap": "studies"}
+    table = "studies" if isinstance(result, CurveResult) else tables.get(result.command, result.command)
+    answer = importlib.import_module(f"advsearch.cli.{table}").answer
     if as_json:
-        output.print_json(summary)
-    elif str(kind) in KEPT:
-        result = read_result(path)
-        print(answer(result) + output.go_on_text(result))
+        output.print_json(result)
     else:
-        with of_a_file(path / NAME):
-            text = answer(summary) + output.go_on_text(summary)
-        print(text)
+        print(answer(result) + output.go_on_text(result))
     return 0
 
 

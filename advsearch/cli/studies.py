@@ -2,81 +2,72 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from advsearch.cli.output import columns
 from advsearch.report import wording
-
-Summary = Mapping[str, Any]
-
-
-def _margin(summary: Summary) -> str:
-    return f"\n  margin: {wording.margin_text(summary)}, in the trials of the worst case"
+from advsearch.runs.results.attack import VerifiedRate
+from advsearch.runs.results.base import INTERRUPTED
+from advsearch.runs.results.gap import CurveResult, EpsilonBudget, GapResult, ObjectRow
 
 
-def answer(summary: Summary) -> str:
-    """Return the tables of a study's summary."""
-    parts = [_gap(summary)] if summary.get("command") == "gap" else [_objects(summary), _curve(summary)]
-    facts = [["time", wording.seconds_text(summary["seconds"]["total"])], ["run", str(summary["run"])]]
-    ending = "Interrupted." if summary.get("ending") == "interrupted" else ""
+def _meaning(result: CurveResult | GapResult) -> str:
+    return f"\n  margin: {wording.margin_text(result.task)}, in the trials of the worst case"
+
+
+def answer(result: CurveResult | GapResult) -> str:
+    """Return the tables of a study."""
+    parts = [_gap(result)] if isinstance(result, GapResult) else [_objects(result), _curve(result)]
+    facts = [["time", wording.seconds_text(result.seconds["total"])], ["run", str(result.run)]]
+    ending = "Interrupted." if result.ending == INTERRUPTED else ""
     return "\n\n".join(part for part in (*parts, columns(facts), ending) if part)
 
 
-def _objects(summary: Summary) -> str:
+def _objects(result: CurveResult) -> str:
     heads = ["object", "clean right", "ending", "epsilon", "wrong", "margin"]
-    return columns([heads, *([row["object"], *_seen(row)] for row in summary["table"])]) + _margin(summary)
+    return columns([heads, *([row.object, *_seen(row)] for row in result.table)]) + _meaning(result)
 
 
-def _seen(row: Summary) -> list[str]:
-    if row.get("ending") is None:
+def _seen(row: ObjectRow) -> list[str]:
+    if row.ending is None:
         return ["not reached"]
-    clean, verified = row.get("clean") or {}, row.get("verified") or {}
-    return [
-        f"{clean['correct']}/{clean['trials']}" if clean else "",
-        str(row["ending"]),
-        _plain(row.get("epsilon")),
-        f"{verified['successes']}/{verified['trials']}" if verified else "",
-        f"{row['margin']:.2f}" if row.get("margin") is not None else "",
-    ]
+    clean = f"{row.clean.correct}/{row.clean.trials}" if row.clean else ""
+    return [clean, row.ending, _plain(row.epsilon), _rate(row.verified), _margin(row.margin)]
 
 
-def _curve(summary: Summary) -> str:
+def _curve(result: CurveResult) -> str:
     heads = ["epsilon", "robust", "accuracy", "95 % interval", "wrong already"]
     rows = [
         [
-            _plain(one["epsilon"]) or "own",
-            f"{one['robust']}/{one['objects']}",
-            wording.percent(one["accuracy"]),
-            wording.interval_text(one),
-            str(one["already_wrong"]),
+            _plain(one.epsilon) or "own",
+            f"{one.robust}/{one.objects}",
+            wording.percent(one.accuracy),
+            wording.interval_text(one.interval),
+            str(one.already_wrong),
         ]
-        for one in summary["curve"]
-        if one["accuracy"] is not None
+        for one in result.curve
+        if one.accuracy is not None
     ]
     return columns([heads, *rows]) if rows else ""
 
 
-def _gap(summary: Summary) -> str:
-    heads = ["object", "control", "right on average", "95 % interval", "worst: wrong", "margin", "ending"]
-    rows = []
-    for row in summary["table"]:
-        average, worst = row["average"], row["worst"] or {}
-        rows.append(
-            [
-                row["object"],
-                row["control"],
-                f"{average['correct']}/{average['configurations']} ({wording.percent(average['accuracy'])})",
-                wording.interval_text(average),
-                f"{worst['successes']}/{worst['trials']}" if worst else "",
-                f"{row['margin']:.2f}" if row["margin"] is not None else "",
-                str(row["ending"]),
-            ]
-        )
-    return columns([heads, *rows]) + _margin(summary)
+def _gap(result: GapResult) -> str:
+    rows = [["object", "control", "right on average", "95 % interval", "worst: wrong", "margin", "ending"]]
+    for row in result.table:
+        average = row.average
+        right = f"{average.correct}/{average.configurations} ({wording.percent(average.accuracy)})"
+        worst = _rate(row.worst), _margin(row.margin)
+        rows.append([row.object, row.control, right, wording.interval_text(average.interval), *worst, row.ending])
+    return columns(rows) + _meaning(result)
 
 
-def _plain(value: Any) -> str:
-    if isinstance(value, Mapping):
+def _rate(rated: VerifiedRate | None) -> str:
+    return f"{rated.successes}/{rated.trials}" if rated else ""
+
+
+def _margin(margin: float | None) -> str:
+    return "" if margin is None else f"{margin:.2f}"
+
+
+def _plain(value: EpsilonBudget) -> str:
+    if isinstance(value, dict):
         return ",".join(f"{name}={_plain(one)}" for name, one in value.items())
     return "" if value is None else wording.number_text(value)

@@ -22,12 +22,14 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.rows import answered
 from advsearch.errors import InputError
+from advsearch.files import Json
 from advsearch.report.notebook import attack_html
 from advsearch.report.page import write_report
 from advsearch.runs import images, store
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
+from advsearch.runs.results.attack import AttackSummary
 from advsearch.scene.formation import to_8_bit
 from advsearch.tasks.base import typical
 
@@ -40,7 +42,7 @@ class AttackResult:
     """The answer of an attack.
 
     Attributes:
-        summary: what `summary.json` holds (docs/design.md, "summary.json").
+        summary: what `summary.json` holds.
         run: the run directory, or None if it was not kept.
         u: (d,) the configuration that was verified; the start where nothing was searched.
         clean: (H, W, 3) display-referred sRGB in [0, 1], 8-bit values: the clean configuration.
@@ -49,7 +51,7 @@ class AttackResult:
         search: the search's own log and claim.
     """
 
-    summary: dict[str, Any]
+    summary: AttackSummary
     run: Path | None
     u: Tensor
     clean: Tensor
@@ -60,7 +62,7 @@ class AttackResult:
     @property
     def found(self) -> bool:
         """Whether a verified configuration was found."""
-        return bool(self.summary["ending"] == Ending.FOUND.value)
+        return self.summary.ending == Ending.FOUND.value
 
     def rows(self, kind: str | None = None) -> Iterator[store.Row]:
         """Yield every evaluated configuration, or those of one kind ("search", "verification", ...), in order.
@@ -83,10 +85,9 @@ class AttackResult:
 
     def __repr__(self) -> str:
         summary, run = self.summary, None if self.run is None else str(self.run)
-        rated = summary.get("verified") or {}
-        verified = f", verified {rated['successes']}/{rated['trials']}" if rated else ""
-        controls = ",".join(summary["controls"])
-        return f"AttackResult({summary['object']!r}, {controls!r}, {summary['ending']!r}{verified}, run={run!r})"
+        verified = f", verified {summary.brief}" if summary.verified else ""
+        controls = ",".join(summary.controls)
+        return f"AttackResult({summary.object!r}, {controls!r}, {summary.ending!r}{verified}, run={run!r})"
 
     def _repr_html_(self) -> str:
         pictures = {"clean": self.clean.numpy(), "adversarial": self.adversarial.numpy()}
@@ -116,18 +117,20 @@ def summarise(
     artifacts = space.artifacts(u)
     answers = _answers(config, problem, findings, u, clean, adversarial)
     run = recorder.run
-    costs = _costs(findings, problem, stages)
+    costs = _costs(findings, problem)
     where = {"run": None if run is None else str(run.path)}
-    summary = {"schema": 1, "command": "attack", **where, **answers, **costs, "seed": config.seed}
-    summary |= {"warnings": [*said, *_remarks(findings, problem)], "command_line": config.command_line()}
+    warnings = [*said, *_remarks(findings, problem)]
     if run is not None:
         _write_pictures(run, problem, findings, linear, clean, adversarial)
         _write_artifacts(run, artifacts)
         for name, data in space.files(u).items():
             write_bytes(run.path / "artifacts" / name, data)
-        summary["seconds"]["total"] = stages.total
         if u.numel() <= MOST_NUMBERS:
             run.store.set_note(ANSWER, json.dumps(u.tolist()))
+    asked = {"seed": config.seed, "command_line": config.command_line()}
+    seconds = {**stages.seconds, "total": stages.total}
+    summary = AttackSummary.of({**where, **answers, **costs, "seconds": seconds, **asked, "warnings": warnings})
+    if run is not None:
         run.write_summary(summary)
         write_report(run.path)
         if not findings.interrupted:
@@ -140,7 +143,7 @@ def summarise(
 
 def _answers(
     config: AttackConfig, problem: Problem, findings: Findings, u: Tensor, clean: Tensor, adversarial: Tensor
-) -> dict[str, Any]:
+) -> Json:
     verification, task, start = findings.verification, problem.task, problem.domain.start
     clean_trial = typical(findings.clean) if findings.clean else problem.judge(clean, problem.whole(start))
     trials = verification.adversarial_trials if verification else (problem.judge(adversarial, problem.whole(u)),)
@@ -148,7 +151,7 @@ def _answers(
     control = count_right(findings.clean, findings.spp) if findings.clean else None
     controls = problem.searched_space.controls
     budgets = [bound.budget for bound in controls]
-    summary: dict[str, Any] = {
+    summary: Json = {
         "object": config.object,
         "model": problem.model.name,
         "task": task.name,
@@ -163,8 +166,8 @@ def _answers(
         "target": list(task.target_names) or None,
         "over": [bound.name for bound in problem.space.controls[len(controls) :]],
         "ending": _ending(findings, problem).value,
-        "image_formation": problem.renderer.formation.summary(),
-        "gradient_plan": problem.plan_summary(problem.plan).to_dict(),
+        "image_formation": problem.renderer.formation,
+        "gradient_plan": problem.plan_summary(problem.plan),
         "light_path_segments": {
             "search": problem.search_depth or problem.renderer.scene.max_depth,
             "verification": problem.renderer.scene.max_depth,
@@ -172,7 +175,7 @@ def _answers(
         "clean": {
             **asdict(clean_trial.answer),
             "correct": clean_trial.right,
-            "moved": [one.to_dict() for one in problem.space.moved],
+            "moved": list(problem.space.moved),
             "control": control.to_control_dict() if control else None,
         },
         "adversarial": asdict(found.answer) if findings.search else None,
@@ -206,7 +209,7 @@ def _answers(
     return summary
 
 
-def _gradients(found: SearchResult) -> dict[str, Any]:
+def _gradients(found: SearchResult) -> Json:
     """What the search saw of its gradients, and what its policy did about them and about steps that failed."""
     norms = [record.gradient_norm for record in found.history if record.objective == record.objective]
     return {
@@ -217,7 +220,7 @@ def _gradients(found: SearchResult) -> dict[str, Any]:
     }
 
 
-def _average(findings: Findings, problem: Problem) -> dict[str, Any]:
+def _average(findings: Findings, problem: Problem) -> Json:
     """How often the model is right over configurations drawn from the whole space."""
     counted = Trials(sum(trial.right for trial in findings.average), len(findings.average), findings.spp)
     scores = [trial.score for trial in findings.average]
@@ -231,7 +234,7 @@ def _average(findings: Findings, problem: Problem) -> dict[str, Any]:
     }
 
 
-def _smallest(bracket: Bracket, problem: Problem) -> dict[str, Any]:
+def _smallest(bracket: Bracket, problem: Problem) -> Json:
     """The bracket of the smallest epsilon, in the unit of each control."""
     budgets = {bound.name: float(bound.budget.epsilon or 0.0) for bound in problem.searched_space.controls}
     flips = bracket.u is not None
@@ -245,7 +248,7 @@ def _smallest(bracket: Bracket, problem: Problem) -> dict[str, Any]:
     }
 
 
-def _distribution(found: Distribution, problem: Problem) -> dict[str, Any] | None:
+def _distribution(found: Distribution, problem: Problem) -> Json | None:
     """Mean and spread of a distribution of configurations, where there are few numbers."""
     if found.mean.numel() > MOST_NUMBERS:
         return None
@@ -265,14 +268,14 @@ def _ending(findings: Findings, problem: Problem) -> Ending:
     return Ending.INTERRUPTED
 
 
-def _verified(verification: Verification | None) -> dict[str, Any] | None:
+def _verified(verification: Verification | None) -> Json | None:
     """Rates, and what the model answered in the trials that it got wrong."""
     if verification is None:
         return None
     return {**verification.adversarial.to_dict(), **answered(verification.adversarial_trials)}
 
 
-def _costs(findings: Findings, problem: Problem, stages: Stages) -> dict[str, Any]:
+def _costs(findings: Findings, problem: Problem) -> Json:
     search, baseline = findings.search, findings.baseline
     return {
         "renders": {
@@ -286,7 +289,6 @@ def _costs(findings: Findings, problem: Problem, stages: Stages) -> dict[str, An
             "objectives": search.non_finite_objectives if search else 0,
             "gradient_elements": search.non_finite_elements if search else 0,
         },
-        "seconds": {**stages.seconds, "total": stages.total},
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from advsearch.report.markup import Html, element, join
@@ -88,12 +88,9 @@ def objective_chart(curves: Sequence[Curve], objective: str, zero_means: str = "
     )
 
 
-def interval_bar(rated: Mapping[str, object]) -> Html:
+def interval_bar(rate: float, interval: tuple[float, float]) -> Html:
     """Return a bar from 0 to 1 with the confidence interval and the rate on it; decoration beside the numbers."""
-    ends, rate = rated.get("interval"), rated.get("rate")
-    if not isinstance(ends, (list, tuple)) or not isinstance(rate, (int, float)):
-        return Html("")
-    low, high, at = (2 + 96 * float(share) for share in (ends[0], ends[1], rate))
+    low, high, at = (2 + 96 * share for share in (*interval, rate))
     return element(
         "svg",
         element("rect", x=0, y=5, width=100, height=2, class_="track"),

@@ -10,6 +10,9 @@ from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
 from advsearch.report.studies import sweep_figure
 from advsearch.runs.images import png_bytes
+from advsearch.runs.results.attack import AttackSummary, UsualAnswer, VerifiedRate
+from advsearch.runs.results.base import Interval
+from advsearch.runs.results.sweep import AxisRow, SweepSummary
 
 SHOWN = 224
 """Width of a picture on the page, in pixels."""
@@ -18,7 +21,7 @@ MOST_ROWS = 24
 """Values of an axis that are listed; of more, none."""
 
 
-def attack_html(summary: Mapping[str, Any], pictures: Mapping[str, Any]) -> str:
+def attack_html(summary: AttackSummary, pictures: Mapping[str, Any]) -> str:
     """Return an attack's verdict, its pictures and its rates.
 
     Args:
@@ -29,47 +32,50 @@ def attack_html(summary: Mapping[str, Any], pictures: Mapping[str, Any]) -> str:
         element("figure", _picture(png_bytes(image), SHOWN), element("figcaption", name), style="display:inline-block")
         for name, image in pictures.items()
     ]
-    clean, found = summary.get("clean") or {}, summary.get("adversarial") or {}
-    random = summary.get("baseline") or {}
     rows = [["", "answer", "probability", "rate", "95 % interval"]]
-    rows.append(["clean", *_answer(clean), *_rate("right", clean.get("control") or {}, "correct")])
-    if found:
-        rows.append(["adversarial", *_answer(found), *_rate(wording.success(summary), summary.get("verified") or {})])
-    if random:
-        rows.append(["random search", "", "", *_rate(wording.success(summary), random.get("verified") or {})])
+    success, control = wording.success(summary), summary.clean.control
+    rate = _rate("right", control.correct, control.trials, control.interval) if control else ["", ""]
+    rows.append(["clean", *_answer(summary.clean), *rate])
+    if summary.adversarial:
+        rows.append(["adversarial", *_answer(summary.adversarial), *_verified(success, summary.verified)])
+    if summary.baseline:
+        rows.append(["random search", "", "", *_verified(success, summary.baseline.verified)])
     return element("div", element("p", wording.verdict(summary)), *shown, _table(rows))
 
 
-def sweep_html(summary: Mapping[str, Any]) -> str:
+def sweep_html(summary: SweepSummary) -> str:
     """Return a sweep's accuracy, its map, and the accuracy of every value of every axis."""
-    if not summary["configurations"]:
+    if not summary.configurations:
         return element("p", "No configuration was looked at.")
-    total = f"Right in {summary['correct']} of {summary['configurations']} configurations"
-    rate = f"{wording.percent(summary['accuracy'])}, 95 % interval {wording.interval_text(summary)}"
+    total = f"Right in {summary.correct} of {summary.configurations} configurations"
+    rate = f"{wording.percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}"
     figure = sweep_figure(summary)
     rows = [["axis", "value", "configurations", "right", "accuracy", "95 % interval"]]
-    for name in dict.fromkeys(row["axis"] for row in summary["axes"]):
-        mine = [row for row in summary["axes"] if row["axis"] == name]
+    for name in dict.fromkeys(row.axis for row in summary.axes):
+        mine = [row for row in summary.axes if row.axis == name]
         rows += [_axis_row(row) for row in mine] if len(mine) <= MOST_ROWS else []
     drawn = _picture(figure["png"], 2 * SHOWN) if figure else None
     return element("div", element("p", f"{total} ({rate})."), drawn, _table(rows) if len(rows) > 1 else None)
 
 
-def _axis_row(row: Mapping[str, Any]) -> list[str]:
-    ends = row["value"] if isinstance(row["value"], (list, tuple)) else [row["value"]]
+def _axis_row(row: AxisRow) -> list[str]:
+    ends = row.value if isinstance(row.value, (list, tuple)) else [row.value]
     value = " to ".join(f"{end:g}" if isinstance(end, float) else str(end) for end in ends)
-    unit = f" {row['unit']}" if row["unit"] not in ("", "name") else ""
-    counts = [str(row["configurations"]), str(row["correct"])]
-    return [row["axis"], value + unit, *counts, wording.percent(row["accuracy"]), wording.interval_text(row)]
+    unit = f" {row.unit}" if row.unit not in ("", "name") else ""
+    counts = [str(row.configurations), str(row.correct)]
+    return [row.axis, value + unit, *counts, wording.percent(row.accuracy), wording.interval_text(row.interval)]
 
 
-def _answer(answer: Mapping[str, Any]) -> list[str]:
-    known = answer.get("probability") is not None
-    return [str(answer.get("label") or ""), wording.percent(answer["probability"]) if known else ""]
+def _answer(answer: UsualAnswer) -> list[str]:
+    return [answer.label, "" if answer.probability is None else wording.percent(answer.probability)]
 
 
-def _rate(what: str, rated: Mapping[str, Any], key: str = "successes") -> list[str]:
-    return [f"{what} in {wording.tally(rated, key)}", wording.interval_text(rated)] if rated.get("trials") else ["", ""]
+def _verified(what: str, rated: VerifiedRate | None) -> list[str]:
+    return _rate(what, rated.successes, rated.trials, rated.interval) if rated else ["", ""]
+
+
+def _rate(what: str, number: int, trials: int, interval: Interval) -> list[str]:
+    return [f"{what} in {number} of {trials}", wording.interval_text(interval)]
 
 
 def _picture(png: bytes, width: int) -> Html:

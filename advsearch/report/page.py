@@ -8,7 +8,6 @@ import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from advsearch import __version__
 from advsearch.report import wording
@@ -17,7 +16,8 @@ from advsearch.report.markup import Html, element, join
 from advsearch.report.style import CSS
 from advsearch.runs import directory, images, store
 from advsearch.runs.files import write_text
-from advsearch.runs.summary import read_summary
+from advsearch.runs.results.attack import AttackSummary, UsualAnswer
+from advsearch.runs.summary import attack_of
 
 LARGE_PICTURE = 1_000_000
 """Bytes above which a PNG is put into the page at a smaller size; the file itself stays as it is."""
@@ -45,7 +45,7 @@ class RunData:
     """
 
     path: Path
-    summary: Mapping[str, Any]
+    summary: AttackSummary
     recipe: str
     pictures: Mapping[str, str]
     curves: Mapping[str, list[float | None]]
@@ -67,7 +67,7 @@ def read_run(path: Path) -> RunData:
     recipe = path / directory.CONFIG
     return RunData(
         path=path,
-        summary=read_summary(path),
+        summary=attack_of(path),
         recipe=recipe.read_text(encoding="utf-8", errors="replace") if recipe.is_file() else "",
         pictures=_read_pictures(path),
         curves=_read_curves(path / store.NAME),
@@ -100,9 +100,9 @@ def page(data: RunData) -> str:
     return "<!doctype html>\n" + element("html", head, body, lang="en") + "\n"
 
 
-def _header(summary: Mapping[str, Any]) -> Html:
+def _header(summary: AttackSummary) -> Html:
     remarks = [element("li", text) for text in wording.remarks(summary)]
-    model, environment = (wording.short_name(summary.get(name)) for name in ("model", "environment"))
+    model, environment = (wording.short_name(name) for name in (summary.model, summary.environment))
     what = f"{wording.budget_text(summary)}; object {wording.noun(summary)}, environment {environment}, model {model}"
     return element(
         "header",
@@ -113,7 +113,7 @@ def _header(summary: Mapping[str, Any]) -> Html:
 
 
 def _pictures(data: RunData) -> Html:
-    clean, adversarial = data.summary.get("clean"), data.summary.get("adversarial")
+    clean, adversarial = data.summary.clean, data.summary.adversarial
     gain = f"{images.DIFFERENCE_GAIN:g} times magnified, grey where nothing changed"
     shown = [
         _figure(data, "images/clean.png", "Clean", _answer(clean)),
@@ -135,36 +135,34 @@ def _textures(data: RunData) -> Html:
     return _section("The texture", [original, changed], "pair")
 
 
-def _rates(summary: Mapping[str, Any]) -> Html:
-    control = dict((summary.get("clean") or {}).get("control") or {})
-    baseline, success = summary.get("baseline") or {}, wording.success(summary)
-    average = dict(summary.get("average") or {})
-    average |= {"trials": average.get("configurations"), "rate": average.get("accuracy")}
-    rows = [
-        ("Clean scene (control group)", "right", control, control.get("correct")),
-        ("Adversarial", success, summary.get("verified") or {}, None),
-        (f"{str(baseline.get('policy', 'random')).capitalize()} search", success, baseline.get("verified") or {}, None),
-        ("Average case (random configurations)", "right", average, average.get("correct")),
-    ]
+def _rates(summary: AttackSummary) -> Html:
+    control, average, baseline = summary.clean.control, summary.average, summary.baseline
+    success, rows = wording.success(summary), []
+    if control:
+        rows.append(("Clean scene (control group)", "right", control.correct, control.trials, control.interval))
+    random = f"{baseline.policy.capitalize()} search" if baseline else ""
+    for name, rated in (("Adversarial", summary.verified), (random, baseline.verified if baseline else None)):
+        if rated:
+            rows.append((name, success, rated.successes, rated.trials, rated.interval))
+    if average:
+        average_case = "Average case (random configurations)"
+        rows.append((average_case, "right", average.correct, average.configurations, average.interval))
     lines = [
         element(
             "tr",
             element("th", name, scope="row"),
             element("td", what),
-            element(
-                "td", f"{rated.get('successes') if right is None else right} of {rated['trials']}", class_="number"
-            ),
-            element("td", wording.interval_text(rated), class_="number"),
-            element("td", interval_bar(rated), class_="hide-small"),
+            element("td", f"{number} of {trials}", class_="number"),
+            element("td", wording.interval_text(interval), class_="number"),
+            element("td", interval_bar(number / trials, interval), class_="hide-small"),
         )
-        for name, what, rated, right in rows
-        if rated.get("trials")
+        for name, what, number, trials, interval in rows
     ]
     if not lines:
         return Html("")
     heads = ("Configuration", "Model is", "Renders", "95 % interval")
     head = element("tr", *(element("th", text, scope="col") for text in heads), element("th", "", class_="hide-small"))
-    spp = (summary.get("verified") or {}).get("spp")
+    spp = summary.verified.spp if summary.verified else None
     note = "Fresh seeds, pictures rounded to 8 bits, Clopper-Pearson intervals"
     return join(
         element("h2", "Verified rates"),
@@ -174,7 +172,7 @@ def _rates(summary: Mapping[str, Any]) -> Html:
 
 
 def _curve(data: RunData) -> Html:
-    known = (("search", str(data.summary.get("policy", "search"))), ("baseline", "random"))
+    known = (("search", data.summary.policy), ("baseline", "random"))
     curves = [
         Curve(name, kind, data.curves[kind])
         for kind, name in known
@@ -182,8 +180,8 @@ def _curve(data: RunData) -> Html:
     ]
     if not curves:
         return Html("")
-    objective = str(data.summary.get("objective", "objective"))
-    above = "right" if wording.minimises(data.summary) else wording.success(data.summary)
+    objective = data.summary.objective
+    above = "right" if data.summary.minimises else wording.success(data.summary)
     zero = f"above: {above}" if objective == "margin" else ""
     charts = [objective_chart(curves, objective, zero, paper) for paper in (WIDE, NARROW)]
     note = "Lines: the best so far. Dots: each evaluation. These are the search's claims; the table above is verified."
@@ -194,32 +192,32 @@ def _curve(data: RunData) -> Html:
     )
 
 
-def _cost(summary: Mapping[str, Any]) -> Html:
-    seconds = summary.get("seconds") or {}
+def _cost(summary: AttackSummary) -> Html:
+    seconds = summary.seconds
     parts = ", ".join(f"{name} {wording.seconds_text(value)}" for name, value in seconds.items() if name != "total")
-    total = wording.seconds_text(seconds.get("total"))
+    total = wording.seconds_text(seconds["total"])
     facts = {
-        "Ending": summary.get("ending"),
-        "Policy": f"{summary.get('policy')}, {wording.count(summary.get('steps'), 'step')}",
+        "Ending": summary.ending,
+        "Policy": f"{summary.policy}, {wording.count(summary.steps, 'step')}",
         "Goal": wording.goal_text(summary),
         "Budget": wording.budget_text(summary),
         "Over": wording.over_text(summary),
         "Smallest epsilon": wording.smallest_text(summary),
         "Renders": wording.renders_text(summary),
         "Time": f"{total} ({parts})" if parts else total,
-        "Image formation": wording.formation_text(summary),
-        "Object": summary.get("object"),
-        "Environment": summary.get("environment"),
-        "Model": summary.get("model"),
-        "Seed": summary.get("seed"),
+        "Image formation": wording.formation_text(summary.image_formation),
+        "Object": summary.object,
+        "Environment": summary.environment,
+        "Model": summary.model,
+        "Seed": str(summary.seed),
     }
     return join(element("h2", "Cost and conditions"), _table_of_facts(facts))
 
 
 def _repeat(data: RunData) -> Html:
-    commands = [shlex.join(["advsearch", "run", f"{data.summary.get('run') or data.path}/{directory.CONFIG}"])]
-    if data.summary.get("command_line"):
-        commands.append(str(data.summary["command_line"]))
+    commands = [shlex.join(["advsearch", "run", f"{data.summary.run or data.path}/{directory.CONFIG}"])]
+    if data.summary.command_line:
+        commands.append(data.summary.command_line)
     recipe = (
         element("details", element("summary", "All settings"), element("pre", data.recipe)) if data.recipe else None
     )
@@ -249,22 +247,19 @@ def _figure(data: RunData, name: str, heading: str, caption: str) -> Html | None
     return element("figure", picture, element("figcaption", label, ": " if heading else None, caption))
 
 
-def _answer(answer: Any) -> str:
-    if not answer or answer.get("label") is None:
+def _answer(answer: UsualAnswer | None) -> str:
+    if answer is None:
         return "no answer recorded"
-    known = answer.get("probability") is not None
-    return f"{answer['label']}, {wording.percent(answer['probability'])}" if known else str(answer["label"])
+    return answer.label if answer.probability is None else f"{answer.label}, {wording.percent(answer.probability)}"
 
 
 def _trial(name: str) -> str:
     return "trial " + Path(name).stem.removeprefix("verification").strip("-_")
 
 
-def _table_of_facts(facts: Mapping[str, Any]) -> Html:
+def _table_of_facts(facts: Mapping[str, str]) -> Html:
     lines = [
-        element("tr", element("th", name, scope="row"), element("td", str(value)))
-        for name, value in facts.items()
-        if value not in (None, "")
+        element("tr", element("th", name, scope="row"), element("td", value)) for name, value in facts.items() if value
     ]
     return element("table", element("tbody", *lines), class_="facts")
 

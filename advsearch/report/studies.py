@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from advsearch.report.diagrams import STYLE
+from advsearch.runs.results.gap import CurveResult, GapResult, GapRow
 from advsearch.runs.results.region import BoxSide, MarginMap
+from advsearch.runs.results.sweep import AxisRow, SweepMap, SweepSummary
 
 BLUE, RED, GREY = "#1d5fd0", "#b3261e", "#5c606a"
 
@@ -16,35 +18,35 @@ Figures = dict[str, bytes]
 """A suffix, png or svg, to the content of a file."""
 
 
-def curve_figure(answer: Mapping[str, Any]) -> Figures:
+def curve_figure(answer: CurveResult) -> Figures:
     """Draw the robust accuracy with its interval over epsilon; nothing where there is one epsilon only."""
-    points = [one for one in answer["curve"] if one["epsilon"] is not None and one["accuracy"] is not None]
+    points = [one for one in answer.curve if one.epsilon is not None and one.accuracy is not None]
     if len(points) < 2:
         return {}
 
     def draw(axes: Any) -> None:
-        at, accuracy = [one["epsilon"] for one in points], [one["accuracy"] for one in points]
-        low, high = ([one["interval"][end] for one in points] for end in (0, 1))
+        at, accuracy = [one.epsilon for one in points], [one.accuracy for one in points]
+        low, high = ([one.interval[end] for one in points] for end in (0, 1))
         axes.fill_between(at, low, high, color=BLUE, alpha=0.15, linewidth=0, label="95 % interval")
         axes.plot(at, accuracy, color=BLUE, marker="o", label="robust accuracy")
         axes.set(xlabel="epsilon", ylabel="robust accuracy", ylim=(-0.02, 1.02))
-        axes.set_title(f"{', '.join(answer['controls'])}: {points[0]['objects']} objects, {answer['model']}")
+        axes.set_title(f"{', '.join(answer.controls)}: {points[0].objects} objects, {answer.model}")
         axes.grid(True)
         axes.legend()
 
     return _figure(draw, (5.6, 3.6))
 
 
-def gap_figure(answer: Mapping[str, Any]) -> Figures:
+def gap_figure(answer: GapResult) -> Figures:
     """Draw, for each object and control, the accuracy on average and of the worst configuration, joined by a line."""
-    rows = answer["table"]
+    rows = answer.table
     if not rows:
         return {}
 
     def draw(axes: Any) -> None:
         for place, row in enumerate(reversed(rows)):
-            mean, worst = row["average"]["accuracy"], _worst(row)
-            axes.plot(row["average"]["interval"], [place, place], color=BLUE, alpha=0.35, linewidth=5)
+            mean, worst = row.average.accuracy, _worst(row)
+            axes.plot(row.average.interval, [place, place], color=BLUE, alpha=0.35, linewidth=5)
             axes.plot([worst, mean], [place, place], color=GREY, linewidth=1)
             first = place == 0
             axes.plot(
@@ -54,9 +56,9 @@ def gap_figure(answer: Mapping[str, Any]) -> Figures:
                 "worst found, verified" if first else None
             )  # an outline: where the two are equal, both are seen
             axes.plot(worst, place, "D", color=RED, mfc="none", mew=1.5, ms=9, zorder=3, label=worst_label)
-        axes.set_yticks(range(len(rows)), [f"{row['object']}, {row['control']}" for row in reversed(rows)])
+        axes.set_yticks(range(len(rows)), [f"{row.object}, {row.control}" for row in reversed(rows)])
         axes.set(xlabel="accuracy", xlim=(-0.03, 1.03))
-        axes.set_title(f"Average and worst case: {answer['model']}")
+        axes.set_title(f"Average and worst case: {answer.model}")
         axes.grid(True, axis="x")
         axes.figure.legend(loc="outside lower center", ncols=2)
 
@@ -82,27 +84,27 @@ def map_figure(drawn: MarginMap, box: Sequence[BoxSide]) -> Figures:
     return _figure(draw, (6.0, 4.6))
 
 
-def sweep_figure(answer: Mapping[str, Any]) -> Figures:
+def sweep_figure(answer: SweepSummary) -> Figures:
     """Draw a sweep: a map over two axes, or the accuracy over the only one; nothing where there is none.
 
     A cell shows the accuracy there; where no cell has more than one configuration, the margin.
     """
-    cells = answer.get("cells")
+    cells = answer.cells
     if cells:
         return _figure(lambda axes: _cells(axes, answer, cells), _map_size(cells))
-    listed = [row for row in answer["axes"] if not isinstance(row["value"], (list, tuple))]
-    rows = listed or answer["axes"]
-    if len({row["axis"] for row in rows}) != 1 or len(rows) > MOST_POINTS:
+    listed = [row for row in answer.axes if not isinstance(row.value, (list, tuple))]
+    rows = listed or answer.axes
+    if len({row.axis for row in rows}) != 1 or len(rows) > MOST_POINTS:
         return {}
     return _figure(lambda axes: _along(axes, answer, rows), (5.6, 3.6))
 
 
-def _cells(axes: Any, answer: Mapping[str, Any], cells: Mapping[str, Any]) -> None:
+def _cells(axes: Any, answer: SweepSummary, cells: SweepMap) -> None:
     """The map of a sweep."""
-    first, second = cells["axes"]
-    seen, correct, margin = cells["configurations"], cells["correct"], cells["margin"]
-    extent = (-0.5, len(first["values"]) - 0.5, -0.5, len(second["values"]) - 0.5)
-    labels = _name(first["axis"], first["unit"]), _name(second["axis"], second["unit"])
+    first, second = cells.axes
+    seen, correct, margin = cells.configurations, cells.correct, cells.margin
+    extent = (-0.5, len(first.values) - 0.5, -0.5, len(second.values) - 0.5)
+    labels = _name(first.axis, first.unit), _name(second.axis, second.unit)
     if max(map(max, seen)) > 1:
         pairs = [zip(*rows, strict=True) for rows in zip(correct, seen, strict=True)]
         values = [[right / count if count else math.nan for right, count in row] for row in pairs]
@@ -110,23 +112,23 @@ def _cells(axes: Any, answer: Mapping[str, Any], cells: Mapping[str, Any]) -> No
     else:
         values = [[math.nan if one is None else one for one in row] for row in margin]
         _heat(axes, values, extent, MARGIN, *labels)
-    axes.set_xticks(*_ticks(first["values"]), rotation=45 if _long(first["values"]) else 0)
-    axes.set_yticks(*_ticks(second["values"]))
-    more = len(cells["over"])
+    axes.set_xticks(*_ticks(first.values), rotation=45 if _long(first.values) else 0)
+    axes.set_yticks(*_ticks(second.values))
+    more = len(cells.over)
     over = f", over {more} more {'axes' if more > 1 else 'axis'}" if more else ""
-    axes.set_title(f"{answer['object']}, {answer['model']}{over}")
+    axes.set_title(f"{answer.object}, {answer.model}{over}")
 
 
-def _along(axes: Any, answer: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:
+def _along(axes: Any, answer: SweepSummary, rows: Sequence[AxisRow]) -> None:
     """The accuracy with its interval over one axis."""
-    at, accuracy = range(len(rows)), [row["accuracy"] for row in rows]
-    low, high = ([row["interval"][end] for row in rows] for end in (0, 1))
+    at, accuracy = range(len(rows)), [row.accuracy for row in rows]
+    low, high = ([row.interval[end] for row in rows if row.interval] for end in (0, 1))
     axes.vlines(at, low, high, color=BLUE, alpha=0.35, linewidth=5, label="95 % interval")
     axes.plot(at, accuracy, "o", color=BLUE, label="accuracy")
-    axes.set_xticks(*_ticks([row["value"] for row in rows]), rotation=45 if _long([r["value"] for r in rows]) else 0)
-    axes.set(xlabel=_name(rows[0]["axis"], rows[0]["unit"]), ylabel="accuracy", ylim=(-0.03, 1.03))
+    axes.set_xticks(*_ticks([row.value for row in rows]), rotation=45 if _long([r.value for r in rows]) else 0)
+    axes.set(xlabel=_name(rows[0].axis, rows[0].unit), ylabel="accuracy", ylim=(-0.03, 1.03))
     axes.margins(x=0.08)
-    axes.set_title(f"{answer['object']}, {answer['model']}")
+    axes.set_title(f"{answer.object}, {answer.model}")
     axes.grid(True, axis="y")
     axes.figure.legend(loc="outside lower center", ncols=2)
 
@@ -146,7 +148,7 @@ def _heat(
     """Draw values as colours, rows from the lowest, with what they mean and the names of both axes."""
     finite = [abs(value) for row in values for value in row if math.isfinite(value)]
     if meaning == ACCURACY:
-        colours: dict[str, Any] = {"cmap": "RdBu", "vmin": 0.0, "vmax": 1.0}
+        colours: dict[str, str | float] = {"cmap": "RdBu", "vmin": 0.0, "vmax": 1.0}
     else:
         largest = max([*finite, 1e-6])
         colours = {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest}
@@ -176,15 +178,14 @@ def _long(values: Sequence[Any]) -> bool:
     return sum(len(text) + 1 for text in _ticks(values)[1]) > 50
 
 
-def _map_size(cells: Mapping[str, Any]) -> tuple[float, float]:
-    wide, high = (min(len(axis["values"]), MOST_TICKS) for axis in cells["axes"])
+def _map_size(cells: SweepMap) -> tuple[float, float]:
+    wide, high = (min(len(axis.values), MOST_TICKS) for axis in cells.axes)
     return 3.2 + 0.34 * wide, 1.8 + 0.3 * high
 
 
-def _worst(row: Mapping[str, Any]) -> float:
+def _worst(row: GapRow) -> float:
     """Accuracy of the worst configuration: what is left of its trials."""
-    worst = row["worst"]
-    return 0.0 if row["ending"] == "already wrong" else 1.0 - float(worst["rate"]) if worst else 1.0
+    return 0.0 if row.ending == "already wrong" else 1.0 - row.worst.rate if row.worst else 1.0
 
 
 def _figure(draw: Any, size: tuple[float, float]) -> Figures:

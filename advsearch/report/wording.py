@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import PurePath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-Summary = Mapping[str, Any]
+if TYPE_CHECKING:
+    from advsearch.runs.results.attack import AttackSummary, VerifiedRate
+    from advsearch.runs.results.base import Formation, Interval
 
 NO_INTERVAL = "no interval"
 
 MARGIN = "how far the wrong answer leads the right one, in logits"
+CLASSIFICATION = "classification"
+"""The task whose answers are names of classes."""
+
 OTHER_MARGIN = "over 0 where the answer is wrong"
 NORMS = {"linf": "the largest change of any value", "l2": "the root of the sum of all squared changes"}
 """What these words mean, said where they are first used."""
@@ -23,16 +28,15 @@ _REASONS = {
 """Why a search ended without an answer, where the name of the ending doesn't say it."""
 
 
-def verdict(summary: Summary) -> str:
+def verdict(summary: AttackSummary) -> str:
     """Return what the run found, in one sentence that holds on its own."""
-    ending = str(summary.get("ending") or "the run ended")
+    ending, verified = summary.ending, summary.verified
     thing = f"this {noun(summary)}"
-    verified = summary.get("verified") or {}
     if ending == "already wrong":
-        wrong = _calls(summary, thing, summary.get("clean"))
+        wrong = _calls(summary, thing, summary.clean.label)
         return f"The model already {wrong}: nothing was changed and nothing counts as found."
-    if not verified.get("trials"):
-        return f"{ending[:1].upper()}{ending[1:]} after {count(summary.get('steps'), 'step')}; nothing is verified."
+    if verified is None:
+        return f"{ending[:1].upper()}{ending[1:]} after {count(summary.steps, 'step')}; nothing is verified."
     rate = rate_text(verified) + _each(summary)
     claim = _claim(summary, thing)
     if ending == "found":
@@ -42,102 +46,70 @@ def verdict(summary: Summary) -> str:
     if ending == "not verified":
         return f"The search claims an answer that is not confirmed: {claim} in {rate}."
     why = _REASONS.get(ending, f"The search ended: {ending}.")
-    return f"No {_changes(summary)} was found that {_wanted(summary, thing)}: {claim} in {rate}. {why}"
+    return f"No {budget_text(summary)} was found that {_wanted(summary, thing)}: {claim} in {rate}. {why}"
 
 
-def remarks(summary: Summary) -> list[str]:
+def remarks(summary: AttackSummary) -> list[str]:
     """Return what has to be known beside the verdict: the control group, the random search, the run's warnings."""
     said = []
-    control = (summary.get("clean") or {}).get("control") or {}
-    missed = (control.get("trials") or 0) - (control.get("correct") or 0)
-    if missed and summary.get("ending") != "already wrong" and not minimises(summary):
-        apart = " They do not count." if over(summary) else ""
-        said.append(f"The clean scene itself fails {missed} of its {control['trials']} trials.{apart}")
-    if summary.get("answer_from") == "random":
-        own = summary.get("policy_verified") or {}
+    control, own = summary.clean.control, summary.policy_verified
+    missed = control.trials - control.correct if control else 0
+    if control and missed and summary.ending != "already wrong" and not summary.minimises:
+        apart = " They do not count." if summary.over else ""
+        said.append(f"The clean scene itself fails {missed} of its {control.trials} trials.{apart}")
+    if summary.answer_from == "random" and own:
         said.append(
             "The random search beside it found a worse configuration than the policy did "
-            f"({tally(own)} with a margin of {own.get('margin', 0.0):.2f}); that of the random search is the answer. "
-            f"The margin is {margin_text(summary)}."
+            f"({own.successes} of {own.trials} with a margin of {own.margin:.2f}); that of the random search is the "
+            f"answer. The margin is {margin_text(summary.task)}."
         )
     else:
         said += _against_random(summary)
-    return said + [str(text) for text in summary.get("warnings") or ()]
+    return said + summary.warnings
 
 
-def noun(summary: Summary) -> str:
+def noun(summary: AttackSummary) -> str:
     """Return what the object is called: ``wine glass`` for ``wine-glass`` and ``mug`` for ``data/mug.obj``."""
-    return PurePath(str(summary.get("object") or "object")).stem.replace("-", " ").replace("_", " ")
+    return PurePath(summary.object).stem.replace("-", " ").replace("_", " ")
 
 
-def title(summary: Summary) -> str:
+def title(summary: AttackSummary) -> str:
     """Return a short name for the run: ``mug, texture``."""
-    return ", ".join([noun(summary), *controls(summary)])
+    return ", ".join([noun(summary), *summary.controls])
 
 
-def margin_text(summary: Summary) -> str:
-    """Return what the margin of the run's task is, as a clause."""
-    return MARGIN if classifies(summary) else OTHER_MARGIN
+def margin_text(task: str) -> str:
+    """Return what the margin of a task is, as a clause."""
+    return MARGIN if task == CLASSIFICATION else OTHER_MARGIN
 
 
-def classifies(summary: Summary) -> bool:
-    """Return whether answers are names of classes."""
-    return bool(summary.get("task", "classification") == "classification")
-
-
-def controls(summary: Summary) -> list[str]:
-    """Return the names of the controls."""
-    return [str(name) for name in summary.get("controls") or ()]
-
-
-def over(summary: Summary) -> list[str]:
-    """Return the names of the controls that varied by chance."""
-    return [str(name) for name in summary.get("over") or ()]
-
-
-def targets(summary: Summary) -> list[str]:
-    """Return the answers that were wanted; empty where any wrong one was."""
-    return [str(name) for name in summary.get("target") or ()]
-
-
-def minimises(summary: Summary) -> bool:
-    """Return whether the object was to be easier to recognise."""
-    return summary.get("goal") == "a right answer"
-
-
-def success(summary: Summary) -> str:
+def success(summary: AttackSummary) -> str:
     """Return one word for a trial that counts: ``wrong``, ``target`` or ``easier``."""
-    return "target" if targets(summary) else "easier" if minimises(summary) else "wrong"
+    return "target" if summary.target else "easier" if summary.minimises else "wrong"
 
 
-def goal_text(summary: Summary) -> str:
+def goal_text(summary: AttackSummary) -> str:
     """Return what was asked for, where it was not just any wrong answer."""
-    if targets(summary):
-        return f"the model should answer {' or '.join(targets(summary))}"
-    return "easier to recognise" if minimises(summary) else ""
+    if summary.target:
+        return f"the model should answer {' or '.join(summary.target)}"
+    return "easier to recognise" if summary.minimises else ""
 
 
-def over_text(summary: Summary) -> str:
+def over_text(summary: AttackSummary) -> str:
     """Return what varied by chance: ``camera and environment, drawn anew for every picture``."""
-    return f"{' and '.join(over(summary))}, drawn anew for every picture" if over(summary) else ""
+    return f"{' and '.join(summary.over)}, drawn anew for every picture" if summary.over else ""
 
 
-def average_text(summary: Summary) -> str:
-    """Return ``right in 150 of 200``: over configurations drawn from the whole space; empty if none were."""
-    average = summary.get("average") or {}
-    return f"right in {average['correct']} of {average['configurations']}" if average else ""
-
-
-def smallest_text(summary: Summary) -> str:
+def smallest_text(summary: AttackSummary) -> str:
     """Return the bracket of the smallest epsilon; empty if it was not asked for."""
-    bracket = summary.get("smallest") or {}
-    if not bracket:
+    bracket = summary.smallest
+    if bracket is None:
         return ""
-    found, below = _epsilons(bracket.get("epsilon")), _epsilons(bracket.get("not_found_at"))
+    found, below = _epsilons(bracket.epsilon), _epsilons(bracket.not_found_at)
     if not found:
         return f"none found up to {below}"
     floor = f"no search found one at {below}" if below else "no search failed, so it may be smaller still"
-    still = "" if bracket.get("closed") or not below else "; the searches did not suffice to bring the two together"
+    still = "" if bracket.closed or not below else "; the searches did not suffice to bring the two together"
     return f"{found}; {floor}{still}"
 
 
@@ -158,20 +130,14 @@ def percent(share: Any) -> str:
     return f"{_percent_number(float(share))} %"
 
 
-def interval_text(rated: Mapping[str, Any]) -> str:
+def interval_text(interval: Interval | None) -> str:
     """Return ``83-100 %`` for the interval of a rate."""
-    ends = rated.get("interval")
-    return f"{_percent_number(ends[0])}-{_percent_number(ends[1])} %" if ends else NO_INTERVAL
+    return f"{_percent_number(interval[0])}-{_percent_number(interval[1])} %" if interval else NO_INTERVAL
 
 
-def tally(rated: Mapping[str, Any], key: str = "successes") -> str:
-    """Return ``20 of 20``."""
-    return f"{rated.get(key, 0)} of {rated.get('trials', 0)}"
-
-
-def rate_text(rated: Mapping[str, Any]) -> str:
+def rate_text(rated: VerifiedRate) -> str:
     """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``."""
-    return f"{tally(rated)} fresh renders (95 % interval {interval_text(rated)})"
+    return f"{rated.successes} of {rated.trials} fresh renders (95 % interval {interval_text(rated.interval)})"
 
 
 def seconds_text(seconds: Any) -> str:
@@ -189,7 +155,7 @@ def count(number: Any, thing: str) -> str:
     return f"{number or 0} {thing}{'' if number == 1 else 's'}"
 
 
-def changed_text(summary: Summary) -> str:
+def changed_text(summary: AttackSummary) -> str:
     """Return `budget_text` with a word on each norm: ``texture within 0.1 (linf: the largest change of any value)``."""
     text = budget_text(summary)
     for norm, meaning in NORMS.items():
@@ -197,13 +163,13 @@ def changed_text(summary: Summary) -> str:
     return text
 
 
-def budget_text(summary: Summary) -> str:
-    """Return what could change and how far: ``texture within 0.1 (linf)``, as far as the summary says."""
-    epsilon, norm = summary.get("epsilon"), summary.get("norm")
-    if isinstance(epsilon, Mapping):
-        norms = norm if isinstance(norm, Mapping) else {}
-        return " and ".join(_within(name, epsilon.get(name), norms.get(name)) for name in controls(summary))
-    return _within(" and ".join(controls(summary)) or "nothing", epsilon, norm)
+def budget_text(summary: AttackSummary) -> str:
+    """Return what could change and how far: ``texture within 0.1 (linf)``."""
+    epsilon, norm = summary.epsilon, summary.norm
+    if isinstance(epsilon, dict) or isinstance(norm, dict):
+        epsilons, norms = (one if isinstance(one, dict) else {} for one in (epsilon, norm))
+        return " and ".join(_within(name, epsilons.get(name), norms.get(name)) for name in summary.controls)
+    return _within(" and ".join(summary.controls) or "nothing", epsilon, norm)
 
 
 def _within(name: str, epsilon: Any, norm: Any) -> str:
@@ -221,30 +187,21 @@ def _epsilons(told: Mapping[str, float] | None) -> str:
     return ", ".join(f"{name} {value:.3g}" for name, value in told.items())
 
 
-def renders_text(summary: Summary) -> str:
+def renders_text(summary: AttackSummary) -> str:
     """Return ``40 of the search, 40 gradients, 21 of the verification``."""
-    renders = summary.get("renders") or {}
     known = {"search": "of the search", "gradient": "gradients", "verification": "of the verification"}
     known["baseline"] = "of the random search"
-    spent = [f"{number} {known.get(name, f'of {name}')}" for name, number in renders.items() if number]
-    return ", ".join(spent) or ("none" if renders else "unknown")
+    spent = [f"{number} {known.get(name, f'of {name}')}" for name, number in summary.renders.items() if number]
+    return ", ".join(spent) or "none"
 
 
-def formation_text(summary: Summary) -> str:
-    """Return the image formation: ``128 x 128 pixels, box filter, denoised (oidn), exposure 0 stops``."""
-    formation = summary.get("image_formation") or {}
-    said = []
-    if formation.get("resolution"):
-        said.append(" x ".join(str(side) for side in formation["resolution"]) + " pixels")
-    if formation.get("filter"):
-        said.append(f"{formation['filter']} filter")
-    denoiser = formation.get("denoiser")
-    if denoiser:
-        said.append("not denoised" if denoiser == "none" else f"denoised ({denoiser})")
-    if formation.get("exposure") is not None:
-        said.append(f"exposure {number_text(formation['exposure'])} stops")
-    known = ("resolution", "filter", "denoiser", "exposure")
-    return ", ".join(said + [f"{name} {number_text(value)}" for name, value in formation.items() if name not in known])
+def formation_text(formation: Formation) -> str:
+    """Return the image formation: ``128 x 128 pixels, box filter, denoised (oidn), exposure 0 stops, gain 1.35``."""
+    height, width = formation.resolution
+    denoised = "not denoised" if formation.denoiser == "none" else f"denoised ({formation.denoiser})"
+    exposure = f"exposure {number_text(formation.exposure)} stops"
+    made = f"{height} x {width} pixels, {formation.filter} filter, {denoised}, {exposure}"
+    return f"{made}, sampler {formation.sampler}, gain {number_text(formation.gain)}"
 
 
 def number_text(value: Any) -> str:
@@ -252,76 +209,66 @@ def number_text(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _how_it_errs(summary: Summary, verified: Mapping[str, Any], thing: str) -> str:
+def _how_it_errs(summary: AttackSummary, verified: VerifiedRate, thing: str) -> str:
     """Return "The model calls this mug a vase" where that is known of every trial, a weaker clause otherwise."""
-    if minimises(summary):
+    if summary.minimises:
         return f"The model recognises {thing}, more surely than in the clean scene,"
-    answers = verified.get("labels") or {}
+    answers = verified.labels
     if len(answers) == 1:
-        return f"The model {_calls(summary, thing, {'label': next(iter(answers))})}"
+        return f"The model {_calls(summary, thing, next(iter(answers)))}"
     if answers:
         most = max(answers, key=lambda label: answers[label])
-        what = "takes {} for one of the targets" if targets(summary) else "is wrong about {}"
-        often = f"calling it {with_article(most)}" if classifies(summary) else f'answering "{most}"'
+        what = "takes {} for one of the targets" if summary.target else "is wrong about {}"
+        often = f"calling it {with_article(most)}" if summary.task == CLASSIFICATION else f'answering "{most}"'
         return f"The model {what.format(thing)}, most often {often},"
-    if not classifies(summary):
+    if summary.task != CLASSIFICATION:
         return f"The model is wrong about {thing}"
-    return f"The model takes {thing} for something else ({_called(summary.get('adversarial'))})"
+    called = with_article(summary.adversarial.label) if summary.adversarial else "something else"
+    return f"The model takes {thing} for something else ({called})"
 
 
-def _claim(summary: Summary, thing: str) -> str:
+def _claim(summary: AttackSummary, thing: str) -> str:
     """Return what a trial counts as, as a clause: "the model is wrong about this mug"."""
-    if minimises(summary):
+    if summary.minimises:
         return f"the model recognises {thing}, more surely than in the clean scene,"
-    if targets(summary):
+    if summary.target:
         return f"the model calls {thing} {_a_target(summary)}"
-    return "it is wrong" if summary.get("ending") in _REASONS else f"the model is wrong about {thing}"
+    return "it is wrong" if summary.ending in _REASONS else f"the model is wrong about {thing}"
 
 
-def _wanted(summary: Summary, thing: str) -> str:
+def _wanted(summary: AttackSummary, thing: str) -> str:
     """Return what was looked for, as a clause: "makes the model miss this mug"."""
-    if minimises(summary):
+    if summary.minimises:
         return f"makes {thing} easier to recognise"
-    return f"makes the model call {thing} {_a_target(summary)}" if targets(summary) else f"makes the model miss {thing}"
+    return f"makes the model call {thing} {_a_target(summary)}" if summary.target else f"makes the model miss {thing}"
 
 
-def _a_target(summary: Summary) -> str:
-    return " or ".join(with_article(name) for name in targets(summary))
+def _a_target(summary: AttackSummary) -> str:
+    return " or ".join(with_article(name) for name in summary.target or ())
 
 
-def _each(summary: Summary) -> str:
+def _each(summary: AttackSummary) -> str:
     """Return what is said of the renders of an answer that holds for many conditions."""
-    return f", each with another {' and '.join(over(summary))}" if over(summary) else ""
+    return f", each with another {' and '.join(summary.over)}" if summary.over else ""
 
 
-def _against_random(summary: Summary) -> list[str]:
-    verified, baseline = summary.get("verified") or {}, summary.get("baseline") or {}
-    random = baseline.get("verified") or {}
-    if not (verified.get("trials") and random.get("trials")):
+def _against_random(summary: AttackSummary) -> list[str]:
+    ours, random = summary.verified, summary.baseline.verified if summary.baseline else None
+    if ours is None or random is None:
         return []
-    ours, theirs = (one["successes"] / one["trials"] for one in (verified, random))
-    if theirs > ours:
-        return [f"Random search with as many renders does better: {tally(random)}."]
-    if theirs == ours and ours > 0:
-        return [f"Random search with as many renders does as well: {tally(random)}. The policy adds nothing here."]
+    tally = f"{random.successes} of {random.trials}"
+    if random.rate > ours.rate:
+        return [f"Random search with as many renders does better: {tally}."]
+    if random.rate == ours.rate > 0:
+        return [f"Random search with as many renders does as well: {tally}. The policy adds nothing here."]
     return []
 
 
-def _calls(summary: Summary, thing: str, answer: Any) -> str:
+def _calls(summary: AttackSummary, thing: str, label: str) -> str:
     """Return ``calls this mug a vase``, or ``answers "0.81" for this mug`` where answers are no names."""
-    if classifies(summary):
-        return f"calls {thing} {_called(answer)}"
-    label = (answer or {}).get("label") or "something else"
-    return f'answers "{label}" for {thing}'
-
-
-def _called(answer: Any) -> str:
-    label = (answer or {}).get("label")
-    return with_article(str(label)) if label else "something else"
-
-
-def _changes(summary: Summary) -> str:
-    return budget_text(summary) if controls(summary) else "configuration"
+    return (
+        f"calls {thing} {with_article(label)}" if summary.task == CLASSIFICATION else f'answers "{label}" for {thing}'
+    )
 
 
 def _percent_number(share: float) -> str:

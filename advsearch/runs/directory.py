@@ -7,14 +7,14 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, UnknownNameError
-from advsearch.files import open_regular
+from advsearch.files import Json, open_regular
 from advsearch.runs import images, lock, replay, store, summary
 from advsearch.runs.files import PART, replacing, storage_errors, write_text
 from advsearch.yaml_text import LARGEST
@@ -171,7 +171,7 @@ class RunDirectory:
                 f"start again with advsearch run {self.path / CONFIG}"
             )
 
-    def _begun_with(self) -> dict[str, Any]:
+    def _begun_with(self) -> Json:
         """What the store notes of the settings; empty of a run that is older than that note."""
         try:
             noted = json.loads(self.store.note(BEGUN_WITH) or "{}")
@@ -241,13 +241,13 @@ class RunDirectory:
         """Return `files.replacing` of a file of this run: ``with run.replacing("artifacts/mesh.obj") as path: ...``."""
         return replacing(self.path / name)
 
-    def write_summary(self, answer: Result | Mapping[str, Any]) -> Path:
-        """Write `summary.json` and return its path; numbers of numpy and torch are converted, NaN becomes null.
+    def write_summary(self, result: Result) -> Path:
+        """Write `summary.json` and return its path.
 
         Raises:
             StorageError: it could not be written.
         """
-        return summary.write_summary(self.path, answer)
+        return summary.write_summary(self.path, result)
 
     def close(self) -> None:
         """Close the results and give up the lock; a second call does nothing."""

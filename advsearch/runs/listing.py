@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from advsearch.errors import AdvsearchError, FileFormatError
+from advsearch.errors import AdvsearchError
+from advsearch.files import Json
 from advsearch.runs import lock, replay, store, summary
 from advsearch.runs.directory import CONFIG, is_run
+from advsearch.runs.results.base import Result
 from advsearch.settings import read_yaml
 
 
@@ -54,57 +55,37 @@ def finished(path: Path) -> bool:
     """Whether a run has come to its end; one that was interrupted, or killed while its report was written, has not."""
     if (path / replay.NAME).exists():
         return False
-    return (path / summary.NAME).is_file() and not summary.goes_on(summary.read_summary(path))
+    return (path / summary.NAME).is_file() and not summary.read_result(path).goes_on
 
 
 def described(path: Path) -> Listed:
     """Return the run in a folder; what cannot be read is shown as far as it can."""
-    config: dict[str, Any] = {}
-    answer: dict[str, Any] = {}
+    config: Json = {}
+    result: Result | None = None
     kinds: dict[str, int] = {}
     with suppress(AdvsearchError):
         config = read_yaml(path / CONFIG)
     with suppress(AdvsearchError):
-        answer = summary.read_summary(path)
+        result = summary.read_result(path)
     with suppress(AdvsearchError), store.Store(path / store.NAME, read_only=True) as results:
         kinds = results.counts()
-    controls = answer.get("controls") or config.get("controls") or ()
+    object_name = getattr(result, "object", None) or ",".join(getattr(result, "objects", ()))
+    controls = getattr(result, "controls", ()) or config.get("controls") or ()
     return Listed(
         name=path.name,
         path=str(path),
-        command=str(config.get("command") or answer.get("command") or "?"),
-        object=str(config.get("object") or answer.get("object") or ("" if config else "?")),
+        command=str(config.get("command") or (result.command if result else "?")),
+        object=str(config.get("object") or object_name or ("" if config else "?")),
         controls=tuple(map(str, controls)) if isinstance(controls, (list, tuple, dict)) else ("?",),
         rows=sum(kinds.values()),
-        state=_state(path, answer),
-        answer=_answer(answer),
+        state=_state(path, result),
+        answer=result.brief if result else "",
         kinds=kinds,
         begun=bool(config),
     )
 
 
-def _state(path: Path, answer: dict[str, Any]) -> str:
+def _state(path: Path, result: Result | None) -> str:
     if lock.is_held(path):
         return "running"
-    return "stopped" if not answer or summary.goes_on(answer) else str(answer.get("ending") or "done")
-
-
-def _answer(answer: dict[str, Any]) -> str:
-    try:
-        with summary.of_a_file(Path(summary.NAME)):
-            return _answer_words(answer)
-    except FileFormatError:
-        return "?"
-
-
-def _answer_words(answer: dict[str, Any]) -> str:
-    verified = answer.get("verified") or {}
-    if verified.get("trials"):
-        return f"{verified['successes']}/{verified['trials']}"
-    if answer.get("accuracy") is not None:
-        return f"accuracy {answer['accuracy']:.1%}"
-    if answer.get("command") == "check":
-        return f"{answer['measured']} of {answer['planned']} parts"
-    if answer.get("command") == "stability":
-        return f"{sum(row['status'] == 'ok' for row in answer['rows'])} of {len(answer['rows'])} hold"
-    return ""
+    return "stopped" if result is None or result.goes_on else str(getattr(result, "ending", "done"))

@@ -59,18 +59,15 @@ def load_run(path: Path) -> None:
     """List a run folder, and read what it holds as `show` and `export` do."""
     import io
 
-    from advsearch.cli.table import answer
+    from advsearch.cli.show import show_run
     from advsearch.runs.export import export
     from advsearch.runs.listing import described
     from advsearch.runs.store import NAME, Store
-    from advsearch.runs.summary import of_a_file, read_summary
 
     described(path.parent)
     with Store(path.parent / NAME, read_only=True) as store:
         export(store, "json", None, io.BytesIO())
-    summary = read_summary(path.parent)
-    with of_a_file(path.parent):
-        answer(summary)
+    show_run(str(path.parent), as_json=False)
 
 
 def misbehave(path: Path) -> None:

@@ -25,6 +25,7 @@ from advsearch.engine.sweeps.points import Picks, Points
 from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally
 from advsearch.engine.sweeps.view import View
 from advsearch.engine.sweeps.worst import check_worst
+from advsearch.files import Json
 from advsearch.progress import Progress
 from advsearch.report.notebook import sweep_html
 from advsearch.report.studies import sweep_figure
@@ -33,6 +34,7 @@ from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
+from advsearch.runs.results.sweep import SweepSummary
 from advsearch.tasks import Judgement
 
 KIND = "sweep"
@@ -61,15 +63,14 @@ class SweepResult:
         in_memory: the rows, where there is no run directory.
     """
 
-    summary: dict[str, Any]
+    summary: SweepSummary
     run: Path | None
     in_memory: tuple[store.Row, ...] = ()
 
     @property
     def accuracy(self) -> float | None:
         """Share of the configurations that the model got right; None where there was none."""
-        accuracy: float | None = self.summary["accuracy"]
-        return accuracy
+        return self.summary.accuracy
 
     def rows(self) -> Iterator[store.Row]:
         """Yield every configuration with its values and what the model said, in order."""
@@ -88,8 +89,8 @@ class SweepResult:
         return to_pandas(self.rows())
 
     def __repr__(self) -> str:
-        right = f"{self.summary['correct']} of {self.summary['configurations']} right"
-        return f"SweepResult({self.summary['object']!r}, {self.summary['model']!r}, {right}, run={self._place})"
+        right = f"{self.summary.correct} of {self.summary.configurations} right"
+        return f"SweepResult({self.summary.object!r}, {self.summary.model!r}, {right}, run={self._place})"
 
     def _repr_html_(self) -> str:
         return sweep_html(self.summary)
@@ -241,7 +242,7 @@ class Sweep:
 
     # ---- the worst configuration ------------------------------------------------------------------------------------
 
-    def _claimed(self, tally: Tally) -> dict[str, Any] | None:
+    def _claimed(self, tally: Tally) -> Json | None:
         """What the sweep saw at its worst."""
         if tally.worst is None:
             return None
@@ -255,7 +256,7 @@ class Sweep:
         facts = {"configuration": index, "values": dict(row.values), "seed": row.seed, "label_set": right}
         return {**facts, "claimed": claim, "verified": None}
 
-    def _verified(self, worst: dict[str, Any]) -> dict[str, Any] | None:
+    def _verified(self, worst: Json) -> Json | None:
         """What fresh renders say of it; keeps a picture."""
         points, picks, model = self._find(worst["configuration"])
         view = self._open(picks.number // self.per_scene)
@@ -275,15 +276,13 @@ class Sweep:
 
     # ---- the answer -------------------------------------------------------------------------------------------------
 
-    def _finish(self, tally: Tally, ending: str, worst: dict[str, Any] | None) -> SweepResult:
+    def _finish(self, tally: Tally, ending: str, worst: Json | None) -> SweepResult:
         """Put the summary together and write it."""
         config, job = self.job.config, self.job
         seconds = self.stages.seconds
         view, checked = self._view, (worst or {}).get("verified")
         swept = seconds.get("sweep", 0.0)
-        summary: dict[str, Any] = {
-            "schema": 1,
-            "command": "sweep",
+        values: Json = {
             "run": None if self.run is None else str(self.run.path),
             "object": config.object,
             "model": ",".join(model.name for model in job.models),
@@ -291,7 +290,7 @@ class Sweep:
             "environment": self.points.environment or config.lit_by,
             "controls": [control.name for control in job.controls],
             "ending": ending,
-            "image_formation": next(iter(view.renderers.values())).formation.summary() if view else None,
+            "image_formation": next(iter(view.renderers.values())).formation if view else None,
             "planned": self.total,
             **tally.to_dict(),
             "worst": worst,
@@ -309,13 +308,14 @@ class Sweep:
             "warnings": [*job.said, *self._remarks(tally, checked)],
             "command_line": config.command_line(),
         }
+        summary = SweepSummary.of(values)
         if self.run is not None:
             self.run.write_summary(summary)
             for suffix, data in sweep_figure(summary).items():
                 write_bytes(self.run.path / "images" / f"sweep.{suffix}", data)
         return SweepResult(summary, None if self.run is None else self.run.path, tuple(self._kept))
 
-    def _remarks(self, tally: Tally, checked: dict[str, Any] | None) -> list[str]:
+    def _remarks(self, tally: Tally, checked: Json | None) -> list[str]:
         """What a reader has to know beside the numbers."""
         said = []
         if tally.not_finite:

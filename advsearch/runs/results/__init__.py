@@ -2,13 +2,30 @@
 
 from __future__ import annotations
 
+from advsearch.files import Json
+from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.check import CheckResult
+from advsearch.runs.results.gap import CurveResult, GapResult
 from advsearch.runs.results.precision import PrecisionResult
 from advsearch.runs.results.region import RegionResult
 from advsearch.runs.results.stability import StabilityResult
+from advsearch.runs.results.sweep import SweepSummary
 
-KEPT: dict[str, type[Result]] = {
-    one.command: one for one in (CheckResult, PrecisionResult, RegionResult, StabilityResult)
-}
-"""The results that a run keeps in `summary.json`, by command."""
+KEPT: tuple[type[Result], ...] = (
+    AttackSummary,
+    SweepSummary,
+    GapResult,
+    RegionResult,
+    CheckResult,
+    PrecisionResult,
+    StabilityResult,
+)
+"""The results that a run keeps in `summary.json`."""
+
+
+def kind_of(values: Json) -> type[Result] | None:
+    """Return the result that the values of a `summary.json` are of; None if there is none of that command."""
+    if values.get("command") == CurveResult.command and "parts" in values:
+        return CurveResult
+    return next((kind for kind in KEPT if kind.command == values.get("command")), None)

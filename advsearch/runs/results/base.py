@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from advsearch.files import Json
 
@@ -26,6 +26,18 @@ Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is Non
 
 Interval = tuple[Number, Number]
 """Both ends of a 95 % interval."""
+
+
+def having(*names: str) -> AfterValidator:
+    """Return the check that a mapping has these names."""
+
+    def check(values: Mapping[str, Any]) -> Mapping[str, Any]:
+        missing = [name for name in names if name not in values]
+        if missing:
+            raise ValueError(f"expected {', '.join(missing)} among its names")
+        return values
+
+    return AfterValidator(check)
 
 
 class Fields(BaseModel):
@@ -62,6 +74,11 @@ class Result(Fields):
         """Whether it was stopped before its end, so that a run can be resumed."""
         return getattr(self, "ending", None) in (INTERRUPTED, OUT_OF_TIME)
 
+    @property
+    def brief(self) -> str:
+        """What came out, in a few words; empty where there are none."""
+        return ""
+
 
 class RunResult(Result):
     """The answer of a command that keeps a run."""
@@ -70,7 +87,7 @@ class RunResult(Result):
     environment: str
     controls: list[str]
     ending: str = Field(description="how it ended")
-    seconds: dict[str, Number] = Field(description="by part of the work, and in `total`")
+    seconds: Annotated[dict[str, Number], having("total")] = Field(description="by part of the work, and in `total`")
     seed: int
     command_line: str = Field(description="that asks the same again")
 

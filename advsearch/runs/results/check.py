@@ -67,7 +67,7 @@ class CheckedRows(Fields):
     rows: list[CheckedRow]
 
 
-class CheckResult(RunResult, CheckedRows):
+class CheckResult(CheckedRows, RunResult):
     """Every derivative of a scene beside differences, as far as they are measured."""
 
     command: ClassVar[str] = "check"
@@ -75,3 +75,8 @@ class CheckResult(RunResult, CheckedRows):
     object: str
     measured: int = Field(description="parts (a scene with a control and a loss) that are done")
     planned: int = Field(description="all parts")
+
+    @property
+    def brief(self) -> str:
+        """How far it has come."""
+        return f"{self.measured} of {self.planned} parts"

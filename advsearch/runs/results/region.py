@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, Number, RunResult
+from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, Number, RunResult, having
 
 
 class AxisRange(Fields):
@@ -53,4 +53,4 @@ class RegionResult(RunResult):
     image_formation: Formation
     clean: CleanScene
     warnings: list[str]
-    renders: dict[str, int] = Field(description="of the `verification`: everything")
+    renders: Annotated[dict[str, int], having("verification")] = Field(description="of the `verification`: everything")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from advsearch.runs.results.base import Fields, Number, Result
+from advsearch.runs.results.base import Fields, Number, Result, having
 
 
 class DecidingNumber(Fields):
@@ -46,5 +46,10 @@ class StabilityResult(Result):
     ending: str = Field(description="`done`, `interrupted` or `out of time`")
     rows: list[CaseRow]
     not_run: list[str] = Field(description="cases that were not begun")
-    seconds: dict[str, Number] = Field(description="in `total`, of this sitting")
+    seconds: Annotated[dict[str, Number], having("total")] = Field(description="in `total`, of this sitting")
     command_line: str = Field(description="that asks the same again")
+
+    @property
+    def brief(self) -> str:
+        """How many cases hold."""
+        return f"{sum(row.status == 'ok' for row in self.rows)} of {len(self.rows)} hold"

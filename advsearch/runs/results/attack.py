@@ -1,0 +1,178 @@
+"""The result of `attack`: what `summary.json` holds of it."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from pydantic import Field
+
+from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, Number, RunResult
+from advsearch.runs.results.plan import PlannedGradient
+
+
+class DescribedValue(Fields):
+    """One value of a configuration, with its unit."""
+
+    value: int | float | str | list[float]
+    unit: str
+
+
+class UsualAnswer(Fields):
+    """What the model usually answers in trials of a configuration."""
+
+    label: str
+    index: int | None = Field(description="of the class")
+    probability: Number | None = Field(description="the mean over the trials with that answer")
+
+
+class ControlGroup(Fields):
+    """Trials of the clean scene: how many are right."""
+
+    correct: int
+    trials: int
+    rate: float
+    interval: Interval
+
+
+class CleanAnswer(CleanScene, UsualAnswer):
+    """What the model usually answers on the clean scene."""
+
+    correct: bool
+    control: ControlGroup | None = Field(description="trials of the clean scene, and in how many it is right")
+
+
+class VerifiedRate(Fields):
+    """Trials with fresh seeds, and how many of them are a success."""
+
+    successes: int
+    trials: int
+    rate: float
+    interval: Interval
+    spp: int = Field(description="samples a pixel")
+    labels: dict[str, int] = Field(description="how often each wrong answer was given")
+    margin: Number = Field(description="mean over the trials, in logits")
+
+
+class BaselineSearch(Fields):
+    """The random search beside it."""
+
+    policy: str
+    renders: int
+    verified: VerifiedRate | None
+
+
+class AverageCase(Fields):
+    """Configurations drawn from the whole space and budget."""
+
+    configurations: int
+    correct: int = Field(description="how many the model got right")
+    accuracy: float
+    interval: Interval
+    margin: Number = Field(description="the mean, in logits")
+    worst_margin: Number = Field(description="the largest, in logits")
+
+
+class SmallestEpsilon(Fields):
+    """The bracket of the least epsilon at which the answer flips, by control."""
+
+    epsilon: dict[str, float] | None = Field(description="the least that passed its trials; null: none did")
+    not_found_at: dict[str, float] | None = Field(description="the largest at which a search found none; null: none")
+    closed: bool = Field(description="the two are within 5 %")
+    confirmed: bool = Field(description="the upper end passed again with new seeds")
+    searches: int
+    checks: int
+
+
+class AnswerDistribution(Fields):
+    """The distribution that the policy answers with, where it is over few numbers."""
+
+    mean: dict[str, DescribedValue]
+    deviation: list[float] = Field(description="in u")
+
+
+class VerificationSamples(Fields):
+    """The sample count of the verification."""
+
+    spp: int
+    converged: bool = Field(description="whether the margins stood still there")
+
+
+class SearchClaim(Fields):
+    """What the search itself believes."""
+
+    objective: Number = Field(description="of the one render that won")
+    re_evaluated: Number = Field(description="its mean when rendered again")
+    success_rate: Number = Field(description="of these renders")
+
+
+class SearchGradients(Fields):
+    """What the search saw of its gradients."""
+
+    count: int
+    cosine_with_the_one_before: Number | None = Field(description="the median: noise, and the way between")
+    zero: int
+    cut: int = Field(description="of which single numbers were outliers and cut")
+    shortened: int = Field(description="outliers as a whole")
+    rejected: int = Field(description="steps that were taken back")
+
+
+class PathSegments(Fields):
+    """The longest light paths that were rendered."""
+
+    search: int
+    verification: int
+
+
+class NotFinite(Fields):
+    """Numbers that were NaN or infinite."""
+
+    objectives: int
+    gradient_elements: int
+
+
+class AttackSummary(RunResult):
+    """The worst configuration of a scene that was found, how sure that is, and what it cost."""
+
+    command: ClassVar[str] = "attack"
+
+    object: str
+    model: str
+    task: str
+    policy: str
+    objective: str
+    epsilon: float | dict[str, float | None] | None = Field(description="the budget; by control where there are more")
+    norm: str | dict[str, str | None] = Field(description="in which the budget is measured; by control as above")
+    label_set: list[str] = Field(description="the names that count as right")
+    goal: str = Field(description="`a wrong answer`, `a target answer` or `a right answer`: what counts as success")
+    target: list[str] | None = Field(description="the targets' names")
+    over: list[str] = Field(description="the controls that varied by chance")
+    image_formation: Formation
+    gradient_plan: PlannedGradient
+    light_path_segments: PathSegments
+    clean: CleanAnswer
+    adversarial: UsualAnswer | None = Field(description="on the search's answer; null if nothing was searched")
+    verified: VerifiedRate | None = Field(description="trials of the answer; null if nothing was verified")
+    baseline: BaselineSearch | None = Field(default=None, description="the random search; absent without `baseline`")
+    answer_from: str | None = Field(default=None, description="`random` where the random search's answer is the run's")
+    policy_verified: VerifiedRate | None = Field(default=None, description="of the policy's own answer then")
+    average: AverageCase | None = Field(default=None, description="only with `average`")
+    smallest: SmallestEpsilon | None = Field(default=None, description="only with `smallest`")
+    distribution: AnswerDistribution | None = Field(default=None, description="of a policy that answers with one")
+    sample_count: VerificationSamples | None = None
+    claimed: SearchClaim | None = Field(default=None, description="what the search itself believes")
+    gradients: SearchGradients | None = Field(default=None, description="of the search")
+    configuration: dict[str, DescribedValue] | None = Field(default=None, description="the answer in a few values")
+    renders: dict[str, int] = Field(description="of the search, its gradients, the baseline and the verification")
+    steps: int
+    non_finite: NotFinite
+    warnings: list[str]
+
+    @property
+    def minimises(self) -> bool:
+        """Whether the object was to be easier to recognise."""
+        return self.goal == "a right answer"
+
+    @property
+    def brief(self) -> str:
+        """The verified rate."""
+        return f"{self.verified.successes}/{self.verified.trials}" if self.verified else ""
