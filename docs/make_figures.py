@@ -16,10 +16,12 @@ import json
 import re
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
+
+from pydantic.fields import FieldInfo
 
 from advsearch.cli.flags import GROUPS, help_text
 from advsearch.cli.main import COMMANDS
@@ -35,6 +37,12 @@ from advsearch.config import (
     SweepConfig,
 )
 from advsearch.controls import OWN
+from advsearch.runs.results.attack import AttackSummary
+from advsearch.runs.results.base import END, Fields, Result
+from advsearch.runs.results.gap import CurveResult, GapResult
+from advsearch.runs.results.region import RegionResult
+from advsearch.runs.results.stability import CaseRow
+from advsearch.runs.results.sweep import SweepSummary
 from advsearch.scene.settings import SETTINGS
 from advsearch.settings import Config, Setting, settings
 
@@ -267,6 +275,44 @@ def endings(record: Record) -> str:
     return table(["`ending`", "meaning"], [[f"`{one.value}`", one.explanation] for one in Ending])
 
 
+def result_fields(kind: type[Fields]) -> Callable[[Record], str]:
+    """The fields of a result in the order in which they are written, those that say themselves in one row."""
+
+    def make(record: Record) -> str:
+        names = list(kind.model_fields)
+        names.sort(key=lambda name: name in END)
+        told = {name: _field(kind.model_fields[name]) for name in names}
+        plain = [f"`{name}`" for name in ("schema", "command") if issubclass(kind, Result)]
+        plain += [f"`{name}`" for name in names if not told[name]]
+        first = [[", ".join(plain), "what was asked for, and of what"]] if plain else []
+        return table(["field", "holds"], first + [[f"`{name}`", told[name]] for name in names if told[name]])
+
+    return make
+
+
+def _field(field: FieldInfo) -> str:
+    """What a field holds: its description, and the fields of what is in it."""
+    inside = [one for one in _types(field.annotation) if isinstance(one, type) and issubclass(one, Fields)]
+    text = field.description or (_first_sentence(inside[0]) if inside else "")
+    parts = [
+        f"`{name}`" + (f" ({part.description})" if part.description else "")
+        for name, part in (inside[0].model_fields.items() if inside else ())
+    ]
+    return f"{text}: {', '.join(parts)}" if parts else text
+
+
+def _first_sentence(kind: type[Fields]) -> str:
+    text = (kind.__doc__ or "").splitlines()[0].rstrip(".")
+    return text[:1].lower() + text[1:]
+
+
+def _types(annotation: Any) -> Iterator[Any]:
+    """A type and what it is made of."""
+    yield annotation
+    for one in get_args(annotation):
+        yield from _types(one)
+
+
 def _shown(value: object) -> str:
     return "chosen" if value is None else f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
 
@@ -397,6 +443,12 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     **{(f"controls/{kind}.md", kind): control(kind) for kind in OWN},
     ("policies/pgd.md", "pgd"): policy("pgd"),
     ("design.md", "endings"): endings,
+    ("design.md", "attack-fields"): result_fields(AttackSummary),
+    ("sweeps.md", "sweep-fields"): result_fields(SweepSummary),
+    ("questions.md", "curve-fields"): result_fields(CurveResult),
+    ("questions.md", "gap-fields"): result_fields(GapResult),
+    ("questions.md", "region-fields"): result_fields(RegionResult),
+    ("stability.md", "case-fields"): result_fields(CaseRow),
     ("reference-model.md", "reference"): reference,
 }
 """What makes each part of a page: (page, name of the part)."""

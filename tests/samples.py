@@ -29,7 +29,8 @@ def rated(successes: int = 20, low: float = 0.8316, high: float = 1.0, **changes
 
 ATTACK: dict[str, Any] = {
     **RUN, "schema": 1, "command": "attack", "run": "runs/mug-texture-001", "object": "mug", "model": "reference",
-    "task": "classification", "controls": ["texture"], "epsilon": 0.1, "norm": "linf", "objective": "margin", "policy": "pgd", "ending": "found",
+    "task": "classification",
+    "controls": ["texture"], "epsilon": 0.1, "norm": "linf", "objective": "margin", "policy": "pgd", "ending": "found",
     "label_set": ["mug"], "goal": "a wrong answer", "target": None, "over": [], "image_formation": FORMATION,
     "gradient_plan": {"renders_per_gradient": 0, "spp": None, "groups": []},
     "light_path_segments": {"search": 6, "verification": 6},

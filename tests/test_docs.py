@@ -23,7 +23,6 @@ from samples import attack
 import advsearch
 import advsearch.config
 from advsearch.api import attack as attacking
-from advsearch.api import gap as studies
 from advsearch.api import region as mapping
 from advsearch.attacks import (
     POLICIES,
@@ -33,7 +32,6 @@ from advsearch.attacks import (
     region,
     sample_count,
     smallest,
-    trials,
     verification,
 )
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
@@ -55,7 +53,7 @@ from advsearch.config import (
     SweepConfig,
 )
 from advsearch.controls import CONTROLS, texture
-from advsearch.engine import outcome, stages
+from advsearch.engine import stages
 from advsearch.engine.loading import as_controls
 from advsearch.engine.naming import check_run_settings, controls_of
 from advsearch.engine.sweeps.axes import read_axes
@@ -63,7 +61,12 @@ from advsearch.evaluation import reference_scenes
 from advsearch.evaluation.stability.suite import chosen
 from advsearch.models import calibration, loading, reference
 from advsearch.runs import directory, export, store
-from advsearch.scene import environments, exposure, formation, library
+from advsearch.runs.results import KEPT
+from advsearch.runs.results.base import Result
+from advsearch.runs.results.gap import CurveResult
+from advsearch.runs.results.plan import PlanResult
+from advsearch.runs.results.render import RenderResult
+from advsearch.scene import environments, exposure, library
 from advsearch.scene.description import FRAME_FILL
 from advsearch.scene.importing import objects
 from advsearch.scene.importing.images import TEXTURE_LIMIT
@@ -202,32 +205,31 @@ def test_every_benchmark_is_in_the_table() -> None:
     assert scripts and not [name for name in scripts if f"| [`{name}`]" not in page]
 
 
-def test_every_field_of_a_summary_is_in_the_table() -> None:
-    page = (DOCS / "design.md").read_text("utf-8")
-    said = set(re.findall(r"`([a-z_]+)`", page.partition("### summary.json")[2].partition("\n## ")[0]))
-    written = keys_in(outcome, trials, formation)
-    assert {"verified", "converged", "interval", "denoiser", "average", "smallest", "distribution"} <= written
-    assert not written - said
+@pytest.mark.parametrize("kind", [*KEPT, CurveResult, PlanResult, RenderResult], ids=lambda kind: kind.__name__)
+def test_every_field_of_a_result_has_a_type_and_most_say_what_they_hold(kind: type[Result]) -> None:
+    assert kind.__doc__ and kind.command
+    silent = {name for name, field in kind.model_fields.items() if not script("make_figures")._field(field)}
+    assert silent <= PLAIN, "say what these hold in Field(description=...)"
 
 
-def keys_in(*sources: ModuleType) -> set[str]:
-    """The names under which modules put something into a mapping, or look it up there."""
-    written: set[str] = set()
-    for source in sources:
-        for node in ast.walk(ast.parse(inspect.getsource(source))):
-            keys = node.keys if isinstance(node, ast.Dict) else [node.slice] if isinstance(node, ast.Subscript) else []
-            written |= {k.value for k in keys if isinstance(k, ast.Constant) and isinstance(k.value, str)}
-    return written
-
-
-def test_every_field_of_the_summaries_of_other_questions_is_in_their_table() -> None:
-    page = (DOCS / "questions.md").read_text("utf-8")
-    said = set(re.findall(r"`([a-z_]+)`", page.partition("## What is in summary.json")[2]))
-    settings_of_attacks = {"overwrite", "measure", "verify_spp", "epsilon", "norm"}
-    inside = settings_of_attacks | {"value", "correct", "trials"}  # what a control describes; of the control group
-    written = keys_in(studies, mapping) - inside
-    assert {"curve", "worst", "box", "volume", "already_wrong"} <= written
-    assert not written - said
+PLAIN = {
+    *(
+        "object",
+        "objects",
+        "task",
+        "environment",
+        "controls",
+        "model",
+        "policy",
+        "objective",
+        "loss",
+        "run",
+        "ending",
+        "depth",
+    ),
+    *("specialised", "interrupted", "figures", "seconds", "seed", "spp", "goal", "renders_per_gradient"),
+}
+"""Fields that say themselves."""
 
 
 def test_every_column_of_an_exported_table_is_in_the_page_about_runs() -> None:

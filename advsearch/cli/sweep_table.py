@@ -89,7 +89,9 @@ def _facts(summary: SweepSummary) -> dict[str, str]:
 def _configuration(worst: WorstConfiguration) -> str:
     outer = ("object", "environment", "model")
     names = [f"{name} {_value(one.value)}" for name, one in worst.values.items() if name not in outer]
-    return ", ".join([*(wording.short_name(worst.values[name].value) for name in outer), *names])
+    return ", ".join(
+        [*(wording.short_name(worst.values[name].value) for name in outer if name in worst.values), *names]
+    )
 
 
 def _said(worst: WorstConfiguration, task: str) -> str:

@@ -137,7 +137,7 @@ class AttackSummary(RunResult):
 
     object: str
     model: str
-    task: str
+    task: str = Field(description="what judges the answers")
     policy: str
     objective: str
     epsilon: float | dict[str, float | None] | None = Field(description="the budget; by control where there are more")
@@ -158,14 +158,14 @@ class AttackSummary(RunResult):
     average: AverageCase | None = Field(default=None, description="only with `average`")
     smallest: SmallestEpsilon | None = Field(default=None, description="only with `smallest`")
     distribution: AnswerDistribution | None = Field(default=None, description="of a policy that answers with one")
-    sample_count: VerificationSamples | None = None
+    sample_count: VerificationSamples | None = Field(default=None, description="of the verification")
     claimed: SearchClaim | None = Field(default=None, description="what the search itself believes")
     gradients: SearchGradients | None = Field(default=None, description="of the search")
     configuration: dict[str, DescribedValue] | None = Field(default=None, description="the answer in a few values")
     renders: dict[str, int] = Field(description="of the search, its gradients, the baseline and the verification")
-    steps: int
+    steps: int = Field(description="evaluations of the search before the reranking")
     non_finite: NotFinite
-    warnings: list[str]
+    warnings: list[str] = Field(description="sentences that a reader has to know")
 
     @property
     def minimises(self) -> bool:

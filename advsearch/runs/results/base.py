@@ -21,6 +21,9 @@ SCHEMA = 1
 INTERRUPTED, OUT_OF_TIME = "interrupted", "out of time"
 """Endings of a run that can go on."""
 
+END = ("warnings", "seconds", "seed", "command_line")
+"""Fields that are written last, in this order."""
+
 Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
 """A number that may be NaN or infinite: null in JSON, which is read as NaN."""
 
@@ -88,13 +91,13 @@ class RunResult(Result):
     controls: list[str]
     ending: str = Field(description="how it ended")
     seconds: Annotated[dict[str, Number], having("total")] = Field(description="by part of the work, and in `total`")
-    seed: int
-    command_line: str = Field(description="that asks the same again")
+    seed: int = Field(description="the root seed")
+    command_line: str = Field(description="the command that asks the same again")
 
     def to_dict(self) -> Json:
         """Return the fields as JSON values, what a reader looks for first in front."""
         values = super().to_dict()
-        for name in ("warnings", "seconds", "seed", "command_line"):
+        for name in END:
             if name in values:
                 values[name] = values.pop(name)
         return values

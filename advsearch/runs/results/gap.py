@@ -17,10 +17,10 @@ class StudyResult(RunResult):
 
     objects: list[str]
     model: str
-    task: str
+    task: str = Field(description="what judges the answers")
     policy: str
     parts: list[str] = Field(description="the attacks in the folder `parts`")
-    warnings: list[str]
+    warnings: list[str] = Field(description="sentences that a reader has to know")
 
 
 class ObjectRow(Fields):
@@ -54,7 +54,7 @@ class CurveResult(StudyResult):
 
     command: ClassVar[str] = "attack"
 
-    epsilons: list[float | None]
+    epsilons: list[float | None] = Field(description="those that were tried; null: the own of each control")
     table: list[ObjectRow]
     curve: list[CurvePoint]
 

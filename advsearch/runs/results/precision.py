@@ -143,7 +143,7 @@ class PrecisionResult(Result):
     slopes: list[PrecisionSlope]
     references: list[PrecisionReference]
     recommendations: list[Recommended]
-    warnings: list[str]
+    warnings: list[str] = Field(description="sentences that a reader has to know")
     left_out: list[NotMeasured]
     seconds: dict[str, float]
     interrupted: bool

@@ -38,7 +38,7 @@ class RegionResult(RunResult):
 
     object: str
     model: str
-    task: str = "classification"
+    task: str = Field(default="classification", description="what judges the answers; absent for classification")
     verdict: str | None = Field(default=None, description="`right` or `wrong`, at the centre")
     box: list[BoxSide] | None = Field(default=None, description="for each parameter, the range of its values")
     same: int | None = Field(default=None, description="fresh samples of the box that had that verdict")
@@ -52,5 +52,5 @@ class RegionResult(RunResult):
     )
     image_formation: Formation
     clean: CleanScene
-    warnings: list[str]
+    warnings: list[str] = Field(description="sentences that a reader has to know")
     renders: Annotated[dict[str, int], having("verification")] = Field(description="of the `verification`: everything")

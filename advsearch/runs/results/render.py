@@ -41,10 +41,10 @@ class RenderResult(Result):
     object: str
     environment: str
     model: str
-    task: str = "classification"
+    task: str = Field(default="classification", description="what judges the answers; absent for classification")
     spp: int = Field(description="samples a pixel")
     image_formation: Formation
     gain: float = Field(description="as in `image_formation`")
     up: MeshUp | None = Field(description="null for an object without a mesh file")
     views: list[ViewAnswers]
-    warnings: list[str]
+    warnings: list[str] = Field(description="sentences that a reader has to know")

@@ -22,8 +22,8 @@ class DecidingNumber(Fields):
 class CaseRow(Fields):
     """One case of the suite and what it showed."""
 
-    case: str
-    group: str
+    case: str = Field(description="its name")
+    group: str = Field(description="its group")
     control: str = Field(description="the controls that it moves")
     finite: bool = Field(description="every picture and gradient was finite, and none had to be made so")
     relative_error: Number | None = Field(description="of a gradient against its reference; null where there is none")
@@ -33,8 +33,8 @@ class CaseRow(Fields):
     decides: str = Field(description="the number that decides")
     holds: str = Field(description="what must hold")
     checks: list[DecidingNumber]
-    measured: dict[str, Number]
-    seconds: float
+    measured: dict[str, Number] = Field(description="further numbers, such as condition numbers and biases")
+    seconds: float = Field(description="what the case took")
 
 
 class StabilityResult(Result):

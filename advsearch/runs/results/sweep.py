@@ -16,10 +16,10 @@ AxisValue = int | float | str | tuple[float, float]
 class CountedAnswers(Fields):
     """Configurations, and in how many of them the model is right."""
 
-    configurations: int
-    correct: int
-    accuracy: float | None = Field(description="null where there is no configuration")
-    interval: Interval | None
+    configurations: int = Field(description="how many were looked at")
+    correct: int = Field(description="right answers")
+    accuracy: float | None = Field(description="their share; null where there is no configuration")
+    interval: Interval | None = Field(description="of that share")
 
 
 class AxisRow(CountedAnswers):
@@ -68,7 +68,7 @@ class WorstConfiguration(Fields):
     """The configuration with the largest margin."""
 
     configuration: int = Field(description="its number")
-    values: Annotated[dict[str, DescribedValue], having("object", "environment", "model")]
+    values: Annotated[dict[str, DescribedValue], having("object", "model")]
     seed: int
     label_set: list[str] = Field(description="the names that count as right there")
     claimed: WorstClaim
@@ -82,7 +82,7 @@ class SweepSummary(CountedAnswers, RunResult):
 
     object: str
     model: str
-    task: str
+    task: str = Field(description="what judges the answers")
     image_formation: Formation | None
     planned: int = Field(description="how many configurations there are")
     not_finite: int = Field(description="answers that were not numbers; they count as not right")
@@ -97,8 +97,8 @@ class SweepSummary(CountedAnswers, RunResult):
     sampler: str | None = Field(description="of the draws; null without any")
     spp: int = Field(description="samples a pixel")
     renders: Annotated[dict[str, int], having("sweep")] = Field(description="of the sweep and of the verification")
-    renders_per_second: float | None = Field(description="null where nothing was rendered now")
-    warnings: list[str]
+    renders_per_second: float | None = Field(description="pictures of the sweep; null where nothing was rendered now")
+    warnings: list[str] = Field(description="sentences that a reader has to know")
 
     @property
     def brief(self) -> str:
