@@ -20,7 +20,7 @@ from advsearch.controls.base import Parameter, scalar
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed
 from advsearch.errors import InputError
-from advsearch.scene.description import SceneDescription
+from advsearch.scene.description import ORBIT_CAMERA, SceneDescription
 from advsearch.scene.framing import framing_distance, middle
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.settings import CAMERA, ORBIT, moving
@@ -49,6 +49,11 @@ class CameraControl(NumberControl):
     )
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        if scene.camera != ORBIT_CAMERA:
+            raise InputError(
+                f"`controls` {self.name}: moves along an orbit around the object, and the scene is seen by its camera "
+                f"{scene.camera!r}; leave the control out, or have it seen by {ORBIT_CAMERA!r}"
+            )
         if "fov" in self.specs and "focal_length" in self.specs:
             raise InputError(f"`controls` {self.name}: fov and focal_length say the same thing; leave one of them out")
         wanted = "aperture" in self.specs or "focus" in self.specs

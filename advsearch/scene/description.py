@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.errors import InputError
+from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
 from advsearch.scene.importing.objects import import_object
@@ -29,10 +29,25 @@ ENVIRONMENT = "environment"
 """What stands for the environment among the settings that were asked for."""
 FRAME_FILL = 0.86
 """Share of the picture's half-width that the object's outline may reach when the distance is worked out."""
+ORBIT_CAMERA = "orbit"
+"""The camera that the settings `camera.*` describe: on a sphere around the object, looking at it."""
 NO_MAP = "none"
 """What the environment of a scene without a map is called."""
 OWN_MAP = "own"
 """What the scene's own environment is called where another may be chosen."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedCamera:
+    """A camera with a pose of its own.
+
+    Attributes:
+        to_world: (4, 4) its pose: it looks along its own +z with +y up and +x to the left.
+        fov: field of view along the larger side of the picture, degrees.
+    """
+
+    to_world: Doubles
+    fov: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +66,8 @@ class SceneDescription:
         thin_lens: the camera has an aperture and a focus distance.
         backdrop: the environment may be hidden behind a plain colour (`backdrop.color`).
         aspect: width over height of the picture.
+        cameras: those with poses of their own, by name.
+        camera: name of the one in use; `ORBIT_CAMERA` for that of the settings.
     """
 
     object: ObjectAsset
@@ -64,6 +81,8 @@ class SceneDescription:
     thin_lens: bool = False
     backdrop: bool = False
     aspect: float = 1.0
+    cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)
+    camera: str = ORBIT_CAMERA
 
     def with_part(self, part: ScenePart) -> SceneDescription:
         """Return the scene with one more part.
@@ -78,6 +97,16 @@ class SceneDescription:
     def with_values(self, **given: float | None) -> SceneDescription:
         """Return the scene with some settings replaced; dots in their names are written as two underscores."""
         return replace(self, values={**self.values, **{name.replace("__", "."): v for name, v in given.items()}})
+
+    def seen_by(self, camera: str) -> SceneDescription:
+        """Return the scene as one of its cameras sees it.
+
+        Raises:
+            UnknownNameError: it has no such camera.
+        """
+        if camera not in (ORBIT_CAMERA, *self.cameras):
+            raise UnknownNameError("camera of the scene", camera, (ORBIT_CAMERA, *self.cameras))
+        return replace(self, camera=camera)
 
     @property
     def meshes(self) -> Mapping[str, MeshPart]:
@@ -133,7 +162,9 @@ class SceneDescription:
         return np.asarray(self.object.mesh.vertices.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3])
 
     def number(self, name: str) -> float:
-        """Return a setting that always has a value."""
+        """Return a setting that always has a value; of the field of view, that of the camera in use."""
+        if name == "camera.fov" and self.camera != ORBIT_CAMERA:
+            return self.cameras[self.camera].fov
         value = self.values[name]
         if value is None:
             raise KeyError(name)

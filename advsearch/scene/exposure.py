@@ -16,20 +16,17 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from advsearch.scene.assets import EnvironmentAsset
 from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.description import ORBIT_CAMERA, SceneDescription
 from advsearch.scene.geometry import camera_to_world, object_to_world
 from advsearch.scene.raster import pixels_in
 from advsearch.scene.settings import resolve
 from advsearch.scene.silhouettes import NEAREST, Frame
-
-if TYPE_CHECKING:
-    from advsearch.scene.description import SceneDescription
 
 Doubles = npt.NDArray[np.float64]
 
@@ -56,7 +53,7 @@ def metered_gain(scene: SceneDescription) -> float:
     Where the camera sees nothing of the object, the card lies on the ground; where no light arrives the factor is 1.
     """
     default = {name: value for name, value in resolve({}).items() if name.startswith(MOVED)}
-    scene = replace(scene, values={**scene.values, **default}, aspect=1.0)
+    scene = replace(scene, values={**scene.values, **default}, aspect=1.0, camera=ORBIT_CAMERA)
     seen = visible_irradiance(scene)
     metered = float(irradiance(scene, np.array([[0.0, 0.0, 1.0]])).mean()) if seen is None else seen
     return METERED_WHITE * math.pi / (WHITE * metered) if metered > 0.0 else 1.0

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from advsearch.scene.description import SceneDescription
+from advsearch.scene.description import ORBIT_CAMERA, SceneDescription
 from advsearch.scene.framing import camera_axes, framing_distance, middle
 
 Doubles = npt.NDArray[np.float64]
@@ -41,7 +41,7 @@ def object_to_world(description: SceneDescription) -> Doubles:
 
 
 def camera_to_world(description: SceneDescription, aspect: float | None = None) -> Doubles:
-    """Return the camera's pose: on an orbit around the middle of the object in its default pose, looking at it.
+    """Return the pose of the camera in use: by default on an orbit around the middle of the object, looking at it.
 
     The camera looks along its own +z with +y up and +x to the left, as Mitsuba's sensors do. It frames the object in
     its default pose, so that a shifted or scaled object moves in the picture.
@@ -50,6 +50,8 @@ def camera_to_world(description: SceneDescription, aspect: float | None = None) 
         description: the scene.
         aspect: width over height of the picture; None takes the description's.
     """
+    if description.camera != ORBIT_CAMERA:
+        return description.cameras[description.camera].to_world
     aspect = description.aspect if aspect is None else aspect
     number = description.number
     axes = camera_axes(number("camera.azimuth"), number("camera.elevation"), number("camera.roll"))

@@ -1,4 +1,4 @@
-"""A scene's named meshes and lamps, and scenes without an environment map."""
+"""A scene's named meshes, lamps and cameras, and scenes without an environment map."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from advsearch.engine.loading import Scene, load_scene
-from advsearch.errors import InputError
-from advsearch.scene.description import describe
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.description import ORBIT_CAMERA, PlacedCamera, describe
+from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.parts import BallLamp, PointLamp
 
@@ -61,3 +62,17 @@ def test_meshes_have_names_and_one_of_them_is_the_object() -> None:
     assert {"object.vertices", "second.vertices"} <= MitsubaScene(scene, (8, 8)).names
     with pytest.raises(InputError, match="the scene has something of that name already"):
         scene.with_part(scene.meshes["object"])
+
+
+def test_a_scene_is_seen_by_any_of_its_cameras() -> None:
+    scene = describe("mug")
+    side = describe("mug", given={"camera.azimuth": 130.0, "camera.fov": 50.0})
+    cameras = {"front": PlacedCamera(camera_to_world(scene), 35.0), "side": PlacedCamera(camera_to_world(side), 50.0)}
+    scene = replace(scene, cameras=cameras)
+    assert torch.equal(picture(Scene(scene.seen_by("front"))), picture(Scene(scene)))
+    assert torch.equal(picture(Scene(scene.seen_by("side"))), picture(Scene(side)))
+    assert scene.seen_by("side").seen_by(ORBIT_CAMERA).number("camera.fov") == 35.0
+    with pytest.raises(UnknownNameError, match=r"unknown camera of the scene 'sied'. Did you mean 'side'"):
+        scene.seen_by("sied")
+    with pytest.raises(InputError, match=r"moves along an orbit .* seen by its camera 'side'; leave the control out"):
+        picture(Scene(scene.seen_by("side")), "camera")
