@@ -9,11 +9,12 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.controls.material.control import BASE_COLOR, NUMBERS, TINT, MaterialControl
+from advsearch.controls.material.control import BASE_COLOR, NUMBERS, MaterialControl
 from advsearch.controls.material.patterns import PATTERNS, SIDE, covering, tile
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.settings import CHANNELS
 from advsearch.scene.surface_map import texel_positions
 
 AGREEMENT = 0.15
@@ -115,7 +116,7 @@ def test_a_fixed_material_is_where_the_search_starts(scene: SceneDescription) ->
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_extremes_have_finite_derivatives(scene: SceneDescription, share: float) -> None:
-    bound = MaterialControl(**{name: [0, 1] for name in (*NUMBERS, *TINT)}).bind(scene)
+    bound = MaterialControl(**{name: [0, 1] for name in (*NUMBERS, *CHANNELS)}).bind(scene)
     u = torch.full((7,), share, requires_grad=True)
     sum(one.sum() for one in bound.inputs(u).values()).backward()
     assert u.grad is not None and bool(torch.isfinite(u.grad).all())

@@ -23,6 +23,7 @@ from advsearch.controls.values import Fixed, Number, OneOf
 from advsearch.errors import InputError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
+from advsearch.scene.settings import CHANNELS
 
 COLOR = "backdrop.color"
 """The scene input: (3,) display-linear values in [0, 1]."""
@@ -110,8 +111,7 @@ class BackgroundControl(NumberControl):
 
     def measured(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Value]:
         color = hsv_to_rgb(values["hue"], values["saturation"], values["value"])
-        names = ("red", "green", "blue")
-        return {name: {"value": float(one), "unit": "sRGB"} for name, one in zip(names, color, strict=True)}
+        return {name: {"value": float(one), "unit": "sRGB"} for name, one in zip(CHANNELS, color, strict=True)}
 
 
 def hsv_to_rgb(hue: Tensor, saturation: Tensor, value: Tensor) -> Tensor:

@@ -22,7 +22,7 @@ from advsearch.controls.values import Fixed
 from advsearch.errors import InputError
 from advsearch.scene.description import ORBIT_CAMERA, SceneDescription
 from advsearch.scene.framing import framing_distance, middle
-from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.geometry import affine, camera_to_world
 from advsearch.scene.settings import CAMERA, ORBIT, moving
 
 SENSOR_WIDTH = 36.0
@@ -119,8 +119,7 @@ class CameraControl(NumberControl):
         up = torch.linalg.cross(-outwards, left)
         left, up = roll.cos() * left + roll.sin() * up, roll.cos() * up - roll.sin() * left
         place = torch.from_numpy(middle(scene)).float() + distance * outwards
-        top = torch.stack([left, up, -outwards, place], dim=1)
-        return torch.cat([top, torch.tensor([[0.0, 0.0, 0.0, 1.0]])])
+        return affine(torch.stack([left, up, -outwards], dim=1), place)
 
 
 def fitted_distance(scene: SceneDescription) -> float:

@@ -28,7 +28,7 @@ from advsearch.errors import InputError
 from advsearch.scene import library, settings
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
 from advsearch.scene.exposure import metered_gain
-from advsearch.scene.settings import LIT
+from advsearch.scene.settings import CHANNELS, LIT
 
 COEFFICIENTS = 27
 """Degrees 0 to 2 of three colour channels."""
@@ -54,7 +54,7 @@ class EnvironmentControl(NumberControl):
         *settings.ENVIRONMENT,
         *(
             Parameter(f"tint_{color}", (), "1", 0.0, 10.0, 1.0, f"Factor on the map's {color}.", estimators=LIT)
-            for color in ("red", "green", "blue")
+            for color in CHANNELS
         ),
         Parameter(
             "harmonics",
@@ -126,7 +126,7 @@ class EnvironmentControl(NumberControl):
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         base = self._map(scene, int(values["which"]))
         turned = turn(base, values["rotation"] - scene.number("environment.rotation"))
-        tint = torch.stack([values[f"tint_{color}"] for color in ("red", "green", "blue")])
+        tint = torch.stack([values[f"tint_{color}"] for color in CHANNELS])
         stops = values["exposure"] - scene.number("environment.exposure")
         lit = turned * tint * torch.exp2(stops)
         if "harmonics" in self.specs:

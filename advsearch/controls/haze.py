@@ -21,6 +21,7 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.parts import HazePart
+from advsearch.scene.settings import CHANNELS, LIT, colors
 
 LEAST_RADIUS = 4.0
 """The haze reaches at least this far from the scene's middle, object sizes."""
@@ -28,13 +29,6 @@ BEHIND_CAMERA = 1.5
 """It reaches at least so many times as far as the camera is away."""
 THIN_HAZE = 0.1
 """Density where it is not searched and was not given."""
-
-
-def _tint(name: str) -> Parameter:
-    description = f"{name.capitalize()} of the haze: what it scatters and does not absorb."
-    return Parameter(
-        name, (), "sRGB", 0.02, 1.0, 1.0, description, search=(0.6, 1.0), estimators=("adjoint", "differences")
-    )
 
 
 class HazeControl(NumberControl):
@@ -53,11 +47,9 @@ class HazeControl(NumberControl):
             0.0,
             "Extinction: over 1 / density the haze takes 63 % of the light out of a ray.",
             search=(0.0, 0.3),
-            estimators=("adjoint", "differences"),
+            estimators=LIT,
         ),
-        _tint("red"),
-        _tint("green"),
-        _tint("blue"),
+        *colors("of the haze: what it scatters and does not absorb.", (0.6, 1.0), low=0.02),
     )
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
@@ -85,5 +77,5 @@ class HazeControl(NumberControl):
         return scene.with_part(HazePart(self.name, max(LEAST_RADIUS, BEHIND_CAMERA * away)))
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        albedo = srgb_to_linear(torch.stack([values[channel] for channel in ("red", "green", "blue")]))
+        albedo = srgb_to_linear(torch.stack([values[channel] for channel in CHANNELS]))
         return {f"{self.name}.density": values["density"].reshape(1), f"{self.name}.albedo": albedo}

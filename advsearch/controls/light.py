@@ -27,7 +27,9 @@ from advsearch.errors import InputError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.exposure import WHITE, metered_gain
+from advsearch.scene.geometry import affine
 from advsearch.scene.parts import BallLamp, PointLamp
+from advsearch.scene.settings import CHANNELS, LIT, colors
 
 LIT_WHITE = 0.9
 """Linear display value of a white surface that faces a lamp of power 1 at distance 1."""
@@ -56,13 +58,6 @@ def _place(name: str, low: float, high: float, default: float, description: str)
     )
 
 
-def _tint(name: str) -> Parameter:
-    description = f"{name.capitalize()} of the lamp's colour."
-    return Parameter(
-        name, (), "sRGB", 0.0, 1.0, 1.0, description, search=(0.6, 1.0), estimators=("adjoint", "differences")
-    )
-
-
 class LightControl(NumberControl):
     """One lamp beside the environment."""
 
@@ -73,9 +68,7 @@ class LightControl(NumberControl):
         _place("x", -2.0, 2.0, 1.5, "Where the lamp's middle is, along x."),
         _place("y", -2.0, 2.0, -1.0, "Where the lamp's middle is, along y."),
         _place("z", 2.0, 3.5, 2.0, "Height of the lamp's middle above the ground plane."),
-        _tint("red"),
-        _tint("green"),
-        _tint("blue"),
+        *colors("of the lamp's colour.", (0.6, 1.0)),
         Parameter(
             "power",
             (),
@@ -85,7 +78,7 @@ class LightControl(NumberControl):
             0.0,
             "Irradiance at distance 1, in multiples of the one that shows a white surface just below white.",
             search=(0.0, 12.0),
-            estimators=("adjoint", "differences"),
+            estimators=LIT,
         ),
         Parameter(
             "size",
@@ -136,7 +129,7 @@ class LightControl(NumberControl):
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         place = torch.stack([values[axis] for axis in ("x", "y", "z")])
-        tint = srgb_to_linear(torch.stack([values[channel] for channel in ("red", "green", "blue")]))
+        tint = srgb_to_linear(torch.stack([values[channel] for channel in CHANNELS]))
         intensity = tint * values["power"] * metered_irradiance(scene)
         if self.chosen["type"] == "point":
             return {f"{self.name}.position": place, f"{self.name}.intensity": intensity}
@@ -146,5 +139,4 @@ class LightControl(NumberControl):
 
 def ball(place: Tensor, radius: Tensor) -> Tensor:
     """Return the pose (4, 4) of the unit ball at a place (3,) with a radius ()."""
-    turned = torch.cat([torch.eye(3) * radius, place[:, None]], dim=1)
-    return torch.cat([turned, torch.tensor([[0.0, 0.0, 0.0, 1.0]])])
+    return affine(torch.eye(3) * radius, place)

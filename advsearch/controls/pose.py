@@ -20,6 +20,7 @@ from advsearch.controls.base import Choice, Parameter
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
+from advsearch.scene.geometry import affine
 from advsearch.scene.settings import GEOMETRIC, POSE
 
 
@@ -63,8 +64,7 @@ class PoseControl(NumberControl):
             lowest = -middle[2]
         shift = torch.stack([values["x"], values["y"], values["z"] - lowest])
         translation = shift - linear @ middle + torch.cat([middle[:2], torch.zeros(1)])
-        top = torch.cat([linear, translation[:, None]], dim=1)
-        return {"object.to_world": torch.cat([top, torch.tensor([[0.0, 0.0, 0.0, 1.0]])])}
+        return {"object.to_world": affine(linear, translation)}
 
 
 def euler(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:

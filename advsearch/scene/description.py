@@ -171,6 +171,11 @@ class SceneDescription:
         return value
 
     @property
+    def ground_color(self) -> tuple[float, ...]:
+        """(3,) colour of the ground plane, display-referred sRGB."""
+        return tuple(self.number(f"ground.{channel}") for channel in settings.CHANNELS)
+
+    @property
     def material(self) -> Material:
         """The object's material with the `material.*` settings over it."""
         own = self.object.material

@@ -75,8 +75,7 @@ def irradiance(scene: SceneDescription, normals: Doubles) -> Doubles:
     directions = directions @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     upper = directions[:, 2] > 0.0
     on_ground = (power[upper] * directions[upper, 2:]).sum(axis=0)
-    color = np.array([scene.number(f"ground.{channel}") for channel in ("red", "green", "blue")])
-    bounced = srgb_to_linear(color.astype(np.float32)) * on_ground / math.pi
+    bounced = srgb_to_linear(np.array(scene.ground_color, np.float32)) * on_ground / math.pi
     vertices = scene.base_vertices
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
     reach = np.abs(middle[:2] + directions[:, :2] * (middle[2] / np.maximum(-directions[:, 2:], 1e-9)))

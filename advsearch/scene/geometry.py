@@ -23,6 +23,12 @@ def rotation(yaw: float, pitch: float, roll: float) -> Doubles:
     return np.asarray(rz @ ry @ rx)
 
 
+def affine(linear: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
+    """Return the pose (4, 4) `linear @ v + place` of a (3, 3) matrix and a place (3,); differentiable."""
+    top = torch.cat([linear, place[:, None]], dim=1)
+    return torch.cat([top, torch.tensor([[0.0, 0.0, 0.0, 1.0]]).to(linear)])
+
+
 def object_to_world(description: SceneDescription) -> Doubles:
     """Return the object's pose: scale and rotate about the middle of its bounding box, keep it on the ground, shift.
 

@@ -16,6 +16,7 @@ GEOMETRIC = ("secant", "differences", "material", "simultaneous", "boundary")
 """Valid estimators for what moves a mesh."""
 ORBIT = ("secant", "differences", "forward", "simultaneous")
 """Mitsuba has no derivative of sensors, so a camera is differentiated by differences."""
+CHANNELS = ("red", "green", "blue")
 LIT = ("adjoint", "differences")
 """Valid estimators for what only changes light and colours."""
 
@@ -37,8 +38,21 @@ def moving(
     return Parameter(name, (), unit, low, high, default, text, periodic, True, search, log, estimators=estimators)
 
 
-def _color(name: str, default: float) -> Parameter:
-    return Parameter(name, (), "sRGB", 0.0, 1.0, default, f"{name.capitalize()} of the ground plane.")
+def colors(
+    text: str,
+    search: tuple[float, float] | None = None,
+    *,
+    low: float = 0.0,
+    defaults: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    estimators: tuple[str, ...] = LIT,
+) -> tuple[Parameter, ...]:
+    """Return the three numbers of a colour, display-referred sRGB; the text goes on behind "Red", "Green", "Blue"."""
+    return tuple(
+        Parameter(
+            name, (), "sRGB", low, 1.0, default, f"{name.capitalize()} {text}", search=search, estimators=estimators
+        )
+        for name, default in zip(CHANNELS, defaults, strict=True)
+    )
 
 
 def _surface(name: str, text: str, search: tuple[float, float]) -> Parameter:
@@ -130,9 +144,7 @@ ENVIRONMENT = (
 )
 GROUND = (
     Parameter("size", (), "object sizes", 0.0, 1000.0, 3.0, "Side of the square ground plane; 0 leaves it out."),
-    _color("red", 0.55),
-    _color("green", 0.45),
-    _color("blue", 0.37),
+    *colors("of the ground plane.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)),
 )
 MATERIAL = (
     _surface("roughness", "Roughness of the surface: 0 is polished, 1 is matt.", (0.1, 1.0)),

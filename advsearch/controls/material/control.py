@@ -25,23 +25,17 @@ from advsearch.controls.values import Fixed, Number, OneOf
 from advsearch.scene.assets import Material, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.settings import LIT, MATERIAL
+from advsearch.scene.settings import CHANNELS, MATERIAL, colors
 
 BASE_COLOR = "object.base_color"
 OWN = "own"
 NUMBERS = tuple(one.name for one in MATERIAL)
-TINT = ("red", "green", "blue")
 RENDERED = {"metallic": (0.0, 0.999), "specular": (0.02, 1.0), "clearcoat": (1e-4, 1.0)}
 """What is really rendered: a value beyond is moved to the nearest of these, where the adjoint is right.
 
 Measured (docs/controls/material.md): at a metallic of exactly 1 the adjoint has the wrong sign, at a clearcoat of
 exactly 0 it is 0, and towards a specular of 0 it grows without bound (the refractive index goes with the root).
 """
-
-
-def _tint(name: str) -> Parameter:
-    text = f"{name.capitalize()} of the tint that multiplies the colour; 1 leaves it."
-    return Parameter(name, (), "sRGB", 0.0, 1.0, 1.0, text, search=(0.3, 1.0), estimators=LIT)
 
 
 class MaterialControl(NumberControl):
@@ -61,7 +55,7 @@ class MaterialControl(NumberControl):
             options=(OWN, *PATTERNS),
         ),
         *MATERIAL,
-        *(_tint(name) for name in TINT),
+        *colors("of the tint that multiplies the colour; 1 leaves it.", (0.3, 1.0)),
     )
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
@@ -86,7 +80,7 @@ class MaterialControl(NumberControl):
             elif self._names_a_material():
                 inputs[f"object.{name}"] = torch.tensor([float(getattr(own, name))])
         if self._colours():
-            tint = torch.stack([values[name] for name in TINT])
+            tint = torch.stack([values[name] for name in CHANNELS])
             inputs[BASE_COLOR] = srgb_to_linear(tint) * self._reflectance(scene, which, so_far)
         return inputs
 
@@ -117,7 +111,7 @@ class MaterialControl(NumberControl):
         return names != (OWN,)
 
     def _colours(self) -> bool:
-        return self._names_a_material() or any(self._varies(name) for name in TINT)
+        return self._names_a_material() or any(self._varies(name) for name in CHANNELS)
 
     @staticmethod
     def _own(scene: SceneDescription, which: str) -> Material:

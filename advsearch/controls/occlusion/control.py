@@ -29,7 +29,7 @@ from advsearch.controls.values import Fixed, OneOf
 from advsearch.errors import InputError
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.geometry import affine, camera_to_world, object_to_world
 from advsearch.scene.parts import MeshPart
 from advsearch.scene.silhouettes import Frame, Passage, Silhouette, angle_outside, middle_axes, silhouette
 
@@ -361,14 +361,9 @@ def _matrix(camera: Tensor, placed: Placement, values: Values) -> Tensor:
     to_world = camera[:3, :3] * torch.tensor([-1.0, 1.0, 1.0]).to(camera)
     linear = placed.size * to_world @ torch.stack([x, y, up], dim=1)
     place = camera[:3, 3] + placed.distance * (to_world @ ahead)
-    return _affine(linear, place)
+    return affine(linear, place)
 
 
 def _put_away(camera: Tensor) -> Tensor:
     """A pose (4, 4) behind the camera, very small."""
-    return _affine(PARKED * torch.eye(3).to(camera), camera[:3, 3] - camera[:3, 2])
-
-
-def _affine(linear: Tensor, place: Tensor) -> Tensor:
-    top = torch.cat([linear, place[:, None]], dim=1)
-    return torch.cat([top, torch.tensor([[0.0, 0.0, 0.0, 1.0]]).to(linear)])
+    return affine(PARKED * torch.eye(3).to(camera), camera[:3, 3] - camera[:3, 2])

@@ -97,7 +97,7 @@ class SkyControl(NumberControl):
 
     def radiance(self, scene: SceneDescription, values: Values) -> Tensor:
         """Return the map (H, W, 3) of linear radiance at some values; differentiable."""
-        ground = tuple(scene.number(f"ground.{channel}") for channel in ("red", "green", "blue"))
+        ground = scene.ground_color
         radiance, metered = sky_over(ground)(values["azimuth"], values["elevation"], values["turbidity"])
         if self.chosen["exposure"] == "fixed":
             start = self.start_values(scene)

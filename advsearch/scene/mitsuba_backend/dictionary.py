@@ -30,8 +30,7 @@ def scene_dict(description: SceneDescription, resolution: tuple[int, int], filte
             "to_world": place().rotate([0, 0, 1], number("environment.rotation")).rotate([1, 0, 0], 90),
         }
     if number("ground.size") > 0.0:
-        color = [number(f"ground.{channel}") for channel in ("red", "green", "blue")]
-        reflectance = srgb_to_linear(np.array(color, np.float32)).tolist()
+        reflectance = srgb_to_linear(np.array(description.ground_color, np.float32)).tolist()
         scene["ground"] = {
             "type": "rectangle",
             "to_world": place().scale(number("ground.size") / 2.0),
