@@ -1,6 +1,6 @@
 """What a control is: a named family of scene parameters that may vary, and their map from the unit box.
 
-A control declares its parameters as data (unit, range, default, whether periodic, differentiable, silhouette-moving)
+A control declares its parameters as data (unit, range, default, whether periodic, its estimators)
 that the command line, the documentation, the gradient plan and the shared tests read. Bound to a scene it becomes a
 `BoundControl`: a slice of u, its budgets, and the map from that slice to scene inputs, written in torch so that
 autograd runs through it.

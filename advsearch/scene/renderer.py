@@ -23,9 +23,10 @@ from advsearch import seeds
 from advsearch.errors import InputError
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.formation import ImageFormation
+from advsearch.scene.gradients.differences import central, one_sided, random_directions
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.motion import Motion, steps_for
-from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, DIRECTIONS, TURN_STEP, first_plan
+from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, first_plan
 from advsearch.scene.mitsuba_backend.denoise import Denoiser
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 
@@ -165,10 +166,10 @@ class Renderer:
         derivative = torch.zeros_like(at) if found is None else found
         secants = () if free else self.plan.having("secant")
         if secants:
-            noise = seeds.stream(self.root_seed, "differences", seed)
+            noise, count = seeds.stream(self.root_seed, "differences", seed), self.plan.spp or spp
             with torch.no_grad():
                 for group in secants:
-                    self._central(group, u.detach(), noise, self.plan.spp or spp, loss, derivative)
+                    central(lambda at: loss(self._picture(at, noise, count)), group, u.detach(), derivative)
         return value.detach(), derivative
 
     def _check(self, u: Tensor, spp: int) -> None:
@@ -279,70 +280,15 @@ class Renderer:
         spp = self.plan.spp or spp
         found = torch.zeros_like(u)
 
-        def loss(picture: Tensor) -> Tensor:
-            return (cotangent * picture).sum()
+        def value(at: Tensor) -> Tensor:
+            return (cotangent * self._picture(at, noise, spp)).sum()
 
         for group in self._differenced():
             if group.estimator in ("differences", "secant"):
-                self._central(group, u, noise, spp, loss, found)
-        self._one_sided(self.plan.having("forward"), u, noise, spp, loss, found)
-        self._random_directions(self.plan.having("simultaneous"), u, noise, spp, loss, found)
+                central(value, group, u, found)
+        one_sided(value, self.plan.having("forward"), u, found)
+        random_directions(value, self.plan.having("simultaneous"), u, noise, found)
         return self._finite(found)
-
-    def _central(
-        self, group: Group, u: Tensor, noise: int, spp: int, loss: Callable[[Tensor], Tensor], found: Tensor
-    ) -> None:
-        for number in range(group.begin, group.begin + group.size):
-            step = torch.zeros_like(u)
-            step[number] = group.step
-            (above, up), (below, down) = _moved(u, step, group.periodic), _moved(u, -step, group.periodic)
-            rise = loss(self._picture(above, noise, spp)) - loss(self._picture(below, noise, spp))
-            found[number] = float(rise) / float((up - down)[number])
-
-    def _one_sided(
-        self,
-        groups: tuple[Group, ...],
-        u: Tensor,
-        noise: int,
-        spp: int,
-        loss: Callable[[Tensor], Tensor],
-        found: Tensor,
-    ) -> None:
-        if not groups:
-            return
-        here = float(loss(self._picture(u, noise, spp)))
-        for group in groups:
-            for number in range(group.begin, group.begin + group.size):
-                step = torch.zeros_like(u)
-                step[number] = group.step if group.periodic or float(u[number]) + group.step <= 1.0 else -group.step
-                moved, width = _moved(u, step, group.periodic)
-                found[number] = (float(loss(self._picture(moved, noise, spp))) - here) / float(width[number])
-
-    def _random_directions(
-        self,
-        groups: tuple[Group, ...],
-        u: Tensor,
-        noise: int,
-        spp: int,
-        loss: Callable[[Tensor], Tensor],
-        found: Tensor,
-    ) -> None:
-        """Simultaneous perturbation (Spall 1992, section 2) along a few random sign vectors, scaled by the steps."""
-        if not groups:
-            return
-        scale, periodic = torch.zeros_like(u), torch.zeros_like(u)
-        for group in groups:
-            scale[group.coordinates] = group.step
-            periodic[group.coordinates] = float(group.periodic)
-        generator = torch.Generator().manual_seed(noise % 2**63)
-        total = torch.zeros_like(u)
-        for _ in range(DIRECTIONS):
-            signs = torch.randint(0, 2, u.shape, generator=generator).to(u.dtype) * 2.0 - 1.0
-            (above, up), (below, down) = (_moved(u, way * signs * scale, periodic.bool()) for way in (1.0, -1.0))
-            rise = float(loss(self._picture(above, noise, spp)) - loss(self._picture(below, noise, spp)))
-            width = up - down
-            total += torch.where(width == 0.0, 0.0, rise / torch.where(width == 0.0, 1.0, width))
-        found += total / DIRECTIONS
 
     # ---- set-up -----------------------------------------------------------------------------------------------------
 
@@ -383,18 +329,6 @@ class Renderer:
                     if reached is not None and bool(reached[group.coordinates].any()):
                         routes[group.name].add(name)
         return {name: frozenset(found) for name, found in routes.items()}
-
-
-def _moved(u: Tensor, step: Tensor, periodic: bool | Tensor) -> tuple[Tensor, Tensor]:
-    """Return u + step brought back into the box, and the step that was really taken.
-
-    Periodic coordinates wrap around, so that they can go the whole step.
-    """
-    there = u + step
-    wrapped = torch.remainder(there, 1.0)
-    clipped = there.clamp(0.0, 1.0)
-    cyclic = torch.as_tensor(periodic).expand(u.shape)
-    return torch.where(cyclic, wrapped, clipped), torch.where(cyclic, step, clipped - u)
 
 
 class _Radiance(torch.autograd.Function):

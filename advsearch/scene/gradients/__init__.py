@@ -1,1 +1,1 @@
-"""How pictures are differentiated: the plan, and the motion of coordinates."""
+"""How pictures are differentiated: the plan, differences, and the motion of coordinates."""

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import Json
+from advsearch.scene.gradients.differences import DIRECTIONS as DIRECTIONS
 from advsearch.scene.gradients.group import BY_DIFFERENCES as BY_DIFFERENCES
 from advsearch.scene.gradients.group import Group
 
@@ -39,8 +40,6 @@ WITH_BOUNDARY = frozenset({"material", "boundary", "guided"})
 ALWAYS_VALID = ("differences", "secant", "forward", "simultaneous", "none")
 """Estimators that need nothing but renders, so they can be forced on any continuous coordinate."""
 
-DIRECTIONS = 4
-"""Random directions of one `simultaneous` gradient."""
 DEFAULT_STEP, TURN_STEP = 0.05, 0.005
 """Half of a difference's width in u, for coordinates that move nothing in the picture: of a range, of a full turn."""
 DEFAULT_PIXELS = 1.0
