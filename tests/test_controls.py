@@ -16,6 +16,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import describe
 from advsearch.scene.gradients.plan import ESTIMATORS
+from advsearch.scene.settings import SETTINGS
 
 every_control = pytest.mark.parametrize("kind", CONTROLS)
 
@@ -41,6 +42,14 @@ def test_a_control_declares_itself(kind: str) -> None:
     assert len({one.name for one in (*control.parameters, *control.choices)}) == len(control.parameters) + len(
         control.choices
     )
+
+
+def test_a_setting_of_the_scene_and_the_parameter_of_that_name_are_one_declaration() -> None:
+    for name, declared in SETTINGS.items():
+        kind, _, parameter = name.partition(".")
+        if kind in CONTROLS:
+            (own,) = (one for one in CONTROLS[kind].parameters if one.name == parameter)
+            assert own is declared, name
 
 
 @every_control
