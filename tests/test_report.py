@@ -295,6 +295,16 @@ def test_the_worst_case_of_a_gap_does_not_hide_an_average_that_is_equal_to_it() 
         assert (abs(pixels - colour).max(axis=-1) < 30).sum() > 20
 
 
+def test_every_row_of_a_gap_is_drawn_whole() -> None:
+    row = {**GAP["table"][0], "worst": rated(10), "ending": "budget spent"}
+    figure = gap_figure(gap(table=[{**row, "control": name} for name in ("pose", "light", "camera")]))["png"]
+    pixels = np.asarray(Image.open(io.BytesIO(figure)).convert("RGB")).astype(int)
+    red = (pixels[..., 0] - pixels[..., 1:].max(axis=-1) > 20).any(axis=1).astype(int)
+    edges = np.diff(np.concatenate([[0], red, [0]])).nonzero()[0].reshape(-1, 2)
+    heights = edges[:, 1] - edges[:, 0]
+    assert len(heights) == 4 and max(heights) - min(heights) <= 2  # the last one is the legend's
+
+
 # ---- words ----
 
 

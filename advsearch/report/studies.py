@@ -57,7 +57,7 @@ def gap_figure(answer: GapResult) -> Figures:
             )  # an outline: where the two are equal, both are seen
             axes.plot(worst, place, "D", color=RED, mfc="none", mew=1.5, ms=9, zorder=3, label=worst_label)
         axes.set_yticks(range(len(rows)), [f"{row.object}, {row.control}" for row in reversed(rows)])
-        axes.set(xlabel="accuracy", xlim=(-0.03, 1.03))
+        axes.set(xlabel="accuracy", xlim=(-0.03, 1.03), ylim=(-0.6, len(rows) - 0.4))
         axes.set_title(f"Average and worst case: {answer.model}")
         axes.grid(True, axis="x")
         axes.figure.legend(loc="outside lower center", ncols=2)
