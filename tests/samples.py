@@ -81,7 +81,8 @@ GAP: dict[str, Any] = {
 }  # fmt: skip
 REGION: dict[str, Any] = {
     **RUN, "schema": 1, "command": "region", "run": "runs/mug-pose-002", "object": "mug", "controls": ["pose"],
-    "model": "reference", "verdict": "wrong", "same": 200, "samples": 200, "rate": 1.0, "interval": [0.982, 1.0],
+    "model": "reference", "task": "classification", "verdict": "wrong", "same": 200, "samples": 200, "rate": 1.0,
+    "interval": [0.982, 1.0],
     "volume": 0.12, "spp": 64, "image_formation": FORMATION, "clean": {"moved": []}, "renders": {"verification": 300},
     "box": [{"name": "pose.yaw", "unit": "degrees", "low": 10.0, "high": 55.5, "centre": 30.0}],
 }  # fmt: skip

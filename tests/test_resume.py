@@ -233,7 +233,8 @@ def test_another_configuration_than_was_stored_is_refused(tmp_path: Path) -> Non
 
 CHANGES: dict[str, Any] = {
     "seed": 1, "steps": 26, "trials": 40, "spp": 7, "epsilon": 0.05, "exposure": 1.0, "set": {"camera.azimuth": 9.0},
-    "label": "bowl", "model": "torchvision:resnet18", "policy": {"name": "pgd", "momentum": 0.5}, "average": 6,
+    "label": "bowl", "task": "fading", "model": "torchvision:resnet18",
+    "policy": {"name": "pgd", "momentum": 0.5}, "average": 6,
     "controls": {"texture": {"resolution": 8}}, "denoise": "none", "deterministic": True, "baseline": False,
 }  # fmt: skip
 

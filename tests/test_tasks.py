@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+import advsearch
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective, get_objective
 from advsearch.errors import InputError, ModelError, UnknownNameError
 from advsearch.models import load_model
@@ -173,6 +174,23 @@ def test_an_output_may_be_a_list_with_one_thing_for_each_picture() -> None:
     pictures = torch.rand(3, 8, 8, 3)
     assert [len(one) for one in model(pictures)] == [int((one > 0.5).sum()) for one in pictures]
     assert model.differentiable
+
+
+@pytest.mark.parametrize(("tolerance", "right"), [(1e3, 2), (1e-3, 0)])
+def test_python_takes_a_task_with_options_of_its_own(tolerance: float, right: int) -> None:
+    network, task = load_model(Level(), input_size=8, read=Yaw().reader), Yaw(tolerance=tolerance)
+    fast: dict[str, Any] = {"spp": 1, "denoise": "none", "resolution": 16}
+    swept = advsearch.sweep("mug", network, {"pose.yaw": [0.0, 90.0]}, task=task, trials=0, **fast).summary
+    assert swept.worst is not None
+    assert (swept.task, swept.correct, swept.worst.label_set) == ("yaw", right, ["90.0"])
+    found = advsearch.attack(
+        "mug", network, task=task, controls={"pose": {"yaw": [0, 90]}}, policy="random", steps=3, trials=6,
+        verify_spp=1, measure="no", **fast,
+    )  # fmt: skip
+    assert found.summary.ending == ("budget spent" if right else "already wrong")
+    assert (found.summary.task, found.summary.objective) == ("yaw", "score")
+    with pytest.raises(InputError, match="model Level: expected logits, and it was loaded for another task"):
+        advsearch.attack("mug", network, **fast)
 
 
 def test_tasks_have_names() -> None:

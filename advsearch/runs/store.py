@@ -96,12 +96,12 @@ class Row:
         spp: samples per pixel of the render.
         objective: what was maximised; stored as None when it is not a number.
         success: whether the answer is what the attack is after; None where nothing is sought, as in a sweep.
-        correct: whether the answer is one of the right ones; None in rows of older runs.
-        margin: the largest logit of a wrong class minus the largest of a right one, over 0 where the model is wrong;
-            stored as None when it is not a number.
-        label: the class that the model answered.
-        label_index: its number.
-        probability: the model's probability for it, in [0, 1].
+        correct: whether the answer is right; None in rows of older runs.
+        margin: how wrong it is, by the run's task, over 0 where it is not right; in classification the largest logit of
+            a wrong class minus the largest of a right one; stored as None when it is not a number.
+        label: what the model answered, in words.
+        label_index: the number of that class; None where there are no classes.
+        probability: the model's probability for it, in [0, 1]; None where it gives none.
         values: parameter to ``{"value": ..., "unit": ...}``.
         seconds: that the evaluation took.
         renders: pictures that it took; None where that was not counted.

@@ -38,7 +38,7 @@ class RegionResult(RunResult):
 
     object: str
     model: str
-    task: str = Field(default="classification", description="what judges the answers; absent for classification")
+    task: str = Field(description="what judges the answers")
     verdict: str | None = Field(default=None, description="`right` or `wrong`, at the centre")
     box: list[BoxSide] | None = Field(default=None, description="for each parameter, the range of its values")
     same: int | None = Field(default=None, description="fresh samples of the box that had that verdict")

@@ -41,7 +41,7 @@ class RenderResult(Result):
     object: str
     environment: str
     model: str
-    task: str = Field(default="classification", description="what judges the answers; absent for classification")
+    task: str = Field(description="what judges the answers")
     spp: int = Field(description="samples a pixel")
     image_formation: Formation
     gain: float = Field(description="as in `image_formation`")
