@@ -77,7 +77,7 @@ def commands() -> dict[str, list[str]]:
         **found,
         "mixture": ["attack", "--control", f"pose,light,{texture}", *few],
         "over": ["attack", "--control", texture, "--over", "camera,light", *few],
-        "average": ["attack", "--control", "pose", "--average", "camera", *few],
+        "average": ["attack", "--control", "pose", "--average", "4", *few],
         "target": ["attack", "--control", texture, "--target", "bowl", *few],
         "minimise": ["attack", "--control", "pose", "--minimise", *few],
         "smallest": ["attack", "--control", texture, "--smallest", *few],

@@ -28,6 +28,9 @@ from advsearch.tasks import Answer, Judgement
 PLAN = "gradient plan"
 """The note under which the store keeps how derivatives are obtained."""
 
+TRANSPORT = "transport"
+"""That under which it keeps at which evaluations the matrix of light transport was made anew."""
+
 ANSWER = "answer"
 """The note under which it keeps the configuration that was verified, if it has at most `MOST_NUMBERS`."""
 
@@ -84,7 +87,11 @@ class Memory:
         return step < self.counts.get(kind, 0)
 
     def evaluator(
-        self, kind: str, make: Callable[[OnImage | None], Evaluate], frames: Frames | None = None
+        self,
+        kind: str,
+        make: Callable[[OnImage | None], Evaluate],
+        frames: Frames | None = None,
+        on_read: Callable[[str, int, Tensor], None] = lambda kind, index, u: None,
     ) -> Evaluate:
         """Return the evaluation that reads back what the log has of this kind, and adds to it what it has not.
 
@@ -92,6 +99,7 @@ class Memory:
             kind: of search.
             make: makes the real one, which tells its pictures.
             frames: what keeps pictures of the search.
+            on_read: told of each evaluation that is read back: kind, index, configuration.
 
         Raises:
             InputError: when called, if another configuration is proposed than the one that was stored.
@@ -113,6 +121,7 @@ class Memory:
             if (kind, number) in log:
                 entry = log.read(kind, number)
                 self._check(entry, u, index)
+                on_read(kind, index, u)
                 if frames is not None and "picture" in entry.arrays:
                     frames.add(torch.from_numpy(entry.arrays["picture"]).float() / 255.0)
                 return _evaluation(entry)

@@ -21,6 +21,7 @@ from advsearch.engine.memory import ANSWER, MOST_NUMBERS
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.rows import answered
+from advsearch.engine.transport import Transport
 from advsearch.errors import InputError
 from advsearch.files import Json
 from advsearch.report.notebook import attack_html
@@ -181,6 +182,7 @@ def _answers(
         "adversarial": asdict(found.answer) if findings.search else None,
         "verified": _verified(verification),
     }
+    summary["transport"] = _transport(findings)
     if findings.baseline is not None:
         summary["baseline"] = {
             "policy": "random",
@@ -207,6 +209,22 @@ def _answers(
         summary["gradients"] = _gradients(findings.search)
         summary["configuration"] = problem.describe(problem.domain.project(findings.search.best_u))
     return summary
+
+
+def _transport(findings: Findings) -> Json:
+    """What predicted the pictures of the searches, and how far it was off; or why nothing did."""
+    transport = findings.transport
+    if transport is None:
+        return {"used": False, "reason": findings.rendered_because or "nothing was searched"}
+    last = transport.deviations[-1] if transport.deviations else None
+    return {
+        "used": True,
+        "entries": transport.start.entries,
+        "bytes": transport.start.bytes,
+        "seconds": transport.seconds,
+        "renewed": sum(len(found) for found in transport.renewals.values()),
+        "error": None if last is None else vars(last),
+    }
 
 
 def _gradients(found: SearchResult) -> Json:
@@ -276,13 +294,15 @@ def _verified(verification: Verification | None) -> Json | None:
 
 
 def _costs(findings: Findings, problem: Problem) -> Json:
-    search, baseline = findings.search, findings.baseline
+    search, baseline, transport = findings.search, findings.baseline, findings.transport
+    products = [len(one.history) if one and transport else 0 for one in (search, baseline)]
     return {
         "renders": {
-            "search": search.renders * problem.draws if search else 0,
-            "gradient": search.gradients if search else 0,
-            "baseline": baseline.renders * problem.draws if baseline else 0,
+            "search": (search.renders * problem.draws if search else 0) - products[0] + _traced(transport),
+            "gradient": search.gradients if search and not transport else 0,
+            "baseline": (baseline.renders * problem.draws if baseline else 0) - products[1],
             "verification": findings.verification_renders + len(findings.first_look),
+            "products": sum(products),
         },
         "steps": len(search.history) if search else 0,
         "non_finite": {
@@ -290,6 +310,13 @@ def _costs(findings: Findings, problem: Problem) -> Json:
             "gradient_elements": search.non_finite_elements if search else 0,
         },
     }
+
+
+def _traced(transport: Transport | None) -> int:
+    """Pictures that were traced for matrices and comparisons."""
+    if transport is None:
+        return 0
+    return 1 + sum(len(found) for found in transport.renewals.values()) + 2 * len(transport.deviations)
 
 
 def _remarks(findings: Findings, problem: Problem) -> list[str]:

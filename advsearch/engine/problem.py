@@ -202,20 +202,29 @@ class Problem:
         def evaluate(u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
             noise = seeds.stream(self.seed, stream, index)
             if self.conditions is None:
-                return self._evaluate(u, noise, index, gradient, samples, on_image)[0]
+                return self.evaluated(u, noise, index, gradient, samples, on_image)[0]
             draws = [seeds.stream(noise, "draw", number) for number in range(self.draws)]
-            found = [self._evaluate(self.whole(u, d), d, index, gradient, samples, None) for d in draws]
+            found = [self.evaluated(self.whole(u, d), d, index, gradient, samples, None) for d in draws]
             if on_image is not None and on_image.wants(index):
                 on_image.tell(index, self.picture(u, noise, self.spp, drawn=False))
             return self._mean(found, u)
 
         return evaluate
 
-    def _evaluate(
-        self, whole: Tensor, noise: int, index: int, gradient: Wanted, samples: int, on_image: OnImage | None
+    def evaluated(
+        self,
+        whole: Tensor,
+        noise: int,
+        index: int,
+        gradient: Wanted,
+        samples: int,
+        on_image: OnImage | None,
+        renderer: Renderer | None = None,
     ) -> tuple[Evaluation, Output]:
-        """One picture of the whole space, judged, with the derivative that is wanted; and the model's output."""
-        before, renders, truth = self.renderer.non_finite, self.renderer.renders, self.truth(whole)
+        """One picture of the whole space, judged, with the derivative that is wanted; and the model's output. It is made
+        by the problem's renderer, or by another one."""
+        renderer = self.renderer if renderer is None else renderer
+        before, renders, truth = renderer.non_finite, renderer.renders, self.truth(whole)
         seen: list[tuple[Tensor, Output]] = []
 
         def loss(image: Tensor) -> Tensor:
@@ -224,12 +233,12 @@ class Problem:
             return self.objective(output, image[None], truth)[0]
 
         spp, derivative = self.spp * samples, None
-        with self.renderer.scene.shorter(self.search_depth):
+        with renderer.scene.shorter(self.search_depth):
             if gradient:
-                value, derivative = self.renderer.gradient(loss, whole, noise, spp, free=gradient == "free")
+                value, derivative = renderer.gradient(loss, whole, noise, spp, free=gradient == "free")
             else:
                 with torch.no_grad():
-                    value = loss(self.renderer(whole, seed=noise, spp=spp))
+                    value = loss(renderer(whole, seed=noise, spp=spp))
         image, output = seen[0]
         if on_image is not None and on_image.wants(index):
             on_image.tell(index, image)
@@ -239,8 +248,8 @@ class Problem:
             objective=float(value),
             gradient=derivative,
             success=judgement.success,
-            non_finite=self.renderer.non_finite - before,
-            cost=(self.renderer.renders - renders) * samples,
+            non_finite=renderer.non_finite - before,
+            cost=max(1, renderer.renders - renders) * samples,
             judgement=judgement,
         )
         return evaluation, output

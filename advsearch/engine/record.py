@@ -14,6 +14,7 @@ from advsearch.attacks.smallest import Bracket
 from advsearch.engine.memory import Memory
 from advsearch.engine.problem import Problem
 from advsearch.engine.rows import judged, trial_row
+from advsearch.engine.transport import Transport
 from advsearch.progress import Progress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
@@ -41,6 +42,8 @@ class Findings:
         smallest: the least epsilon, where it was asked for.
         frames: pictures of the search as 8-bit values in [0, 1], for the animation.
         interrupted: somebody pressed Ctrl-C.
+        transport: what predicted the pictures of the searches, if anything did.
+        rendered_because: why nothing did, in words.
         verification_renders: renders spent on choosing the sample count and on trials.
     """
 
@@ -56,6 +59,8 @@ class Findings:
     smallest: Bracket | None = None
     frames: list[Any] = field(default_factory=list)
     interrupted: bool = False
+    transport: Transport | None = None
+    rendered_because: str = ""
     verification_renders: int = 0
 
     @property

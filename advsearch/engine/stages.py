@@ -14,6 +14,7 @@ from advsearch import seeds
 from advsearch.attacks import (
     Domain,
     Ending,
+    Evaluate,
     Evaluation,
     Policy,
     SearchResult,
@@ -32,12 +33,14 @@ from advsearch.attacks.smallest import ATTEMPTS, MOST_CHECKS, ROUNDS, confirmed,
 from advsearch.config import AttackConfig
 from advsearch.engine.bounces import WORTH, bounces_of, most_pictures
 from advsearch.engine.gradients import inside
-from advsearch.engine.memory import PLAN, Frames, Memory
+from advsearch.engine.memory import PLAN, TRANSPORT, Frames, Memory
 from advsearch.engine.planning import cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.samples import search_samples, verification_ladder
+from advsearch.engine.transport import Transport, reason_against
 from advsearch.report.wording import count
+from advsearch.scene.transport.renderer import TransportTooLargeError
 from advsearch.tasks import Judgement
 
 FIRST_LOOK = 4
@@ -81,6 +84,7 @@ class Attack:
         try:
             self.plan()
             if self.worth_attacking():
+                self.collect_transport()
                 if self.config.smallest:
                     find_smallest(self)
                 else:
@@ -225,7 +229,7 @@ class Attack:
             before = record.renders
 
         found = run_search(
-            self.memory.evaluator(kind, lambda tell: self.problem.evaluator(kind, tell), frames),
+            self._evaluator(kind, frames),
             self.problem.domain if domain is None else domain,
             policy,
             steps=steps,
@@ -238,6 +242,33 @@ class Attack:
             self.findings.search = self.findings.search or found
             raise KeyboardInterrupt
         return found
+
+    def _evaluator(self, kind: str, frames: Frames | None) -> Evaluate:
+        """What the evaluations of a search come from: rendered, or predicted; what is stored is read back."""
+        transport = self.findings.transport
+        if transport is None:
+            return self.memory.evaluator(kind, lambda tell: self.problem.evaluator(kind, tell), frames)
+        return self.memory.evaluator(kind, lambda tell: transport.evaluator(kind, tell), frames, transport.passed)
+
+    def collect_transport(self) -> None:
+        """Make the matrix that predicts the pictures of the searches, where there can be one and it pays."""
+        problem, config, findings = self.problem, self.config, self.findings
+        findings.rendered_because = reason_against(problem, config.steps, config.specialise) or ""
+        if findings.rendered_because:
+            return
+        stored = self.memory.note(TRANSPORT) or {}
+        findings.transport = Transport(
+            problem,
+            config.steps,
+            renewals=stored,
+            keep=lambda renewals: self.memory.set_note(TRANSPORT, renewals),
+        )
+        hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"
+        self.stages.begin("transport", "collecting light transport", findings.transport.samples, hint=hint)
+        try:
+            findings.transport.prepare(self._advance)
+        except TransportTooLargeError as error:
+            findings.transport, findings.rendered_because = None, str(error)
 
     # ---- verification -----------------------------------------------------------------------------------------------
 

@@ -200,7 +200,7 @@ class Renderer:
         inputs = self.scene.assembly(self.space.inputs(u))
         applied = {name: inputs.pop(name) for name in ON_PICTURE if name in inputs}
         hide = "backdrop.color" in applied
-        rendered: Tensor = _Radiance.apply(self, tuple(inputs), seed, spp, hide, *inputs.values())  # type: ignore[no-untyped-call]
+        rendered = self._rendered(inputs, seed, spp, hide)
         radiance = rendered[..., :3]
         if "camera.exposure" in applied:
             radiance = radiance * torch.exp2(applied["camera.exposure"])
@@ -208,6 +208,11 @@ class Renderer:
             uncovered = (1.0 - rendered[..., 3:]).clamp(0.0, 1.0)
             radiance = radiance + uncovered * (applied["backdrop.color"] / self.formation.gain)
         return radiance
+
+    def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
+        """Radiance of scene inputs, with a graph, and with coverage if hidden."""
+        found: Tensor = _Radiance.apply(self, tuple(inputs), seed, spp, hide, *inputs.values())  # type: ignore[no-untyped-call]
+        return found
 
     # ---- the halves of the autograd functions -----------------------------------------------------------------------
 

@@ -130,6 +130,25 @@ class NotFinite(Fields):
     gradient_elements: int
 
 
+class PredictionError(Fields):
+    """How far a predicted picture was from a traced one, at the last comparison."""
+
+    levels: Number = Field(description="of 255: of the change of the picture, root mean square")
+    logits: Number = Field(description="of the objective")
+
+
+class LinearTransport(Fields):
+    """The matrix that predicted the pictures of the searches."""
+
+    used: bool
+    reason: str | None = Field(default=None, description="why every picture was rendered")
+    entries: int | None = Field(default=None, description="of the matrix")
+    bytes: int | None = Field(default=None, description="of its memory")
+    seconds: float | None = Field(default=None, description="that it and the comparisons took")
+    renewed: int | None = Field(default=None, description="how often it was made anew")
+    error: PredictionError | None = Field(default=None, description="of the last comparison")
+
+
 class AttackSummary(RunResult):
     """The worst configuration of a scene that was found, how sure that is, and what it cost."""
 
@@ -159,10 +178,13 @@ class AttackSummary(RunResult):
     smallest: SmallestEpsilon | None = Field(default=None, description="only with `smallest`")
     distribution: AnswerDistribution | None = Field(default=None, description="of a policy that answers with one")
     sample_count: VerificationSamples | None = Field(default=None, description="of the verification")
+    transport: LinearTransport | None = Field(
+        default=None, description="whether [a matrix of light transport](transport.md) predicted the searches' pictures"
+    )
     claimed: SearchClaim | None = Field(default=None, description="what the search itself believes")
     gradients: SearchGradients | None = Field(default=None, description="of the search")
     configuration: dict[str, DescribedValue] | None = Field(default=None, description="the answer in a few values")
-    renders: dict[str, int] = Field(description="of the search, its gradients, the baseline and the verification")
+    renders: dict[str, int] = Field(description="of the search, its gradients, the baseline and the verification; `products`: predicted instead")
     steps: int = Field(description="evaluations of the search before the reranking")
     non_finite: NotFinite
     warnings: list[str] = Field(description="sentences that a reader has to know")

@@ -25,6 +25,7 @@ from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS
 from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, leave_dark_lamps_out, mesh_translation, translation
 from advsearch.scene.mitsuba_backend.population import population
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER, next_count
+from advsearch.scene.mitsuba_backend.transport import Vertices, collect
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 
 MAX_DEPTH = 6
@@ -252,6 +253,21 @@ class MitsubaScene:
         population.changes += 1  # the first call loads integrators of its own
         found = {f"{name}.vertices": one for name, one in zip(names, by_vertices, strict=True)}
         return found | {f"{name}.normals": one for name, one in zip(names, by_normals, strict=True)}
+
+    def transport(self, inputs: Mapping[str, Tensor], name: str, seed: int, spp: int) -> list[Vertices]:
+        """Return what the vertices of light paths add to their pixels for a unit more of a base colour.
+
+        Args:
+            inputs: as in `radiance`.
+            name: an input that is a base colour.
+            seed: number of the noise.
+            spp: samples a pixel.
+        """
+        self._apply(inputs)
+        key, spp = self._inputs[name][0], next_count(self.sampler, spp)
+        return collect(
+            self._scene, self._parameters, key, depth=self.max_depth, seed=seed, spp=spp, sampler=self.sampler
+        )
 
     # ---- inside -----------------------------------------------------------------------------------------------------
 

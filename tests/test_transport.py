@@ -1,0 +1,170 @@
+"""Light transport as a matrix: its pictures against traced ones, its derivative against the adjoint, and searches."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import advsearch
+from advsearch.engine import transport as searching
+from advsearch.scene.mitsuba_backend.transport import Vertices
+from advsearch.scene.renderer import Renderer
+from advsearch.scene.transport import renderer as linear
+from advsearch.scene.transport.matrix import COARSE, TextureTransport
+
+SIZE = 64
+
+
+def levels(one: Tensor, other: Tensor) -> float:
+    """Root mean square difference of two pictures in levels of 255."""
+    return 255.0 * float(((one - other) ** 2).mean().sqrt())
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return advsearch.load_scene("mug").renderer({"texture": {"resolution": 64}}, resolution=SIZE)
+
+
+@pytest.fixture(scope="module")
+def predicted(renderer: Renderer) -> linear.LinearRenderer:
+    return linear.LinearRenderer(renderer, renderer.start, seed=1)
+
+
+def changed(renderer: Renderer, epsilon: float, kind: str) -> Tensor:
+    """A configuration `epsilon` of the range from the start: by a sign a number, or all one way."""
+    generator = torch.Generator().manual_seed(2)
+    way = {"signs": torch.randint(0, 2, renderer.start.shape, generator=generator) * 2.0 - 1.0}
+    return (renderer.start + epsilon * way.get(kind, torch.tensor(1.0 if kind == "up" else -1.0))).clamp(0.0, 1.0)
+
+
+@pytest.mark.parametrize(("kind", "most"), [("signs", 1.3), ("up", 2.0), ("down", 2.0)])
+def test_a_predicted_change_is_the_traced_one(
+    renderer: Renderer, predicted: linear.LinearRenderer, kind: str, most: float
+) -> None:
+    """Within an epsilon of 0.1; what is left is light that meets the object twice, and noise. The two traced pictures
+    of a change have the same noise."""
+    u = changed(renderer, 0.1, kind)
+    with torch.no_grad():
+        after, before = (renderer(one, seed=11, spp=256) for one in (u, renderer.start))
+        change = predicted(u) - predicted(renderer.start)
+    assert levels(change, after - before) < most
+    assert levels(after, before) > 3.0 * most, "the change itself is large"
+
+
+def test_what_it_starts_from_is_the_traced_picture(renderer: Renderer, predicted: linear.LinearRenderer) -> None:
+    with torch.no_grad():
+        one, other = (renderer(renderer.start, seed=seed, spp=256) for seed in (11, 12))
+        assert levels(predicted(renderer.start), one) < 1.5 * levels(one, other)
+
+
+def test_its_derivative_is_that_of_the_adjoint(renderer: Renderer, predicted: linear.LinearRenderer) -> None:
+    def loss(picture: Tensor) -> Tensor:
+        return (picture * picture).mean()
+
+    u = changed(renderer, 0.05, "signs")
+    _, exact = predicted.gradient(loss, u, seed=3, spp=1)
+    sampled = torch.stack([renderer.gradient(loss, u, seed=seed, spp=64)[1] for seed in range(4)]).mean(dim=0)
+    assert float(torch.nn.functional.cosine_similarity(exact, sampled, dim=0)) > 0.97
+    assert 0.9 < float(exact.norm() / sampled.norm()) < 1.1
+    assert torch.equal(exact, predicted.gradient(loss, u, seed=4, spp=8)[1]), "nothing of it is by chance"
+
+
+def vertices(rows: Sequence[tuple[int, float, float, float]]) -> Vertices:
+    """Vertices from rows of pixel, u, v and weight."""
+    table = np.array(rows, dtype=np.float32).reshape(-1, 4)
+    weight = torch.from_numpy(table[:, 3:]).expand(-1, 3).contiguous()
+    return Vertices(torch.from_numpy(table[:, 0]).long(), torch.from_numpy(table[:, 1:3]).contiguous(), weight)
+
+
+def test_a_lookup_is_bilinear_and_repeats_at_the_border() -> None:
+    """One vertex in the middle of a texel, one between two, one over the corner; their weights add up."""
+    made = TextureTransport((1, 3), (4, 4))
+    made.add([vertices([(0, 0.375, 0.625, 2.0), (1, 0.5, 0.625, 2.0), (2, 0.0, 0.0, 4.0)])], share=0.5)
+    made.finish()
+    texture = torch.arange(16.0).reshape(4, 4, 1).expand(-1, -1, 3).contiguous()
+    seen = made.times(texture)[0, :, 0]
+    corners = (texture[0, 0, 0] + texture[0, 3, 0] + texture[3, 0, 0] + texture[3, 3, 0]) / 4.0
+    assert seen.tolist() == pytest.approx([9.0, 9.5, 2.0 * float(corners)])
+
+
+def test_the_transpose_is_one() -> None:
+    generator = torch.Generator().manual_seed(0)
+    places = torch.rand(60, 2, generator=generator)
+    rows = [(int(60 * x) % 12, float(x), float(y), float(x - y)) for x, y in places]
+    made = TextureTransport((3, 4), (COARSE + 3, 2 * COARSE))
+    made.add([vertices(rows[:30]), vertices(rows[30:])], share=1.0)
+    made.finish()
+    change = torch.randn(COARSE + 3, 2 * COARSE, 3, generator=generator)
+    cotangent = torch.randn(3, 4, 3, generator=generator)
+    forward = float((made.times(change) * cotangent).sum())
+    assert forward == pytest.approx(float((change * made.transposed_times(cotangent)).sum()), rel=1e-5)
+
+
+def test_smoothed_rows_keep_where_they_look_and_take_the_sum_that_is_asked_for() -> None:
+    made = TextureTransport((1, 2), (COARSE, COARSE))
+    made.add([vertices([(0, 0.3, 0.3, 1.0), (0, 0.8, 0.3, 3.0), (1, 0.3, 0.3, 1.0)])], share=1.0)
+    made.finish(lambda picture: torch.full_like(picture, 2.0))
+    ones = torch.ones(COARSE, COARSE, 3)
+    assert made.times(ones)[0, :, 0].tolist() == pytest.approx([2.0, 2.0])
+    left = ones.clone()
+    left[:, COARSE // 2 :] = 0.0
+    assert made.times(left)[0, :, 0].tolist() == pytest.approx([0.5, 2.0], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("controls", "options", "reason"),
+    [
+        (["texture"], {}, None),
+        (["patch"], {}, None),
+        (["texture", "pose"], {}, "pose.yaw changes more than a base colour"),
+        ({"texture": {}, "haze": {"density": 0.2}}, {}, "there is haze"),
+        (["texture"], {"denoise": "none"}, "noise is part of the picture without the denoiser"),
+        (["texture"], {"estimators": {"texture": "adjoint"}}, "the estimator of texture.texels is forced"),
+    ],
+)
+def test_where_it_can_predict(controls: object, options: dict[str, object], reason: str | None) -> None:
+    made = advsearch.load_scene("mug").renderer(controls, resolution=16, **options)  # type: ignore[arg-type]
+    assert linear.why_not(made) == reason
+
+
+def test_a_matrix_that_is_too_large_is_not_made(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(linear, "MOST_BYTES", 1000)
+    with pytest.raises(linear.TransportTooLargeError, match="would take more than"):
+        linear.LinearRenderer(renderer, renderer.start, seed=1)
+
+
+# ---- searches -------------------------------------------------------------------------------------------------------
+
+SMALL = {"resolution": SIZE, "trials": 6, "steps": 18, "verify_spp": 8, "controls": {"texture": {"resolution": 8}}}
+
+
+def test_a_search_says_what_predicted_its_pictures(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """It compares, makes the matrix anew where that is off, and a run that goes on ends with the same rows."""
+    monkeypatch.setattr(searching, "EVERY", 6)
+    monkeypatch.setattr(searching, "BOUND", 0.0)
+    found = advsearch.attack("mug", run=tmp_path / "a", **SMALL)  # type: ignore[arg-type]
+    told, renders = found.summary["transport"], found.summary["renders"]
+    assert told["used"] and told["entries"] > 0 and told["error"]["levels"] >= 0.0
+    assert told["renewed"] == 2 and renders["products"] == 2 * 18 and renders["gradient"] == 0
+    kept = json.loads((tmp_path / "a" / "summary.json").read_text())
+    assert kept["transport"]["renewed"] == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({}, "pays from 16"),
+        ({"specialise": False}, "nothing is left out"),
+        ({"over": ["light"]}, "by chance"),
+    ],
+)
+def test_a_search_that_renders_says_why(options: dict[str, object], reason: str) -> None:
+    found = advsearch.attack("mug", **{**SMALL, "steps": 3, "resolution": 32, "baseline": False, **options})  # type: ignore[arg-type]
+    assert not found.summary["transport"]["used"] and reason in found.summary["transport"]["reason"]
+    assert found.summary["renders"]["products"] == 0
