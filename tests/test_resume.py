@@ -104,7 +104,9 @@ class StandInProblem:
 
 
 def configuration(policy: str = "pgd", **more: Any) -> AttackConfig:
-    return AttackConfig(object="mug", policy=policy, steps=25, trials=6, average=5, measure="no", verify_spp=8, **more)
+    return AttackConfig(
+        object="mug", policy=policy, steps=25, trials=6, average=5, measure="no", verify_spp=8, specialise=False, **more
+    )
 
 
 def carry_out(folder: Path, config: AttackConfig, *, pause: float = 0.0, resume: bool = False) -> Findings:

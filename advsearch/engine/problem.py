@@ -221,8 +221,8 @@ class Problem:
         on_image: OnImage | None,
         renderer: Renderer | None = None,
     ) -> tuple[Evaluation, Output]:
-        """One picture of the whole space, judged, with the derivative that is wanted; and the model's output. It is made
-        by the problem's renderer, or by another one."""
+        """One picture of the whole space, by the problem's renderer or by another one, judged, with the derivative that
+        is wanted; and the model's output."""
         renderer = self.renderer if renderer is None else renderer
         before, renders, truth = renderer.non_finite, renderer.renders, self.truth(whole)
         seen: list[tuple[Tensor, Output]] = []
