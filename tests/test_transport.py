@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from test_resume import rows
 from torch import Tensor
 
 import advsearch
 from advsearch.engine import transport as searching
+from advsearch.progress import NullProgress
 from advsearch.scene.mitsuba_backend.transport import Vertices
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport import renderer as linear
@@ -154,6 +157,33 @@ def test_a_search_says_what_predicted_its_pictures(monkeypatch: pytest.MonkeyPat
     assert told["renewed"] == 2 and renders["products"] == 2 * 18 and renders["gradient"] == 0
     kept = json.loads((tmp_path / "a" / "summary.json").read_text())
     assert kept["transport"]["renewed"] == 2
+
+
+class Impatient(NullProgress):
+    """Presses Ctrl-C after so many evaluations of the search."""
+
+    def __init__(self, after: int) -> None:
+        self._left, self._searching = after, False
+
+    def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
+        self._searching = name.startswith("searching with")
+
+    def advance(self, n: int = 1, **info: float | str) -> None:
+        self._left -= self._searching
+        if self._searching and self._left == 0:
+            raise KeyboardInterrupt
+
+
+def test_a_search_that_goes_on_ends_with_the_same_rows(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Though what is read back is not predicted again: the matrix was made anew once before the interrupt."""
+    monkeypatch.setattr(searching, "EVERY", 6)
+    monkeypatch.setattr(searching, "BOUND", 0.0)
+    settings: Any = {**SMALL, "baseline": False, "deterministic": True}
+    advsearch.attack("mug", run=tmp_path / "whole", **settings)
+    stopped = advsearch.attack("mug", run=tmp_path / "parts", progress=Impatient(9), **settings)
+    assert stopped.summary["ending"] == "interrupted"
+    advsearch.attack("mug", run=tmp_path / "parts", resume=True, **settings)
+    assert rows(tmp_path / "parts") == rows(tmp_path / "whole")
 
 
 @pytest.mark.parametrize(
