@@ -152,9 +152,9 @@ def test_a_search_says_what_predicted_its_pictures(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(searching, "EVERY", 6)
     monkeypatch.setattr(searching, "BOUND", 0.0)
     found = advsearch.attack("mug", run=tmp_path / "a", **SMALL)  # type: ignore[arg-type]
-    told, renders = found.summary["transport"], found.summary["renders"]
-    assert told["used"] and told["entries"] > 0 and told["error"]["levels"] >= 0.0
-    assert told["renewed"] == 2 and renders["products"] == 2 * 18 and renders["gradient"] == 0
+    told, renders = found.summary.transport, found.summary.renders
+    assert told is not None and told.used and told.entries and told.error and told.error.levels >= 0.0
+    assert told.renewed == 2 and renders["products"] == 2 * 18 and renders["gradient"] == 0
     kept = json.loads((tmp_path / "a" / "summary.json").read_text())
     assert kept["transport"]["renewed"] == 2
 
@@ -181,7 +181,7 @@ def test_a_search_that_goes_on_ends_with_the_same_rows(monkeypatch: pytest.Monke
     settings: Any = {**SMALL, "baseline": False, "deterministic": True}
     advsearch.attack("mug", run=tmp_path / "whole", **settings)
     stopped = advsearch.attack("mug", run=tmp_path / "parts", progress=Impatient(9), **settings)
-    assert stopped.summary["ending"] == "interrupted"
+    assert stopped.summary.ending == "interrupted"
     advsearch.attack("mug", run=tmp_path / "parts", resume=True, **settings)
     assert rows(tmp_path / "parts") == rows(tmp_path / "whole")
 
@@ -196,5 +196,6 @@ def test_a_search_that_goes_on_ends_with_the_same_rows(monkeypatch: pytest.Monke
 )
 def test_a_search_that_renders_says_why(options: dict[str, object], reason: str) -> None:
     found = advsearch.attack("mug", **{**SMALL, "steps": 3, "resolution": 32, "baseline": False, **options})  # type: ignore[arg-type]
-    assert not found.summary["transport"]["used"] and reason in found.summary["transport"]["reason"]
-    assert found.summary["renders"]["products"] == 0
+    told = found.summary.transport
+    assert told is not None and not told.used and reason in str(told.reason)
+    assert found.summary.renders["products"] == 0

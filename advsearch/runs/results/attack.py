@@ -184,7 +184,9 @@ class AttackSummary(RunResult):
     claimed: SearchClaim | None = Field(default=None, description="what the search itself believes")
     gradients: SearchGradients | None = Field(default=None, description="of the search")
     configuration: dict[str, DescribedValue] | None = Field(default=None, description="the answer in a few values")
-    renders: dict[str, int] = Field(description="of the search, its gradients, the baseline and the verification; `products`: predicted instead")
+    renders: dict[str, int] = Field(
+        description="of the search, its gradients, the baseline and the verification; `products`: predicted instead"
+    )
     steps: int = Field(description="evaluations of the search before the reranking")
     non_finite: NotFinite
     warnings: list[str] = Field(description="sentences that a reader has to know")
