@@ -1209,3 +1209,10 @@ def test_real_cow_is_the_same_from_both_formats() -> None:
     points = np.random.default_rng(0).permutation(one.mesh.vertices[one.mesh.faces].mean(axis=1))[:300]
     assert color_at(one, points) == pytest.approx(color_at(other, points), abs=0.02)
     assert one.warnings == () and one.mesh.vertices.max() == pytest.approx(other.mesh.vertices.max(), abs=1e-5)
+
+
+def test_a_huge_texture_coordinate_is_looked_up() -> None:
+    texture = np.random.default_rng(0).random((4, 6, 3), dtype=np.float32)
+    assert np.isfinite(sampled(texture, np.array([[1e308, -1e308], [-1e308, 1.0]]))).all()
+    near = np.array([[0.3, 0.7]])
+    assert np.allclose(sampled(texture, near + np.array([[2.0, -3.0]])), sampled(texture, near), atol=1e-5)

@@ -211,7 +211,8 @@ def sampled(texture: Floats, uvs: Array) -> Floats:
         (T, 3) float32.
     """
     height, width = texture.shape[:2]
-    x, y = uvs[:, 0] * width - 0.5, (1.0 - uvs[:, 1]) * height - 0.5
+    u, v = (uvs % 1.0).T  # first, since a huge number times a width is infinite
+    x, y = u * width - 0.5, (1.0 - v) * height - 0.5
     left, top = np.floor(x), np.floor(y)
     fx, fy = (x - left).astype(np.float32)[:, None], (y - top).astype(np.float32)[:, None]
     columns = [((left + k) % width).astype(np.int64) for k in (0, 1)]
