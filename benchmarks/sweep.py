@@ -29,7 +29,7 @@ threads.configure()
 
 from advsearch.config import SweepConfig  # noqa: E402
 from advsearch.engine.loading import as_controls, framed, load_scene  # noqa: E402
-from advsearch.engine.sweeps import view  # noqa: E402
+from advsearch.engine.sweeps import swept_scene  # noqa: E402
 from advsearch.engine.sweeps.axes import read_axes  # noqa: E402
 from advsearch.engine.sweeps.job import Job, Place  # noqa: E402
 from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
@@ -98,7 +98,9 @@ class Watch(NullProgress):
 
 def constant(configurations: int) -> None:
     """Print the speed of the loop and how much its memory grows, for a grid and for draws."""
-    mock.patch.object(view, "make_renderer", lambda scene, space, size, *more, **named: ConstantRenderer(size)).start()
+    mock.patch.object(
+        swept_scene, "make_renderer", lambda scene, space, size, *more, **named: ConstantRenderer(size)
+    ).start()
     model = load_model(Trivial(), labels=("mug", "vase"), input_size=16, name="trivial")
     side = max(1, round(configurations**0.5))
     grid = {"pose.yaw": f"0:360:{side}", "camera.elevation": f"5:60:{side}"}

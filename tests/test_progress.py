@@ -28,7 +28,7 @@ from advsearch.config import AttackConfig, PlanConfig, PrecisionConfig, RegionCo
 from advsearch.engine.memory import Memory
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.stages import Attack
-from advsearch.engine.sweeps.view import View
+from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.runs.directory import RunDirectory
 
 JARGON = re.compile(r"set-up|rerank|adjoint|estimator|baseline|sample count|spp|bounces$|verification", re.IGNORECASE)
@@ -270,7 +270,7 @@ def test_a_resumed_sweep_takes_the_probes_of_its_worst_configuration_from_the_st
     config = SweepConfig(**SMALL, grid={"pose.yaw": "0,90"}, trials=14, run=str(tmp_path / "whole"))
     whole = sweep_from_config(config)
     rendered, stop = 0, 5
-    once = View.trial
+    once = SweptScene.trial
 
     def trial(self: Any, *given: Any) -> Any:
         nonlocal rendered
@@ -279,7 +279,7 @@ def test_a_resumed_sweep_takes_the_probes_of_its_worst_configuration_from_the_st
             raise KeyboardInterrupt
         return once(self, *given)
 
-    monkeypatch.setattr(View, "trial", trial)
+    monkeypatch.setattr(SweptScene, "trial", trial)
     cut = sweep_from_config(config.model_copy(update={"run": str(tmp_path / "run")}))
     assert cut.summary.ending == "interrupted"
     stop, rendered = 0, 0

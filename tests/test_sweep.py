@@ -38,7 +38,7 @@ from advsearch.config import SweepConfig
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
 from advsearch.engine.domains import domain_of
-from advsearch.engine.sweeps import view
+from advsearch.engine.sweeps import swept_scene
 from advsearch.engine.sweeps.axes import axis_values, on_grid, read_axes
 from advsearch.engine.sweeps.loop import KIND, Sweep
 from advsearch.engine.sweeps.points import BINS, Points
@@ -105,7 +105,7 @@ def fake(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Non
     FakeRenderer.made, FakeRenderer.calls, FakeRenderer.stops_at, FakeRenderer.level = [], 0, None, None
     FakeRenderer.stops_with = KeyboardInterrupt
     if "really_rendered" not in request.node.name:
-        monkeypatch.setattr(view, "make_renderer", FakeRenderer)
+        monkeypatch.setattr(swept_scene, "make_renderer", FakeRenderer)
 
 
 def model(threshold: float = 0.55, name: str = "brightness", size: int = SIZE) -> advsearch.Model:
@@ -634,7 +634,7 @@ PICTURES, WHOLE = 2 * 6 * 3 * 3, 108 + 16 + 6 + 1
 def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[list[Any], dict[str, Any]]]:
     path = tmp_path_factory.mktemp("whole") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(view, "make_renderer", FakeRenderer)
+        patch.setattr(swept_scene, "make_renderer", FakeRenderer)
         FakeRenderer.made, FakeRenderer.calls = [], 0
         summary = advsearch.sweep("mug", model(), run=path, **SURVIVES).summary
         assert FakeRenderer.calls == WHOLE

@@ -107,7 +107,7 @@ def train(cache: Path, counts: dict[str, int], epochs: int, seed: int) -> None:
     images, truth = pictures(cache, "train", counts["train"], seed)
     held, held_truth = pictures(cache, "validation", counts["validation"], seed)
 
-    def say(state: training.Progress) -> None:
+    def say(state: training.TrainingState) -> None:
         if state.step % 50 == 0:
             print(
                 f"step {state.step} of {state.steps}, loss {state.loss:.3f}, {state.seconds_left / 60:.1f} min left",

@@ -23,7 +23,7 @@ LARGEST_GRADIENT_NORM = 2.0
 
 
 @dataclass(frozen=True)
-class Progress:
+class TrainingState:
     """Where a training is: told to the callback after every step."""
 
     epoch: int
@@ -68,7 +68,7 @@ def train(
     average_decay: float = 0.998,
     bfloat16: bool = True,
     validation: tuple[Images, Sequence[int] | Tensor] | None = None,
-    progress: Callable[[Progress], None] | None = None,
+    progress: Callable[[TrainingState], None] | None = None,
 ) -> Trained:
     """Train a reference network from nothing.
 
@@ -166,7 +166,7 @@ class _Loop:
         epochs: int,
         batch_size: int,
         validation: tuple[Images, Sequence[int] | Tensor] | None,
-        progress: Callable[[Progress], None],
+        progress: Callable[[TrainingState], None],
     ) -> Epoch:
         """Run one epoch and return what it did."""
         begun = time.perf_counter()
@@ -185,7 +185,7 @@ class _Loop:
             self.step += 1
             elapsed = time.perf_counter() - self.started
             left = elapsed / self.step * (steps - self.step)
-            progress(Progress(number, self.step, steps, loss, self.step * batch_size / elapsed, left))
+            progress(TrainingState(number, self.step, steps, loss, self.step * batch_size / elapsed, left))
         checked = evaluate(self.average, *validation) if validation else None
         seconds = time.perf_counter() - begun
         rate = self.optimiser.param_groups[0]["lr"]

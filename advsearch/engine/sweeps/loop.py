@@ -23,7 +23,7 @@ from advsearch.engine.samples import search_samples
 from advsearch.engine.sweeps.job import Job, check_all
 from advsearch.engine.sweeps.points import Picks, Points
 from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally
-from advsearch.engine.sweeps.view import View
+from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.engine.sweeps.worst import check_worst
 from advsearch.files import Json
 from advsearch.progress import Progress
@@ -118,7 +118,7 @@ class Sweep:
         self.samples = search_samples(job.config)
         self._seeds = Seeds(job.config.seed, KIND)
         self._kept: list[store.Row] = []
-        self._view: View | None = None
+        self._view: SweptScene | None = None
         self._rendered = 0
         self._not_finite = run is not None and run.store.note(NOT_FINITE) is not None
         self._told, self._untold = 0.0, 0
@@ -167,7 +167,7 @@ class Sweep:
                 self._batch(view, numbers, tally)
             begin = 0
 
-    def _batch(self, view: View, numbers: range, tally: Tally) -> None:
+    def _batch(self, view: SweptScene, numbers: range, tally: Tally) -> None:
         """Render, classify and store neighbouring pictures of a scene, then count them."""
         begun = time.perf_counter()
         before = view.number * self.per_scene
@@ -211,11 +211,11 @@ class Sweep:
             self.stages.progress.advance(self._untold, accuracy=tally.correct / tally.seen)
             self._told, self._untold = now, 0
 
-    def _open(self, scene: int) -> View:
+    def _open(self, scene: int) -> SweptScene:
         """The scene with this number; loading it lets the one before go."""
         if self._view is None or self._view.number != scene:
             self._view = None
-            self._view = View(self.job, scene)
+            self._view = SweptScene(self.job, scene)
         return self._view
 
     # ---- counting ---------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from advsearch.engine.rows import judgement_of, trial_row
 from advsearch.engine.samples import verification_ladder
 from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.summary import verified
-from advsearch.engine.sweeps.view import View
+from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.runs.directory import RunDirectory
 from advsearch.seeds import stream
 from advsearch.tasks import Judgement
@@ -29,7 +29,7 @@ KIND, PROBES = "verification", "sample count worst"
 
 
 def check_worst(
-    view: View, job: Job, model: int, u: Tensor, run: RunDirectory | None, stages: Stages
+    view: SweptScene, job: Job, model: int, u: Tensor, run: RunDirectory | None, stages: Stages
 ) -> dict[str, Any] | None:
     """Render a configuration again, and say how often the model is wrong.
 

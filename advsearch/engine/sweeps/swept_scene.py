@@ -20,7 +20,7 @@ from advsearch.tasks import Judgement
 Values = dict[str, Value]
 
 
-class View:
+class SweptScene:
     """One scene, ready to be rendered and shown to the models.
 
     Args:
