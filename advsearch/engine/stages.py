@@ -417,6 +417,8 @@ class Attack:
         """Begin the stage of a search of at most so many steps, and its ranking."""
         renders = planned_renders(steps, close=self.config.close_looks)
         hint = f"{renders} pictures of {count(self.problem.spp, 'sample')} a pixel; {shorter}"
+        if self.findings.transport is not None:
+            hint = f"{steps} pictures predicted and {renders - steps} traced; {shorter}"
         self.stages.begin(name, title, renders, hint=hint, at_most=True)
 
     def _begin_trials(

@@ -118,7 +118,7 @@ class Transport:
         present = self._present.get(kind, self.start)
         if isinstance(present, Tensor):
             present = self._made(present[:-1], kind, int(present[-1]))
-        if index and index % EVERY == 0 and kind == "search":
+        if index and index % EVERY == 0 and kind.startswith("search"):
             found = self.deviation(present, u, index)
             self.deviations.append(found)
             if found.levels > BOUND:

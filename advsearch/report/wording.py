@@ -190,7 +190,7 @@ def _epsilons(told: Mapping[str, float] | None) -> str:
 def renders_text(summary: AttackSummary) -> str:
     """Return ``40 of the search, 40 gradients, 21 of the verification``."""
     known = {"search": "of the search", "gradient": "gradients", "verification": "of the verification"}
-    known["baseline"] = "of the random search"
+    known |= {"baseline": "of the random search", "products": "predicted"}
     spent = [f"{number} {known.get(name, f'of {name}')}" for name, number in summary.renders.items() if number]
     return ", ".join(spent) or "none"
 
