@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from advsearch.api.attack import attack as attack
-    from advsearch.api.questions import gap as gap
-    from advsearch.api.questions import region as region
+    from advsearch.api.gap import gap as gap
+    from advsearch.api.region import region as region
     from advsearch.api.render import Rendering as Rendering
     from advsearch.api.render import render as render
     from advsearch.api.sweep import sweep as sweep
@@ -35,10 +35,10 @@ _HOMES = {
     "Scene": "advsearch.engine.loading",
     "SweepResult": "advsearch.engine.sweeps.loop",
     "attack": "advsearch.api.attack",
-    "gap": "advsearch.api.questions",
+    "gap": "advsearch.api.gap",
     "load_model": "advsearch.models",
     "load_scene": "advsearch.engine.loading",
-    "region": "advsearch.api.questions",
+    "region": "advsearch.api.region",
     "render": "advsearch.api.render",
     "sweep": "advsearch.api.sweep",
 }

@@ -411,7 +411,7 @@ def test_a_bracket_says_what_is_known_of_both_ends(bracket: dict[str, Any], text
 
 def test_several_controls_have_a_budget_each() -> None:
     several = attack(
-        controls=["texture", "pose"], epsilon={"texture": 0.05, "pose": None}, norm={"texture": "l2", "pose": None}
+        controls=["texture", "pose"], epsilon={"texture": 0.05, "pose": None}, norm={"texture": "l2", "pose": "box"}
     )
     assert wording.budget_text(several) == "texture within 0.05 (l2) and pose"
     assert wording.renders_text(attack(renders={"search": 8, "gradient": 0})) == "8 of the search"

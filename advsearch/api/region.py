@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -16,6 +16,7 @@ from advsearch.attacks import make_policy
 from advsearch.attacks.region import ATTEMPTS, LEVELS, Part, Region, grow
 from advsearch.config import AttackConfig, RegionConfig, SceneConfig
 from advsearch.engine.memory import ANSWER, Memory
+from advsearch.engine.naming import Named, options_of
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.stages import Attack
@@ -48,6 +49,45 @@ class Varied:
 
     names: tuple[str, ...]
     places: Tensor
+
+
+def region(
+    object: str | Path,
+    model: str | Path = "reference",
+    *,
+    environment: str | Path | None = None,
+    up: Literal["y", "z"] | None = None,
+    set: Mapping[str, float | str | Sequence[float]] | None = None,
+    exposure: float = 0.0,
+    resolution: int | str | tuple[int, int] | None = None,
+    labels: str | Path | None = None,
+    label: str | int | Sequence[str] | None = None,
+    task: str = "classification",
+    controls: Named = "texture",
+    texture_resolution: int | None = None,
+    spp: int | Literal["auto"] | None = None,
+    denoise: Literal["oidn", "none"] = "oidn",
+    pixel_sampler: Literal["independent", "multijitter"] = "multijitter",
+    seed: int = 0,
+    threads: int | None = None,
+    deterministic: bool = False,
+    run: str | Path | None = None,
+    overwrite: bool = False,
+    around: str | None = None,
+    vary: str | None = None,
+    samples: int = 200,
+    map: int = 0,
+    verify_spp: int | None = None,
+    progress: Progress | None = None,
+) -> RegionResult:
+    """Grow the box around a configuration in which the verdict stays what it is (docs/questions.md).
+
+    The arguments are the settings of `advsearch region` by the same names. The run is kept, in `run` or under runs/.
+
+    Raises:
+        InputError: anything that the caller can put right.
+    """
+    return region_from_config(RegionConfig(**options_of(locals(), RegionConfig, ())), progress=progress)
 
 
 def region_from_config(

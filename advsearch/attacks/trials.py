@@ -67,22 +67,3 @@ class Trials:
     def interval(self) -> tuple[float, float]:
         """95 % Clopper-Pearson interval of the rate."""
         return clopper_pearson(self.successes, self.trials)
-
-    def to_dict(self) -> dict[str, object]:
-        """Return the form of `verified` in summary.json (docs/design.md, "summary.json")."""
-        return {
-            "successes": self.successes,
-            "trials": self.trials,
-            "rate": self.rate,
-            "interval": list(self.interval),
-            "spp": self.spp,
-        }
-
-    def to_control_dict(self) -> dict[str, object]:
-        """Return the form of `clean.control` in summary.json: the successes are right answers."""
-        return {
-            "correct": self.successes,
-            "trials": self.trials,
-            "rate": self.rate,
-            "interval": list(self.interval),
-        }

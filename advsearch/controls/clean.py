@@ -41,10 +41,6 @@ class Moved:
     scene: Number
     used: Number
 
-    def to_dict(self) -> dict[str, Number]:
-        """Return what `summary.json` holds of it."""
-        return {"parameter": self.parameter, "unit": self.unit, "scene": self.scene, "used": self.used}
-
 
 def sentences(moved: Sequence[Moved]) -> list[str]:
     """Return what is said of the values that had to move: one sentence a control."""

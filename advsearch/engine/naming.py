@@ -17,6 +17,9 @@ from advsearch.models.loading import named_code
 from advsearch.settings import split_names
 from advsearch.tasks import Task, make_task
 
+Named = str | Sequence[str] | Mapping[str, Mapping[str, object] | None]
+"""Controls by name; a mapping gives each name its settings."""
+
 
 def scene_settings(fixed: Mapping[str, Any] | None, exposure: float | None) -> dict[str, Any]:
     """Return the parameters that a scene is loaded with: those of `set`, and the exposure.

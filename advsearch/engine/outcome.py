@@ -5,34 +5,54 @@ from __future__ import annotations
 import json
 import statistics
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.attacks import Ending, SearchResult, Trials, Verification, count_right
+from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.smallest import Bracket
 from advsearch.config import AttackConfig
 from advsearch.engine.memory import ANSWER, MOST_NUMBERS
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
-from advsearch.engine.rows import answered
+from advsearch.engine.rows import verified_rate
 from advsearch.engine.transport import Transport
 from advsearch.errors import InputError
-from advsearch.files import Json
 from advsearch.report.notebook import attack_html
 from advsearch.report.page import write_report
 from advsearch.runs import images, store
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.attack import AttackSummary
+from advsearch.runs.results.attack import (
+    AnswerDistribution,
+    AttackSummary,
+    AverageCase,
+    BaselineSearch,
+    CleanAnswer,
+    ControlGroup,
+    DescribedValue,
+    LinearTransport,
+    NotFinite,
+    PathSegments,
+    PredictionError,
+    SearchClaim,
+    SearchGradients,
+    SmallestEpsilon,
+    UsualAnswer,
+    VerificationSamples,
+    VerifiedRate,
+)
+from advsearch.runs.results.base import Formation, MovedValue
 from advsearch.scene.formation import to_8_bit
 from advsearch.tasks.base import typical
+
+T = TypeVar("T")
 
 PICTURE_SPP = 64
 """Samples a pixel of the pictures that are kept, unless verification needed more."""
@@ -116,10 +136,7 @@ def summarise(
     )
     space = problem.searched_space
     artifacts = space.artifacts(u)
-    answers = _answers(config, problem, findings, u, clean, adversarial)
     run = recorder.run
-    costs = _costs(findings, problem)
-    where = {"run": None if run is None else str(run.path)}
     warnings = [*said, *_remarks(findings, problem)]
     if run is not None:
         _write_pictures(run, problem, findings, linear, clean, adversarial)
@@ -128,9 +145,9 @@ def summarise(
             write_bytes(run.path / "artifacts" / name, data)
         if u.numel() <= MOST_NUMBERS:
             run.store.set_note(ANSWER, json.dumps(u.tolist()))
-    asked = {"seed": config.seed, "command_line": config.command_line()}
-    seconds = {**stages.seconds, "total": stages.total}
-    summary = AttackSummary.of({**where, **answers, **costs, "seconds": seconds, **asked, "warnings": warnings})
+    summary = _summary(config, problem, findings, clean, adversarial, u)
+    where = {"run": None if run is None else str(run.path), "warnings": warnings}
+    summary = summary.model_copy(update={**where, "seconds": {**stages.seconds, "total": stages.total}})
     if run is not None:
         run.write_summary(summary)
         write_report(run.path)
@@ -142,138 +159,176 @@ def summarise(
 # ---- the summary ----------------------------------------------------------------------------------------------------
 
 
-def _answers(
-    config: AttackConfig, problem: Problem, findings: Findings, u: Tensor, clean: Tensor, adversarial: Tensor
-) -> Json:
-    verification, task, start = findings.verification, problem.task, problem.domain.start
-    clean_trial = typical(findings.clean) if findings.clean else problem.judge(clean, problem.whole(start))
-    trials = verification.adversarial_trials if verification else (problem.judge(adversarial, problem.whole(u)),)
-    found = typical(trials)
-    control = count_right(findings.clean, findings.spp) if findings.clean else None
+def _summary(
+    config: AttackConfig, problem: Problem, findings: Findings, clean: Tensor, adversarial: Tensor, u: Tensor
+) -> AttackSummary:
+    """All but where it is kept, how long it took and what there is to say."""
+    task, search, baseline = problem.task, findings.search, findings.baseline
+    judgement = typical(findings.clean) if findings.clean else problem.judge(clean, problem.whole(problem.domain.start))
     controls = problem.searched_space.controls
-    budgets = [bound.budget for bound in controls]
-    summary: Json = {
-        "object": config.object,
-        "model": problem.model.name,
-        "task": task.name,
-        "environment": problem.space.environment or config.lit_by,
-        "controls": [bound.name for bound in controls],
-        "policy": config.policy_name,
-        "objective": config.objective or task.objective,
-        "epsilon": budgets[0].epsilon if len(budgets) == 1 else {b.name: b.budget.epsilon for b in controls},
-        "norm": budgets[0].norm if len(budgets) == 1 else {b.name: b.budget.norm for b in controls},
-        "label_set": list(task.truth_names(problem.truth())),
-        "goal": task.goal,
-        "target": list(task.target_names) or None,
-        "over": [bound.name for bound in problem.space.controls[len(controls) :]],
-        "ending": _ending(findings, problem).value,
-        "image_formation": problem.renderer.formation,
-        "gradient_plan": problem.plan_summary(problem.plan),
-        "light_path_segments": {
-            "search": problem.search_depth or problem.renderer.scene.max_depth,
-            "verification": problem.renderer.scene.max_depth,
-        },
-        "clean": {
-            **asdict(clean_trial.answer),
-            "correct": clean_trial.right,
-            "moved": list(problem.space.moved),
-            "control": control.to_control_dict() if control else None,
-        },
-        "adversarial": asdict(found.answer) if findings.search else None,
-        "verified": _verified(verification),
-    }
-    summary["transport"] = _transport(findings)
-    if findings.baseline is not None:
-        summary["baseline"] = {
-            "policy": "random",
-            "renders": findings.baseline.renders * problem.draws,
-            "verified": _verified(findings.baseline_verification),
-        }
-    if findings.beaten is not None:
-        summary["answer_from"] = "random"
-        summary["policy_verified"] = _verified(findings.beaten)
-    if findings.average:
-        summary["average"] = _average(findings, problem)
-    if findings.smallest is not None:
-        summary["smallest"] = _smallest(findings.smallest, problem)
-    if findings.search is not None and findings.search.distribution is not None:
-        summary["distribution"] = _distribution(findings.search.distribution, problem)
-    if findings.sample_count is not None:
-        summary["sample_count"] = {"spp": findings.sample_count.spp, "converged": findings.sample_count.converged}
-    if findings.search is not None:
-        summary["claimed"] = {
-            "objective": findings.search.claimed_objective,
-            "re_evaluated": findings.search.best_objective,
-            "success_rate": findings.search.success_rate,
-        }
-        summary["gradients"] = _gradients(findings.search)
-        summary["configuration"] = problem.describe(problem.domain.project(findings.search.best_u))
-    return summary
+    budgets = {bound.name: bound.budget for bound in controls}
+    depth = problem.renderer.scene.max_depth
+    count = findings.sample_count
+    return AttackSummary(
+        run=None,
+        object=config.object,
+        model=problem.model.name,
+        task=task.name,
+        environment=problem.space.environment or config.lit_by,
+        controls=list(budgets),
+        policy=config.policy_name,
+        objective=config.objective or task.objective,
+        epsilon=_alone({name: budget.epsilon for name, budget in budgets.items()}),
+        norm=_alone({name: budget.norm for name, budget in budgets.items()}),
+        label_set=list(task.truth_names(problem.truth())),
+        goal=task.goal,
+        target=list(task.target_names) or None,
+        over=[bound.name for bound in problem.space.controls[len(controls) :]],
+        ending=_ending(findings, problem).value,
+        image_formation=Formation.of(problem.renderer.formation),
+        gradient_plan=problem.plan_summary(problem.plan),
+        light_path_segments=PathSegments(search=problem.search_depth or depth, verification=depth),
+        clean=CleanAnswer(
+            **vars(judgement.answer),
+            correct=judgement.right,
+            moved=[MovedValue.of(one) for one in problem.space.moved],
+            control=_control(findings),
+        ),
+        adversarial=_adversarial(problem, findings, adversarial, u),
+        verified=_verified(findings.verification),
+        baseline=None
+        if baseline is None
+        else BaselineSearch(
+            policy="random",
+            renders=baseline.renders * problem.draws,
+            verified=_verified(findings.baseline_verification),
+        ),
+        answer_from="random" if findings.beaten is not None else None,
+        policy_verified=_verified(findings.beaten),
+        average=_average(findings) if findings.average else None,
+        smallest=None if findings.smallest is None else _smallest(findings.smallest, problem),
+        distribution=_distribution(search.distribution, problem) if search and search.distribution else None,
+        transport=_transport(findings),
+        sample_count=None if count is None else VerificationSamples(spp=count.spp, converged=count.converged),
+        claimed=None
+        if search is None
+        else SearchClaim(
+            objective=search.claimed_objective, re_evaluated=search.best_objective, success_rate=search.success_rate
+        ),
+        gradients=None if search is None else _gradients(search),
+        configuration=None if search is None else _described(problem, search.best_u),
+        renders=_renders(findings, problem),
+        steps=len(search.history) if search else 0,
+        non_finite=NotFinite(
+            objectives=search.non_finite_objectives if search else 0,
+            gradient_elements=search.non_finite_elements if search else 0,
+        ),
+        warnings=[],
+        seconds={"total": 0.0},
+        seed=config.seed,
+        command_line=config.command_line(),
+    )
 
 
-def _transport(findings: Findings) -> Json:
+def _alone(values: dict[str, T]) -> T | dict[str, T]:
+    """What holds of the only control; by control where there are several."""
+    return next(iter(values.values())) if len(values) == 1 else values
+
+
+def _adversarial(problem: Problem, findings: Findings, picture: Tensor, u: Tensor) -> UsualAnswer | None:
+    """What the model usually answers on the search's answer."""
+    if findings.search is None:
+        return None
+    verification = findings.verification
+    trials = verification.adversarial_trials if verification else (problem.judge(picture, problem.whole(u)),)
+    return UsualAnswer.of(typical(trials).answer)
+
+
+def _control(findings: Findings) -> ControlGroup | None:
+    if not findings.clean:
+        return None
+    counted = count_right(findings.clean, findings.spp)
+    rate, interval = counted.rate, counted.interval
+    return ControlGroup(correct=counted.successes, trials=counted.trials, rate=rate, interval=interval)
+
+
+def _described(problem: Problem, u: Tensor) -> dict[str, DescribedValue]:
+    values = problem.describe(problem.domain.project(u))
+    return {name: DescribedValue.of(value) for name, value in values.items()}
+
+
+def _transport(findings: Findings) -> LinearTransport:
     """What predicted the pictures of the searches, and how far it was off; or why nothing did."""
     transport = findings.transport
     if transport is None:
-        return {"used": False, "reason": findings.rendered_because or "nothing was searched"}
-    last = transport.deviations[-1] if transport.deviations else None
+        return LinearTransport(used=False, reason=findings.rendered_because or "nothing was searched")
+    return LinearTransport(
+        used=True,
+        entries=transport.start.entries,
+        bytes=transport.start.bytes,
+        seconds=transport.seconds,
+        renewed=sum(len(found) for found in transport.renewals.values()),
+        error=PredictionError.of(transport.deviations[-1]) if transport.deviations else None,
+    )
+
+
+def _renders(findings: Findings, problem: Problem) -> dict[str, int]:
+    """How many pictures each part took, and how many were predicted instead."""
+    search, baseline, transport = findings.search, findings.baseline, findings.transport
+    products = [len(one.history) if one and transport else 0 for one in (search, baseline)]
     return {
-        "used": True,
-        "entries": transport.start.entries,
-        "bytes": transport.start.bytes,
-        "seconds": transport.seconds,
-        "renewed": sum(len(found) for found in transport.renewals.values()),
-        "error": None if last is None else vars(last),
+        "search": (search.renders * problem.draws if search else 0) - products[0] + _traced(transport),
+        "gradient": search.gradients if search and not transport else 0,
+        "baseline": (baseline.renders * problem.draws if baseline else 0) - products[1],
+        "verification": findings.verification_renders + len(findings.first_look),
+        "products": sum(products),
     }
 
 
-def _gradients(found: SearchResult) -> Json:
+def _gradients(found: SearchResult) -> SearchGradients:
     """What the search saw of its gradients, and what its policy did about them and about steps that failed."""
     norms = [record.gradient_norm for record in found.history if record.objective == record.objective]
-    return {
-        "count": found.gradients,
-        "cosine_with_the_one_before": statistics.median(found.agreement) if found.agreement else None,
-        "zero": sum(norm == 0.0 for norm in norms),
+    return SearchGradients(
+        count=found.gradients,
+        cosine_with_the_one_before=statistics.median(found.agreement) if found.agreement else None,
+        zero=sum(norm == 0.0 for norm in norms),
         **vars(found.counts),
-    }
+    )
 
 
-def _average(findings: Findings, problem: Problem) -> Json:
+def _average(findings: Findings) -> AverageCase:
     """How often the model is right over configurations drawn from the whole space."""
-    counted = Trials(sum(trial.right for trial in findings.average), len(findings.average), findings.spp)
+    counted = count_right(findings.average, findings.spp)
     scores = [trial.score for trial in findings.average]
-    return {
-        "configurations": counted.trials,
-        "correct": counted.successes,
-        "accuracy": counted.rate,
-        "interval": list(counted.interval),
-        "margin": sum(scores) / len(scores),
-        "worst_margin": max(scores),
-    }
+    return AverageCase(
+        configurations=counted.trials,
+        correct=counted.successes,
+        accuracy=counted.rate,
+        interval=counted.interval,
+        margin=sum(scores) / len(scores),
+        worst_margin=max(scores),
+    )
 
 
-def _smallest(bracket: Bracket, problem: Problem) -> Json:
+def _smallest(bracket: Bracket, problem: Problem) -> SmallestEpsilon:
     """The bracket of the smallest epsilon, in the unit of each control."""
     budgets = {bound.name: float(bound.budget.epsilon or 0.0) for bound in problem.searched_space.controls}
     flips = bracket.u is not None
-    return {
-        "epsilon": {name: bracket.high * epsilon for name, epsilon in budgets.items()} if flips else None,
-        "not_found_at": {name: bracket.low * epsilon for name, epsilon in budgets.items()} if bracket.low else None,
-        "closed": bracket.closed,
-        "confirmed": bracket.confirmed,
-        "searches": bracket.searches,
-        "checks": bracket.checks,
-    }
+    return SmallestEpsilon(
+        epsilon={name: bracket.high * epsilon for name, epsilon in budgets.items()} if flips else None,
+        not_found_at={name: bracket.low * epsilon for name, epsilon in budgets.items()} if bracket.low else None,
+        closed=bracket.closed,
+        confirmed=bracket.confirmed,
+        searches=bracket.searches,
+        checks=bracket.checks,
+    )
 
 
-def _distribution(found: Distribution, problem: Problem) -> Json | None:
+def _distribution(found: Distribution, problem: Problem) -> AnswerDistribution | None:
     """Mean and spread of a distribution of configurations, where there are few numbers."""
     if found.mean.numel() > MOST_NUMBERS:
         return None
-    return {
-        "mean": problem.describe(problem.domain.project(found.mean)),
-        "deviation": found.deviation.tolist(),
-    }
+    return AnswerDistribution(mean=_described(problem, found.mean), deviation=found.deviation.tolist())
 
 
 def _ending(findings: Findings, problem: Problem) -> Ending:
@@ -286,30 +341,11 @@ def _ending(findings: Findings, problem: Problem) -> Ending:
     return Ending.INTERRUPTED
 
 
-def _verified(verification: Verification | None) -> Json | None:
+def _verified(verification: Verification | None) -> VerifiedRate | None:
     """Rates, and what the model answered in the trials that it got wrong."""
     if verification is None:
         return None
-    return {**verification.adversarial.to_dict(), **answered(verification.adversarial_trials)}
-
-
-def _costs(findings: Findings, problem: Problem) -> Json:
-    search, baseline, transport = findings.search, findings.baseline, findings.transport
-    products = [len(one.history) if one and transport else 0 for one in (search, baseline)]
-    return {
-        "renders": {
-            "search": (search.renders * problem.draws if search else 0) - products[0] + _traced(transport),
-            "gradient": search.gradients if search and not transport else 0,
-            "baseline": (baseline.renders * problem.draws if baseline else 0) - products[1],
-            "verification": findings.verification_renders + len(findings.first_look),
-            "products": sum(products),
-        },
-        "steps": len(search.history) if search else 0,
-        "non_finite": {
-            "objectives": search.non_finite_objectives if search else 0,
-            "gradient_elements": search.non_finite_elements if search else 0,
-        },
-    }
+    return verified_rate(verification.adversarial, verification.adversarial_trials)
 
 
 def _traced(transport: Transport | None) -> int:

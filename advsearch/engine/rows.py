@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from advsearch.attacks import Trials
+from advsearch.runs.results.attack import VerifiedRate
 from advsearch.runs.store import Row
 from advsearch.tasks import Answer, Judgement
 
@@ -66,7 +68,15 @@ def judgement_of(row: Row) -> Judgement:
     return Judgement(score, margin, right, Answer(row.label or "", row.label_index, row.probability))
 
 
-def answered(trials: Sequence[Judgement]) -> dict[str, Any]:
-    """Return how often each answer was given that is a success, and the mean score of the trials, in logits."""
+def verified_rate(rate: Trials, trials: Sequence[Judgement]) -> VerifiedRate:
+    """Return the rate of a success, with how often each such answer was given and the mean score of the trials."""
     labels = Counter(trial.answer.label for trial in trials if trial.success)
-    return {"labels": dict(labels.most_common()), "margin": sum(trial.score for trial in trials) / len(trials)}
+    return VerifiedRate(
+        successes=rate.successes,
+        trials=rate.trials,
+        rate=rate.rate,
+        interval=rate.interval,
+        spp=rate.spp,
+        labels=dict(labels.most_common()),
+        margin=sum(trial.score for trial in trials) / len(trials),
+    )

@@ -64,18 +64,6 @@ class ImageFormation:
             return radiance * self.gain
         return linear_to_srgb(radiance * self.gain)
 
-    def summary(self) -> dict[str, object]:
-        """The `image_formation` entry of a run's summary."""
-        height, width = self.resolution
-        return {
-            "denoiser": self.denoiser,
-            "filter": self.filter,
-            "sampler": self.sampler,
-            "exposure": self.exposure,
-            "resolution": [height, width],
-            "gain": self.gain,
-        }
-
 
 def to_8_bit(display: Tensor) -> Tensor:
     """Round to the 256 levels of an 8-bit file and return the values in [0, 1]; not differentiable."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from advsearch.runs.results.sweep import MapAxis, SweepMap
 from advsearch.tasks import Judgement
 
 MOST_CELLS = 4096
@@ -39,15 +40,16 @@ class Cells:
             self._finite[row][column] += 1
             self._margin[row][column] += trial.margin
 
-    def to_dict(self) -> dict[str, Any] | None:
+    def drawn(self) -> SweepMap | None:
         """Return the axes, and for each cell the counts and the mean margin; rows are values of the second axis."""
         if not self.shown:
             return None
         pairs = [zip(sums, counts, strict=True) for sums, counts in zip(self._margin, self._finite, strict=True)]
-        return {
-            "axes": [{"axis": name, "unit": unit, "values": list(values)} for name, unit, values in self._axes],
-            "over": self.rest,
-            "configurations": self._seen,
-            "correct": self._correct,
-            "margin": [[total / count if count else None for total, count in row] for row in pairs],
-        }
+        first, second = (MapAxis(axis=name, unit=unit, values=list(values)) for name, unit, values in self._axes)
+        return SweepMap(
+            axes=(first, second),
+            over=self.rest,
+            configurations=self._seen,
+            correct=self._correct,
+            margin=[[total / count if count else None for total, count in row] for row in pairs],
+        )

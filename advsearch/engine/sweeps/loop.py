@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,6 @@ from advsearch.engine.sweeps.points import Picks, Points
 from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.engine.sweeps.worst import check_worst
-from advsearch.files import Json
 from advsearch.progress import Progress
 from advsearch.report.notebook import sweep_html
 from advsearch.report.studies import sweep_figure
@@ -34,7 +33,9 @@ from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.results.attack import DescribedValue
+from advsearch.runs.results.base import Formation
+from advsearch.runs.results.sweep import SweepSummary, WorstClaim, WorstConfiguration, WorstVerified
 from advsearch.tasks import Judgement
 
 KIND = "sweep"
@@ -148,7 +149,7 @@ class Sweep:
             self._go_through(first, tally)
             worst = self._claimed(tally)
             if worst is not None:
-                worst["verified"] = self._verified(worst)
+                worst = worst.model_copy(update={"verified": self._verified(worst)})
         except KeyboardInterrupt:
             ending = INTERRUPTED
             if self.run is not None and self.run.store.count(KIND) != tally.seen:
@@ -242,7 +243,7 @@ class Sweep:
 
     # ---- the worst configuration ------------------------------------------------------------------------------------
 
-    def _claimed(self, tally: Tally) -> Json | None:
+    def _claimed(self, tally: Tally) -> WorstConfiguration | None:
         """What the sweep saw at its worst."""
         if tally.worst is None:
             return None
@@ -250,21 +251,25 @@ class Sweep:
         points, picks, model = self._find(index)
         values = points.values(points.configurations(picks), picks)[0]
         row = self._row(picks.number, model, self._seeds(picks.number), seen, values, 0.0)
-        claim = {**asdict(seen.answer), "margin": seen.margin}
         truth = self.job.truth(self.job.places[picks.number // self.per_scene], model, values)
-        right = list(self.job.tasks[model].truth_names(truth))
-        facts = {"configuration": index, "values": dict(row.values), "seed": row.seed, "label_set": right}
-        return {**facts, "claimed": claim, "verified": None}
+        return WorstConfiguration(
+            configuration=index,
+            values={name: DescribedValue.of(value) for name, value in row.values.items()},
+            seed=row.seed or 0,
+            label_set=list(self.job.tasks[model].truth_names(truth)),
+            claimed=WorstClaim(**vars(seen.answer), margin=seen.margin),
+            verified=None,
+        )
 
-    def _verified(self, worst: Json) -> Json | None:
+    def _verified(self, worst: WorstConfiguration) -> WorstVerified | None:
         """What fresh renders say of it; keeps a picture."""
-        points, picks, model = self._find(worst["configuration"])
+        points, picks, model = self._find(worst.configuration)
         view = self._open(picks.number // self.per_scene)
         u = points.configurations(picks)[0]
         checked = check_worst(view, self.job, model, u, self.run, self.stages)
         if self.run is not None:
-            spp = max(PICTURE_SPP, checked["spp"] if checked else 0)
-            self.run.save_image("worst", view.picture(model, u, worst["seed"], spp))
+            spp = max(PICTURE_SPP, checked.spp if checked else 0)
+            self.run.save_image("worst", view.picture(model, u, worst.seed, spp))
         return checked
 
     def _find(self, index: int) -> tuple[Points, Picks, int]:
@@ -276,55 +281,54 @@ class Sweep:
 
     # ---- the answer -------------------------------------------------------------------------------------------------
 
-    def _finish(self, tally: Tally, ending: str, worst: Json | None) -> SweepResult:
+    def _finish(self, tally: Tally, ending: str, worst: WorstConfiguration | None) -> SweepResult:
         """Put the summary together and write it."""
         config, job = self.job.config, self.job
         seconds = self.stages.seconds
-        view, checked = self._view, (worst or {}).get("verified")
+        view, checked = self._view, worst.verified if worst else None
         swept = seconds.get("sweep", 0.0)
-        values: Json = {
-            "run": None if self.run is None else str(self.run.path),
-            "object": config.object,
-            "model": ",".join(model.name for model in job.models),
-            "task": config.task,
-            "environment": self.points.environment or config.lit_by,
-            "controls": [control.name for control in job.controls],
-            "ending": ending,
-            "image_formation": next(iter(view.renderers.values())).formation if view else None,
-            "planned": self.total,
-            **tally.to_dict(),
-            "worst": worst,
-            "grid": {axis.name: len(axis.values) for axis in job.axes},
-            "samples": job.samples,
-            "sampler": config.sampler if job.controls else None,
-            "spp": self.samples,
-            "renders": {
+        summary = SweepSummary(
+            run=None if self.run is None else str(self.run.path),
+            object=config.object,
+            model=",".join(model.name for model in job.models),
+            task=config.task,
+            environment=self.points.environment or config.lit_by,
+            controls=[control.name for control in job.controls],
+            ending=ending,
+            image_formation=Formation.of(next(iter(view.renderers.values())).formation) if view else None,
+            planned=self.total,
+            **tally.counted(),
+            worst=worst,
+            grid={axis.name: len(axis.values) for axis in job.axes},
+            samples=job.samples,
+            sampler=config.sampler if job.controls else None,
+            spp=self.samples,
+            renders={
                 "sweep": tally.seen // self.models * len(set(job.sizes)),
-                "verification": checked["renders"] if checked else 0,
+                "verification": checked.renders if checked else 0,
             },
-            "renders_per_second": self._rendered / swept if self._rendered and swept else None,
-            "seconds": {**seconds, "total": self.stages.total},
-            "seed": config.seed,
-            "warnings": [*job.said, *self._remarks(tally, checked)],
-            "command_line": config.command_line(),
-        }
-        summary = SweepSummary.of(values)
+            renders_per_second=self._rendered / swept if self._rendered and swept else None,
+            seconds={**seconds, "total": self.stages.total},
+            seed=config.seed,
+            warnings=[*job.said, *self._remarks(tally, checked)],
+            command_line=config.command_line(),
+        )
         if self.run is not None:
             self.run.write_summary(summary)
             for suffix, data in sweep_figure(summary).items():
                 write_bytes(self.run.path / "images" / f"sweep.{suffix}", data)
         return SweepResult(summary, None if self.run is None else self.run.path, tuple(self._kept))
 
-    def _remarks(self, tally: Tally, checked: Json | None) -> list[str]:
+    def _remarks(self, tally: Tally, checked: WorstVerified | None) -> list[str]:
         """What a reader has to know beside the numbers."""
         said = []
         if tally.not_finite:
             said.append(f"{tally.not_finite} answers of the model were not finite; they count as not right.")
         if self._not_finite:
             said.append("Some values of pictures were not finite and were set to 0.")
-        if checked and not checked["converged"]:
+        if checked and not checked.converged:
             said.append(
-                f"The worst margin still moved with the sample count at {checked['spp']} samples a pixel, the most "
+                f"The worst margin still moved with the sample count at {checked.spp} samples a pixel, the most "
                 "that was tried: noise may take part in it."
             )
         return said

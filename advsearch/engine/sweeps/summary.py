@@ -7,11 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from advsearch.attacks import Trials, clopper_pearson
-from advsearch.engine.rows import answered
+from advsearch.attacks import clopper_pearson
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.engine.sweeps.cells import Cells
 from advsearch.engine.sweeps.points import Drawn, Picks
+from advsearch.files import Json
+from advsearch.runs.results.sweep import AxisRow
 from advsearch.tasks import Judgement
 
 FINISHED, INTERRUPTED = "finished", "interrupted"
@@ -47,22 +48,22 @@ class Count:
         self.seen[place] += 1
         self.correct[place] += right
 
-    def rows(self) -> list[dict[str, Any]]:
+    def rows(self) -> list[AxisRow]:
         """Return the table of this axis; values without configurations so far are left out."""
         return [
-            {"axis": self.name, "unit": self.unit, "value": value, **rate(correct, seen)}
+            AxisRow(axis=self.name, unit=self.unit, value=value, **rate(correct, seen))
             for value, seen, correct in zip(self.values, self.seen, self.correct, strict=True)
             if seen
         ]
 
 
-def rate(correct: int, seen: int) -> dict[str, Any]:
+def rate(correct: int, seen: int) -> Json:
     """Return count, accuracy and its 95 % Clopper-Pearson interval; null where nothing was seen."""
     return {
         "configurations": seen,
         "correct": correct,
         "accuracy": correct / seen if seen else None,
-        "interval": list(clopper_pearson(correct, seen)) if seen else None,
+        "interval": clopper_pearson(correct, seen) if seen else None,
     }
 
 
@@ -126,27 +127,17 @@ class Tally:
         elif self.worst is None or trial.margin > self.worst[1].margin:
             self.worst = index, trial
 
-    def table(self) -> list[dict[str, Any]]:
+    def table(self) -> list[AxisRow]:
         """Return accuracy by axis and value; axes with a single value are left out."""
         counts = [*self._outer, *self._grid, *self._drawn]
         return [row for count in counts if len(count.values) > 1 for row in count.rows()]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the part of the summary that is counted."""
+    def counted(self) -> Json:
+        """Return the fields of the summary that are counted."""
         return {
             **rate(self.correct, self.seen),
             "not_finite": self.not_finite,
             "answers": dict(sorted(self.answers.most_common(MOST_ANSWERS), key=lambda one: (-one[1], one[0]))),
             "axes": self.table(),
-            "cells": self._cells.to_dict(),
+            "cells": self._cells.drawn(),
         }
-
-
-def verified(trials: Sequence[Judgement], spp: int, *, converged: bool, renders: int) -> dict[str, Any]:
-    """Return what fresh renders of the worst configuration say; a success is a wrong answer."""
-    return {
-        **Trials(sum(trial.success for trial in trials), len(trials), spp).to_dict(),
-        **answered(trials),
-        "converged": converged,
-        "renders": renders,
-    }

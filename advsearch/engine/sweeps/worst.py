@@ -7,20 +7,19 @@ group: a trial counts where the model is wrong.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from torch import Tensor
 
-from advsearch.attacks import choose_spp, run_trials
+from advsearch.attacks import Trials, choose_spp, run_trials
 from advsearch.attacks.sample_count import most_samples
 from advsearch.attacks.verification import RenderTrial
 from advsearch.engine.record import Stages
-from advsearch.engine.rows import judgement_of, trial_row
+from advsearch.engine.rows import judgement_of, trial_row, verified_rate
 from advsearch.engine.samples import verification_ladder
 from advsearch.engine.sweeps.job import Job
-from advsearch.engine.sweeps.summary import verified
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results.sweep import WorstVerified
 from advsearch.seeds import stream
 from advsearch.tasks import Judgement
 
@@ -30,7 +29,7 @@ KIND, PROBES = "verification", "sample count worst"
 
 def check_worst(
     view: SweptScene, job: Job, model: int, u: Tensor, run: RunDirectory | None, stages: Stages
-) -> dict[str, Any] | None:
+) -> WorstVerified | None:
     """Render a configuration again, and say how often the model is wrong.
 
     Trials that the run has stored already are not made again.
@@ -85,7 +84,8 @@ def check_worst(
     trials = run_trials(render, u, spp=count.spp, seed=config.seed, trials=config.trials, on_trial=keep)
     settled = count.converged or len(ladder) == 1
     renders = count.renders + len(trials)
-    return verified(trials, count.spp, converged=settled, renders=renders)
+    rate = verified_rate(Trials(sum(trial.success for trial in trials), len(trials), count.spp), trials)
+    return WorstVerified(**vars(rate), converged=settled, renders=renders)
 
 
 def _stored(run: RunDirectory | None, kind: str) -> list[Judgement]:

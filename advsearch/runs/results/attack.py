@@ -160,7 +160,7 @@ class AttackSummary(RunResult):
     policy: str
     objective: str
     epsilon: float | dict[str, float | None] | None = Field(description="the budget; by control where there are more")
-    norm: str | dict[str, str | None] = Field(description="in which the budget is measured; by control as above")
+    norm: str | dict[str, str] = Field(description="in which the budget is measured; by control as above")
     label_set: list[str] = Field(description="the names that count as right")
     goal: str = Field(description="`a wrong answer`, `a target answer` or `a right answer`: what counts as success")
     target: list[str] | None = Field(description="the targets' names")
