@@ -6,6 +6,7 @@ import math
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,7 +57,7 @@ class Smooth:
     def value(self, u: Tensor) -> float:
         return float(np.cos(self.frequency @ u.double().numpy() + self.phase).sum()) / math.sqrt(10)
 
-    def __call__(self, u: Tensor, *, index: int, gradient: bool | str) -> Evaluation:
+    def __call__(self, u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         assert self.domain.contains(u)
         assert u.dtype == torch.float32
         self.asked.append(gradient)
@@ -71,7 +72,7 @@ class Smooth:
         return Evaluation(value, slope, value > 0, cost=cost)
 
 
-def played(domain: Domain, policy: Policy[object], steps: int, seed: int = 0) -> tuple[SearchResult, Smooth]:
+def played(domain: Domain, policy: Policy[Any], steps: int, seed: int = 0) -> tuple[SearchResult, Smooth]:
     problem = Smooth(domain)
     return search(problem, domain, policy, steps=steps, seed=seed), problem
 
@@ -137,7 +138,7 @@ def test_old_states_replay_the_same_future() -> None:
 def test_an_interrupt_keeps_the_best_so_far(number: int) -> None:
     problem = Smooth(domain_of(POSE), noise=0.0)
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         if len(problem.seen) == number:
             raise KeyboardInterrupt
         return problem(u, index=index, gradient=gradient)
@@ -152,7 +153,7 @@ def test_values_that_are_not_finite_are_the_worst(blocks: tuple[Block, ...]) -> 
     """Half of the box cannot be evaluated."""
     problem = Smooth(domain_of(blocks))
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         evaluation = problem(u, index=index, gradient=gradient)
         bad = index % 3 != 0 and float(u[-1]) > 0.6
         return Evaluation(math.nan, evaluation.gradient, False) if bad else evaluation
@@ -213,7 +214,7 @@ def test_an_angle_is_searched_across_its_seam() -> None:
     sides, reached = set(), []
     for seed in range(4):
 
-        def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
             sides.add(float(u[0]) < 0.5) if value(u) > 0.9 else None
             return Evaluation(value(u), None, False)
 
@@ -297,8 +298,8 @@ def gap(kind: str, d: int, seed: int, noise: float = 0.3) -> float:
     function = FUNCTIONS[kind](np.random.default_rng([seed, d]), d)
     domain = Domain(torch.full((d,), 0.45), (Block(d),), gradient_cost=2 * d)
 
-    def reached(policy: Policy[object]) -> float:
-        def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def reached(policy: Policy[Any]) -> float:
+        def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
             rng = np.random.default_rng([seed, index, zlib.crc32(u.numpy().tobytes())])
             value = function(u.double().numpy()) + noise * rng.normal()
             return Evaluation(value, None, value > 0)

@@ -371,7 +371,7 @@ def test_feature_distance_refuses_what_it_cannot_measure() -> None:
         ({"minimise": True}, "minimise: expected `objective` margin or .* it is least at the start"),
     ],
 )
-def test_feature_distance_knows_no_class_and_no_way_back(asked: dict[str, bool], message: str) -> None:
+def test_feature_distance_knows_no_class_and_no_way_back(asked: dict[str, Any], message: str) -> None:
     check_objective("feature_distance")
     with pytest.raises(InputError, match=message):
         check_objective("feature_distance", **asked)

@@ -54,7 +54,7 @@ class Problem:
         """Evaluate with gaussian noise: on the value, of `noise` x 5 % of the optimum; on every gradient element, of
         `noise` x the gradient's root mean square (so with noise 1 half of the gradient's energy is noise)."""
 
-        def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+        def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
             rng = seeded(seed, index)
             exact = self.gradient(u)
             rough = exact + noise * exact.square().mean().sqrt() * torch.randn(exact.shape, generator=rng)
@@ -174,7 +174,7 @@ def test_random_tries_every_option_of_a_discrete_choice() -> None:
     domain = Domain(torch.tensor([0.1, 0.5]), (Block(1, options=5), Block(1)))
     seen: list[float] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         seen.append(float(u[0]))
         return Evaluation(0.0, None, False)
 
@@ -226,7 +226,7 @@ def test_pgd_halves_its_step_when_the_objective_stalls_and_not_before() -> None:
     assert sizes[-1] <= sizes[0] / 8
     climbing = Domain(torch.zeros(4), (Block(4),))
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         return Evaluation(float(index), torch.ones(4), False)
 
     assert search(evaluate, climbing, PGD(), steps=STEPS, seed=0).history[-1].step_size == PGD().step_size
@@ -235,7 +235,7 @@ def test_pgd_halves_its_step_when_the_objective_stalls_and_not_before() -> None:
 def test_pgd_goes_back_to_its_best_when_it_has_fallen_behind() -> None:
     """A peak that only the first steps see; then the gradient leads away from it, downhill."""
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         return Evaluation(5.0 if index == 2 else -0.1 * index, torch.ones(2), False)
 
     seen: list[Tensor] = []
@@ -263,7 +263,7 @@ def test_a_window_goes_back_only_for_more_than_noise() -> None:
 def test_a_non_finite_objective_sends_pgd_back_with_half_the_step() -> None:
     wall = 0.55
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         value = float(u[0]) if float(u[0]) < wall else math.nan
         return Evaluation(value, torch.ones(1) if gradient else None, False)
 
@@ -275,7 +275,7 @@ def test_a_non_finite_objective_sends_pgd_back_with_half_the_step() -> None:
 
 
 def test_pgd_without_any_gradient_stalls() -> None:
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         return Evaluation(-1.0, torch.zeros_like(u), False)
 
     domain = Domain(torch.full((5,), 0.5), (Block(5, "linf", 0.1),))
@@ -289,9 +289,9 @@ def test_pgd_goes_on_along_its_momentum_when_a_gradient_cannot_be_paid() -> None
     domain = Domain(torch.full((2,), 0.1), (Block(2, "linf", 0.9),), gradient_cost=3)
     seen: list[float] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         seen.append(float(u[0]))
-        return Evaluation(seen[-1], torch.ones(2) if gradient else None, False, cost=1 + 3 * gradient)
+        return Evaluation(seen[-1], torch.ones(2) if gradient else None, False, cost=1 + 3 * bool(gradient))
 
     result = search(evaluate, domain, PGD(step_size=0.125), steps=10, seed=0, candidates=0)
     assert (result.gradients, result.renders, len(seen)) == (2, 10, 4)
@@ -302,7 +302,7 @@ def test_pgd_leaves_a_flat_start_at_random() -> None:
     """The gradient is zero at the start only, as under a saturated softmax."""
     problem = linear(20, "linf", seed=0)
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         evaluation = problem.evaluator()(u, index=index, gradient=gradient)
         return Evaluation(0.0, torch.zeros(20), False) if index == 0 else evaluation
 
@@ -372,7 +372,7 @@ def classifier(d: int = 18, objective: str = "margin", nan_at: int = -1, cost: i
     rng = seeded(1, 1)
     first, second = torch.randn(d, 12, generator=rng), torch.randn(12, 4, generator=rng)
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         x = u.clone().requires_grad_(bool(gradient))
         noise = 0.01 / math.sqrt(samples) * torch.randn(d, generator=seeded(7, index))
         logits = (((x + noise) @ first).tanh() @ second)[None]
@@ -387,7 +387,7 @@ def classifier(d: int = 18, objective: str = "margin", nan_at: int = -1, cost: i
     return evaluate
 
 
-def constant(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+def constant(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
     return Evaluation(0.5, torch.zeros_like(u) if gradient else None, False, cost=samples)
 
 
@@ -487,7 +487,7 @@ def test_half_of_the_domain_cannot_be_evaluated(policy: Policy[Any], bad: float)
     domain = domain_for(policy)
     inner = classifier(domain.dim)
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         evaluation = inner(u, index=index, gradient=gradient, samples=samples)
         lost = float(u[-1]) > float(domain.start[-1]) + 1e-3 and index % 3
         return replace(evaluation, objective=bad, gradient=u * math.nan if gradient else None) if lost else evaluation
@@ -503,7 +503,7 @@ def test_choices_and_angles_are_searched_by_every_policy(policy: Policy[Any]) ->
     """The best option of two choices is worth more than the numbers; angles are met on both sides of their seam."""
     seen: list[Tensor] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         assert CHOOSY.contains(u)
         seen.append(u)
         first, second = min(2, int(u[0] * 3)), min(1, int(u[4] * 2))
@@ -522,7 +522,7 @@ def test_choices_and_angles_are_searched_by_every_policy(policy: Policy[Any]) ->
 def test_one_number_is_enough(policy: Policy[Any]) -> None:
     domain = Domain(torch.tensor([0.5]), (Block(1, "linf", 0.1),))
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         return Evaluation(-abs(float(u[0]) - 0.57), torch.ones(1) if gradient else None, False, 0, samples)
 
     result = search(evaluate, domain, policy, steps=40, seed=0, candidates=0)
@@ -546,7 +546,7 @@ def test_states_are_passed_and_not_kept(policy: Policy[Any]) -> None:
             state = policy.update(state, proposal.u, evaluation)
         return state, torch.stack(seen)
 
-    before = np.random.get_state()[1].copy(), torch.random.get_rng_state()  # noqa: NPY002
+    before = np.random.get_state(legacy=False)["state"]["key"].copy(), torch.random.get_rng_state()  # noqa: NPY002
     state: object = policy.start(domain, torch.Generator().manual_seed(0), 60)
     for middle in (3, 16):
         if policy.name == "grid" and middle == 16:
@@ -558,7 +558,7 @@ def test_states_are_passed_and_not_kept(policy: Policy[Any]) -> None:
         _, restored = play(pickle.loads(stored), 5, 4)
         assert torch.equal(once, again)
         assert torch.equal(once, restored)
-    after = np.random.get_state()[1], torch.random.get_rng_state()  # noqa: NPY002
+    after = np.random.get_state(legacy=False)["state"]["key"], torch.random.get_rng_state()  # noqa: NPY002
     assert np.array_equal(before[0], after[0])
     assert torch.equal(before[1], after[1])
 

@@ -60,7 +60,7 @@ def at(value: float) -> Tensor:
 def objective_is(value: Callable[[Tensor, int], float]) -> Callable[..., Evaluation]:
     """An `evaluate` whose margin is a function of u and the seed index."""
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         v = value(u, index)
         return Evaluation(v, torch.ones_like(u) if gradient else None, v > 0)
 
@@ -134,9 +134,11 @@ def test_ranking_takes_the_winners_curse_out() -> None:
     claimed, believed = [], []
     for seed in range(20):
         noise = torch.randn(200, generator=torch.Generator().manual_seed(seed)).tolist()
-        result = search(
-            objective_is(lambda u, index, noise=noise: noise[index] - 5.0), DOMAIN, Random(), steps=40, seed=seed
-        )
+
+        def noisy(u: Tensor, index: int, noise: list[float] = noise) -> float:
+            return noise[index] - 5.0
+
+        result = search(objective_is(noisy), DOMAIN, Random(), steps=40, seed=seed)
         claimed.append(result.claimed_objective + 5.0)
         believed.append(result.best_objective + 5.0)
     assert sum(claimed) / 20 > 1.5
@@ -149,7 +151,7 @@ def test_ranking_takes_the_winners_curse_out() -> None:
 def priced(cost: int, log: list[tuple[int, bool | str]]) -> Callable[..., Evaluation]:
     """RISE with gradients that cost so many renders more; notes what was asked for."""
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool | str) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         log.append((index, gradient))
         derivative = torch.ones_like(u) if gradient else None
         extra = cost if gradient is True else 0
@@ -202,7 +204,7 @@ def test_an_interrupt_counts_what_was_rendered() -> None:
 
 @pytest.mark.parametrize("cost", [0, 2])
 def test_an_evaluation_that_costs_what_nobody_said_is_a_bug(cost: int) -> None:
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         return Evaluation(0.0, torch.ones_like(u) if gradient else None, False, cost=cost)
 
     with pytest.raises(RuntimeError, match=f"evaluate took {cost} renders; expected 1 to 1"):
@@ -225,10 +227,10 @@ class Samples(Script):
 
 
 def sampled(log: list[tuple[bool, int]], extra: int = 0) -> Callable[..., Evaluation]:
-    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
-        log.append((gradient, samples))
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+        log.append((bool(gradient), samples))
         slope = torch.ones_like(u) if gradient else None
-        return Evaluation(float(u[0]), slope, False, cost=samples * (1 + extra * gradient))
+        return Evaluation(float(u[0]), slope, False, cost=samples * (1 + extra * bool(gradient)))
 
     return evaluate
 
@@ -244,9 +246,10 @@ def test_samples_cost_as_many_renders_and_the_last_get_what_is_left() -> None:
 
 
 def test_samples_are_only_named_where_they_are_not_one() -> None:
-    def plain(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def without_samples(u: Tensor, *, index: int, gradient: bool | str) -> Evaluation:
         return Evaluation(0.0, None, False)
 
+    plain: Any = without_samples
     assert search(plain, DOMAIN, Samples((at(0.0),), samples=(1,)), steps=1, seed=0).renders == 3
     with pytest.raises(TypeError, match="samples"):
         search(plain, DOMAIN, Samples((at(0.0),), samples=(2,)), steps=2, seed=0)
@@ -263,7 +266,7 @@ def test_a_gradient_with_samples_is_asked_for_where_a_render_is_left_to_use_it()
 
 
 def test_an_evaluation_that_ignores_its_samples_is_a_bug() -> None:
-    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         return Evaluation(0.0, None, False)
 
     with pytest.raises(RuntimeError, match="evaluate took 1 renders; expected 4 to 4"):
@@ -298,7 +301,7 @@ def test_a_policy_that_knows_no_choices_never_sees_one() -> None:
     domain = Domain(torch.tensor([0.2, 0.1, 0.9]), (Block(1, options=3), Block(1), Block(1, options=2)))
     seen: list[tuple[int, int]] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         seen.append((int(u[0] * 3), int(u[2] * 2)))
         return Evaluation(float(seen[-1] == (1, 0)) + float(u[1]), None, False)
 
@@ -333,7 +336,7 @@ def test_a_distribution_is_the_policys_answer() -> None:
 
 
 def test_seconds_end_a_search_after_the_evaluation_that_exceeds_them() -> None:
-    def slow(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def slow(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         time.sleep(0.02)
         return Evaluation(float(u[0]), None, False)
 
@@ -385,7 +388,7 @@ def test_a_candidate_that_turns_nan_when_ranked_is_not_the_answer() -> None:
 def test_non_finite_gradient_elements_become_zero_and_are_counted() -> None:
     gradients = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         value = torch.tensor([math.nan, 1.0, -math.inf]) if gradient else None
         return Evaluation(0.5, value, True, non_finite=1)
 
@@ -397,7 +400,7 @@ def test_non_finite_gradient_elements_become_zero_and_are_counted() -> None:
         seed=0,
         on_step=lambda record, u, evaluation: gradients.append(evaluation.gradient),
     )
-    assert gradients[0].tolist() == [0.0, 1.0, 0.0]
+    assert gradients[0] is not None and gradients[0].tolist() == [0.0, 1.0, 0.0]
     assert result.history[0].non_finite == 3  # two here and one that the renderer had found
     assert result.non_finite_elements == 3 + 1 + 4  # the last step and four ranking renders report one each
     assert result.history[0].gradient_norm == 1.0
@@ -437,7 +440,7 @@ def test_an_interrupt_in_the_callback_keeps_that_very_step() -> None:
 
 
 def test_other_exceptions_pass_through() -> None:
-    def broken(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def broken(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         raise ZeroDivisionError("in the renderer")
 
     with pytest.raises(ZeroDivisionError, match="in the renderer"):
@@ -466,7 +469,9 @@ def test_a_policy_that_leaves_the_domain_is_a_bug(u: Tensor, message: str) -> No
     [(None, "no gradient although one was asked for"), (torch.ones(2), r"shape \(2,\); expected torch.float32")],
 )
 def test_a_gradient_that_is_missing_or_misshapen_is_a_bug(gradient: Tensor | None, message: str) -> None:
-    def evaluate(u: Tensor, *, index: int, gradient: bool, answer: Tensor | None = gradient) -> Evaluation:
+    answer = gradient
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         return Evaluation(0.0, answer, False)
 
     with pytest.raises(RuntimeError, match=message):

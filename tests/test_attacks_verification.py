@@ -154,7 +154,11 @@ def test_every_render_of_a_sample_count_has_its_own_seed_and_both_groups_share_t
     seen: dict[str, list[int]] = {"a": [], "b": []}
 
     def record(name: str) -> Callable[[int, int], float]:
-        return lambda spp, seed: seen[name].append(seed) or 0.0
+        def noted(spp: int, seed: int) -> float:
+            seen[name].append(seed)
+            return 0.0
+
+        return noted
 
     choose_spp({name: record(name) for name in seen}, seed=3, ladder=(4, 8, 16), drift=0.5)
     assert seen["a"] == seen["b"]
@@ -272,7 +276,7 @@ def test_a_lucky_claim_is_not_verified(seed: int) -> None:
     """The winner's curse: nothing in the budget beats margin -1, one logit of noise makes 60 renders look otherwise."""
     render = noisy(-1.2, -1.0, 1.0)
 
-    def evaluate(u: torch.Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: torch.Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         margin = render(u, 1_000_003 * (seed + 1) + index, 16).margin
         return Evaluation(margin, None, margin > 0)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +28,8 @@ INSTANCES = [pytest.param(name, seed, id=f"{name}-{seed}") for name in sorted(OB
 
 @functools.cache
 def instance(name: str, seed: int | None) -> ObjectAsset:
-    return OBJECTS[name].generate(None if seed is None else np.random.default_rng(seed))
+    made: ObjectAsset = OBJECTS[name].generate(None if seed is None else np.random.default_rng(seed))
+    return made
 
 
 def corners(mesh: Mesh) -> np.ndarray:
@@ -47,7 +49,8 @@ def charts(mesh: Mesh) -> np.ndarray:
     i, j = mesh.faces[:, [0, 1]].astype(np.int64).reshape(-1), mesh.faces[:, [1, 2]].astype(np.int64).reshape(-1)
     size = len(mesh.vertices)
     _, piece = connected_components(coo_matrix((np.ones(len(i)), (i, j)), shape=(size, size)), directed=False)
-    return piece[mesh.faces[:, 0]]
+    found: np.ndarray = piece[mesh.faces[:, 0]]
+    return found
 
 
 # ---------------------------------------------------------------------------------------------------- objects
@@ -138,7 +141,9 @@ def test_a_grid_patch_faces_outwards_and_maps_charts_to_points() -> None:
     patch = grid("x", points, normals, (2.0, 1.0), np.array([0.0, 1.0]), np.array([0.0, 1.0]))
     a, b, c = patch.vertices[patch.faces[0]]
     assert np.cross(b - a, c - a)[2] > 0.0
-    np.testing.assert_allclose(patch.rest(np.array([0.5, 1.0]), np.array([0.25, 1.0])), [[1.0, 0.25, 0.0], [2, 1, 0]])
+    np.testing.assert_allclose(
+        patch.rest(np.array([0.5, 1.0]), np.array([0.25, 1.0])), np.array([[1.0, 0.25, 0.0], [2.0, 1.0, 0.0]])
+    )
 
 
 # ----------------------------------------------------------------------------------------------- environments
@@ -183,7 +188,9 @@ def test_the_shipped_files_are_what_the_scripts_make() -> None:
     assert build.differing() == []
 
 
-def test_the_check_command_names_a_file_that_differs(tmp_path, monkeypatch, capsys) -> None:
+def test_the_check_command_names_a_file_that_differs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(build, "DATA", tmp_path)
     monkeypatch.setattr(build, "everything", lambda: iter([("a/b.txt", b"right"), ("c.txt", b"here")]))
     assert build.main([]) == 0

@@ -216,8 +216,8 @@ def test_a_distance_that_is_set_does_not_follow_the_field_of_view() -> None:
     near = describe("mug", given={"camera.distance": 2.0})
     for scene, stays in ((near, True), (describe("mug"), False)):
         space = space_of(scene, camera={"fov": [20, 60]})
-        places = [space.inputs(torch.tensor([share]))["camera.to_world"][:3, 3] for share in (0.0, 1.0)]
-        assert torch.allclose(*places) is stays
+        near_end, far_end = (space.inputs(torch.tensor([share]))["camera.to_world"][:3, 3] for share in (0.0, 1.0))
+        assert torch.allclose(near_end, far_end) is stays
 
 
 # ---- sweeps ---------------------------------------------------------------------------------------------------------
@@ -265,7 +265,7 @@ def test_a_sweep_of_a_loaded_scene_refuses_the_same() -> None:
 
 
 def test_a_row_names_the_environment_that_lights_it() -> None:
-    plain = {"resolution": 8, "spp": 1, "trials": 0}
+    plain: dict[str, Any] = {"resolution": 8, "spp": 1, "trials": 0}
 
     def lit_by(**options: Any) -> list[Any]:
         found = advsearch.sweep("mug", **options, **plain)

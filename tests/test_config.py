@@ -138,7 +138,7 @@ def test_epsilon_is_a_number_greater_than_zero(value: Any) -> None:
 
 def test_all_problems_are_told_at_once() -> None:
     with pytest.raises(InputError) as error:
-        AttackConfig(epsilon=-1, steps=0)  # type: ignore[call-arg]
+        AttackConfig.model_validate({"epsilon": -1, "steps": 0})
     assert flags.with_flags(str(error.value)) == (
         "--object: expected the name of an object or a .obj, .ply, .glb, .gltf or .stl file, got nothing; "
         "--epsilon: expected a number greater than 0 and at most 1e+06, got -1; "
@@ -148,7 +148,7 @@ def test_all_problems_are_told_at_once() -> None:
 
 def test_an_unknown_setting_has_near_matches() -> None:
     with pytest.raises(UnknownNameError, match=r"unknown setting 'epsilonn'\. Did you mean 'epsilon'") as error:
-        AttackConfig(object="mug", epsilonn=0.1)
+        AttackConfig.model_validate({"object": "mug", "epsilonn": 0.1})
     assert error.value.near[0] == "epsilon"
 
 
@@ -349,7 +349,7 @@ def test_yaml_round_trip_of_everything(tmp_path: Path) -> None:
 
 def test_the_command_line_says_the_same() -> None:
     config = AttackConfig(**GIVEN)
-    again = of_command_line(config.command_line())
+    again: AttackConfig = of_command_line(config.command_line())
     assert again == config.model_copy(update={"run": None, "overwrite": False})
     assert AttackConfig(object="mug").command_line() == "advsearch attack --object mug"
 
@@ -363,7 +363,7 @@ def test_the_command_line_says_the_same() -> None:
 def test_any_values_go_round(
     tmp_path_factory: pytest.TempPathFactory, epsilon: float | None, exposure: float, seed: int, name: str, value: float
 ) -> None:
-    config = AttackConfig(object=name, label=name, epsilon=epsilon, exposure=exposure, seed=seed, set={"a.b": value})
+    config = AttackConfig(object=name, label=name, epsilon=epsilon, exposure=exposure, seed=seed, set_={"a.b": value})
     path = tmp_path_factory.getbasetemp() / "any.yaml"
     path.write_text(config.to_yaml(), encoding="utf-8")
     assert AttackConfig.from_yaml(path) == config

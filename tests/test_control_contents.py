@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ def scene() -> SceneDescription:
     return describe("mug")
 
 
-def bound(scene: SceneDescription, **settings: object) -> BoundContents:
+def bound(scene: SceneDescription, **settings: Any) -> BoundContents:
     control = ContentsControl(**settings)
     return control.bind(control.prepare(scene))
 
@@ -170,7 +171,7 @@ def test_what_is_not_said_is_coffee(scene: SceneDescription) -> None:
         {"water": [0.0, 0.2], "milk": 0.2, "coffee": [0.1, 0.3]},
     ],
 )
-def test_proportions_that_cannot_add_up_are_refused(settings: dict[str, object]) -> None:
+def test_proportions_that_cannot_add_up_are_refused(settings: dict[str, Any]) -> None:
     with pytest.raises(InputError, match="expected proportions of water, milk and coffee that add up to 1, got water"):
         ContentsControl(level=[0, 1], **settings)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -248,7 +249,7 @@ def test_the_tables_have_five_rows() -> None:
         assert tables and all(len(table) == 5 for table in tables.values()), tables.keys()
 
 
-def groups(scene: SceneDescription, **settings: object) -> dict[str, tuple[int, tuple[str, ...]]]:
+def groups(scene: SceneDescription, **settings: Any) -> dict[str, tuple[int, tuple[str, ...]]]:
     bound = CorruptionControl(**settings).bind(scene)
     return {group.parameter: (group.options, group.valid) for group in bound.groups}
 

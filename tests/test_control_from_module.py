@@ -13,6 +13,7 @@ import advsearch
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig
 from advsearch.controls import CONTROLS, make_control
+from advsearch.controls.space import Space
 from advsearch.errors import InputError
 from advsearch.runs.directory import RunDirectory
 
@@ -132,6 +133,7 @@ def test_a_run_that_is_stopped_says_how_to_go_on_with_its_code(capsys: pytest.Ca
 def test_settings_and_a_name_of_its_own() -> None:
     given = {"old": {"kind": "own_controls:Fade", "amount": [0.0, 0.3]}}
     render = advsearch.load_scene("mug").renderer(given, resolution=16)
+    assert isinstance(render.space, Space)
     assert list(render.space.describe(render.start)) == ["old.amount"]
     assert make_control("own_controls:Fade", {"amount": [0.0, 0.5]}).name == "fade"
 

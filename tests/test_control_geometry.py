@@ -42,7 +42,8 @@ def wild(size: int) -> list[Tensor]:
 def face_normals(places: Tensor, faces: np.ndarray) -> Tensor:
     corners = places[torch.from_numpy(faces)]
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return normals / normals.norm(dim=1, keepdim=True).clamp_min(1e-300)
+    found: Tensor = normals / normals.norm(dim=1, keepdim=True).clamp_min(1e-300)
+    return found
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -72,7 +72,7 @@ def test_size_changes_radiance_and_not_power(scene: SceneDescription) -> None:
 def test_it_starts_dark_unless_its_power_is_not_searched(scene: SceneDescription) -> None:
     def power(**settings: Any) -> float:
         bound = LightControl(**settings).bind(scene)
-        return float(bound.values(bound.start)["power"])  # type: ignore[attr-defined]
+        return float(bound.values(bound.start)["power"])
 
     assert power() == 0.0
     assert power(power=[1, 50]) == 1.0

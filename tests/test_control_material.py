@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -69,6 +70,12 @@ def test_a_pattern_has_one_scale_on_the_object_whatever_its_charts(scene: SceneD
     assert np.abs(texels[inside][:, 0] - expected).max() < 0.05
 
 
+def searched(*names: str) -> MaterialControl:
+    """A control over whole ranges."""
+    ranges: dict[str, Any] = {name: [0, 1] for name in names}
+    return MaterialControl(**ranges)
+
+
 # ---- from values to inputs ------------------------------------------------------------------------------------------
 
 
@@ -107,7 +114,7 @@ def test_a_named_material_brings_its_numbers_and_given_ones_win(scene: SceneDesc
 
 def test_a_fixed_material_is_where_the_search_starts(scene: SceneDescription) -> None:
     bound = MaterialControl(which="wood").bind(scene)
-    values = bound.values(bound.start)  # type: ignore[attr-defined]
+    values = bound.values(bound.start)
     assert float(values["roughness"]) == pytest.approx(PATTERNS["wood"].material.roughness)
     plain = MaterialControl(which="plain", red=0.2, green=[0, 1], blue=0.9).bind(scene)
     color = plain.inputs(torch.tensor([0.4]))[BASE_COLOR]
@@ -116,9 +123,9 @@ def test_a_fixed_material_is_where_the_search_starts(scene: SceneDescription) ->
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
 def test_extremes_have_finite_derivatives(scene: SceneDescription, share: float) -> None:
-    bound = MaterialControl(**{name: [0, 1] for name in (*NUMBERS, *CHANNELS)}).bind(scene)
+    bound = searched(*NUMBERS, *CHANNELS).bind(scene)
     u = torch.full((7,), share, requires_grad=True)
-    sum(one.sum() for one in bound.inputs(u).values()).backward()
+    torch.stack([one.sum() for one in bound.inputs(u).values()]).sum().backward()
     assert u.grad is not None and bool(torch.isfinite(u.grad).all())
     assert float(u.grad[:4].abs().min()) == 1.0  # moved into the range that is rendered, yet with a slope
 
@@ -136,7 +143,7 @@ def test_bad_settings_are_explained() -> None:
 @pytest.mark.parametrize("name", ["roughness", "metallic", "specular", "clearcoat"])
 def test_extremes_render_finite_with_finite_gradients(name: str) -> None:
     """Also on an object that has no clear coat of its own."""
-    render = advsearch.load_scene("book").renderer([MaterialControl(**{name: [0, 1]})], resolution=32)
+    render = advsearch.load_scene("book").renderer([searched(name)], resolution=32)
     pictures = []
     for value in (0.0, 1.0):
         u = torch.tensor([value], requires_grad=True)
@@ -150,7 +157,7 @@ def test_extremes_render_finite_with_finite_gradients(name: str) -> None:
 
 @pytest.mark.parametrize(("name", "value"), [("roughness", 0.3), ("metallic", 0.4), ("specular", 0.5), ("green", 0.6)])
 def test_the_adjoint_agrees_with_differences(name: str, value: float) -> None:
-    material = MaterialControl(**{name: [0, 1]})
+    material = searched(name)
     render = advsearch.load_scene("mug").renderer([material], resolution=32, denoise="none")
     assert render.plan.groups[0].estimator == "adjoint"
     weight = torch.ones(32, 32, 3)

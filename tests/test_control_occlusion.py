@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ def scene() -> SceneDescription:
     return describe("mug")
 
 
-def hidden(scene: SceneDescription, **settings: object) -> Placement:
+def hidden(scene: SceneDescription, **settings: Any) -> Placement:
     """The placement at the upper end of the coverage's range."""
     control = OcclusionControl(**{"coverage": [0, 0.9], **settings})
     bound = control.bind(control.prepare(scene))
@@ -165,7 +166,7 @@ def test_it_follows_the_camera_and_the_pose_whatever_the_order(scene: SceneDescr
     assert float(seat @ forward) / float(seat.norm()) > 0.9
     assert space.describe(u)["occlusion.hidden"]["value"] == pytest.approx(0.4, abs=ACCURACY)
     unmoved = occlusion.placement(scene, space.controls[0].values(u[:1]), {})  # type: ignore[attr-defined]
-    assert abs(unmoved.distance - space.describe(u)["occlusion.true_distance"]["value"]) > 1e-3
+    assert abs(unmoved.distance - float(space.describe(u)["occlusion.true_distance"]["value"])) > 1e-3
 
 
 @pytest.mark.parametrize("size", [0.05, 5.0])

@@ -119,9 +119,9 @@ def test_it_bleeds_through_no_wall(scene: SceneDescription, surface: tuple[Float
 def test_it_stays_on_the_part_that_it_is_stuck_to() -> None:
     """Two plates side by side in one plane, not connected."""
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float32)
-    vertices = np.concatenate([corners, corners + np.float32([1.1, 0, 0])])
+    vertices = np.concatenate([corners, corners + np.array([1.1, 0, 0], np.float32)])
     faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], dtype=np.uint32)
-    up = np.tile(np.float32([0, 0, 1]), (8, 1))
+    up = np.tile(np.array([0, 0, 1], np.float32), (8, 1))
     surface = MeshSurface(Mesh(vertices, faces, up, vertices[:, :2]))
     region = surface.region(0, np.array([0.9, 0.1, 0.0]), np.array([0.0, 0.0, 1.0]), 5.0)
     assert region.tolist() == [True, True, False, False]

@@ -41,7 +41,8 @@ def looked_up(emitter: Any, directions: np.ndarray) -> np.ndarray:
 
     interaction = dr.zeros(mi.SurfaceInteraction3f, len(directions))
     interaction.wi = mi.Vector3f(*(mi.Float(-directions[:, axis].astype(np.float32)) for axis in range(3)))
-    return np.array(emitter.eval(interaction)).T
+    found: np.ndarray = np.array(emitter.eval(interaction)).T
+    return found
 
 
 def plugin(azimuth: float, elevation: float, turbidity: float, **scales: float) -> Any:
@@ -77,12 +78,12 @@ def test_the_suns_light_is_mitsubas(azimuth: float, elevation: float, turbidity:
 
 @pytest.mark.parametrize("turbidity", [3.0, 4.0, 7.5])
 def test_the_derivative_of_turbidity_is_the_same_from_both_sides(turbidity: float) -> None:
-    sky, sun = Sky(torch.full((3,), 0.3)), numbers(10.0, 40.0)
+    sky, (first, second) = Sky(torch.full((3,), 0.3)), numbers(10.0, 40.0)
     at = torch.tensor(turbidity, requires_grad=True)
-    radiance, metered = sky(*sun, at)
+    radiance, metered = sky(first, second, at)
     (slope,) = torch.autograd.grad((radiance / metered).double().mean(), at)
     step = 0.01
-    values = [sky(*sun, torch.tensor(turbidity + k * step)) for k in (-1, 0, 1)]
+    values = [sky(first, second, torch.tensor(turbidity + k * step)) for k in (-1, 0, 1)]
     means = [float((one / each).double().mean()) for one, each in values]
     assert (means[2] - means[1]) / step == pytest.approx(float(slope), rel=0.05)
     assert (means[1] - means[0]) / step == pytest.approx(float(slope), rel=0.05)
@@ -114,6 +115,7 @@ def test_the_map_keeps_the_suns_light_and_the_ground_reflects_it() -> None:
 def strongest(scene: SceneDescription, radiance: np.ndarray) -> float:
     """Irradiance from above the horizon on the surface that gets most of it."""
     above = np.concatenate([radiance[: ROWS // 2], np.zeros_like(radiance[ROWS // 2 :])])
+    assert scene.environment is not None
     lit = replace(scene, environment=replace(scene.environment, radiance=above)).with_values(ground__size=0.0)
     steps = np.linspace(0.0, 2.0 * math.pi, 48, endpoint=False)
     normals = [
@@ -139,7 +141,7 @@ def test_every_sky_has_one_strength_unless_exposure_is_fixed(scene: SceneDescrip
 def test_it_replaces_the_environment_and_starts_as_what_it_put_there(scene: SceneDescription) -> None:
     control = SkyControl()
     prepared = control.prepare(scene)
-    assert prepared.environment.name == "sky"
+    assert prepared.environment is not None and prepared.environment.name == "sky"
     bound = control.bind(prepared)
     assert torch.equal(bound.inputs(bound.start)["environment.data"], torch.from_numpy(prepared.environment.radiance))
     assert METERED_IRRADIANCE == pytest.approx(0.9 * math.pi / 0.8)

@@ -39,9 +39,9 @@ def test_a_control_declares_itself(kind: str) -> None:
             assert parameter.low == 0.0 and parameter.high == len(parameter.options) - 1
         if parameter.moves_silhouettes:
             assert not {"adjoint"} & set(parameter.estimators), "an interior adjoint misses moving outlines"
-    assert len({one.name for one in (*control.parameters, *control.choices)}) == len(control.parameters) + len(
-        control.choices
-    )
+    assert len({one.name for one in control.parameters} | {one.name for one in control.choices}) == len(
+        control.parameters
+    ) + len(control.choices)
 
 
 def test_a_setting_of_the_scene_and_the_parameter_of_that_name_are_one_declaration() -> None:
@@ -207,7 +207,7 @@ def test_the_worked_example_is_a_control_that_renders() -> None:
 def test_no_value_of_any_control_ends_in_a_traceback(kind: str) -> None:
     """Neither a parameter, a choice, a name nor a kind; what is bound to a scene later is not looked at here."""
     control = CONTROLS[kind]
-    for name in [one.name for one in (*control.parameters, *control.choices)] + ["name", "kind"]:
+    for name in [one.name for one in control.parameters] + [one.name for one in control.choices] + ["name", "kind"]:
         for value in SHORT:
             try:
                 made = make_control(kind, {name: value})

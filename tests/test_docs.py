@@ -139,8 +139,8 @@ def test_every_flag_of_attack_is_in_the_command_line_page() -> None:
 @pytest.mark.parametrize("kind", CONTROLS)
 def test_every_control_has_a_page_with_its_parameters_settings_and_an_example(kind: str) -> None:
     page = (DOCS / "controls" / f"{kind}.md").read_text("utf-8")
-    for declared in (*CONTROLS[kind].parameters, *CONTROLS[kind].choices):
-        assert f"| `{declared.name}` |" in page
+    declared = [one.name for one in CONTROLS[kind].parameters] + [one.name for one in CONTROLS[kind].choices]
+    assert not [name for name in declared if f"| `{name}` |" not in page]
     assert f"--control {kind}" in page
 
 
@@ -461,7 +461,7 @@ def test_every_yaml_example_is_a_configuration(page: Path, tmp_path: Path) -> No
 
 def parameters(call: str) -> set[str]:
     """Return the keywords that a function of `advsearch` takes."""
-    options = {"attack": AttackConfig, "sweep": SweepConfig}
+    options: dict[str, type[SceneConfig]] = {"attack": AttackConfig, "sweep": SweepConfig}
     own = set(inspect.signature(getattr(advsearch, call)).parameters)
     return own | set(options[call].model_fields) if call in options else own
 

@@ -122,7 +122,7 @@ def test_radiance_orientation(tmp_path: Path, size: bytes, rows: int, columns: i
 @pytest.mark.parametrize("kind", [np.float16, np.float32])
 @pytest.mark.parametrize("names", ["RGB", "RGBA", "RGBZ"])
 def test_exr_channels(tmp_path: Path, kind: type, names: str) -> None:
-    image = light().astype(kind)
+    image: np.ndarray = light().astype(kind)
     channels = {name: image[:, :, min(k, 2)].copy() for k, name in enumerate(names)}
     got = import_environment(write_exr(tmp_path / "room.exr", channels))
     assert got.name == "room" and got.warnings == ()
@@ -150,7 +150,8 @@ def energy(radiance: np.ndarray) -> np.ndarray:
     height, width = radiance.shape[:2]
     edges = np.cos(np.arange(height + 1) * np.pi / height)
     angle = (edges[:-1] - edges[1:]) * 2 * np.pi / width
-    return np.einsum("h,hwc->c", angle, radiance.astype(np.float64))
+    found: np.ndarray = np.einsum("h,hwc->c", angle, radiance.astype(np.float64))
+    return found
 
 
 @pytest.mark.parametrize(("height", "width"), [(1024, 2048), (700, 1400)])
@@ -277,7 +278,7 @@ def link(name: str, target: str) -> Callable[[Path], Path]:
 PLANE = light()[:, :, 0].copy()
 LINE = HEADER + b"-Y 8 +X 16\n"
 NOISE = np.random.default_rng(0).bytes(2000)
-BAD = {
+BAD: dict[str, tuple[Callable[[Path], Path], str]] = {
     "directory": (
         lambda folder: folder,
         r"expected a file with an environment, got a directory; name a file inside it",

@@ -140,7 +140,7 @@ def test_the_objects_colour_and_what_comes_after_metering_take_no_part() -> None
 
 def test_an_object_too_thin_to_be_seen_leaves_the_card_on_the_ground() -> None:
     scene = grey_ball("noon")
-    needle = replace(scene.object.mesh, vertices=scene.object.mesh.vertices * np.float32([1e-5, 1e-5, 1.0]))
+    needle = replace(scene.object.mesh, vertices=scene.object.mesh.vertices * np.array([1e-5, 1e-5, 1.0], np.float32))
     scene = replace(scene, object=replace(scene.object, mesh=needle))
     assert visible_irradiance(scene) is None
     up = float(irradiance(scene, np.array([[0.0, 0.0, 1.0]])).mean())
@@ -151,8 +151,9 @@ def test_another_environment_keeps_the_exposure_it_would_be_loaded_with() -> Non
     scene = describe("mug", "studio")
     space = make_space([EnvironmentControl(which=["own", "noon"])], scene)
     own, noon = (space.inputs(torch.tensor([u]))["environment.data"] * scene.gain for u in (0.25, 0.75))
-    assert torch.equal(own, torch.from_numpy(scene.environment.radiance) * scene.gain)
     loaded = describe("mug", "noon")
+    assert scene.environment is not None and loaded.environment is not None
+    assert torch.equal(own, torch.from_numpy(scene.environment.radiance) * scene.gain)
     torch.testing.assert_close(noon, torch.from_numpy(loaded.environment.radiance) * loaded.gain, rtol=1e-4, atol=1e-6)
 
 

@@ -46,7 +46,8 @@ def sequential(*last: nn.Module) -> nn.Sequential:
 def by_hand(network: nn.Sequential, layers: int) -> Tensor:
     """What the first layers of a network answer."""
     with torch.no_grad():
-        return network[:layers](images().permute(0, 3, 1, 2))
+        found: Tensor = network[:layers](images().permute(0, 3, 1, 2))
+        return found
 
 
 def load(network: Any) -> Model:
@@ -87,7 +88,8 @@ def test_tokens_before_a_linear_layer_are_averaged() -> None:
             self.head = nn.Linear(3, 4)
 
         def forward(self, x: Tensor) -> Tensor:
-            return self.head(x.flatten(2).movedim(1, 2)).mean(dim=1)
+            found: Tensor = self.head(x.flatten(2).movedim(1, 2)).mean(dim=1)
+            return found
 
     features = features_of(load(Tokens()))
     assert features.source == "the input of head (Linear), 3 numbers"
@@ -101,7 +103,8 @@ def test_the_last_layer_is_the_last_to_run_and_not_the_last_to_be_declared() -> 
             self.head, self.body, self.unused = nn.Linear(5, 4), nn.Linear(3, 5), nn.Linear(9, 4)
 
         def forward(self, x: Tensor) -> Tensor:
-            return self.head(input=self.body(x.mean(dim=(2, 3))).tanh())
+            found: Tensor = self.head(input=self.body(x.mean(dim=(2, 3))).tanh())
+            return found
 
     assert features_of(load(Backwards())).source == "the input of head (Linear), 5 numbers"
 
@@ -113,7 +116,8 @@ def test_a_head_that_is_no_layer_gives_the_output_of_the_last_layer() -> None:
             self.body, self.prototypes = nn.Linear(3, 5), nn.Parameter(torch.randn(5, 4))
 
         def forward(self, x: Tensor) -> Tensor:
-            return self.body(x.mean(dim=(2, 3))) @ self.prototypes
+            found: Tensor = self.body(x.mean(dim=(2, 3))) @ self.prototypes
+            return found
 
     network = Prototypes()
     features = features_of(load(network))

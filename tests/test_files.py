@@ -46,7 +46,7 @@ def test_a_pipe_that_takes_the_place_of_a_file_is_refused(tmp_path: Path, monkey
     ordinary = tmp_path / "ordinary"
     ordinary.write_bytes(b"x")
     status, pipe = os.stat(ordinary), _pipe(tmp_path)
-    monkeypatch.setattr(files.os, "stat", lambda path: status)
+    monkeypatch.setattr(os, "stat", lambda path: status)
     with pytest.raises(FileFormatError, match="got a pipe"):
         files.open_regular(pipe, "a mesh", 100)
 

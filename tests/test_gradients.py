@@ -120,7 +120,7 @@ def test_differences_are_central_differences_of_the_picture_with_one_seed() -> N
 def test_a_step_is_one_that_a_search_can_follow_and_never_under_a_pixel() -> None:
     both = torch.tensor([0.001, 0.1])
     fast, slow = first_plan((group("a.b", 0, 1, ("secant",)), group("a.c", 1, 1, ("secant",))), both).groups
-    assert (fast.step, fast.pixel) == (SEARCH_STEP, pytest.approx(0.001)) and slow.step == slow.pixel == both[1]
+    assert fast.step == SEARCH_STEP and fast.pixel == pytest.approx(0.001) and slow.step == slow.pixel == both[1]
     assert fast.step_reason == "30 times as wide as moves an outline by a pixel, so that a search can follow"
     assert slow.step_reason == "an outline moves by a pixel, or nothing moves"
     for lit in (("adjoint", "differences"), ("image",)):  # what moves no outline is as it was
@@ -521,7 +521,7 @@ def test_naming_one_parameter_searches_only_that() -> None:
         ({"far": {"kind": "pose", "yaw": [0, 90]}}, ["far.yaw"]),
         (["pose:near"], [f"near.{name}" for name in ("yaw", "pitch", "roll", "x", "y", "scale")]),
     ):
-        render = scene.renderer(asked, resolution=16)  # type: ignore[arg-type]
+        render = scene.renderer(asked, resolution=16)
         assert [one.name for one in render.plan.groups] == names
     with pytest.raises(UnknownNameError, match="unknown parameter of control pose 'yow'"):
         scene.renderer(["pose.yow"], resolution=16)

@@ -39,6 +39,7 @@ class Net(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.linspace(-1, 1, 36).reshape(3, 12))
+        self.shift: Tensor
         self.register_buffer("shift", torch.ones(12))
 
     def forward(self, x: Tensor) -> Tensor:
@@ -346,7 +347,7 @@ class Scripted(nn.Module):
 
 class Saves(Scripted):
     def forward(self, x: Tensor) -> Tensor:
-        torch.save(x, self.path)  # type: ignore[arg-type]
+        torch.save(x, self.path)
         return x.mean((2, 3))
 
 
@@ -362,7 +363,7 @@ class SavesWhileLoading(Scripted):
 
     @torch.jit.export
     def __setstate__(self, state: tuple[Tensor, str, bool]) -> None:
-        torch.save(state[0], state[1])  # type: ignore[arg-type]
+        torch.save(state[0], state[1])
         self.weight, self.path, self.note, self.training = state[0], state[1], "", state[2]  # type: ignore
 
 

@@ -50,8 +50,8 @@ def statement(text: str) -> Callable[[Path], None]:
     return change
 
 
-def content(name: str, data: bytes) -> Callable[[Path], None]:
-    return lambda folder: (folder / name).write_bytes(data) and None
+def content(name: str, data: bytes) -> Callable[[Path], object]:
+    return lambda folder: (folder / name).write_bytes(data)
 
 
 def truncated(folder: Path) -> None:
@@ -66,7 +66,7 @@ def scribbled(folder: Path) -> None:
     path.write_bytes(data)
 
 
-STORES: dict[str, Callable[[Path], None]] = {
+STORES: dict[str, Callable[[Path], object]] = {
     "truncated": truncated,
     "scribbled over": scribbled,
     "no rows": statement("DROP TABLE evaluations"),

@@ -53,7 +53,8 @@ def picture(folder: Path, name: str = "wood.png", size: int = 16) -> np.ndarray:
     waves = np.stack([np.sin(x + 1.0), np.sin(y), np.sin(x + y + 2.0) * np.cos(y)], axis=2)
     codes = np.round(127.5 + 120.0 * waves).astype(np.uint8)
     Image.fromarray(codes).save(folder / name)
-    return codes.astype(np.float32) / np.float32(255.0)
+    found: np.ndarray = codes.astype(np.float32) / np.float32(255.0)
+    return found
 
 
 def exported(folder: Path, name: str, mesh: trimesh.Trimesh | trimesh.Scene, **options: Any) -> Path:
@@ -65,7 +66,8 @@ def face_normals(mesh: Mesh) -> np.ndarray:
     """Return unit normals of the faces (F, 3), from their winding."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
     vectors = np.cross(b - a, c - a)
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    found: np.ndarray = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    return found
 
 
 def volume(mesh: Mesh) -> float:
@@ -413,7 +415,8 @@ def texture_error(asset: ObjectAsset, pixels: np.ndarray, low: tuple[float, floa
             at, uv = weights @ (mesh.vertices[face][:, :2] + 0.5), weights @ mesh.uvs[face]
             there = np.array(low) + at * (np.array(high) - low)
             errors.append(np.abs(sampled(asset.base_color, uv[None]) - sampled(pixels, there[None])).max())
-    return max(errors)
+    found: float = max(errors)
+    return found
 
 
 def test_uvs_that_overstep_a_little_keep_their_layout(tmp_path: Path) -> None:
@@ -619,7 +622,7 @@ def glb(folder: Path, material: PBRMaterial | None, **attributes: np.ndarray) ->
 
 def test_gltf_color_is_linear(tmp_path: Path) -> None:
     asset = import_object(glb(tmp_path, PBRMaterial(baseColorFactor=[0.2, 0.5, 1.0, 0.3])))
-    expected = linear_to_srgb(np.round(np.array([0.2, 0.5, 1.0], np.float32) * 255) / 255)
+    expected = linear_to_srgb(np.round(np.array([0.2, 0.5, 1.0], np.float32) * 255) / np.float32(255))
     assert asset.base_color == pytest.approx(np.broadcast_to(expected, (8, 8, 3)), abs=1e-6)
     assert asset.material == Material() and asset.warnings == ()
 
@@ -792,7 +795,7 @@ INTEGER_UVS = {
     "accessors": [{"componentType": 5123, "count": 3, "type": "VEC2"}],
     "meshes": [{"primitives": [{"attributes": {"TEXCOORD_0": 0}}]}],
 }
-BAD = {
+BAD: dict[str, tuple[Callable[[Path], Path], str]] = {
     "directory": (lambda folder: folder, r": expected a file with an object, got a directory; name a file inside it"),
     "missing": (lambda folder: folder / "no.obj", r"no\.obj: no such object file\. Check the path"),
     "missing folder": (lambda f: f / "no" / "no.obj", r"no such object file\. The folder .*no does not exist either\."),

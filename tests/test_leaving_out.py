@@ -44,11 +44,12 @@ def test_nothing_that_is_left_out_changes_a_picture_or_a_gradient(control: str) 
 def test_putting_an_item_back_takes_effect(monkeypatch: pytest.MonkeyPatch) -> None:
     renderer = made("texture")
     written: list[str] = []
+    note: Any = written.append
 
     def adjoints(item: str) -> tuple[set[str], set[str]]:
         scene = renderer.scene.like(leave_out=EVERYTHING - {item})
         inner = scene._write
-        monkeypatch.setattr(scene, "_write", lambda name, value: (written.append(name), inner(name, value)))
+        monkeypatch.setattr(scene, "_write", lambda name, value: [note(name), inner(name, value)])
         inputs = {"object.base_color": scene.base("object.base_color") * 0.5}
         scene.radiance(inputs, 0, 1)
         by_render = set(written)
@@ -122,7 +123,7 @@ def test_searches_cut_paths_and_verifications_do_not() -> None:
     evaluate(start, index=0, gradient=False)
     problem.search_depth = 2
     evaluate(start, index=0, gradient=False)
-    evaluate(start, index=0, gradient="full")
+    evaluate(start, index=0, gradient=True)
     assert seen[1].mean() < seen[0].mean() - 0.005 and torch.equal(seen[1], seen[2])
     assert problem.trial(start, 3, 8) == trial
 

@@ -116,8 +116,8 @@ def test_message_without_any_usable_file_lists_what_is_there_and_what_to_type(
 ) -> None:
     old = library(tmp_path, "usr/lib/x86_64-linux-gnu/libLLVM-15.so.1")
     monkeypatch.setattr(llvm, "_read_os_release", lambda: DEBIAN)
-    monkeypatch.setattr(llvm.os, "geteuid", lambda: 1000, raising=False)
-    monkeypatch.setattr(llvm.sys, "platform", "linux")
+    monkeypatch.setattr(os, "geteuid", lambda: 1000, raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
     with pytest.raises(EnvironmentSetupError) as caught:
         llvm._newest(llvm.find(tmp_path, {}))
     message = str(caught.value)

@@ -230,20 +230,20 @@ def test_other_floating_types_work_on_both_sides() -> None:
 
 
 def test_evaluation_mode_and_frozen_without_touching_the_original() -> None:
-    original = nn.Sequential(
-        nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.Dropout(0.9), nn.AdaptiveAvgPool2d(1), nn.Flatten()
-    )
+    first, second = nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4)
+    original = nn.Sequential(first, second, nn.Dropout(0.9), nn.AdaptiveAvgPool2d(1), nn.Flatten())
+    assert first.bias is not None and second.running_mean is not None
     model = load_model(original, input_size=8)
     leaf = images(4).requires_grad_()
     model(leaf).sum().backward()
     assert leaf.grad is not None and float(leaf.grad.abs().sum()) > 0
     assert all(p.requires_grad and p.grad is None for p in original.parameters())
     assert all(module.training for module in original.modules())
-    assert float(original[1].running_mean.abs().sum()) == 0.0  # no statistics were taken
+    assert float(second.running_mean.abs().sum()) == 0.0  # no statistics were taken
     with torch.no_grad():
-        original[0].bias += 1.0  # in place, as an optimiser would
+        first.bias += 1.0  # in place, as an optimiser would
         before = model(leaf)
-        original[0].bias -= 1.0
+        first.bias -= 1.0
     assert not torch.allclose(before, model(leaf))
 
 
@@ -823,6 +823,7 @@ def test_reference_network_is_small_and_folding_changes_nothing() -> None:
         net = reference.build(14)
         for module in net.modules():  # statistics and gains that a folding mistake would show
             if isinstance(module, nn.BatchNorm2d):
+                assert module.running_mean is not None and module.running_var is not None
                 nn.init.uniform_(module.weight, 0.5, 1.5)
                 nn.init.normal_(module.running_mean, std=0.1)
                 nn.init.uniform_(module.running_var, 0.5, 1.5)
@@ -883,7 +884,7 @@ def _coloured(count: int, size: int = 32) -> tuple[Tensor, Tensor]:
 def test_training_learns_and_repeats_bit_for_bit() -> None:
     data, labels = _coloured(64)
     plain = Augmentation(colour=0.02, brightness=0.05, contrast=0.1, cutout=0.1)
-    told: list[training.Progress] = []
+    told: list[training.TrainingState] = []
     state = torch.random.get_rng_state()
 
     def run(array: Any) -> training.Trained:
@@ -952,7 +953,7 @@ def test_figures_of_known_answers() -> None:
     logits = torch.tensor([[2.0, 0.0], [2.0, 0.0], [0.0, 2.0], [0.0, 2.0]])
     got = calibration.report(logits, [0, 1, 1, 1], bins=10)
     confidence = float(torch.tensor([2.0, 0.0]).softmax(0)[0])
-    assert got.accuracy == 0.75 and got.per_class == (1.0, pytest.approx(2 / 3))
+    assert got.accuracy == 0.75 and got.per_class == pytest.approx((1.0, 2 / 3))
     assert got.confusion == ((1, 0), (1, 2))
     assert got.confidence == pytest.approx(confidence) and got.error == pytest.approx(confidence - 0.75)
     assert [b.count for b in got.bins] == [0] * 8 + [4, 0]

@@ -15,7 +15,7 @@ from advsearch.attacks.policies.scaling import half_widths
 def path(domain: Domain, slope: Tensor, policy: Adam, steps: int) -> list[Tensor]:
     seen: list[Tensor] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         return Evaluation(float(u @ slope), slope.clone() if gradient else None, False)
 
     search(
@@ -55,7 +55,7 @@ def test_half_widths_are_the_units() -> None:
 def test_the_rate_falls_in_a_line() -> None:
     domain = Domain(torch.full((2,), 0.5), (Block(2),))
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         return Evaluation(0.0, torch.ones(2) if gradient else None, False)
 
     history = search(evaluate, domain, Adam(step_size=0.4), steps=10, seed=0, candidates=0).history
@@ -65,10 +65,10 @@ def test_the_rate_falls_in_a_line() -> None:
 def test_without_any_gradient_it_stalls_and_leaves_a_flat_start_at_random() -> None:
     domain = Domain(torch.full((5,), 0.5), (Block(5, "linf", 0.1),))
 
-    def never(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def never(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         return Evaluation(-1.0, torch.zeros_like(u), False)
 
-    def later(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def later(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         slope = torch.ones_like(u) if index > 1 else torch.zeros_like(u)
         return Evaluation(float(u.sum()), slope if gradient else None, False)
 
@@ -79,7 +79,7 @@ def test_without_any_gradient_it_stalls_and_leaves_a_flat_start_at_random() -> N
 
 
 def test_a_non_finite_objective_sends_it_back_with_half_the_rate() -> None:
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         value = float(u[0]) if float(u[0]) < 0.55 else math.nan
         return Evaluation(value, torch.ones(1) if gradient else None, False)
 

@@ -131,7 +131,7 @@ def test_the_policy_of_the_page_works() -> None:
 def test_the_policy_of_the_page_stays_in_a_ball_and_gets_choices_for_free() -> None:
     domain = Domain(torch.tensor([0.5, 0.5, 0.5, 0.1]), (Block(3, "l2", 0.1), Block(1, options=4)))
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         assert domain.contains(u)
         value = float(u[0] - u[1]) + (int(u[3] * 4) == 2) if index % 7 else math.nan
         return Evaluation(value, None, False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ both = pytest.mark.parametrize("policy", [CMAES(), NES()], ids=lambda policy: po
 
 
 def evaluator(value: Callable[[Tensor], float], noise: float = 0.0) -> Callable[..., Evaluation]:
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         error = noise * float(torch.randn(1, generator=seeded(5, index)))
         return Evaluation(value(u) + error, None, False)
 
@@ -32,7 +33,7 @@ def bowl(centre: float) -> Callable[[Tensor], float]:
 
 
 @both
-def test_only_ranks_matter(policy: Policy[object]) -> None:
+def test_only_ranks_matter(policy: Policy[Any]) -> None:
     """A monotone change of the objective, however steep, changes no proposal (bitwise: ranks are the same)."""
     domain = Domain(torch.full((4,), 0.5), (Block(4, low=0.25, high=0.75),))
     if policy.name == "cmaes":
@@ -55,7 +56,7 @@ def test_only_ranks_matter(policy: Policy[object]) -> None:
 
 
 @both
-def test_a_peak_on_the_seam_of_an_angle_is_met_from_both_sides(policy: Policy[object]) -> None:
+def test_a_peak_on_the_seam_of_an_angle_is_met_from_both_sides(policy: Policy[Any]) -> None:
     domain = Domain(torch.tensor([0.6, 0.6]), (Block(1, periodic=True), Block(1)))
 
     def value(u: Tensor) -> float:
@@ -76,7 +77,7 @@ def test_a_peak_on_the_seam_of_an_angle_is_met_from_both_sides(policy: Policy[ob
 
 
 @both
-def test_through_noise_the_mean_is_better_than_the_best_that_was_seen(policy: Policy[object]) -> None:
+def test_through_noise_the_mean_is_better_than_the_best_that_was_seen(policy: Policy[Any]) -> None:
     """Noise of a third of the bowl's height: one lucky render says nothing, the distribution averages."""
     domain = Domain(torch.full((6,), 0.2), (Block(6),))
     means, lucky = [], []
@@ -91,7 +92,7 @@ def test_through_noise_the_mean_is_better_than_the_best_that_was_seen(policy: Po
 
 @both
 @pytest.mark.parametrize("norm", ["linf", "l2", "box"])
-def test_an_optimum_in_a_corner_is_reached_and_the_mean_stays_inside(policy: Policy[object], norm: str) -> None:
+def test_an_optimum_in_a_corner_is_reached_and_the_mean_stays_inside(policy: Policy[Any], norm: str) -> None:
     domain = Domain(torch.full((5,), 0.45), (Block(5, norm, {"linf": 0.2, "l2": 0.3, "box": None}[norm]),))  # type: ignore[arg-type]
     w = torch.tensor([1.0, -2.0, 0.5, 1.5, -1.0])
     far = domain.project(domain.start + 1e4 * w)

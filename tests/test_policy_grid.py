@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -12,11 +13,11 @@ from advsearch.attacks import Block, Domain, Ending, Evaluation, Grid, Policy, S
 from advsearch.errors import InputError
 
 
-def flat(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+def flat(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
     return Evaluation(0.0, None, False)
 
 
-def points(policy: Policy[object], domain: Domain, steps: int, seed: int = 0) -> tuple[Tensor, SearchResult]:
+def points(policy: Policy[Any], domain: Domain, steps: int, seed: int = 0) -> tuple[Tensor, SearchResult]:
     seen: list[Tensor] = []
     result = search(
         flat,
@@ -157,7 +158,7 @@ def test_sobol_beats_random_in_two_dimensions() -> None:
     domain = Domain(torch.full((2,), 0.5), (Block(2),))
     places = torch.rand(500, 2, generator=seeded(0, 0))
 
-    def gap(policy: Policy[object]) -> float:
+    def gap(policy: Policy[Any]) -> float:
         return sum(float(torch.cdist(places, points(policy, domain, 64, s)[0]).amin(1).max()) for s in range(5)) / 5
 
     assert gap(Sobol()) < 0.85 * gap(Random())

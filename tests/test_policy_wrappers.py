@@ -77,7 +77,7 @@ def played(
 ) -> tuple[SearchResult, list[Tensor]]:
     seen: list[Tensor] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         seen.append(u.clone())
         slope = torch.ones_like(u) if gradient else None
         cost = samples * (1 + domain.gradient_cost * (gradient is True))
@@ -136,10 +136,10 @@ def test_a_costly_gradient_does_not_overdraw_a_turn() -> None:
     domain = replace(BOX, gradient_cost=3)
     asked: list[bool] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
-        asked.append(gradient)
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+        asked.append(bool(gradient))
         slope = torch.ones_like(u) if gradient else None
-        return Evaluation(float(u[0]), slope, False, cost=1 + 3 * gradient)
+        return Evaluation(float(u[0]), slope, False, cost=1 + 3 * bool(gradient))
 
     search(evaluate, domain, Restarts(Still(0.5, gradient=True), 2), steps=20, seed=0, candidates=0)
     assert asked == [True, True, False, False] * 2
@@ -193,7 +193,7 @@ def test_restarts_find_the_higher_of_two_hills() -> None:
         low, high = ((math.exp(-20 * float((u - c).square().sum())), c) for c in (0.2, 0.85))
         return -40 * (low[0] * (u - low[1]) + 2 * high[0] * (u - high[1]))
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         return Evaluation(value(u), slope(u) if gradient else None, False)
 
     domain = Domain(torch.tensor([0.25, 0.15]), (Block(2),))
@@ -227,7 +227,7 @@ def test_a_portfolio_answers_with_its_leaders_distribution() -> None:
 def halved(policy: Halving, steps: int, value: Callable[[Tensor], float]) -> list[tuple[StepRecord, tuple[float, ...]]]:
     told: list[tuple[StepRecord, tuple[float, ...]]] = []
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool, samples: int = 1) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         return Evaluation(value(u), None, False, cost=samples)
 
     search(
@@ -309,7 +309,7 @@ def test_choices_beside_a_ball_keep_its_gradient_and_its_distribution() -> None:
     )
     w = torch.tensor([1.0, 0.0, -1.0, 1.0])
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         bonus = 0.3 * (int(u[1] * 3) == 1)
         return Evaluation(float(w @ u) + bonus, w.clone() if gradient else None, False)
 

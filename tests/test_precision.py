@@ -73,7 +73,8 @@ class Clock:
 def noisy(count: int, seed: int, bias: float = 0.0, power: float = -0.5) -> np.ndarray:
     """A picture with noise of standard deviation count^power, and a bias that no samples remove."""
     generator = np.random.default_rng(seed)
-    return TRUTH * (1.0 + bias) + count**power * generator.standard_normal(SIZE)
+    found: np.ndarray = TRUTH * (1.0 + bias) + count**power * generator.standard_normal(SIZE)
+    return found
 
 
 def setting(count: int, series: str = "independent", cost: float | None = None) -> MeasuredSetting:
@@ -180,7 +181,7 @@ def test_quartiles() -> None:
 def test_independent_noise_has_slope_minus_a_half() -> None:
     points = measured(exact())
     for against in ("samples", "seconds"):
-        line = fit(points, against, INDEPENDENT)  # type: ignore[arg-type]
+        line = fit(points, against, INDEPENDENT)
         assert line is not None and line.value == pytest.approx(-0.5, abs=TOLERANCE)
         assert line.interval[0] < -0.5 < line.interval[1] or abs(line.value + 0.5) < 0.02
         assert line.agrees is True and line.points == 5
@@ -228,7 +229,8 @@ def test_a_line_needs_three_known_points() -> None:
 
 
 def error_at(samples: float) -> float:
-    return samples**-0.5 * math.sqrt(SIZE) / float(np.linalg.norm(TRUTH))
+    found: float = samples**-0.5 * math.sqrt(SIZE) / float(np.linalg.norm(TRUTH))
+    return found
 
 
 @pytest.mark.parametrize("goal", [0.3, 0.1, 0.05])
@@ -530,4 +532,5 @@ def test_a_tiny_scene_from_end_to_end(
 
 
 def test_a_report_without_points_has_no_figure() -> None:
-    assert precision_figures(PrecisionResult.model_construct(points=[], slopes=[])) == {}
+    nothing: dict[str, Any] = {"points": [], "slopes": []}
+    assert precision_figures(PrecisionResult.model_construct(**nothing)) == {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ from advsearch.errors import InputError
 NORMS = {"linf": lambda w: float(w.abs().sum()), "l2": lambda w: float(w.norm())}
 
 
-def linear(size: int, norm: str, share: float) -> tuple[Domain, Tensor, float]:
+def linear(size: int, norm: Literal["linf", "l2"], share: float) -> tuple[Domain, Tensor, float]:
     """A linear model whose smallest flipping epsilon is `share` of the domain's: the domain, weights and bias."""
     weights = torch.randn(size, generator=torch.Generator().manual_seed(size))
     epsilon = 0.4
@@ -27,13 +28,15 @@ def linear(size: int, norm: str, share: float) -> tuple[Domain, Tensor, float]:
 @pytest.mark.parametrize("norm", NORMS)
 @pytest.mark.parametrize("size", [2, 30, 1000])
 @pytest.mark.parametrize("share", [0.9, 0.3, 0.03])
-def test_the_smallest_epsilon_of_a_linear_model_is_within_five_per_cent(norm: str, size: int, share: float) -> None:
+def test_the_smallest_epsilon_of_a_linear_model_is_within_five_per_cent(
+    norm: Literal["linf", "l2"], size: int, share: float
+) -> None:
     domain, weights, bias = linear(size, norm, share)
 
     def value(u: Tensor) -> float:
         return float((u - domain.start) @ weights) + bias
 
-    def evaluate(u: Tensor, *, index: int, gradient: bool) -> Evaluation:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
         return Evaluation(value(u), weights.clone(), value(u) > 0.0)
 
     def found(inside: Domain, number: int) -> Tensor:

@@ -30,7 +30,8 @@ def attack(data: Path, run: Path, case: str) -> dict[str, Any]:
     command += ["--control", "texture", "--epsilon", str(epsilon), "--run", str(run), "--json", *flags]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    summary: dict[str, Any] = json.loads(done.stdout)
+    return summary
 
 
 @pytest.mark.parametrize(

@@ -169,7 +169,8 @@ def test_the_denoiser_is_the_identity_in_the_backward_pass(raw: Renderer, denois
         u = inside(render).requires_grad_()
         linear.radiance(u, seed=0, spp=16).sum().backward()
         gradients.append(u.grad)
-    assert gradients[0] is not None and torch.allclose(gradients[0], gradients[1], rtol=1e-4, atol=1e-7)
+    assert gradients[0] is not None and gradients[1] is not None
+    assert torch.allclose(gradients[0], gradients[1], rtol=1e-4, atol=1e-7)
 
 
 def test_the_denoiser_brings_few_samples_close_to_many(raw: Renderer, denoised: Renderer) -> None:

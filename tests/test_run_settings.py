@@ -85,6 +85,7 @@ def test_python_gives_controls_the_settings_of_the_run(controls: Any, monkeypatc
     monkeypatch.setattr(attacking, "_carry_out", lambda job, progress: job)
     job: Any = advsearch.attack("mug", controls=controls, **ALL)
     again = controls_of(job.config.controls, job.config)
+    texture: Any
     for texture in (job.controls[0], again[0]):
         assert (texture.epsilon, texture.norm, texture.resolution) == (0.07, "l2", 16)
 
@@ -111,7 +112,7 @@ def test_a_sweep_and_a_render_give_every_texture_its_resolution(asked: Any, monk
 
 
 def test_a_gap_gives_each_control_what_it_takes(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
-    seen = []
+    seen: list[Any] = []
 
     monkeypatch.setattr("advsearch.api.gap._Parts.attack", lambda self, config, name: _seen(config, seen))
     config = GapConfig(object="mug", controls="texture,pose,geometry", run=str(tmp_path / "gap"), **ALL)

@@ -59,6 +59,12 @@ ELEVATION = next(one for one in CONTROLS["camera"].parameters if one.name == "el
 NOISE = 0.05
 
 
+def kept(seen: list[Any], thing: Any, answer: Any) -> Any:
+    """Note a thing and answer, where an expression has to do both."""
+    seen.append(thing)
+    return answer
+
+
 class FakeRenderer:
     """A picture whose grey level is a smooth function of u plus noise that the seed decides."""
 
@@ -413,7 +419,7 @@ def test_what_a_row_says_of_an_occluder_is_true_of_its_own_camera() -> None:
 
 def test_what_a_row_says_is_true_of_the_picture_that_its_model_was_shown() -> None:
     wide = advsearch.load_model(Brightness(), labels=LABELS, input_size=(SIZE, 2 * SIZE), name="wide")
-    drawn = {"camera": {}}
+    drawn: dict[str, Any] = {"camera": {}}
     both = advsearch.sweep("mug", [model(), wide], controls=drawn, samples=2, trials=0)
     alone = [
         row.values["camera.distance"]
@@ -835,7 +841,7 @@ EXAMPLES = [words for name in ("sweeps.md", "command-line.md") for words in exam
 @pytest.mark.parametrize("words", EXAMPLES, ids=" ".join)
 def test_every_example_of_the_documentation_is_a_sweep(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[SweepConfig] = []
-    monkeypatch.setattr(cli_sweep, "carry_out", lambda config, **rest: asked.append(config) or 0)
+    monkeypatch.setattr(cli_sweep, "carry_out", lambda config, **rest: kept(asked, config, 0))
     assert main(words[1:]) == 0
     job = _job_of(asked[0])
     assert Sweep(job, None, NullProgress()).total > 1

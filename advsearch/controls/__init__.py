@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from importlib import import_module
+from typing import Any
 
 from advsearch.controls.base import BoundControl, Budget, Choice, Control, Group, Parameter
 from advsearch.controls.clean import Moved, check_prepared
@@ -174,7 +175,7 @@ def _suggestion(control: Control) -> str:
     return f"{control.name}={{{one.name}: [{low:g}, {high:g}]}}"
 
 
-def __getattr__(name: str) -> object:
+def __getattr__(name: str) -> Any:
     """Import the class of a control when it is asked for by name."""
     for module, class_name in OWN.items():
         if class_name == name:

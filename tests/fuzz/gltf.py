@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
+from collections.abc import Callable
 from functools import cache
 from typing import Any
 
@@ -30,7 +31,8 @@ def box_glb() -> bytes:
     box.visual = TextureVisuals(uv=box.vertices[:, :2] + 0.5, material=material)
     scene = trimesh.Scene(box)
     scene.add_geometry(trimesh.creation.icosphere(subdivisions=1), transform=trimesh.transformations.scale_matrix(0.5))
-    return scene.export(file_type="glb")
+    written: bytes = scene.export(file_type="glb")
+    return written
 
 
 def parts(data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -77,7 +79,7 @@ def types_confused(random: Random) -> Case:
 
 def text(random: Random) -> Case:
     """JSON that is hostile as text."""
-    kinds = {
+    kinds: dict[str, Callable[[], bytes]] = {
         "nested lists": lambda: b"[" * 100_000 + b"]" * 100_000,
         "nested nodes": lambda: b'{"asset": {"version": "2.0"}, "extras": ' + b'{"a":' * 90_000 + b"1" + b"}" * 90_001,
         "an integer of 6,000 digits": lambda: b'{"asset": {"version": "2.0"}, "scene": ' + b"9" * 6_000 + b"}",

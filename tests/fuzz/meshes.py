@@ -32,12 +32,10 @@ def box_file(kind: str, encoding: str = "") -> bytes:
     box = trimesh.creation.box()
     if kind == "ply":
         box.visual.vertex_colors = np.arange(32, dtype=np.uint8).reshape(8, 4) * 8
-        return box.export(file_type=kind, encoding=encoding)
-    return (
-        box.export(file_type=f"{kind}_ascii" if encoding == "ascii" else kind).encode()
-        if encoding == "ascii"
-        else (box.export(file_type=kind))
-    )
+        coloured: bytes = box.export(file_type=kind, encoding=encoding)
+        return coloured
+    written: str | bytes = box.export(file_type=f"{kind}_ascii" if encoding == "ascii" else kind)
+    return written.encode() if isinstance(written, str) else written
 
 
 # --- Wavefront OBJ ----------------------------------------

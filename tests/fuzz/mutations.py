@@ -100,7 +100,7 @@ def _lengths(random: Random, data: bytes) -> bytes:
         at = random.randrange(min(len(content), random.choice((32, 256, 4096))))
         size, order = random.choice((1, 2, 4, 4)), random.choice(("little", "big"))
         value = random.choice(INTEGERS) & (256**size - 1)
-        content[at : at + size] = value.to_bytes(size, order)  # type: ignore[arg-type]
+        content[at : at + size] = value.to_bytes(size, order)
     return bytes(content)
 
 

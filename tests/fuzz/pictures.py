@@ -7,6 +7,7 @@ import math
 import struct
 import tempfile
 import zlib
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -66,7 +67,7 @@ def picture(random: Random) -> tuple[str, bytes]:
     """Return a hostile picture and what it is."""
     kind, mode = random.choice(SAMPLES)
     what, data = damaged(random, sample(kind, mode))
-    bombs = (
+    bombs: tuple[tuple[str, Callable[[], bytes]], ...] = (
         ("a bomb of 20,000 x 20,000", lambda: plain_png(20_000, 20_000, 1, 0)),
         ("a bomb of 12,000 x 9,000", lambda: plain_png(12_000, 9_000)),
         ("a bomb in a palette", lambda: plain_png(30_000, 30_000, 1, 3)),

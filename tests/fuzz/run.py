@@ -14,6 +14,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from fuzz.case import Case
 from fuzz.pictures import plain_png
@@ -162,7 +163,7 @@ class _Worker:
             raise RuntimeError("the process that loads the cases did not start")
         return self._process
 
-    def _answer(self, process: subprocess.Popen[bytes], cpu: float, resident: int) -> tuple[dict | None, str]:
+    def _answer(self, process: subprocess.Popen[bytes], cpu: float, resident: int) -> tuple[dict[str, Any] | None, str]:
         """Wait for the answer; give up when the case takes more than it may."""
         active, deadline = cpu, time.monotonic() + IDLE_SECONDS
         while True:
@@ -186,8 +187,9 @@ class _Worker:
     def _line(process: subprocess.Popen[bytes], deadline: float) -> bytes | None:
         """Return a line of the answer, nothing where the process has ended, or None when it is late."""
         pipe = process.stdout
+        assert pipe is not None
         ready, _, _ = select.select([pipe], [], [], max(0.0, deadline - time.monotonic()))
-        return pipe.readline() if ready else None  # type: ignore[union-attr]
+        return pipe.readline() if ready else None
 
 
 def _usage(pid: int) -> tuple[float, int]:
@@ -200,7 +202,7 @@ def _usage(pid: int) -> tuple[float, int]:
     return (int(fields[11]) + int(fields[12])) / _TICKS, int(pages) * _PAGE
 
 
-def _faults(answer: dict, case: Case, path: Path) -> Iterator[str]:
+def _faults(answer: dict[str, Any], case: Case, path: Path) -> Iterator[str]:
     """Yield what is wrong with the way a case ended."""
     if answer["ending"] == "traceback":
         yield "an error that is not for users"

@@ -31,7 +31,8 @@ class Watch:
     """Notes what a case must not do: start programs, read what is outside its folder, write outside the run folder."""
 
     def __init__(self, outside: str, runs: str) -> None:
-        self.outside, self.runs, self.active, self.seen = outside, runs, False, []
+        self.outside, self.runs, self.active = outside, runs, False
+        self.seen: list[str] = []
         sys.addaudithook(self.hook)
 
     def hook(self, event: str, arguments: tuple[Any, ...]) -> None:
