@@ -1,0 +1,117 @@
+"""Searching textures by a matrix of light transport: a step, what the matrix costs, and how far its pictures are off.
+
+    python benchmarks/transport.py [--object mug] [--environment studio] [--model reference] [--label mug] [--repeats 5]
+
+Each figure is the median of turns that are taken one after the other in one process:
+
+- a step (picture, model, derivative) by the matrix, and by rendering and the adjoint, over the model's forward and
+  backward pass alone;
+- making the matrix, in rendered steps;
+- the error of a predicted change of the picture within epsilon 0.1 (levels of 255, root mean square): random signs, and
+  the whole texture lighter and darker; beside it how far two traced pictures of as many samples lie apart.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from advsearch import threads
+
+threads.configure()
+
+from advsearch.engine.loading import load_scene  # noqa: E402
+from advsearch.models import load_model  # noqa: E402
+from advsearch.scene.renderer import Renderer  # noqa: E402
+from advsearch.scene.transport.renderer import LinearRenderer  # noqa: E402
+
+EPSILON = 0.1
+SPP = 8
+TRACED = 256
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--object", default="mug")
+    parser.add_argument("--environment", default="studio")
+    parser.add_argument("--model", default="reference")
+    parser.add_argument("--labels")
+    parser.add_argument("--label", default="mug")
+    parser.add_argument("--repeats", type=int, default=5)
+    args = parser.parse_args()
+    model = load_model(args.model, labels=args.labels)
+    right = model.label_set(args.label).indices[0]
+    size = model.input_size
+    renderer = load_scene(args.object, args.environment).renderer(["texture"], resolution=(size[0], size[1]))
+
+    def loss(picture: Tensor) -> Tensor:
+        return -model(picture)[0, right]
+
+    print(f"{args.object} in {args.environment}, {model.name}, {size[0]} x {size[1]}; medians of {args.repeats}")
+    times(renderer, loss, args.repeats)
+    errors(renderer)
+
+
+def times(renderer: Renderer, loss: Callable[[Tensor], Tensor], repeats: int) -> None:
+    """Print what a step and a matrix take."""
+    linear = LinearRenderer(renderer, renderer.start, seed=1)
+    still = renderer(renderer.start, seed=0, spp=SPP).detach()
+    u = changed(renderer, "signs")
+
+    def alone() -> None:
+        loss(still.clone().requires_grad_()).backward()
+
+    turns: dict[str, Callable[[], object]] = {
+        "model": alone,
+        "matrix": lambda: linear.gradient(loss, u, 0, SPP),
+        "rendered": lambda: renderer.gradient(loss, u, 0, SPP),
+        "making": lambda: LinearRenderer(renderer, renderer.start, seed=2),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in turns}
+    for turn in range(repeats + 1):
+        for name, work in turns.items():
+            begun = time.perf_counter()
+            work()
+            if turn:
+                seconds[name].append(time.perf_counter() - begun)
+    middle = {name: statistics.median(found) for name, found in seconds.items()}
+    print(f"  a step by the matrix, over the model alone       {middle['matrix'] / middle['model']:8.2f}")
+    print(f"  a rendered step, over the model alone            {middle['rendered'] / middle['model']:8.2f}")
+    print(f"  making the matrix, in rendered steps             {middle['making'] / middle['rendered']:8.2f}")
+    print(f"  entries {linear.entries:,}, {linear.bytes / 2**20:.0f} MiB")
+
+
+def errors(renderer: Renderer) -> None:
+    """Print how far predicted changes are off."""
+    linear = LinearRenderer(renderer, renderer.start, seed=1)
+    with torch.no_grad():
+        before, other = (renderer(renderer.start, seed=seed, spp=TRACED) for seed in (11, 12))
+        print(f"  two traced pictures of {TRACED} samples lie apart by      {levels(before, other):6.2f} levels")
+        for kind in ("signs", "lighter", "darker"):
+            u = changed(renderer, kind)
+            change = renderer(u, seed=11, spp=TRACED) - before
+            off = levels(linear(u) - linear(renderer.start), change)
+            size = levels(change, torch.zeros_like(change))
+            print(f"  {kind:8s} predicted change off by {off:6.2f} levels, of a change of {size:6.2f}")
+
+
+def changed(renderer: Renderer, kind: str) -> Tensor:
+    """A texture `EPSILON` of display-referred sRGB from the start."""
+    signs = torch.randint(0, 2, renderer.start.shape, generator=torch.Generator().manual_seed(0)) * 2.0 - 1.0
+    way = {"signs": signs, "lighter": torch.ones_like(signs), "darker": -torch.ones_like(signs)}[kind]
+    return (renderer.start + EPSILON * way).clamp(0.0, 1.0)
+
+
+def levels(one: Tensor, other: Tensor) -> float:
+    """Root mean square difference in levels of 255."""
+    return 255.0 * float(((one - other) ** 2).mean().sqrt())
+
+
+if __name__ == "__main__":
+    main()
