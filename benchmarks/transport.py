@@ -51,7 +51,8 @@ def main() -> None:
     renderer = load_scene(args.object, args.environment).renderer(["texture"], resolution=(size[0], size[1]))
 
     def loss(picture: Tensor) -> Tensor:
-        return -model(picture)[0, right]
+        score: Tensor = -model(picture)[0, right]
+        return score
 
     print(f"{args.object} in {args.environment}, {model.name}, {size[0]} x {size[1]}; medians of {args.repeats}")
     times(renderer, loss, args.repeats)
