@@ -83,8 +83,7 @@ class LinearRenderer(Renderer):
         """
         (height, width), picture = self._there[name].shape[:2], self.formation.resolution
         made = TextureTransport(picture, (height, width))
-        samples = max(1, min(SPP, PASS // (picture[0] * picture[1])))
-        passes = -(-SPP // samples)
+        samples, passes = _passes(self)
         for number in range(passes):
             noise = seeds.stream(seed, f"transport {name}", number)
             made.add(self.scene.transport(self._there, name, noise, samples), 1.0 / passes)
@@ -143,4 +142,12 @@ def why_not(renderer: Renderer) -> str | None:
 def samples_to_collect(renderer: Renderer) -> int:
     """Samples a pixel that a linear renderer traces before it can begin."""
     inputs = {name for group in renderer.plan.groups for name in renderer.routes.get(group.name, ())}
-    return BASE_SPP + SPP * len(inputs)
+    samples, passes = _passes(renderer)
+    return BASE_SPP + samples * passes * len(inputs)
+
+
+def _passes(renderer: Renderer) -> tuple[int, int]:
+    """Samples a pixel of a pass, and how many passes there are."""
+    height, width = renderer.formation.resolution
+    samples = max(1, min(SPP, PASS // (height * width)))
+    return samples, -(-SPP // samples)
