@@ -22,8 +22,8 @@ def _rates(summary: AttackSummary) -> list[list[str]]:
     if summary.adversarial:
         rows.append(["adversarial", *_answer(summary.adversarial), *_verified(success, summary.verified)])
     if summary.baseline:
-        renders = f"{summary.baseline.renders} renders"
-        rows.append(["random search", renders, "", *_verified(success, summary.baseline.verified)])
+        pictures = f"{summary.baseline.renders} pictures"
+        rows.append(["random search", pictures, "", *_verified(success, summary.baseline.verified)])
     if summary.average:
         average = summary.average
         drawn = wording.count(average.configurations, "configuration")
