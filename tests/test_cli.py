@@ -838,9 +838,9 @@ def test_doctor_passes_its_status_on(flag: list[str], monkeypatch: pytest.Monkey
 def test_the_table_is_read_in_five_seconds() -> None:
     assert answer(SUMMARY) == (
         "The model calls this mug a vase in 20 of 20 fresh renders (95 % interval 83-100 %).\n\n"
-        "  clean           mug          98 %   right in 20 of 20   83-100 %\n"
-        "  adversarial     vase         91 %   wrong in 20 of 20   83-100 %\n"
-        "  random search   40 pictures         wrong in 1 of 20    0.1-25 %\n\n"
+        "  clean           mug           98 %   right in 20 of 20   83-100 %\n"
+        "  adversarial     vase          91 %   wrong in 20 of 20   83-100 %\n"
+        "  random search   40 pictures          wrong in 1 of 20    0.1-25 %\n\n"
         "  changed    texture within 0.1 (linf: the largest change of any value)\n"
         "  search     pgd, 40 steps: found\n"
         "  renders    40 of the search, 40 gradients, 21 of the verification\n"
