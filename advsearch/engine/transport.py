@@ -22,7 +22,7 @@ from advsearch.engine.problem import OnImage, Problem
 from advsearch.scene.transport.renderer import SPP, LinearRenderer, samples_to_collect, why_not
 
 WORTH = 16
-"""Evaluations from which a search pays for the matrix, which costs as much as some 6 rendered ones with gradients
+"""Evaluations from which a search pays for the matrix, which costs as much as some 10 rendered ones with gradients
 (`benchmarks/transport.py`)."""
 EVERY = 20
 BOUND = 1.0

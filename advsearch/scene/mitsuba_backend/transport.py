@@ -70,18 +70,25 @@ def collect(scene: Any, parameters: Any, key: str, *, depth: int, seed: int, spp
             aperture = noise.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
             ray, _ = sensor.sample_ray(0.0, 0.5, place, aperture)
             vertices = _trace(scene, texture, ray, noise, depth)
-            dr.eval([list(one) for one in vertices])
-            pixels = pixel.torch().long()
+            taking_part = [dr.any(one != 0.0) & dr.all(dr.isfinite(one)) for _, one in vertices]
+            dr.eval(vertices, taking_part)
+            return [_kept(*one, taken, spp) for one, taken in zip(vertices, taking_part, strict=True)]
     finally:
         parameters[key] = mi.TensorXf(dr.detach(texture))
         parameters.update()
-    found = []
-    for uv, weight in vertices:
-        values = torch.stack([channel.torch() for channel in weight], dim=1)
-        taking_part = (values != 0.0).any(dim=1) & torch.isfinite(values).all(dim=1)
-        places = torch.stack([uv.x.torch(), uv.y.torch()], dim=1)
-        found.append(Vertices(pixels[taking_part], places[taking_part], values[taking_part] / spp))
-    return found
+
+
+def _kept(uv: Any, weight: Any, taking_part: Any, spp: int) -> Vertices:
+    """Take the vertices that take part out of all, as tensors."""
+    mi = mitsuba()
+    import drjit as dr
+
+    index: Any = dr.compress(taking_part)
+    uv, weight = dr.gather(mi.Point2f, uv, index), dr.gather(mi.Color3f, weight, index) / spp
+    pixel = index // spp
+    dr.eval(uv, weight, pixel)
+    places = torch.stack([uv.x.torch(), uv.y.torch()], dim=1)
+    return Vertices(pixel.torch().long(), places, torch.stack([one.torch() for one in weight], dim=1))
 
 
 def _trace(scene: Any, texture: Any, ray: Any, noise: Any, depth: int) -> list[tuple[Any, Any]]:

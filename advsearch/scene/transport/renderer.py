@@ -15,7 +15,7 @@ from advsearch.scene.gradients.group import Group
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.matrix import Smooth, TextureTransport
 
-BASE_SPP = 256
+BASE_SPP = 128
 """Samples a pixel of the base picture, whose noise all predicted pictures have."""
 SPP = 64
 """Samples a pixel of the paths whose vertices become the matrix; its rows lose their noise in the denoiser."""
