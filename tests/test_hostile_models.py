@@ -201,6 +201,17 @@ def test_a_tensor_without_data_takes_no_memory(exported: Path, tmp_path: Path) -
         load_model(path)
 
 
+@pytest.mark.parametrize("sizes", [0, 7, True, "3", [3], [{"as_int": -1}], [{"as_int": "3"}], {"as_int": 3}])
+def test_sizes_of_a_tensor_that_are_no_list_of_numbers_are_refused(
+    exported: Path, tmp_path: Path, sizes: object
+) -> None:
+    def plant(program: Program) -> None:
+        next(iter(program[TABLES[0]]["config"].values()))["tensor_meta"]["sizes"] = sizes
+
+    with pytest.raises(FileFormatError, match="expected the sizes of a tensor for"):
+        load_model(planted(exported, tmp_path / "sizes.pt2", plant))
+
+
 def test_a_counter_of_sizes_ends(exported: Path, tmp_path: Path) -> None:
     """torch counts up to the number in the name of a size."""
 

@@ -113,8 +113,9 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
 def _check_tensor(archive: Archive, record: str, meta: Any) -> None:
     """torch makes a tensor without data of whatever size it is told."""
     sizes: Any = meta.get("sizes") if isinstance(meta, dict) else None
-    numbers: list[Any] = [size.get("as_int") for size in sizes or [] if isinstance(size, dict)]
-    if not isinstance(sizes, list) or not all(isinstance(number, int) and number >= 0 for number in numbers):
+    listed = sizes if isinstance(sizes, list) else [None]
+    numbers: list[Any] = [size.get("as_int") if isinstance(size, dict) else None for size in listed]
+    if not all(isinstance(number, int) and number >= 0 for number in numbers):
         raise refused(archive.path, f"expected the sizes of a tensor for {record[:80]!r}, got something else")
     if record in archive and archive.members[record].file_size == 0 and math.prod(numbers) > 0:
         raise refused(archive.path, f"{record[:80]!r} is empty, but should hold a tensor of {numbers[:8]}")
