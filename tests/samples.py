@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from advsearch.config import AttackConfig
+from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.gap import CurveResult, GapResult
 from advsearch.runs.results.region import RegionResult
 from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.store import Row
 
 FORMATION: dict[str, Any] = {
     "denoiser": "oidn", "filter": "box", "sampler": "multijitter", "exposure": 0.0, "resolution": [128, 128],
@@ -43,6 +49,10 @@ ATTACK: dict[str, Any] = {
     "non_finite": {"objectives": 0, "gradient_elements": 0},
     "seconds": {"setup": 3.1, "search": 9.0, "verification": 2.2, "total": 14.6},
 }  # fmt: skip
+BRACKET = {"epsilon": {"texture": 0.01234}, "not_found_at": {"texture": 0.0118}, "closed": True, "confirmed": True,
+           "searches": 7, "checks": 40}  # fmt: skip
+TARGET: dict[str, Any] = {"goal": "a target answer", "target": ["vase"]}
+EASIER: dict[str, Any] = {"goal": "a right answer", "target": None}
 SWEEP: dict[str, Any] = {
     **RUN, "schema": 1, "command": "sweep", "run": "runs/mug-sweep-001", "object": "mug", "model": "reference",
     "task": "classification",
@@ -111,3 +121,22 @@ def gap(**changes: Any) -> GapResult:
 def region(**changes: Any) -> RegionResult:
     """Return a region's result with other fields."""
     return RegionResult.of({**REGION, **changes})
+
+
+SUMMARY = attack()
+
+
+def make_run(path: Path, summary: AttackSummary = SUMMARY, *, pictures: bool = True, rows: bool = True) -> Path:
+    """Return a run directory with stand-in pictures and results."""
+    grey = np.full((8, 8, 3), 0.5)
+    with RunDirectory.create_for(AttackConfig(object=summary.object, run=str(path))) as run:
+        for name in ("clean", "adversarial", "difference", "verification-00", "verification-01") if pictures else ():
+            run.save_image(name, grey)
+        for name in ("texture", "texture-original") if pictures else ():
+            run.save_image(name, grey, folder="artifacts")
+        if pictures:
+            run.save_animation("search", [grey, grey * 0])
+        for step in range(40) if rows else ():
+            run.record(Row("search", step, objective=step / 10 - 2), Row("baseline", step, objective=-2.0 - step / 100))
+        run.write_summary(summary)
+    return path

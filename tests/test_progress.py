@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_resume import StandInProblem, carry_out, configuration, rows
+from stand_ins import StandInProblem, carry_out, configuration, rows
 
 from advsearch.api import plan as planning
 from advsearch.api.attack import attack_from_config

@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
+import conftest
 import numpy as np
 import OpenEXR
 import pytest
@@ -13,7 +14,7 @@ import pytest
 from advsearch.errors import FileFormatError, InputError
 from advsearch.scene.environments import import_environment
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "environments"
+DATA = conftest.DATA / "environments"
 real_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the shared test data is not at {DATA}")
 
 HEADER = b"#?RADIANCE\n# made by hand\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=2\n\n"

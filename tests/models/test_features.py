@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import conftest
 import pytest
 import torch
 from torch import Tensor, nn
@@ -15,7 +16,7 @@ from advsearch.errors import InputError
 from advsearch.models import Model, ModelWarning, Preprocessing, load_model
 from advsearch.models.features import Features, features_of
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "models"
+DATA = conftest.DATA / "models"
 MOBILENET = DATA / "mobilenet_v2_imagenet.pt2"
 SIZE = 12
 

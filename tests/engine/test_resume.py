@@ -9,22 +9,22 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 import torch
+from conftest import ROOT
+from stand_ins import StandInProblem, carry_out, configuration, rows
 from torch import Tensor
 
-from advsearch.attacks import Block, Domain, Evaluation, Policy, Proposal, make_policy
-from advsearch.attacks.verification import WORST_CASE, Rule
+from advsearch.attacks import Domain, Evaluation, Policy, Proposal, make_policy
 from advsearch.config import AttackConfig
 from advsearch.engine.memory import Memory
-from advsearch.engine.record import Findings, Recorder, Stages
+from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.stages import Attack
 from advsearch.errors import FileFormatError, InputError, RunExistsError
 from advsearch.progress import NullProgress
@@ -32,120 +32,8 @@ from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.replay import Entry, ReplayLog
 from advsearch.runs.store import Row
-from advsearch.seeds import stream
-from advsearch.tasks import Classification, Judgement
 
 POLICIES = ("pgd", "auto", "random", "cmaes")
-
-
-@dataclass(frozen=True)
-class StandInPlan:
-    """A gradient plan with nothing in it."""
-
-    renders: int = 0
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"groups": []}
-
-    def restored(self, stored: dict[str, Any]) -> StandInPlan:
-        return self
-
-
-def judged(logits: Tensor) -> Judgement:
-    """What is said of two logits, of which the first is right."""
-    return Classification(labels=("mug", "bowl")).judge(logits[None], (0,))[0]
-
-
-@dataclass
-class StandInProblem:
-    """A noisy quadratic where a scene, a model and an objective would be; `pause` seconds an evaluation."""
-
-    pause: float = 0.0
-    on_evaluation: Callable[[], None] = lambda: None
-    domain: Domain = field(default_factory=lambda: Domain(torch.full((6,), 0.5), (Block(4, "linf", 0.2), Block(2))))
-    conditions: None = None
-    rule: Rule = WORST_CASE
-    spp: int = 4
-    search_depth: int | None = None
-    seed: int = 3
-    draws: int = 1
-    plan: StandInPlan = StandInPlan()
-
-    def _logits(self, u: Tensor, seed: int) -> Tensor:
-        noise = 0.02 * torch.randn(1, generator=torch.Generator().manual_seed(seed))
-        value = 0.05 - (u - torch.linspace(0.3, 0.8, 6)).square().sum() + noise[0]
-        return torch.stack([-value, value])
-
-    def evaluator(self, kind: str, tell: Any = None) -> Any:
-        def evaluate(u: Tensor, *, index: int, gradient: Any, samples: int = 1) -> Evaluation:
-            time.sleep(self.pause)
-            self.on_evaluation()
-            at = u.clone().requires_grad_()
-            logits = self._logits(at, stream(self.seed, kind, index))
-            value = logits[1] - logits[0]
-            slope = torch.autograd.grad(value, at)[0] if gradient else None
-            if tell is not None and tell.wants(index):
-                tell.tell(index, torch.full((2, 2, 3), float(u.mean())))
-            return Evaluation(
-                float(value.detach()), slope, bool(value > 0), cost=samples, judgement=judged(logits.detach())
-            )
-
-        return evaluate
-
-    def trial(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True) -> Judgement:
-        time.sleep(self.pause)
-        return judged(self._logits(u, seed))
-
-    def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Any]:
-        return {f"u.{number}": {"value": float(value), "unit": "1"} for number, value in enumerate(u)}
-
-    def conditions_of(self, u: Tensor, seed: int) -> dict[str, Any]:
-        return {}
-
-
-def configuration(policy: str = "pgd", **more: Any) -> AttackConfig:
-    return AttackConfig(
-        object="mug", policy=policy, steps=25, trials=6, average=5, measure="no", verify_spp=8, specialise=False, **more
-    )
-
-
-def carry_out(folder: Path, config: AttackConfig, *, pause: float = 0.0, resume: bool = False) -> Findings:
-    """Carry out the attack in a folder, from the beginning or from where it is."""
-    problem: Any = StandInProblem(pause)
-    open_run = RunDirectory.resume if resume else RunDirectory.create
-    with open_run(folder) as run:
-        if not resume:
-            run.write_config(config)
-        memory = Memory(run)
-        stages = Stages(NullProgress())
-        attack = Attack(
-            problem, config, make_policy(config.policy_name), Recorder(run, problem, memory), memory, stages
-        )
-        findings = attack.carry_out()
-        if not findings.interrupted:
-            run.finish()
-        return findings
-
-
-def rows(folder: Path) -> list[tuple[Any, ...]]:
-    """All that is stored, but for times."""
-    with RunDirectory.resume(folder) as run:
-        return [
-            (
-                r.id,
-                r.kind,
-                r.step,
-                r.seed,
-                r.spp,
-                r.objective,
-                r.success,
-                r.label,
-                r.probability,
-                r.renders,
-                str(r.values),
-            )
-            for r in run.store.rows()
-        ]
 
 
 def kill_and_resume(folder: Path, policy: str) -> int:
@@ -189,7 +77,7 @@ def test_killed_at_random_moments_it_ends_with_the_same_rows(tmp_path: Path, pol
         capture_output=True,
         text=True,
         timeout=300,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / "tests")},
     )
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) >= 5, "it was hardly killed"

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from samples import ATTACK, AVERAGE, FORMATION, GAP, attack, gap, rated
+from samples import ATTACK, AVERAGE, BRACKET, EASIER, FORMATION, GAP, SUMMARY, TARGET, attack, gap, make_run, rated
 
-from advsearch.config import AttackConfig
 from advsearch.errors import FileFormatError
 from advsearch.report import wording
 from advsearch.report.charts import NARROW, Curve, interval_bar, nice_ticks, objective_chart
@@ -21,12 +20,7 @@ from advsearch.report.markup import Html, element, join
 from advsearch.report.page import LARGE_PICTURE, SMALLER_SIDE, write_report
 from advsearch.report.studies import gap_figure
 from advsearch.report.style import CSS
-from advsearch.runs.directory import RunDirectory
 from advsearch.runs.images import read_png
-from advsearch.runs.results.attack import AttackSummary
-from advsearch.runs.store import Row
-
-SUMMARY = attack()
 
 VOID = {"meta", "img", "br", "hr"}
 
@@ -63,22 +57,6 @@ class Page(HTMLParser):
     def all(self, tag: str) -> list[dict[str, str | None]]:
         """Return the attributes of each such tag."""
         return [attributes for name, attributes in self.tags if name == tag]
-
-
-def make_run(path: Path, summary: AttackSummary = SUMMARY, *, pictures: bool = True, rows: bool = True) -> Path:
-    """Return a run directory with stand-in pictures and results."""
-    grey = np.full((8, 8, 3), 0.5)
-    with RunDirectory.create_for(AttackConfig(object=summary.object, run=str(path))) as run:
-        for name in ("clean", "adversarial", "difference", "verification-00", "verification-01") if pictures else ():
-            run.save_image(name, grey)
-        for name in ("texture", "texture-original") if pictures else ():
-            run.save_image(name, grey, folder="artifacts")
-        if pictures:
-            run.save_animation("search", [grey, grey * 0])
-        for step in range(40) if rows else ():
-            run.record(Row("search", step, objective=step / 10 - 2), Row("baseline", step, objective=-2.0 - step / 100))
-        run.write_summary(summary)
-    return path
 
 
 def page_of(run: Path) -> Page:
@@ -120,10 +98,6 @@ def test_the_page_says_it_all(tmp_path: Path) -> None:
     assert not re.search(r"None|nan|\{|\}|\$", text)
 
 
-BRACKET = {"epsilon": {"texture": 0.01234}, "not_found_at": {"texture": 0.0118}, "closed": True, "confirmed": True,
-           "searches": 7, "checks": 40}  # fmt: skip
-TARGET: dict[str, Any] = {"goal": "a target answer", "target": ["vase"]}
-EASIER: dict[str, Any] = {"goal": "a right answer", "target": None}
 ANY: dict[str, Any] = {"goal": "a wrong answer", "target": None, "over": []}
 
 

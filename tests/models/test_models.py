@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import conftest
 import numpy as np
 import pytest
 import torch
@@ -34,7 +35,7 @@ from advsearch.models import (
 )
 from advsearch.models.augmentation import Augmentation
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "models"
+DATA = conftest.DATA / "models"
 MOBILENET = DATA / "mobilenet_v2_imagenet.pt2"
 needs_data = pytest.mark.skipif(not MOBILENET.is_file(), reason=f"real model {MOBILENET} is absent")
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import conftest
 import numpy as np
 import pytest
 import trimesh
@@ -28,7 +29,7 @@ from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.texture import sampled
 from advsearch.scene.importing.upright import guess_up
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "objects"
+DATA = conftest.DATA / "objects"
 real_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"the shared test data is not at {DATA}")
 
 CUBE_V = "".join(f"v {x} {y} {z}\n" for z in (0, 1) for y in (0, 1) for x in (0, 1))

@@ -236,7 +236,7 @@ def test_turning_an_environment_has_the_right_sign_and_size() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("parameter", "share"), [("roughness", 0.3), ("metallic", 0.5), ("specular", 0.5)])
 def test_the_adjoint_of_a_surface_agrees_with_differences_to_a_twentieth(parameter: str, share: float) -> None:
-    """To a looser bound, with fewer samples, in tests/test_control_material.py."""
+    """To a looser bound, with fewer samples, in tests/controls/test_control_material.py."""
     render = renderer({"material": {parameter: [0.1, 0.9]}})
     loss, u = smooth_loss((SIZE, SIZE)), torch.tensor([share])
     names = [render.plan.groups[0].name]

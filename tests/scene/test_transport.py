@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_resume import rows
+from stand_ins import rows
 from torch import Tensor
 
 import advsearch

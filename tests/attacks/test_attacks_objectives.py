@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from conftest import ROOT
 from torch import Tensor, nn
 
 from advsearch.attacks import OBJECTIVES, get_objective, margin
@@ -480,7 +480,7 @@ def test_what_a_users_function_raises_passes_through() -> None:
 
 # ---- the page about objectives --------------------------------------------------------------------------------------
 
-PAGE = (Path(__file__).resolve().parents[1] / "docs" / "objectives.md").read_text("utf-8")
+PAGE = (ROOT / "docs" / "objectives.md").read_text("utf-8")
 
 
 def test_the_page_says_of_every_objective_what_the_registry_says() -> None:

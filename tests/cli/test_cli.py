@@ -19,11 +19,11 @@ from typing import Any
 
 import pytest
 import samples
+from conftest import ROOT
 from rich.console import Console
 from rich.progress import Progress as Bars
 from rich.progress import TextColumn
-from samples import ATTACK, AVERAGE, rated
-from test_report import BRACKET, EASIER, SUMMARY, TARGET, make_run
+from samples import ATTACK, AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, make_run, rated
 
 import advsearch
 from advsearch import __version__
@@ -218,7 +218,7 @@ def test_a_bug_keeps_its_traceback_and_ends_with_1() -> None:
         "sys.modules.update(test_cli.stand_ins(attack))\n"
         "from advsearch.cli.main import main; sys.exit(main(['attack', '--object', 'mug', '--json']))"
     )
-    done = python(code, cwd=Path(__file__).parent)
+    done = python(code, cwd=Path(__file__).parent, env={**os.environ, "PYTHONPATH": str(ROOT / "tests")})
     assert done.returncode == 1 and done.stdout == ""
     assert "Traceback" in done.stderr and done.stderr.endswith("ValueError: a bug\n")
 

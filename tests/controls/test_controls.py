@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from conftest import ROOT
 from hostile import SHORT, shown
 
 from advsearch import load_scene
@@ -184,7 +184,7 @@ def test_the_default_balls_reach_the_same_root_mean_square() -> None:
 
 def worked_example() -> type:
     """The class of the worked example in docs/controls/writing.md."""
-    page = (Path(__file__).resolve().parents[1] / "docs" / "controls" / "writing.md").read_text("utf-8")
+    page = (ROOT / "docs" / "controls" / "writing.md").read_text("utf-8")
     source = page.split("```python\n")[1].split("```")[0]
     namespace: dict[str, Any] = {"__name__": "worked_example"}
     exec(compile(source, "writing.md", "exec"), namespace)

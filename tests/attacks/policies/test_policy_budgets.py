@@ -7,18 +7,17 @@ import math
 import re
 import sys
 from dataclasses import MISSING, fields
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import pytest
 import torch
+from conftest import ROOT
 from torch import Tensor
 
 from advsearch.attacks import POLICIES, Block, Domain, Ending, Evaluation, Policy, make_policy, search
 from advsearch.attacks.policies.budgets import BUDGETS, DIMENSIONS, budget
 
-ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "policies" / "README.md").read_text("utf-8")
 
 CHEAP = {"auto": 200, "cmaes": 500, "portfolio": 200}

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from conftest import ROOT
 from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
@@ -834,7 +835,7 @@ def examples_of(page: Path) -> list[list[str]]:
     return [shlex.split(line) for line in re.findall(r"^advsearch sweep .*$", text, re.M)]
 
 
-DOCS = Path(__file__).resolve().parents[1] / "docs"
+DOCS = ROOT / "docs"
 EXAMPLES = [words for name in ("sweeps.md", "command-line.md") for words in examples_of(DOCS / name)]
 
 
