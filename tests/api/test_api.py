@@ -57,6 +57,7 @@ def test_a_weakness_is_found_verified_and_kept(scene: advsearch.Scene, level: fl
     result = advsearch.attack(scene, model(level + 0.03), run=tmp_path / "run", **FAST)
     summary = result.summary
     assert result.found and summary.ending == "found"
+    assert summary.verified and summary.clean.control and summary.adversarial and summary.baseline
     assert summary.verified.successes == summary.verified.trials == 6
     assert summary.clean.control.correct == 6 and summary.clean.label == "mug"
     assert summary.adversarial.label == "vase" and summary.verified.labels == {"vase": 6}
@@ -93,14 +94,15 @@ def test_a_start_that_is_already_wrong_is_said_and_not_counted(scene: advsearch.
     summary = result.summary
     assert summary.ending == "already wrong" and not result.found
     assert summary.verified is None and summary.adversarial is None
-    assert summary.clean.label == "vase" and summary.clean.control.correct == 0
+    assert summary.clean.label == "vase" and summary.clean.control and summary.clean.control.correct == 0
     assert summary.renders["search"] == summary.renders["gradient"] == 0
 
 
 def test_what_cannot_be_found_is_not_claimed(scene: advsearch.Scene) -> None:
     summary = advsearch.attack(scene, model(0.98), **FAST).summary
     assert summary.ending == "budget spent"
-    assert summary.verified.successes == 0 and summary.clean.control.correct == 6
+    assert summary.verified and summary.verified.successes == 0
+    assert summary.clean.control and summary.clean.control.correct == 6
 
 
 def test_the_same_seed_gives_the_same_numbers_when_deterministic(scene: advsearch.Scene, level: float) -> None:

@@ -76,6 +76,17 @@ def stand_ins(attack: Api | None, **others: Api) -> dict[str, types.ModuleType]:
     return found
 
 
+def noting(given: list[Any], answer: Any) -> Api:
+    """Return a function that keeps what it is called with first, goes on with no run, and answers that."""
+
+    def called(first: Any, *more: Any, resumed: Path | None = None, **named: Any) -> Any:
+        assert resumed is None
+        given.append(first)
+        return answer
+
+    return called
+
+
 @pytest.fixture
 def api(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Put stand-ins in the place of `attack_from_config` and of what else is named."""
@@ -206,7 +217,7 @@ def test_a_message_names_the_argument_in_python_and_the_flag_on_the_command_line
     assert main(["attack", "--object", "mug", "--up", "z"]) == 2
     assert "error: --up: bundled objects stand upright already; leave --up out" in capsys.readouterr().err
     with pytest.raises(InputError, match=r"^smallest: finds one epsilon by itself; give one `epsilon` as the largest"):
-        advsearch.attack("mug", smallest=True, epsilon=(0.1, 0.2))
+        advsearch.attack("mug", smallest=True, epsilon=(0.1, 0.2))  # type: ignore[arg-type]
     assert main(["attack", "--object", "mug", "--smallest", "--epsilon", "0.1,0.2"]) == 2
     assert "error: --smallest: finds one epsilon by itself; give one --epsilon as" in capsys.readouterr().err
 
@@ -424,9 +435,9 @@ def test_several_objects_or_epsilons_are_a_curve(
     api: Callable[..., None], capsys: pytest.CaptureFixture[str], line: str
 ) -> None:
     given: list[Any] = []
-    api(curve_from_config=lambda config, progress, resumed: given.append((config, resumed)) or samples.curve())
+    api(curve_from_config=noting(given, samples.curve()))
     assert main(["attack", *line.split(), "--quiet"]) == 0
-    assert given[0][0].is_study and given[0][1] is None
+    assert given[0].is_study
     assert capsys.readouterr().out == (
         "  object   clean right   ending   epsilon   wrong   margin\n"
         "  mug      20/20         found    0.1       19/20   1.50\n"
@@ -445,7 +456,7 @@ def test_gap_builds_its_configuration_and_prints_a_row_for_each_control(
     api: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     given: list[Any] = []
-    api(gap_from_config=lambda config, progress, resumed: given.append(config) or samples.gap())
+    api(gap_from_config=noting(given, samples.gap()))
     argv = ["gap", "--object", "mug,bowl", "--control", "pose,light", "--average", "50", "--run", "x", "--quiet"]
     assert main(argv) == 0
     assert given == [GapConfig(object="mug,bowl", controls={"pose": {}, "light": {}}, average=50, run="x")]
@@ -474,7 +485,7 @@ def test_region_builds_its_configuration_and_prints_the_box(
     api: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     given: list[Any] = []
-    api(region_from_config=lambda config, progress, resumed: given.append(config) or samples.region())
+    api(region_from_config=noting(given, samples.region()))
     argv = "region --object mug --control pose.yaw,pose.pitch --vary pose.yaw,pose.pitch --map 24 --samples 50 --quiet"
     assert main(argv.split()) == 0
     assert given == [
@@ -503,7 +514,7 @@ def test_region_takes_scene_and_controls_from_the_run_that_it_goes_around(
     with RunDirectory.create_for(theirs):
         pass
     given: list[Any] = []
-    api(region_from_config=lambda config, progress, resumed: given.append(config) or samples.region())
+    api(region_from_config=noting(given, samples.region()))
     assert main("region --around first --vary pose.yaw --seed 9 --quiet".split()) == 0
     (config,) = given
     assert (config.object, config.controls, config.spp) == ("bowl", {"pose": {"yaw": [0, 90]}}, 4)
@@ -519,7 +530,7 @@ def test_sweep_builds_its_configuration_and_passes_its_ending_on(
     api: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     given: list[Any] = []
-    api(sweep_from_config=lambda config, progress: given.append(config) or Result(samples.sweep()))
+    api(sweep_from_config=noting(given, Result(samples.sweep())))
     assert main("sweep --object mug --grid pose.yaw=5:50:8 --grid camera.elevation=10,30 --quiet".split()) == 0
     assert given == [SweepConfig(object="mug", grid={"pose.yaw": "5:50:8", "camera.elevation": [10, 30]})]
     assert capsys.readouterr().out.startswith(
@@ -552,7 +563,7 @@ def test_run_does_what_the_command_of_a_file_says(
         "region_from_config": samples.region(),
     }
     answer = summaries.get(called) or Result(samples.sweep() if called == "sweep_from_config" else SUMMARY)
-    api(**{called: lambda config, **named: given.append(config) or answer})
+    api(**{called: noting(given, answer)})
     assert main(["run", str(path), "seed=8", "--quiet"]) == 0
     assert given == [config.model_copy(update={"seed": 8})]
 
@@ -824,8 +835,13 @@ def test_doctor_passes_its_status_on(flag: list[str], monkeypatch: pytest.Monkey
     import advsearch.cli
 
     asked: list[bool] = []
+
+    def run(json: bool) -> int:
+        asked.append(json)
+        return 3
+
     module = types.ModuleType("advsearch.cli.doctor")
-    module.run = lambda json: asked.append(json) or 3  # type: ignore[attr-defined]
+    vars(module).update(run=run)
     monkeypatch.setitem(sys.modules, "advsearch.cli.doctor", module)
     monkeypatch.setattr(advsearch.cli, "doctor", module, raising=False)
     assert main(["doctor", *flag]) == 3
@@ -978,7 +994,14 @@ def test_a_terminal_shows_the_last_stages_with_counts_and_times(monkeypatch: pyt
     shown = stream.getvalue()
     assert "stage 8" in shown and "searching: --steps shortens it" in shown
     assert re.search(r"10 of at most 40, \d s, at most \d+ s left, best 0\.5", shown)
-    assert sum(task.visible for task in progress._bars.tasks) == 5
+
+
+def test_a_terminal_shows_the_last_stages_alone() -> None:
+    with Bars(TextColumn("{task.description}"), console=Console(file=io.StringIO(), force_terminal=True)) as bars:
+        progress = BarProgress(bars)
+        for number in range(9):
+            progress.stage(f"stage {number}")
+    assert [task.description for task in bars.tasks if task.visible] == [f"stage {number}" for number in range(4, 9)]
 
 
 @pytest.mark.parametrize("argv", [["list"], ["show", "control", "lens"], ["labels"], ["list", "--json"]])

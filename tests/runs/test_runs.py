@@ -14,7 +14,7 @@ import sqlite3
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -388,7 +388,7 @@ def test_runs_are_found_by_name_and_path(home: Path) -> None:
 
 def test_the_recipe_repeats_the_run_elsewhere(home: Path) -> None:
     Path("mug.obj").write_text("v 0 0 0")
-    config = AttackConfig(object="mug.obj", run="first", epsilon=0.1, set={"camera.azimuth": 130})
+    config = AttackConfig(object="mug.obj", run="first", epsilon=0.1, set_={"camera.azimuth": 130})
     with RunDirectory.create_for(config) as run:
         assert run.path == Path("runs/first")
         again = AttackConfig.from_yaml(run.path / "run.yaml")
@@ -431,12 +431,13 @@ def test_a_bad_disk_is_said_and_leaves_nothing(
     run.write_summary(attack(ending="old"))
     with monkeypatch.context() as broken:
         broken.setattr("os.replace", _raises(number))
-        for write in (
+        writes: list[Callable[[], object]] = [
             lambda: run.save_image("clean", np.zeros((4, 4, 3))),
             lambda: run.save_exr("clean", np.zeros((4, 4, 3))),
             lambda: run.save_animation("search", [np.zeros((4, 4, 3))]),
             lambda: run.write_summary(attack(ending="new")),
-        ):
+        ]
+        for write in writes:
             with pytest.raises(StorageError, match=f"cannot write .*run/.*: {advice}"):
                 write()
     assert not list((run.path / "images").iterdir())
