@@ -162,6 +162,16 @@ class Config(BaseModel):
         """Return every setting by the name it has in YAML, as JSON values."""
         return self.model_dump(by_alias=True, mode="json")
 
+    @property
+    def place(self) -> tuple[str | None, bool]:
+        """Where a run of this is kept, if that is said, and whether what is there is replaced."""
+        return getattr(self, "run", None), getattr(self, "overwrite", False)
+
+    @property
+    def title(self) -> tuple[str, ...]:
+        """What names a run of this whose place is not said."""
+        return (self.command,)
+
     def recipe(self) -> Self:
         """Return what `run.yaml` holds: no place for the run (a repetition gets its own) and files by absolute path."""
         places = {name: _absolute(getattr(self, name)) for name in FILES if name in type(self).model_fields}

@@ -55,7 +55,7 @@ from advsearch.config import (
 from advsearch.controls import CONTROLS, texture
 from advsearch.engine import stages
 from advsearch.engine.loading import as_controls
-from advsearch.engine.naming import check_run_settings, controls_of
+from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.axes import read_axes
 from advsearch.evaluation import reference_scenes
 from advsearch.evaluation.stability.suite import chosen
@@ -385,8 +385,10 @@ def check_names(config: Config) -> None:
         chosen(config.cases, config.groups)
         return
     assert isinstance(config, SceneConfig)
-    check_run_settings(config)
-    controls_of(config.controls, config)
+    over = getattr(config, "over", {})
+    shared = RunSettings(getattr(config, "epsilon", None), getattr(config, "norm", None), config.texture_resolution)
+    shared.check(config.controls, over)
+    shared.given_to(config.controls)
     resolve(config.set_)  # type: ignore[arg-type]
     lights = config.environments if isinstance(config, SweepConfig) else (config.lit_by,)
     for name in config.objects:

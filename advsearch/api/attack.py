@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -23,17 +23,11 @@ from advsearch.controls.clean import sentences
 from advsearch.engine.answers import check_truth, facts_of
 from advsearch.engine.loading import Controls, Scene, framed, load_scene, make_renderer, settings_of
 from advsearch.engine.memory import Memory
-from advsearch.engine.naming import (
-    RUN_SETTINGS,
-    check_run_settings,
-    controls_of,
-    load_models,
-    options_of,
-    scene_settings,
-)
+from advsearch.engine.naming import load_models, options_of, scene_settings
 from advsearch.engine.outcome import AttackResult, summarise
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
+from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.samples import search_samples
 from advsearch.engine.stages import Attack
 from advsearch.errors import InputError
@@ -248,8 +242,9 @@ def _controls(
 ) -> tuple[tuple[Control, ...], tuple[Control, ...]]:
     """The controls that are searched and those that vary by chance, with the run's settings; only a search has a
     budget."""
-    check_run_settings(config)
-    return controls_of(searched, config), controls_of(drawn, config, [one for one in RUN_SETTINGS if one != "epsilon"])
+    shared = RunSettings(config.epsilon, config.norm, config.texture_resolution)
+    shared.check(config.controls, config.over)
+    return shared.given_to(searched), replace(shared, epsilon=None).given_to(drawn)
 
 
 Wanted = str | Callable[..., Tensor]
@@ -266,7 +261,7 @@ def _asked(config: AttackConfig, task: str | Task, objective: Wanted | None) -> 
 
 def _model(model: Model | nn.Module | str | Path, config: AttackConfig, task: Task) -> tuple[Model, list[str]]:
     """Load the model; its warnings become sentences of the run."""
-    (loaded,), said = load_models([model], config, task)
+    (loaded,), said = load_models([model], task, labels=config.labels, used_threads=config.used_threads)
     return loaded, said
 
 

@@ -29,7 +29,6 @@ from advsearch.engine.gradients import (
 )
 from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.memory import Memory
-from advsearch.engine.naming import run_settings_for
 from advsearch.engine.planning import (
     CONVERGED,
     COUNTS,
@@ -41,9 +40,10 @@ from advsearch.engine.planning import (
     tuned,
 )
 from advsearch.engine.problem import Problem
+from advsearch.engine.run_settings import RunSettings
 from advsearch.files import Json
 from advsearch.progress import NullProgress, Progress
-from advsearch.runs.directory import RunDirectory, default_name
+from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.check import WHOLE, CheckedRow, CheckedRows, CheckResult, DerivativeRow, DirectionRow
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
 from advsearch.scene.gradients.group import Group
@@ -103,9 +103,7 @@ def check_from_config(
     progress, begun = progress or NullProgress(), time.perf_counter()
     progress.stage(LOADING)
     parts = _parts(config, config.losses, config.all)
-    name = default_name("all" if config.all else config.object, ["check"])
-    opened = RunDirectory.resume(resumed, config) if resumed is not None else RunDirectory.create_for(config, name)
-    with opened as run:
+    with RunDirectory.of(config, resumed) as run:
         results, measured = Results(Memory(run), config.seconds), 0
 
         def rows() -> Iterator[CheckedRow]:
@@ -164,6 +162,7 @@ def _configurations(config: AttackConfig, everything: bool) -> Iterator[AttackCo
     if not everything:
         yield config
         return
+    shared = RunSettings(config.epsilon, config.norm, config.texture_resolution)
     for object, environment in SCENES:
         for control in CONTROLS:
             if control == "contents" and object == "bottle":
@@ -175,7 +174,7 @@ def _configurations(config: AttackConfig, everything: bool) -> Iterator[AttackCo
                 "environment": None if environment == DEFAULT_ENVIRONMENT else environment,
                 "controls": {control: {}},
                 "label": None,
-                **run_settings_for(config, control, {}),
+                **vars(shared.alone(control, {})),
             }
             yield config.model_copy(update=update)
 

@@ -16,7 +16,8 @@ from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.config import AttackConfig, GapConfig
 from advsearch.engine.answers import one_label_for_several
-from advsearch.engine.naming import Named, check_run_settings, different, load_models, options_of, run_settings_for
+from advsearch.engine.naming import Named, different, load_models, options_of
+from advsearch.engine.run_settings import RunSettings
 from advsearch.files import Json
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.studies import curve_figure, gap_figure
@@ -28,6 +29,7 @@ from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.results.gap import CurvePoint, CurveResult, GapResult, GapRow, ObjectRow
 from advsearch.runs.summary import attack_of
 from advsearch.scene.library import list_objects, load_object
+from advsearch.tasks import make_task
 
 
 def gap(
@@ -124,8 +126,7 @@ def _study(
 ) -> Study:
     """Carry out the attacks of a study in its run; `body` returns what is its own in the result."""
     begun = time.perf_counter()
-    opened = RunDirectory.resume(resumed, config) if resumed is not None else RunDirectory.create_for(config)
-    with opened as run:
+    with RunDirectory.of(config, resumed) as run:
         said = _label_for_all(config)
         for text in said:
             progress.message(text)
@@ -161,7 +162,9 @@ def _label_for_all(config: AttackConfig) -> list[str]:
         return []
     bundled = list_objects()
     own = {name: load_object(name).label if name in bundled else None for name in config.objects}
-    models, _ = load_models([config.model], config)
+    models, _ = load_models(
+        [config.model], make_task(config.task), labels=config.labels, used_threads=config.used_threads
+    )
     return one_label_for_several(models, config.label, own)
 
 
@@ -282,12 +285,13 @@ def _flips_within(row: ObjectRow, epsilon: float | None) -> bool:
 
 
 def _gap(config: GapConfig, parts: _Parts) -> list[GapRow]:
-    check_run_settings(config)
+    shared = RunSettings(config.epsilon, config.norm, config.texture_resolution)
+    shared.check(config.controls, config.over)
     rows = []
     for place, name in enumerate(different(config.objects, "object")):
         for number, (control, settings) in enumerate(config.controls.items()):
-            shared = run_settings_for(config, control, settings)
-            one = _as_attack(config, object=name, controls={control: settings}, **shared)
+            own = vars(shared.alone(control, settings))
+            one = _as_attack(config, object=name, controls={control: settings}, **own)
             summary = parts.attack(one, f"{place:02d}-{number:02d}-" + default_name(name, [control]))
             if summary is not None and summary.average is not None:
                 rows.append(_compared(name, control, summary, summary.average))

@@ -31,7 +31,7 @@ from advsearch.evaluation.precision.rounds import Rounds, TimeBudget, in_rounds
 from advsearch.files import Json
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.diagrams import precision_figures
-from advsearch.runs.directory import RunDirectory, check_free, default_name
+from advsearch.runs.directory import RunDirectory, check_free
 from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.precision import PrecisionResult
@@ -298,9 +298,7 @@ def _kept(config: PrecisionConfig, report: PrecisionResult) -> PrecisionResult:
         report = report.model_copy(update={"figures": _write(folder, report)})
         write_text(folder / NUMBERS, to_json(report) + "\n")
         return report
-    default = default_name(config.object, ("precision",))
-    with RunDirectory.create(config.run, overwrite=config.overwrite, default=default) as kept:
-        kept.write_config(config)
+    with RunDirectory.create_for(config) as kept:
         figures = _write(kept.path / "images", report)
         report = report.model_copy(update={"run": str(kept.path), "figures": figures})
         kept.write_summary(report)

@@ -108,8 +108,7 @@ def region_from_config(
         stages.progress.message(text)
     varied = _varied(problem, config)
     centre = _centre(problem, config)
-    opened = RunDirectory.resume(resumed, config) if resumed is not None else RunDirectory.create_for(config)
-    with opened as run:
+    with RunDirectory.of(config, resumed) as run:
         memory = Memory(run)
         attack = Attack(problem, as_attack, make_policy("random"), Recorder(run, problem, memory), memory, stages)
         try:

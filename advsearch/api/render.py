@@ -6,13 +6,15 @@ from pathlib import Path
 
 from advsearch.config import RenderConfig
 from advsearch.engine.loading import load_scene
-from advsearch.engine.naming import check_run_settings, controls_of, load_models, scene_settings
+from advsearch.engine.naming import load_models, scene_settings
 from advsearch.engine.rendering import Rendering as Rendering
 from advsearch.engine.rendering import render as render
 from advsearch.engine.rendering import writable
+from advsearch.engine.run_settings import RunSettings
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.results.render import RenderResult
+from advsearch.tasks import make_task
 
 
 def render_from_config(config: RenderConfig, *, progress: Progress | None = None) -> RenderResult:
@@ -28,15 +30,17 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
         if spec is not None and out.exists() and Path(spec).exists() and out.samefile(spec):
             raise InputError(f"out: would replace {spec}, which is read; choose another name")
     progress.stage("loading the scene and the model")
-    check_run_settings(config)
-    controls = controls_of(config.controls, config)
+    shared = RunSettings(texture_resolution=config.texture_resolution)
+    shared.check(config.controls)
+    controls = shared.given_to(config.controls)
     given = scene_settings(config.set_, config.exposure)
     scene = load_scene(config.object, config.environment, up=config.up, settings=given)
-    (model,), said = load_models([config.model], config)
+    task = make_task(config.task)
+    (model,), said = load_models([config.model], task, labels=config.labels, used_threads=config.used_threads)
     found = render(
         scene,
         model,
-        task=config.task,
+        task=task,
         controls=controls,
         around=config.around,
         resolution=config.resolution,

@@ -31,13 +31,7 @@ def stability(
         InputError: anything that the caller can put right; nothing is written then.
     """
     cases, begun = chosen(config.cases, config.groups), time.perf_counter()
-    if resumed is not None:
-        opened = RunDirectory.resume(resumed, config)
-    else:
-        opened = RunDirectory.create(config.run, overwrite=config.overwrite, default="stability")
-    with opened as run:
-        if resumed is None:
-            run.write_config(config)
+    with RunDirectory.of(config, resumed) as run:
 
         def result(rows: Sequence[CaseRow], ending: str) -> StabilityResult:
             return StabilityResult(

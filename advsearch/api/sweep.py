@@ -12,14 +12,15 @@ from advsearch.api.attack import LOADING
 from advsearch.config import SweepConfig
 from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.loading import Controls, Scene, load_scene, settings_of
-from advsearch.engine.naming import check_run_settings, controls_of, different, load_models, options_of, scene_settings
+from advsearch.engine.naming import different, load_models, options_of, scene_settings
+from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.axes import read_axes
 from advsearch.engine.sweeps.job import Job, Place, check_scenes
 from advsearch.engine.sweeps.loop import SweepResult, carry_out
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.progress import NullProgress, Progress
-from advsearch.runs.directory import CONFIG, RunDirectory, check_free, default_name, find_run, is_run, run_path
+from advsearch.runs.directory import CONFIG, RunDirectory, check_free, find_run, is_run, run_path
 from advsearch.runs.listing import finished
 from advsearch.scene.description import NO_MAP
 from advsearch.settings import split_names
@@ -177,8 +178,9 @@ def _job_of(config: SweepConfig) -> Job:
 def _job(
     config: SweepConfig, places: Sequence[Place], models: Sequence[AnyModel], task: str | Task, controls: Controls
 ) -> Job:
-    check_run_settings(config)
-    drawn = controls_of(controls, config)
+    shared = RunSettings(texture_resolution=config.texture_resolution)
+    shared.check(config.controls)
+    drawn = shared.given_to(controls)
     axes = read_axes(config.grid, drawn)
     if config.samples is not None and not drawn:
         raise InputError(
@@ -226,7 +228,7 @@ def _models(models: Sequence[AnyModel], config: SweepConfig, task: Task) -> tupl
             f"model: expected models with different names, got {', '.join(names)}; from Python, "
             "load_model(..., name=...) gives one"
         )
-    return load_models(models, config, task)
+    return load_models(models, task, labels=config.labels, used_threads=config.used_threads)
 
 
 # ---- where it is kept -----------------------------------------------------------------------------------------------
@@ -244,11 +246,5 @@ def _stopped(config: SweepConfig) -> Path | None:
 
 def _kept(job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
     """Sweep in a run directory: a new one, or one that was begun."""
-    if resumed is not None:
-        with RunDirectory.resume(resumed, job.config) as run:
-            return carry_out(job, run, progress)
-    config = job.config
-    stem = "-".join(Path(name).stem for name in config.objects)
-    with RunDirectory.create(config.run, overwrite=config.overwrite, default=default_name(stem, ["sweep"])) as run:
-        run.write_config(config)
+    with RunDirectory.of(job.config, resumed) as run:
         return carry_out(job, run, progress)

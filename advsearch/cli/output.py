@@ -91,13 +91,14 @@ def _code_in(file: Path) -> Sequence[str]:
     """The Python code that a run.yaml names."""
     from advsearch.cli.run import command_in, described
     from advsearch.config import SceneConfig
+    from advsearch.settings import split_names
 
     config = described(command_in(file), file, {})
     if not isinstance(config, SceneConfig) or ":" not in "".join([config.model, *config.kinds_of_controls]):
         return ()
     from advsearch.engine.naming import code_of  # takes seconds
 
-    return code_of(config)
+    return code_of(split_names(config.model), config.kinds_of_controls)
 
 
 @contextmanager

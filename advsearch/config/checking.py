@@ -54,6 +54,11 @@ class CheckConfig(AttackConfig):
     )
 
     @property
+    def title(self) -> tuple[str, ...]:
+        """The object, or that it is of all, and what is asked of it."""
+        return "all" if self.all else self.object, self.command
+
+    @property
     def losses(self) -> tuple[str, ...]:
         """What is differentiated, in turn."""
         return ("linear", "model") if self.loss == "both" else (self.loss,)

@@ -137,6 +137,11 @@ class PrecisionConfig(SceneConfig):
             raise ValueError("out of range")
         return value
 
+    @property
+    def title(self) -> tuple[str, ...]:
+        """The object, and what is asked of it."""
+        return self.object, self.command
+
     def as_attack(self) -> AttackConfig:
         """Return the settings that an attack shares."""
         shared = {name: getattr(self, name) for name in SceneConfig.model_fields if name not in PLACE}

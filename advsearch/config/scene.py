@@ -167,6 +167,16 @@ class SceneConfig(Config):
         return self
 
     @property
+    def title(self) -> tuple[str, ...]:
+        """Object and controls."""
+        return self.object, *self.controls
+
+    @property
+    def used_threads(self) -> int | None:
+        """Processor threads that are taken; None for all."""
+        return 1 if self.deterministic else self.threads
+
+    @property
     def lit_by(self) -> str:
         """The environment by name: the default one where none was asked for."""
         return self.environment or DEFAULT_ENVIRONMENT

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator
@@ -116,6 +117,11 @@ class SweepConfig(SceneConfig):
         otherwise="runs/OBJECT-sweep-NNN",
         min_length=1,
     )
+
+    @property
+    def title(self) -> tuple[str, ...]:
+        """The objects, and that it is a sweep."""
+        return "-".join(Path(name).stem for name in self.objects), self.command
 
     @property
     def environments(self) -> tuple[str, ...]:

@@ -22,7 +22,6 @@ from advsearch.yaml_text import LARGEST
 if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
-    from advsearch.config import SceneConfig
     from advsearch.runs.results.base import Result
     from advsearch.settings import Config
 
@@ -119,10 +118,23 @@ class RunDirectory:
             raise
 
     @classmethod
-    def create_for(cls, config: SceneConfig, default: str | None = None) -> RunDirectory:
-        """Make the directory that `config` asks for, with its `run.yaml`; arguments and errors as for `create`."""
-        default = default or default_name(config.object, config.controls)
-        run = cls.create(config.run, overwrite=config.overwrite, default=default)
+    def of(cls, config: Config, resumed: Path | None = None) -> RunDirectory:
+        """Open the directory of the run that `config` describes: a new one, or the one to go on with.
+
+        Args:
+            config: what the run is carried out with.
+            resumed: the folder of the run to go on with; None for a new run.
+
+        Raises:
+            InputError: as for `create`, and for `resume`.
+        """
+        return cls.create_for(config) if resumed is None else cls.resume(resumed, config)
+
+    @classmethod
+    def create_for(cls, config: Config) -> RunDirectory:
+        """Make the directory that `config` asks for, with its `run.yaml`; errors as for `create`."""
+        (place, overwrite), (first, *others) = config.place, config.title
+        run = cls.create(place, overwrite=overwrite, default=default_name(first, others))
         try:
             run.write_config(config)
         except BaseException:

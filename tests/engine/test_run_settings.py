@@ -20,16 +20,25 @@ from advsearch.controls import CONTROLS, make_control
 from advsearch.controls.patch.control import PatchControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
-from advsearch.engine.naming import RUN_SETTINGS, check_run_settings, controls_of
+from advsearch.engine.run_settings import RunSettings
 from advsearch.errors import InputError, UnknownNameError
 
+RUN_SETTINGS = tuple(vars(RunSettings()))
 ALL: dict[str, Any] = {"epsilon": 0.07, "norm": "l2", "texture_resolution": 16}
+
+
+def shared(config: AttackConfig) -> RunSettings:
+    return RunSettings(config.epsilon, config.norm, config.texture_resolution)
+
+
+def check(config: AttackConfig) -> None:
+    shared(config).check(config.controls, config.over)
 
 
 def settings(controls: Any, **options: Any) -> dict[str, dict[str, object]]:
     """Settings of the controls of an attack, by the name of the instance."""
     config = AttackConfig(object="mug", controls=controls, **options)
-    return {one.name: one.settings() for one in controls_of(config.controls, config)}
+    return {one.name: one.settings() for one in shared(config).given_to(config.controls)}
 
 
 def test_controls_declare_settings_that_a_run_has() -> None:
@@ -84,7 +93,7 @@ def test_a_patch_takes_an_epsilon_in_the_norm_of_the_run(norm: str | None, expec
 def test_python_gives_controls_the_settings_of_the_run(controls: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(attacking, "_carry_out", lambda job, progress: job)
     job: Any = advsearch.attack("mug", controls=controls, **ALL)
-    again = controls_of(job.config.controls, job.config)
+    again = shared(job.config).given_to(job.config.controls)
     texture: Any
     for texture in (job.controls[0], again[0]):
         assert (texture.epsilon, texture.norm, texture.resolution) == (0.07, "l2", 16)
@@ -121,7 +130,7 @@ def test_a_gap_gives_each_control_what_it_takes(monkeypatch: pytest.MonkeyPatch,
 
 
 def _seen(config: AttackConfig, seen: list[Any]) -> None:
-    check_run_settings(config)
+    check(config)
     seen.append((config.epsilon, config.norm, config.texture_resolution))
 
 
@@ -165,7 +174,7 @@ def _seen(config: AttackConfig, seen: list[Any]) -> None:
 )
 def test_a_setting_that_no_control_takes_is_refused(controls: Any, options: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError) as error:
-        check_run_settings(AttackConfig(object="mug", controls=controls, **options))
+        check(AttackConfig(object="mug", controls=controls, **options))
     assert with_flags(str(error.value)).startswith(message)
 
 
@@ -180,8 +189,8 @@ def test_a_setting_that_no_control_takes_is_refused(controls: Any, options: dict
 def test_an_environment_takes_an_epsilon_for_its_harmonics(controls: Any) -> None:
     named = controls if isinstance(controls, dict) else {name: {} for name in controls}
     config = AttackConfig(object="mug", controls=named, epsilon=0.07)
-    check_run_settings(config)
-    (control,) = controls_of(named, config)
+    check(config)
+    (control,) = shared(config).given_to(named)
     assert control.settings()["epsilon"] == 0.07
 
 
@@ -193,8 +202,8 @@ def test_an_environment_without_harmonics_refuses_an_epsilon_of_its_own() -> Non
 @pytest.mark.parametrize("controls", ["patch", "patch.size", {"patch": {"pixels": [0.1, 0.9]}}])
 def test_a_patch_takes_an_epsilon_for_searched_pixels(controls: Any) -> None:
     config = AttackConfig(object="mug", controls=controls, epsilon=0.07)
-    check_run_settings(config)
-    (control,) = controls_of(config.controls, config)
+    check(config)
+    (control,) = shared(config).given_to(config.controls)
     assert control.settings()["epsilon"] == 0.07
 
 
@@ -202,22 +211,22 @@ def test_an_epsilon_that_another_control_takes_leaves_a_fixed_patch() -> None:
     config = AttackConfig(
         object="mug", controls={"texture": {}, "patch": {"pixels": 0.5, "size": [0.1, 0.3]}}, epsilon=0.07
     )
-    check_run_settings(config)
-    texture, patch = controls_of(config.controls, config)
+    check(config)
+    texture, patch = shared(config).given_to(config.controls)
     assert texture.settings()["epsilon"] == 0.07 and "epsilon" not in patch.settings()
 
 
 def test_an_epsilon_that_another_control_takes_leaves_an_environment_as_it_is() -> None:
     config = AttackConfig(object="mug", controls="texture,environment", epsilon=0.07)
-    check_run_settings(config)
-    texture, environment = controls_of("texture,environment", config)
+    check(config)
+    texture, environment = shared(config).given_to("texture,environment")
     assert texture.settings()["epsilon"] == 0.07 and "epsilon" not in environment.settings()
 
 
 def test_an_epsilon_for_a_control_that_is_not_there_is_refused() -> None:
     with pytest.raises(UnknownNameError, match=r"unknown control in --epsilon 'texure'\. Did you mean 'texture'"):
         try:
-            check_run_settings(AttackConfig(object="mug", epsilon="texure=1"))
+            check(AttackConfig(object="mug", epsilon="texure=1"))
         except UnknownNameError as error:
             error.args = (with_flags(str(error)),)
             raise
@@ -227,8 +236,8 @@ def test_an_epsilon_for_a_control_that_is_not_there_is_refused() -> None:
 def test_an_instance_says_its_own(setting: str) -> None:
     config = AttackConfig(object="mug", **{setting: ALL[setting]})
     with pytest.raises(InputError, match=rf"{setting}: control texture is an instance already; give it its own"):
-        controls_of([PoseControl(), TextureControl()], config)
-    assert controls_of([PoseControl()], config)[0].name == "pose"
+        shared(config).given_to([PoseControl(), TextureControl()])
+    assert shared(config).given_to([PoseControl()])[0].name == "pose"
 
 
 @pytest.mark.parametrize("given", [{"estimators": {"*": "forward"}}, {"measure": "full"}])
