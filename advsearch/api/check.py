@@ -32,7 +32,6 @@ from advsearch.engine.memory import Memory
 from advsearch.engine.planning import (
     CONVERGED,
     COUNTS,
-    Cosine,
     cosine_samples,
     cosines,
     measured_plan,
@@ -45,6 +44,7 @@ from advsearch.files import Json
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.check import WHOLE, CheckedRow, CheckedRows, CheckResult, DerivativeRow, DirectionRow
+from advsearch.runs.results.plan import CosineRow
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import STEP_RANGE
@@ -235,20 +235,21 @@ def _model(part: CheckedPart, title: str, results: Results, progress: Progress) 
         seed, tick = seeds.stream(config.seed, "measure"), lambda: progress.advance(1)
         return measured_plan(renderer, problem.loss, u, seed=seed, spp=problem.spp, counted=True, tick=tick).to_dict()
 
-    def compared() -> list[Json]:
-        most = cosine_samples(renderer.plan, counts=counts)
-        progress.stage(f"{title}: the model's gradients", most, hint=IN_SAMPLES, at_most=True)
-        table = cosines(renderer, problem.loss, u, seed=config.seed, counts=counts, tick=progress.advance)
-        return [vars(row) for row in table]
+    def kept(name: str, measure: Callable[[], Sequence[CosineRow]]) -> list[CosineRow]:
+        return results.rows(f"{part.key} cosines {name}", CosineRow, measure)
 
     renderer.plan = renderer.plan.restored(results.get(f"{part.key} plan", measured))
     steps = {group.name: group.step for group in renderer.plan.groups}
-    table = [Cosine(**row) for row in results.get(f"{part.key} cosines", compared)]
-    renderer.plan, spp = tuned(renderer.plan, table)
-    for row in table:
+    most = cosine_samples(renderer.plan, counts=counts)
+    progress.stage(f"{title}: the model's gradients", most, hint=IN_SAMPLES, at_most=True)
+    table: list[CosineRow] = []
+    tick = progress.advance
+    for row in cosines(renderer, problem.loss, u, seed=config.seed, counts=counts, tick=tick, keep=kept):
+        table.append(row)
         taken = [group.estimator for group in renderer.plan.groups if group.control == row.control]
         names = ", ".join(dict.fromkeys(taken))
-        yield DirectionRow(**_place(part), **vars(row), parameter=WHOLE, estimator=names, status=row.status)
+        yield DirectionRow(**_place(part), **row.model_dump(exclude={"denoise"}), parameter=WHOLE, estimator=names)
+    renderer.plan, spp = tuned(renderer.plan, table)
     wider = {group.name: group.step / steps[group.name] for group in renderer.plan.groups if steps[group.name]}
     for one in _rows(
         problem,

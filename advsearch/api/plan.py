@@ -11,9 +11,9 @@ from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.config import AttackConfig
 from advsearch.engine.bounces import bounces_of, most_pictures
 from advsearch.engine.gradients import inside
-from advsearch.engine.planning import GOAL, Cosine, cosine_samples, cosines, measured_plan, plan_gradients, tuned
+from advsearch.engine.planning import GOAL, cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.engine.problem import Problem
-from advsearch.evaluation.leaving_out import measured_gains, most_gradients, resolved_texels, rows_of
+from advsearch.evaluation.leaving_out import measured_gains, most_gradients, resolved_texels
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.wording import count
 from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME, Formation
@@ -65,7 +65,7 @@ def plan(config: AttackConfig, *, progress: Progress | None = None) -> PlanResul
         renders_per_gradient=gradient.renders_per_gradient,
         spp=spp,
         groups=gradient.groups,
-        cosines=[CosineRow(denoise=name, **vars(row)) for name, rows in tables.items() for row in rows],
+        cosines=[row for rows in tables.values() for row in rows],
         denoise=quieter(tables, config.denoise),
         left_out=_left_out(problem, used) if config.specialise else [],
         specialised=config.specialise,
@@ -93,7 +93,7 @@ class _Measurements:
         self._problem, self._config, self._progress = problem, config, progress
         self._other = "none" if config.denoise == "oidn" else "oidn"
         self._theirs: Problem | None = None
-        self.tables: dict[str, list[Cosine]] = {config.denoise: [], self._other: []}
+        self.tables: dict[str, list[CosineRow]] = {config.denoise: [], self._other: []}
         self.gains: list[GainRow] | None = None
         self.bounces: PathLength | None = None
         self.texels: list[TexelRow] | None = None
@@ -142,13 +142,14 @@ class _Measurements:
         title = f"the same for {control} with denoiser {self._other}"
         self.tables[self._other] += self._cosines(self._theirs, control, title)
 
-    def _cosines(self, problem: Problem, control: str, title: str) -> list[Cosine]:
+    def _cosines(self, problem: Problem, control: str, title: str) -> list[CosineRow]:
         renderer, only = problem.renderer, (control,)
         hint = "counted in samples a pixel; `resolution` shortens it, `seconds` ends it"
         self._progress.stage(title, cosine_samples(renderer.plan, controls=only), hint=hint, at_most=True)
         seed, u = seeds.stream(self._config.seed, "measure"), inside(renderer)
-        rows = cosines(renderer, problem.loss, u, seed=seed, controls=only, tick=self._progress.advance)
-        for row in rows:
+        rows = []
+        for row in cosines(renderer, problem.loss, u, seed=seed, controls=only, tick=self._progress.advance):
+            rows.append(row)
             self._progress.message(
                 f"{control}: a gradient of {row.spp} samples and {row.factor:g} x the step has a cosine of "
                 f"{row.cosine:.2f} with the converged one"
@@ -183,11 +184,10 @@ def leaving_out(
     bounces = bounces_of(problem, config.seed, tick=tick)
     progress.stage("measuring what leaving things out saves", most_gradients(), hint=hint, at_most=True)
     gains = measured_gains(renderer, problem.loss, u, seed=seed, spp=problem.spp, depth=bounces.depth, tick=tick)
-    texels = [TexelRow.of(one) for one in resolved_texels(renderer, u, seed=seed)]
-    return rows_of(gains), PathLength.of(bounces), texels
+    return gains, bounces, resolved_texels(renderer, u, seed=seed)
 
 
-def quieter(tables: Mapping[str, Sequence[Cosine]], asked: str) -> DenoiserAdvice:
+def quieter(tables: Mapping[str, Sequence[CosineRow]], asked: str) -> DenoiserAdvice:
     """Say which denoiser makes the better gradients: the one that reaches the goal in all controls in less time.
 
     A denoiser is part of the image formation, the same in search and verification, so that this is advice: another one

@@ -97,6 +97,7 @@ def text(chosen: PlanResult) -> str:
             "cosine with the converged gradient",
             "of converged ones",
             "seconds",
+            "status",
         ]
         body = [
             [
@@ -107,6 +108,7 @@ def text(chosen: PlanResult) -> str:
                 f"{row.cosine:.3f}",
                 f"{row.converged:.3f}",
                 f"{row.seconds:.2f}",
+                row.status,
             ]
             for row in chosen.cosines
         ]

@@ -7,8 +7,9 @@ from collections.abc import Callable
 import torch
 
 from advsearch import seeds
-from advsearch.engine.path_length import SHORTEST, Bounces, measured_bounces
+from advsearch.engine.path_length import SHORTEST, measured_bounces
 from advsearch.engine.problem import Problem
+from advsearch.runs.results.plan import PathLength
 
 DRAWS = 2
 """Configurations, beside the clean one, that the measurement looks at."""
@@ -23,7 +24,7 @@ def most_pictures(problem: Problem) -> int:
     return (1 + DRAWS) * 2 * (1 + problem.renderer.scene.max_depth - SHORTEST)
 
 
-def bounces_of(problem: Problem, seed: int, tick: Callable[[], None] = lambda: None) -> Bounces:
+def bounces_of(problem: Problem, seed: int, tick: Callable[[], None] = lambda: None) -> PathLength:
     """Measure the bounces that a problem's search needs, over its clean configuration and random ones of its space.
 
     Args:

@@ -10,11 +10,12 @@ from typing import Any, TypeVar
 
 from advsearch.engine.memory import Memory
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME, Result
+from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME, Fields, Result
 from advsearch.runs.summary import NAME, read_result
 
 Row = TypeVar("Row")
 Answer = TypeVar("Answer", bound=Result)
+Kind = TypeVar("Kind", bound=Fields)
 
 
 class OutOfTime(Exception):
@@ -48,6 +49,14 @@ class Results:
             stored = json.loads(json.dumps(measure()))
             self._memory.set_note(key, stored)
         return stored
+
+    def row(self, key: str, kind: type[Kind], measure: Callable[[], Kind]) -> Kind:
+        """Return the fields that `measure` returns, or those of this kind that are stored; otherwise as `get`."""
+        return kind.of(self.get(key, lambda: measure().to_dict()))
+
+    def rows(self, key: str, kind: type[Kind], measure: Callable[[], Sequence[Kind]]) -> list[Kind]:
+        """Return what `row` does, of several at once."""
+        return [kind.of(one) for one in self.get(key, lambda: [one.to_dict() for one in measure()])]
 
     def put(self, key: str, value: Any) -> None:
         """Store a JSON value."""

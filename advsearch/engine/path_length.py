@@ -7,13 +7,13 @@ leaves out nothing, so that no answer rests on it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
+from advsearch.runs.results.plan import PathCut, PathLength
 from advsearch.scene.renderer import Renderer
 
 SHORTEST = 2
@@ -21,54 +21,6 @@ SHORTEST = 2
 BOUND = 0.5
 """Root-mean-square change of the displayed picture, in 8-bit levels, that a search accepts."""
 LEVELS = 255.0
-
-
-@dataclass(frozen=True)
-class Cut:
-    """What paths of at most so many segments leave out, the worst over the configurations looked at.
-
-    Attributes:
-        depth: longest path in segments.
-        light: share of the picture's radiance that is missing.
-        levels: root-mean-square bias of the displayed picture, in 8-bit levels.
-    """
-
-    depth: int
-    light: float
-    levels: float
-
-
-@dataclass(frozen=True)
-class Bounces:
-    """The path length of a search and why.
-
-    Attributes:
-        depth: longest path in segments that the search renders.
-        full: that the verification renders.
-        cuts: what was measured, longest paths first.
-        configurations: how many the measurement looked at.
-    """
-
-    depth: int
-    full: int
-    cuts: tuple[Cut, ...]
-    configurations: int
-
-    @property
-    def reason(self) -> str:
-        """In words."""
-        found = {cut.depth: cut for cut in self.cuts}
-        rejected = found.get(self.depth - 1)
-        said = []
-        if self.depth < self.full:
-            cut = found[self.depth]
-            said.append(
-                f"paths of {self.depth} segments leave out {cut.light:.2%} of the light, which moves the picture by "
-                f"{cut.levels:.2f} of 255 levels (bound {BOUND:g})"
-            )
-        if rejected is not None:
-            said.append(f"{rejected.depth} would leave out {rejected.light:.2%} and move it by {rejected.levels:.2f}")
-        return "; ".join(said) or f"all {self.full} segments"
 
 
 def measured_bounces(
@@ -79,7 +31,7 @@ def measured_bounces(
     spp: int,
     bound: float = BOUND,
     tick: Callable[[], None] = lambda: None,
-) -> Bounces:
+) -> PathLength:
     """Return the shortest paths whose pictures agree with those of the full length to within a bound.
 
     Args:
@@ -87,7 +39,7 @@ def measured_bounces(
         configurations: where to look, each (d,).
         seed: root of the noise, which is the same for all lengths.
         spp: samples a pixel of each of two halves; few are enough.
-        bound: in 8-bit levels, see `Cut.levels`.
+        bound: in 8-bit levels, see `PathCut.levels`.
         tick: called after each picture.
 
     Returns:
@@ -112,11 +64,27 @@ def measured_bounces(
             cut = pictures(u, depth)
             light = max(light, _missing(whole, cut))
             levels = max(levels, LEVELS * _bias(whole, cut))
-        cuts.append(Cut(depth, light, levels))
+        cuts.append(PathCut(depth=depth, light=light, levels=levels))
         if not levels <= bound:
             break
         chosen = depth
-    return Bounces(chosen, full, tuple(cuts), len(configurations))
+    reason = _reason(chosen, full, {cut.depth: cut for cut in cuts})
+    return PathLength(depth=chosen, full=full, cuts=cuts, configurations=len(configurations), reason=reason)
+
+
+def _reason(depth: int, full: int, cuts: Mapping[int, PathCut]) -> str:
+    """Why a search renders paths of this length, by what cuts at other lengths leave out."""
+    said = []
+    if depth < full:
+        cut = cuts[depth]
+        said.append(
+            f"paths of {depth} segments leave out {cut.light:.2%} of the light, which moves the picture by "
+            f"{cut.levels:.2f} of 255 levels (bound {BOUND:g})"
+        )
+    if depth - 1 in cuts:
+        rejected = cuts[depth - 1]
+        said.append(f"{rejected.depth} would leave out {rejected.light:.2%} and move it by {rejected.levels:.2f}")
+    return "; ".join(said) or f"all {full} segments"
 
 
 def _missing(whole: Sequence[tuple[Tensor, Tensor]], cut: Sequence[tuple[Tensor, Tensor]]) -> float:

@@ -11,15 +11,17 @@ from __future__ import annotations
 import itertools
 import statistics
 import time
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
 from advsearch.engine.gradients import EXPENSIVE, Loss, estimated, only
+from advsearch.runs.results.check import GradientStatus
+from advsearch.runs.results.plan import CosineRow
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, GradientPlan
 from advsearch.scene.renderer import Renderer
@@ -47,38 +49,18 @@ TELLS = 0.5
 the truth is then about sqrt(3 c / (1 + 2 c)) (Spearman and Brown), 0.87 and less. Above it the noise of the converged
 one, which is independent of the working one's, only makes the measured cosine smaller: what is called `ok` is so."""
 
-Status = Literal["ok", "noisy", "reference unusable"]
+Keep = Callable[[str, Callable[[], Sequence[CosineRow]]], Sequence[CosineRow]]
+"""From the name of a measurement, and what makes it, to its rows: those that are known already, or those it makes."""
 
 
-@dataclass(frozen=True)
-class Cosine:
-    """How well a working gradient of the model's loss points the way of the converged one.
-
-    Attributes:
-        control: which control's coordinates.
-        factor: step as a multiple of the plan's.
-        spp: samples a pixel of the working gradient.
-        cosine: mean over seeds; NaN where the converged gradient is zero.
-        converged: smallest cosine of two of the converged gradients, of different seeds.
-        seconds: median time of one working gradient.
-    """
-
-    control: str
-    factor: float
-    spp: int
-    cosine: float
-    converged: float
-    seconds: float
-
-    @property
-    def status(self) -> Status:
-        """Whether it is good enough; "reference unusable" where the converged gradients don't agree well enough to
-        tell."""
-        if not self.converged >= TELLS:
-            return "reference unusable"
-        if self.cosine >= GOAL:
-            return "ok"
-        return "noisy" if self.converged >= GOAL else "reference unusable"
+def status_of(cosine: float, converged: float) -> GradientStatus:
+    """Return whether a cosine with the converged gradient is good enough; "reference unusable" where the converged ones
+    don't agree well enough (`converged` is the smallest cosine of two of them) to tell."""
+    if not converged >= TELLS:
+        return "reference unusable"
+    if cosine >= GOAL:
+        return "ok"
+    return "noisy" if converged >= GOAL else "reference unusable"
 
 
 def contested(plan: GradientPlan, *, every: bool = False) -> list[tuple[tuple[Group, ...], tuple[str, ...]]]:
@@ -233,35 +215,33 @@ def cosines(
     repeats: int = REPEATS,
     controls: Collection[str] | None = None,
     tick: Callable[[int], None] = lambda samples: None,
-) -> list[Cosine]:
+    keep: Keep = lambda name, measure: measure(),
+) -> Iterator[CosineRow]:
     """Measure, control by control, the cosine of working gradients with the converged one at the same step.
 
     Sample counts are tried in their order until one reaches the goal at a step; then the next step follows. With
     `controls` only these are measured. `tick` is called after each gradient with the samples a pixel that it took;
-    `cosine_samples` bounds their sum.
+    `cosine_samples` bounds their sum. `keep` is asked for the rows of each control and step, by a name.
     """
     base = renderer.plan
-    found: list[Cosine] = []
-    try:
-        for control in dict.fromkeys(group.control for group in base.groups):
-            names = {one.name for one in base.groups if one.control == control and one.estimator != "none"}
-            if not names or (controls is not None and control not in controls):
+    for control in dict.fromkeys(group.control for group in base.groups):
+        names = {one.name for one in base.groups if one.control == control and one.estimator != "none"}
+        if not names or (controls is not None and control not in controls):
+            continue
+        by_steps = any(one.estimator in BY_DIFFERENCES for one in base.groups if one.control == control)
+        reached = False
+        tried: list[GradientPlan] = []
+        for factor in factors if by_steps else factors[:1]:
+            if factor == FACTORS[-1] and reached:
+                break
+            plan = _silenced(base.with_steps(factor), names)
+            if plan in tried:  # no step can be wider
                 continue
-            by_steps = any(one.estimator in BY_DIFFERENCES for one in base.groups if one.control == control)
-            mine: list[Cosine] = []
-            tried: list[GradientPlan] = []
-            for factor in factors if by_steps else factors[:1]:
-                if factor == FACTORS[-1] and any(row.status == "ok" for row in mine):
-                    break
-                renderer.plan = _silenced(base.with_steps(factor), names)
-                if renderer.plan in tried:  # no step can be wider
-                    continue
-                tried.append(renderer.plan)
-                mine += _cosines_at(renderer, loss, u, control, factor, seed, counts, repeats, tick)
-            found += mine
-    finally:
-        renderer.plan = base
-    return found
+            tried.append(plan)
+            measure = partial(_cosines_at, renderer, plan, loss, u, control, factor, seed, counts, repeats, tick)
+            for row in keep(f"{control} x {factor:g}", measure):
+                reached = reached or row.status == "ok"
+                yield row
 
 
 def _silenced(plan: GradientPlan, names: set[str]) -> GradientPlan:
@@ -273,6 +253,7 @@ def _silenced(plan: GradientPlan, names: set[str]) -> GradientPlan:
 
 def _cosines_at(
     renderer: Renderer,
+    plan: GradientPlan,
     loss: Loss,
     u: Tensor,
     control: str,
@@ -281,7 +262,11 @@ def _cosines_at(
     counts: Sequence[int],
     repeats: int,
     tick: Callable[[int], None],
-) -> list[Cosine]:
+) -> list[CosineRow]:
+    """The rows of one control at one step; the renderer has this plan meanwhile."""
+    before = renderer.plan
+    renderer.plan = plan
+
     def converged(spp: int) -> tuple[Tensor, float]:
         found = []
         for k in range(WITNESSES):
@@ -290,25 +275,39 @@ def _cosines_at(
         agreements = torch.tensor([_cosine(*pair) for pair in itertools.combinations(found, 2)])
         return torch.stack(found).mean(dim=0), float(agreements.min())  # NaN if one is
 
-    many = CONVERGED
-    truth, agreement = converged(many)
-    found = []
-    for spp in counts:
-        if many == CONVERGED and (agreement < GOAL or spp > CONVERGED):
-            many = AGAIN * CONVERGED
-            truth, agreement = converged(many)
-        values, times = [], []
-        for number in range(repeats):
-            begun = time.perf_counter()
-            gradient = renderer.gradient(loss, u, seeds.stream(seed, "working", number), spp)[1]
-            times.append(time.perf_counter() - begun)
-            values.append(_cosine(gradient, truth))
-            tick(spp)
-        mean = statistics.fmean(values)
-        found.append(Cosine(control, factor, spp, mean, agreement, statistics.median(times)))
-        if mean >= GOAL:
-            break
-    return found
+    try:
+        many = CONVERGED
+        truth, agreement = converged(many)
+        found = []
+        for spp in counts:
+            if many == CONVERGED and (agreement < GOAL or spp > CONVERGED):
+                many = AGAIN * CONVERGED
+                truth, agreement = converged(many)
+            values, times = [], []
+            for number in range(repeats):
+                begun = time.perf_counter()
+                gradient = renderer.gradient(loss, u, seeds.stream(seed, "working", number), spp)[1]
+                times.append(time.perf_counter() - begun)
+                values.append(_cosine(gradient, truth))
+                tick(spp)
+            mean = statistics.fmean(values)
+            found.append(
+                CosineRow(
+                    denoise=renderer.formation.denoiser,
+                    control=control,
+                    factor=factor,
+                    spp=spp,
+                    cosine=mean,
+                    converged=agreement,
+                    seconds=statistics.median(times),
+                    status=status_of(mean, agreement),
+                )
+            )
+            if mean >= GOAL:
+                break
+        return found
+    finally:
+        renderer.plan = before
 
 
 def _cosine(one: Tensor, other: Tensor) -> float:
@@ -316,7 +315,7 @@ def _cosine(one: Tensor, other: Tensor) -> float:
     return float(one @ other) / size if size > 0.0 else float("nan")
 
 
-def tuned(plan: GradientPlan, table: Sequence[Cosine]) -> tuple[GradientPlan, int | None]:
+def tuned(plan: GradientPlan, table: Sequence[CosineRow]) -> tuple[GradientPlan, int | None]:
     """Return the plan with each control's step chosen from measured cosines, and the sample count that all then need.
 
     The cheapest setting that reaches the goal wins; where none does, the one with the greatest cosine, and the reason
@@ -341,7 +340,7 @@ def tuned(plan: GradientPlan, table: Sequence[Cosine]) -> tuple[GradientPlan, in
     return plan, max(counts) if counts else None
 
 
-def _shortfall(chosen: Cosine) -> str:
+def _shortfall(chosen: CosineRow) -> str:
     if chosen.converged < TELLS:
         return f"which says little, two converged ones have {chosen.converged:.2f}"
     return f"below {GOAL:g}, the best that was found"

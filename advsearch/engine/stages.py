@@ -157,7 +157,7 @@ class Attack:
                 hint="counted in samples a pixel; `measure=quick` leaves it out",
                 at_most=True,
             )
-            table = cosines(renderer, problem.loss, u, seed=seed, tick=self._advance)
+            table = list(cosines(renderer, problem.loss, u, seed=seed, tick=self._advance))
             plan, spp = tuned(problem.plan, table)
             problem.plan = plan
             problem.spp = problem.spp if config.spp is not None or spp is None else spp

@@ -11,15 +11,14 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
 from advsearch.engine.gradients import Loss
-from advsearch.runs.results.plan import GainRow
+from advsearch.runs.results.plan import GainRow, TexelRow
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
@@ -34,31 +33,6 @@ WHAT = {**ITEMS, BOUNCES: "bounces of light beyond the search's longest path", A
 AGREES = 1.2
 """Difference, as a share of what another seed changes, up to which two pictures or gradients agree: 1 is expected where
 the random numbers are others."""
-
-
-@dataclass(frozen=True)
-class Gain:
-    """What leaving one thing out brings.
-
-    Attributes:
-        item: a key of `WHAT`.
-        gain: time of a gradient x variance of a picture with it put back, over that without it.
-        picture: root-mean-square difference of the pictures with and without it at one seed, over that of two seeds
-            (both with, both without: the mean square of the two).
-        gradient: the same of the gradients; 0 where there are none.
-        seconds: of a gradient with it put back.
-    """
-
-    item: str
-    gain: float
-    picture: float
-    gradient: float
-    seconds: float
-
-    @property
-    def safe(self) -> bool:
-        """Whether pictures and gradients agree to within their noise."""
-        return self.picture <= AGREES and self.gradient <= AGREES
 
 
 REPEATS = 3
@@ -81,7 +55,7 @@ def measured_gains(
     repeats: int = REPEATS,
     depth: int | None = None,
     tick: Callable[[], None] = lambda: None,
-) -> list[Gain]:
+) -> list[GainRow]:
     """Put back what is left out, item by item and all at once, and measure a gradient.
 
     Args:
@@ -95,7 +69,8 @@ def measured_gains(
         tick: called after each gradient.
 
     Returns:
-        One row for each item, and one for all.
+        One row for each item, and one for all. What two seeds differ by is the root mean square of both with the item
+        and both without.
     """
     scene = renderer.scene
     depth = scene.max_depth if depth is None else depth
@@ -117,23 +92,18 @@ def measured_gains(
             for k in range(2)
         )
         noise = _ratio(again[number][0] - first[number][0], again[0][0] - first[0][0])
-        rows.append(Gain(item, noise**2 * typical[number] / typical[0], picture, gradient, typical[number]))
-    return rows
-
-
-def rows_of(gains: Sequence[Gain]) -> list[GainRow]:
-    """Return rows for a file or a table."""
-    return [
-        GainRow(
-            item=one.item,
-            what=WHAT[one.item],
-            gain=one.gain,
-            picture_difference=one.picture,
-            gradient_difference=one.gradient,
-            seconds=one.seconds,
+        rows.append(
+            GainRow(
+                item=item,
+                what=WHAT[item],
+                gain=noise**2 * typical[number] / typical[0],
+                picture_difference=picture,
+                gradient_difference=gradient,
+                safe=picture <= AGREES and gradient <= AGREES,
+                seconds=typical[number],
+            )
         )
-        for one in gains
-    ]
+    return rows
 
 
 def _one(
@@ -167,30 +137,11 @@ def _ratio(above: Tensor, below: Tensor) -> float:
 # ---- texels ---------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Texels:
-    """How many texels of a searched texture a pixel shows.
-
-    Attributes:
-        control: whose texture.
-        side: of the texture, in texels.
-        seen: texels that light reaches the camera from directly.
-        pixels: pixels that show the surface.
-        enough: side, a power of two, at which a pixel still shows `PER_PIXEL` texels; at most `side`.
-    """
-
-    control: str
-    side: int
-    seen: int
-    pixels: int
-    enough: int
-
-
 PER_PIXEL = 2.0
-"""Texels a pixel that `Texels.enough` keeps: two samples a period (Nyquist), with room for oblique views."""
+"""Texels a pixel that `TexelRow.enough` keeps: two samples a period (Nyquist), with room for oblique views."""
 
 
-def resolved_texels(renderer: Renderer, u: Tensor, *, seed: int, spp: int = 16) -> list[Texels]:
+def resolved_texels(renderer: Renderer, u: Tensor, *, seed: int, spp: int = 16) -> list[TexelRow]:
     """Return, for every searched texture, how its texels compare with the pixels that show them."""
     found = []
     groups = [group for group in renderer.plan.groups if group.parameter == "texels"]
@@ -202,7 +153,7 @@ def resolved_texels(renderer: Renderer, u: Tensor, *, seed: int, spp: int = 16) 
     return found
 
 
-def _texels(scene: MitsubaScene, control: str, name: str, inputs: dict[str, Tensor], seed: int, spp: int) -> Texels:
+def _texels(scene: MitsubaScene, control: str, name: str, inputs: dict[str, Tensor], seed: int, spp: int) -> TexelRow:
     texture = inputs[name]
     bright, dark = ({**inputs, name: torch.full_like(texture, level)} for level in (1.0, 0.0))
     difference = scene.guides(bright, seed, spp)[0] - scene.guides(dark, seed, spp)[0]
@@ -213,4 +164,4 @@ def _texels(scene: MitsubaScene, control: str, name: str, inputs: dict[str, Tens
     enough = side
     while enough > 2 and seen * (enough / 2 / side) ** 2 >= PER_PIXEL * pixels:
         enough //= 2
-    return Texels(control, side, seen, pixels, enough)
+    return TexelRow(control=control, side=side, seen=seen, pixels=pixels, enough=enough)

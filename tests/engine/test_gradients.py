@@ -29,9 +29,11 @@ from advsearch.engine.gradients import (
     smooth_loss,
     verdict,
 )
-from advsearch.engine.planning import TELLS, Cosine, contested, cosines, measured_plan, tuned
+from advsearch.engine.planning import TELLS, contested, cosines, measured_plan, status_of, tuned
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.runs.results.check import WHOLE, DerivativeRow, DirectionRow
+from advsearch.runs.results.plan import CosineRow
+from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import ESTIMATORS, SEARCH_STEP, first_plan
 from advsearch.scene.renderer import Renderer
@@ -396,6 +398,8 @@ def test_over_many_coordinates_an_adjoint_is_not_contested_by_random_directions(
 class Told:
     """A renderer whose gradients are told: by sample count, one for each call in turn."""
 
+    formation = ImageFormation()
+
     def __init__(self, gradients: dict[int, list[list[float]]]) -> None:
         self.plan = first_plan((group("haze.density", 0, 2, ("adjoint",)),), torch.tensor([0.01, 0.01]))
         self.gradients, self.asked = gradients, list[int]()
@@ -414,7 +418,7 @@ def test_converged_gradients_of_which_one_disagrees_get_more_samples() -> None:
     assert told.asked == [128, 128, 128, 512, 512, 512, 8, 8, 8]
     assert (row.status, row.cosine, row.converged) == ("ok", 1.0, 1.0)
     agreed: Any = Told({128: [right], 8: [right]})
-    cosines(agreed, lambda image: image, torch.zeros(2), seed=0, counts=(8,))
+    list(cosines(agreed, lambda image: image, torch.zeros(2), seed=0, counts=(8,)))
     assert 512 not in agreed.asked
 
 
@@ -441,10 +445,11 @@ def test_the_widest_step_is_tried_only_where_no_other_will_do() -> None:
 
 def test_the_cheapest_setting_that_reaches_the_goal_is_taken() -> None:
     plan = first_plan((group("pose.yaw", 0, 1, ("secant",)),), torch.tensor([0.01]))
+    place: Any = {"denoise": "none", "control": "pose", "converged": 0.99}
     rows = [
-        Cosine("pose", 1.0, 8, 0.5, 0.99, 1.0),
-        Cosine("pose", 1.0, 64, 0.95, 0.99, 8.0),
-        Cosine("pose", 3.0, 16, 0.93, 0.99, 2.0),
+        CosineRow(factor=1.0, spp=8, cosine=0.5, seconds=1.0, status="noisy", **place),
+        CosineRow(factor=1.0, spp=64, cosine=0.95, seconds=8.0, status="ok", **place),
+        CosineRow(factor=3.0, spp=16, cosine=0.93, seconds=2.0, status="ok", **place),
     ]
     chosen, spp = tuned(plan, rows)
     assert spp == 16 and chosen.groups[0].step == pytest.approx(3.0 * SEARCH_STEP)
@@ -465,7 +470,7 @@ def test_the_cheapest_setting_that_reaches_the_goal_is_taken() -> None:
     ],
 )
 def test_a_cosine_counts_only_where_converged_gradients_agree(cosine: float, converged: float, status: str) -> None:
-    assert Cosine("haze", 1.0, 8, cosine, converged, 1.0).status == status
+    assert status_of(cosine, converged) == status
 
 
 def test_a_noisy_reference_only_lowers_a_cosine() -> None:

@@ -83,9 +83,9 @@ def test_what_changes_the_picture_is_not_called_safe(monkeypatch: pytest.MonkeyP
     renderer = made("camera.exposure")
     rows = measured_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=512, repeats=2, depth=2)
     tracing, bounces, _ = rows
-    assert tracing.picture < 1e-5 and tracing.safe  # a recorded kernel rounds otherwise
+    assert tracing.picture_difference < 1e-5 and tracing.safe  # a recorded kernel rounds otherwise
     assert tracing.gain > 0.0
-    assert bounces.item == "bounces" and bounces.picture > 1.0 and not bounces.safe
+    assert bounces.item == "bounces" and bounces.picture_difference > 1.0 and not bounces.safe
 
 
 def test_bounces_are_cut_where_they_are_dark_and_not_where_they_are_seen() -> None:

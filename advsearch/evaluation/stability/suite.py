@@ -22,7 +22,6 @@ from advsearch.evaluation.stability import (
     cases_stiff,
 )
 from advsearch.evaluation.stability.case import FELL_SHORT, GROUPS, OK, Case, Check, Outcome
-from advsearch.files import Json
 from advsearch.progress import Progress
 from advsearch.runs.results.stability import CaseRow, DecidingNumber
 
@@ -93,16 +92,11 @@ def run_cases(cases: Sequence[Case], results: Results, progress: Progress) -> It
     progress.stage("trying extreme scenes, objectives and arithmetic", len(cases), hint=hint)
     for case in cases:
         known = results.stored(case.name) is not None
-        row = CaseRow.of(results.get(case.name, partial(_values, case)))
+        row = results.row(case.name, CaseRow, partial(run_case, case))
         yield row
         if not known:
             progress.message(f"{case.name}: {row.status}, {row.seconds:.1f} s")
         progress.advance(1)
-
-
-def _values(case: Case) -> Json:
-    """The row of a case as JSON values."""
-    return run_case(case).to_dict()
 
 
 __all__ = ["CASES", "FELL_SHORT", "GROUPS", "OK", "Case", "Check", "Outcome", "chosen", "run_case", "run_cases"]

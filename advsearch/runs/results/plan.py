@@ -7,6 +7,7 @@ from typing import ClassVar
 from pydantic import Field
 
 from advsearch.runs.results.base import Fields, Formation, Number, Result
+from advsearch.runs.results.check import GradientStatus
 
 
 class GroupDerivative(Fields):
@@ -41,15 +42,16 @@ class PlannedGradient(Fields):
 
 
 class CosineRow(Fields):
-    """How well a working gradient points the way of the converged one."""
+    """How well a working gradient of the model's loss points the way of the converged one."""
 
     denoise: str
     control: str
     factor: float = Field(description="step as a multiple of the plan's")
     spp: int = Field(description="samples a pixel")
-    cosine: Number
+    cosine: Number = Field(description="mean over seeds; null where the converged gradient is zero")
     converged: Number = Field(description="smallest cosine of two converged gradients")
-    seconds: float = Field(description="of one working gradient")
+    seconds: float = Field(description="of one working gradient, median")
+    status: GradientStatus = Field(description="whether it is good enough to search by")
 
 
 class DenoiserAdvice(Fields):
@@ -66,17 +68,18 @@ class GainRow(Fields):
     item: str
     what: str
     gain: float = Field(description="a gradient's time x the picture's variance with it, over those without it")
-    picture_difference: Number = Field(description="over that of two seeds")
-    gradient_difference: Number = Field(description="over that of two seeds")
+    picture_difference: Number = Field(description="root mean square at one seed, over that of two seeds")
+    gradient_difference: Number = Field(description="the same of gradients; 0 where there are none")
+    safe: bool = Field(description="whether pictures and gradients agree to within their noise")
     seconds: float = Field(description="of a gradient with it")
 
 
 class PathCut(Fields):
-    """What paths of at most so many segments leave out."""
+    """What paths of at most so many segments leave out, the worst over the configurations looked at."""
 
     depth: int = Field(description="longest path in segments")
     light: float = Field(description="share of the radiance that is missing")
-    levels: float = Field(description="root-mean-square bias of the picture in 8-bit levels")
+    levels: float = Field(description="root-mean-square bias of the displayed picture in 8-bit levels")
 
 
 class PathLength(Fields):
@@ -84,7 +87,7 @@ class PathLength(Fields):
 
     depth: int = Field(description="of the search, in segments")
     full: int = Field(description="of the verification")
-    cuts: list[PathCut]
+    cuts: list[PathCut] = Field(description="what was measured, longest paths first")
     configurations: int = Field(description="how many the measurement looked at")
     reason: str
 
@@ -92,11 +95,11 @@ class PathLength(Fields):
 class TexelRow(Fields):
     """How many texels of a searched texture a pixel shows."""
 
-    control: str
-    side: int
-    seen: int
-    pixels: int
-    enough: int = Field(description="side at which the pixels still resolve as much")
+    control: str = Field(description="whose texture")
+    side: int = Field(description="of the texture, in texels")
+    seen: int = Field(description="texels that light reaches the camera from directly")
+    pixels: int = Field(description="pixels that show the surface")
+    enough: int = Field(description="side, `side` halved as often as the pixels still resolve as much")
 
 
 class EstimatorLimit(Fields):
