@@ -1,4 +1,4 @@
-"""Models in files: `torch.export` archives (.pt2) and TorchScript, told apart by content, not by name.
+"""Models in files: `torch.export` archives (.pt2) and TorchScript, told apart by content; and ONNX, by its suffix.
 
 No Python object is ever unpickled: archives that need it are refused. A model file is a program all the same; open only
 files whose makers you trust.
@@ -20,11 +20,12 @@ import torch
 
 from advsearch.errors import FileFormatError, ModelError
 from advsearch.files import open_regular
-from advsearch.models import exported, torchscript
+from advsearch.models import exported, onnx, torchscript
 from advsearch.models.archive import LARGEST, Archive, open_archive, refused
 from advsearch.models.deadline import TookTooLong, try_torchscript
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source, source_of
+from advsearch.models.zoo.library import without_unpickling
 
 #: Suffixes that make a name a file even if there is no such file.
 SUFFIXES = (".pt2", ".pt", ".pth", ".ts", ".torchscript", ".bin", ".pkl", ".pickle", ".ckpt", ".safetensors", ".onnx")
@@ -50,6 +51,8 @@ def load_file(path: Path) -> Source:
         head = file.read(16)
         if not head:
             raise FileFormatError(f"model file {path}: expected a model, got an empty file")
+        if path.suffix.lower() == ".onnx":
+            return onnx.load(path)
         if head[:2] != b"PK":
             raise FileFormatError(f"model file {path}: {_not_an_archive(path, head)}")
         archive = open_archive(path, file, os.fstat(file.fileno()).st_size)
@@ -138,7 +141,7 @@ def _try_to_load(path: Path, checked: io.BytesIO) -> None:
 
 def _load_exported(path: Path, archive: Archive) -> Source:
     checked = exported.rewritten(archive)
-    with _damaged(path, "torch.export"), _no_unpickling(), _quiet_export():
+    with _damaged(path, "torch.export"), without_unpickling(), _quiet_export():
         program = torch.export.load(checked)
         module = program.module()
     return source_of(module, path.stem, **_signature(program, path.stem))
@@ -182,26 +185,6 @@ def _damaged(path: Path, kind: str) -> Iterator[None]:
             f"model file {path}: cannot be read as {kind} with torch {torch.__version__}; damaged, made by another "
             f"version, or in need of unpickling, which is never done ({first_line(error)})"
         ) from error
-
-
-@contextlib.contextmanager
-def _no_unpickling() -> Iterator[None]:
-    """Hold `torch.load` to tensors and plain containers: `torch.export.load` else falls back to full unpickling."""
-    changed = {"TORCH_FORCE_WEIGHTS_ONLY_LOAD": "1", "TORCH_FORCE_NO_WEIGHTS_ONLY_LOAD": None}
-    before = {key: os.environ.get(key) for key in changed}
-    _set_environment(changed)
-    try:
-        yield
-    finally:
-        _set_environment(before)
-
-
-def _set_environment(values: dict[str, str | None]) -> None:
-    for key, value in values.items():
-        if value is None:
-            os.environ.pop(key, None)
-        else:
-            os.environ[key] = value
 
 
 @contextlib.contextmanager

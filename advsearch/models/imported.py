@@ -1,4 +1,4 @@
-"""Models that Python code builds: ``package.module:callable`` and ``torchvision:NAME``, each with ``@weights``."""
+"""Models that Python code builds: ``package.module:callable``, with weights after an ``@``."""
 
 from __future__ import annotations
 
@@ -10,12 +10,10 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-import torch
 from torch import nn
 
 from advsearch.errors import ModelError, UnknownNameError
 from advsearch.models.model import Model
-from advsearch.models.preprocessing import PRESETS
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source, load_weights, source_of
 from advsearch.registry import check_import, current_directory_importable
@@ -52,7 +50,7 @@ def load_callable(spec: str) -> Source | Model:
     for part in attribute.split("."):
         if not hasattr(value, part):
             known = [key for key in vars(value) if not key.startswith("_") and callable(getattr(value, key))]
-            raise UnknownNameError(f"attribute of {module_name}", part, _near(part, known))
+            raise UnknownNameError(f"attribute of {module_name}", part, near_names(part, known))
         value = getattr(value, part)
     built = _build(value, spec)
     if isinstance(built, Model):
@@ -103,98 +101,7 @@ def _where(error: BaseException) -> str:
     return f"{first_line(error)}{place}"
 
 
-def _near(name: str, known: Iterable[str]) -> list[str]:
+def near_names(name: str, known: Iterable[str]) -> list[str]:
     """Return at most a dozen names to show, the nearest first."""
     names = sorted(known)
     return difflib.get_close_matches(name, names, n=12, cutoff=0.3) or names[:12]
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# torchvision
-
-
-def load_torchvision(spec: str) -> Source:
-    """Return ``torchvision:NAME[@weights.safetensors]``, a classifier of torchvision's registry.
-
-    Nothing is downloaded. Without ``@weights`` torchvision's default weights must already be in torch's cache. Size,
-    normalisation and labels are those of the default weights, where torchvision tells them.
-
-    Raises:
-        ModelError: torchvision is missing or broken, there are no weights, or they do not fit.
-        UnknownNameError: torchvision has no classifier of that name.
-    """
-    name, weights = split_weights(spec.partition(":")[2])
-    torchvision = _import_torchvision(spec)
-    known = _classifiers(torchvision)
-    if name not in known:
-        raise UnknownNameError("torchvision classifier", name, _near(name, known))
-    default = _default_weights(torchvision, name)
-    if weights is None:
-        module = _with_cached_weights(torchvision, spec, name, default)
-    else:
-        module = torchvision.models.get_model(name, weights=None)
-        load_weights(module, weights, name)
-    fields: dict[str, Any] = {"input_size": (224, 224), "mean": PRESETS["imagenet"][0], "std": PRESETS["imagenet"][1]}
-    return source_of(module, name, **{**fields, **_described(default, module)})
-
-
-def _import_torchvision(spec: str) -> Any:
-    try:
-        return importlib.import_module("torchvision")
-    except Exception as error:  # a build for another torch raises RuntimeError, among others
-        raise ModelError(
-            f"model {spec}: needs torchvision, built for torch {torch.__version__}, which cannot be imported "
-            f"({first_line(error)}). Install it from the index that torch came from, or export the network with "
-            "torch.export where torchvision works"
-        ) from error
-
-
-def _classifiers(torchvision: Any) -> list[str]:
-    """Return the names in torchvision's own module of models; those in submodules segment and detect."""
-    return list(torchvision.models.list_models(module=torchvision.models))
-
-
-def _default_weights(torchvision: Any, name: str) -> Any | None:
-    try:
-        return torchvision.models.get_model_weights(name).DEFAULT
-    except (AttributeError, ValueError):
-        return None
-
-
-def _with_cached_weights(torchvision: Any, spec: str, name: str, default: Any | None) -> nn.Module:
-    url = getattr(default, "url", "")
-    cached = Path(torch.hub.get_dir(), "checkpoints", url.rpartition("/")[2])
-    if not url or not cached.is_file():
-        raise ModelError(
-            f"model {spec}: its weights are not on this machine (looked for {cached}) and nothing is downloaded. Give "
-            f"'torchvision:{name}@weights.safetensors', or fetch them once with python -c \"import torchvision; "
-            f"torchvision.models.get_model('{name}', weights='DEFAULT')\""
-        )
-    module: nn.Module = torchvision.models.get_model(name, weights=None)
-    try:
-        module.load_state_dict(torch.load(cached, map_location="cpu", weights_only=True))
-    except Exception as error:  # a damaged file raises nearly anything
-        raise ModelError(
-            f"model {spec}: cannot load {cached} ({first_line(error)}); delete it and fetch it again"
-        ) from error
-    return module
-
-
-def _described(default: Any | None, module: nn.Module) -> dict[str, Any]:
-    """Return the fields of `Source` that torchvision's default weights tell."""
-    if default is None:
-        return {}
-    fields: dict[str, Any] = {}
-    transforms = default.transforms()
-    crop = getattr(transforms, "crop_size", None)
-    if crop:
-        fields["input_size"] = (int(crop[0]), int(crop[-1]))
-    for key in ("mean", "std"):
-        numbers = getattr(transforms, key, None)
-        if numbers is not None:
-            fields[key] = tuple(float(number) for number in numbers)
-    categories = default.meta.get("categories") if hasattr(default, "meta") else None
-    last = [p for p in module.parameters() if p.dim() == 1][-1:]
-    if categories and last and last[0].numel() == len(categories):
-        fields["labels"] = tuple(categories)
-    return fields

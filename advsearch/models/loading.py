@@ -19,6 +19,7 @@ from advsearch.models.model import Model, Read
 from advsearch.models.preprocessing import Preprocessing
 from advsearch.models.probe import probe
 from advsearch.models.source import Source, source_of
+from advsearch.models.zoo import timm, torchvision, transformers
 from advsearch.registry import Registry
 
 #: Size of the input where neither the model nor the caller says.
@@ -26,15 +27,15 @@ DEFAULT_INPUT_SIZE = (224, 224)
 
 SOURCES: Registry[Callable[[str], Source | Model]] = Registry(
     "advsearch.models",
-    {"torchvision": imported.load_torchvision},
+    {"torchvision": torchvision.load, "timm": timm.load, "hf": transformers.load},
     "a function from the whole text, such as 'zoo:resnet18', to a Source or a Model",
     lambda name, entry: callable(entry),
 )
 """What loads ``SOURCE:NAME``, by source."""
 
 FORMS = (
-    "A model is 'reference', a file (.pt2 or TorchScript), 'package.module:callable', "
-    "'torchvision:NAME@weights.safetensors', or in Python an nn.Module"
+    "A model is 'reference', a file (.pt2, TorchScript or .onnx), 'torchvision:NAME', 'timm:NAME', 'hf:REPOSITORY', "
+    "'package.module:callable', or in Python an nn.Module"
 )
 
 
@@ -140,7 +141,7 @@ def _find(spec: object) -> Source | Model:
         return imported.load_callable(text)
     if Path(text).suffix.lower() in files.SUFFIXES or "/" in text or os.sep in text or os.path.exists(text):
         return files.load_file(Path(text))
-    raise UnknownNameError("model", text, ["reference", "torchvision:NAME"], FORMS)
+    raise UnknownNameError("model", text, ["reference", "torchvision:NAME", "timm:NAME"], FORMS)
 
 
 def _described(spec: object) -> str:

@@ -1,0 +1,68 @@
+"""Models in ONNX files: run by onnxruntime, which gives answers and no gradients."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from advsearch.errors import FileFormatError, ModelError
+from advsearch.models.probe import first_line
+from advsearch.models.source import Source
+from advsearch.models.zoo.library import library
+
+FLOATS = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16, "tensor(double)": torch.float64}
+LARGEST_BATCH = 64
+
+
+class OnnxNetwork(nn.Module):
+    """A session of onnxruntime as a function from a batch of images to its outputs; no gradient goes through it."""
+
+    def __init__(self, session: Any) -> None:
+        super().__init__()
+        self.session = session
+
+    def forward(self, images: Tensor) -> Tensor | tuple[Tensor, ...]:
+        """Return the only output, or all of them in their order."""
+        made = self.session.run(None, {self.session.get_inputs()[0].name: images.detach().cpu().numpy()})
+        outputs = tuple(torch.from_numpy(output) for output in made)
+        return outputs[0] if len(outputs) == 1 else outputs
+
+
+def load(path: Path) -> Source:
+    """Return the network in an ONNX file that is known to be an ordinary one; onnxruntime holds its other files to its
+    folder.
+
+    Raises:
+        FileFormatError: it is damaged, or refers to files that are elsewhere.
+        ModelError: onnxruntime is missing, or the network does not take one batch of images.
+    """
+    runtime = library("onnxruntime", str(path), "onnx")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    options.log_severity_level = 4  # what is wrong is raised as well
+    try:
+        session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # its errors have no type in common
+        raise FileFormatError(
+            f"model file {path}: cannot be read as ONNX with onnxruntime {runtime.__version__} ({first_line(error)})"
+        ) from error
+    inputs = session.get_inputs()
+    shape = inputs[0].shape if inputs else []
+    if len(inputs) != 1 or len(shape) != 4 or inputs[0].type not in FLOATS:
+        found = ", ".join(f"{one.name} {one.type} {one.shape}" for one in inputs) or "none"
+        raise ModelError(
+            f"model {path.stem}: expected one input, a batch of floating-point images of 4 dimensions, got {found}"
+        )
+    layout = "NHWC" if shape[3] == 3 and shape[1] != 3 else "NCHW"
+    sides = shape[1:3] if layout == "NHWC" else shape[2:4]
+    return Source(
+        OnnxNetwork(session),
+        path.stem,
+        input_size=(sides[0], sides[1]) if all(isinstance(side, int) for side in sides) else None,
+        layout=layout,
+        batch_limits=(shape[0], shape[0]) if isinstance(shape[0], int) else (1, LARGEST_BATCH),
+        dtype=FLOATS[inputs[0].type],
+    )

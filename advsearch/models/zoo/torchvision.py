@@ -1,0 +1,75 @@
+"""``torchvision:NAME``: networks of torchvision that classify, segment or find objects."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor, nn
+
+from advsearch.errors import UnknownNameError
+from advsearch.models.imported import near_names, split_weights
+from advsearch.models.preprocessing import PRESETS
+from advsearch.models.source import Source, load_weights, source_of
+from advsearch.models.zoo.library import library, reading
+
+
+def load(spec: str) -> Source:
+    """Return ``torchvision:NAME[@weights.safetensors]``, with torchvision's default weights where none are given.
+
+    Size, normalisation and labels are those of the default weights, where torchvision tells them. Its detectors
+    normalise by themselves.
+
+    Raises:
+        ModelError: torchvision is missing or broken, its weights cannot be had, or those that were given do not fit.
+        UnknownNameError: torchvision has no such network.
+    """
+    name, weights = split_weights(spec.partition(":")[2])
+    models = library("torchvision", spec, "torchvision").models
+    classifies, segments, finds = (
+        models.list_models(module=m) for m in (models, models.segmentation, models.detection)
+    )
+    if name not in (*classifies, *segments, *finds):
+        raise UnknownNameError("torchvision network", name, near_names(name, (*classifies, *segments, *finds)))
+    default = getattr(models.get_model_weights(name), "DEFAULT", None)
+    parts = {} if name in classifies else {"weights_backbone": None}
+    with reading(spec, f"Give 'torchvision:{name}@weights.safetensors'"):
+        module: nn.Module = models.get_model(name, weights=None if weights else default, **parts)
+    if weights is not None:
+        load_weights(module, weights, name)
+    described = _described(default, module if name in classifies else None)
+    if name in finds:
+        described.update(mean=None, std=None)
+    return source_of(_Segmenter(module) if name in segments else module, name, **described)
+
+
+class _Segmenter(nn.Module):
+    """Logits (N, classes, H, W) of each pixel, out of a dictionary."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, images: Tensor) -> Tensor:
+        logits: Tensor = self.network(images)["out"]
+        return logits
+
+
+def _described(default: Any | None, classifier: nn.Module | None) -> dict[str, Any]:
+    """Return the fields of `Source` that default weights tell; the labels of a classifier only if they fit it."""
+    mean, std = PRESETS["imagenet"]
+    fields: dict[str, Any] = {"input_size": (224, 224), "mean": mean, "std": std}
+    if default is None:
+        return fields
+    transforms = default.transforms()
+    sides = getattr(transforms, "crop_size", None) or getattr(transforms, "resize_size", None)
+    if sides:
+        fields["input_size"] = (int(sides[0]), int(sides[-1]))
+    for key in ("mean", "std"):
+        numbers = getattr(transforms, key, None)
+        if numbers is not None:
+            fields[key] = tuple(float(number) for number in numbers)
+    labels = tuple(str(label) for label in default.meta.get("categories", ()))
+    last = [] if classifier is None else [p for p in classifier.parameters() if p.dim() == 1][-1:]
+    if labels and (classifier is None or (last and last[0].numel() == len(labels))):
+        fields["labels"] = labels
+    return fields
