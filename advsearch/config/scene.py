@@ -87,7 +87,8 @@ class SceneConfig(Config):
         "reference",
         "model",
         "the network under test",
-        "reference, a .pt2 (torch.export), .pt or .ts (TorchScript) file, package.module:callable, or torchvision:NAME",
+        "reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, or "
+        "package.module:callable",
     )
     labels: str | None = setting(
         None, "model", "names of the model's classes", "a JSON or text file", otherwise="the model's own"

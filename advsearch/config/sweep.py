@@ -47,7 +47,8 @@ class SweepConfig(SceneConfig):
         "reference",
         "model",
         "the network under test; several separated by commas are shown the same pictures",
-        "reference, a .pt2 (torch.export), .pt or .ts (TorchScript) file, package.module:callable, or torchvision:NAME",
+        "reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, or "
+        "package.module:callable",
     )
     grid: dict[str, Any] = setting(
         dict,

@@ -21,6 +21,16 @@ PROBABILITY_TOLERANCE = 1e-3
 #: Two answers are the same if they differ by less than this times the largest logit (float32 kernels differ by 1e-6).
 REPEAT_TOLERANCE = 1e-3
 
+STEP = 1e-3
+"""Change of each value of an image, in [0, 1], along the gradient that is checked."""
+
+MASKED = 0.9
+"""Share of a change by which answers may miss what the gradient foretells: a sign that is wrong is a miss of 2, a step
+function one of 1; kinks of ordinary networks stay under a half."""
+
+SMALLEST = 1e-5
+"""Smallest change that is looked at, as a share of the answers: what is less may be rounding."""
+
 PROGRAMS = (torch.fx.GraphModule, torch.jit.ScriptModule)
 """What torch makes of a model file."""
 
@@ -68,7 +78,7 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
     if not repeatable:
         _warn(f"model {model.name} answers the same image differently each time: results hold for single draws only")
     fields["batch_limits"] = _batch_limits(model, torch.cat([grey, noise]), rows if repeatable else None)
-    fields["differentiable"] = _gradient_reaches(model, noise)
+    fields["differentiable"] = _gradient_reaches(model, noise, repeatable)
     return dataclasses.replace(model, **fields)
 
 
@@ -151,8 +161,8 @@ def _batch_limits(model: Model, pair: Tensor, rows: Tensor | None) -> tuple[int,
     return low, high
 
 
-def _gradient_reaches(model: Model, images: Tensor) -> bool:
-    """Return whether a gradient of the logits reaches the image; warn if not."""
+def _gradient_reaches(model: Model, images: Tensor, repeatable: bool) -> bool:
+    """Return whether a gradient of the logits reaches the image; warn if not, and if answers do not follow it."""
     leaf = images.clone().requires_grad_()
     try:
         with torch.enable_grad():
@@ -160,11 +170,30 @@ def _gradient_reaches(model: Model, images: Tensor) -> bool:
             weights = torch.linspace(-1.0, 1.0, logits.shape[1])
             gradient = torch.autograd.grad((logits * weights).sum(), leaf)[0]
         reaches, why = bool((gradient != 0).any()), "it is zero everywhere"
+        if reaches and repeatable:
+            _check_gradient(model, images, gradient, weights)
     except (RuntimeError, ModelError) as error:
         reaches, why = False, first_line(error)
     if not reaches:
         _warn(f"no gradient of model {model.name} reaches its image ({why}): use a policy without gradients")
     return reaches
+
+
+def _check_gradient(model: Model, images: Tensor, gradient: Tensor, weights: Tensor) -> None:
+    """Warn if a network's answers do not move as its gradient says: it is masked, or not of this network."""
+    step = STEP * gradient.sign()
+    ends = (images + step).clamp(0.0, 1.0), (images - step).clamp(0.0, 1.0)
+    with torch.no_grad():
+        answers = [_run(model, end) for end in ends]
+    seen = float(((answers[0] - answers[1]) * weights).sum())
+    expected = float(((ends[0] - ends[1]) * gradient).sum())
+    change = max(abs(seen), abs(expected))
+    if change > SMALLEST * float(answers[0].abs().sum()) and abs(seen - expected) > MASKED * change:
+        _warn(
+            f"the gradient of model {model.name} does not say how its answers change: {expected:.3g} expected, "
+            f"{seen:.3g} seen for a small step along it. Steps that round, or a defence that masks gradients? A search "
+            "that follows them may find nothing: try a policy without gradients beside it"
+        )
 
 
 def first_line(error: BaseException) -> str:

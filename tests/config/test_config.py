@@ -43,8 +43,8 @@ WRONG: dict[str, tuple[Any, str]] = {
     "resolution": ("4x4", "expected SIDE or HEIGHTxWIDTH, each from 8 to 4096, got 4x4"),
     "model": (
         "a\0b",
-        "expected reference, a .pt2 (torch.export), .pt or .ts (TorchScript) file, package.module:callable, "
-        "or torchvision:NAME",
+        "expected reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, "
+        "or package.module:callable",
     ),
     "labels": (True, "expected a JSON or text file, got True"),
     "task": ("  ", "expected the name of a task, got '  '"),

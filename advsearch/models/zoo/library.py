@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import logging
 import os
 import warnings
 from collections.abc import Iterator
@@ -57,6 +58,8 @@ def reading(spec: str, advice: str) -> Iterator[None]:
         spec: the model.
         advice: what else its user may give.
     """
+    disabled = logging.root.manager.disable
+    logging.disable(logging.WARNING)  # of single tries to connect: an error is raised in the end
     try:
         with without_unpickling(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -68,6 +71,8 @@ def reading(spec: str, advice: str) -> Iterator[None]:
             f"model {spec}: cannot be fetched or read ({first_line(error)}). Weights come from the library's cache on "
             f"this machine, else from where it publishes them; they are never unpickled. {advice}"
         ) from error
+    finally:
+        logging.disable(disabled)
 
 
 def _set_environment(values: dict[str, str | None]) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,8 @@ def load(spec: str) -> Source:
     transformers = library("transformers", spec, "hf")
     if Path(name).is_dir():
         name = str(Path(name).resolve())
+    if not sys.stderr.isatty():
+        transformers.utils.logging.disable_progress_bar()
     where = {"revision": revision} if revision else {}
     with reading(spec, ADVICE):
         config = transformers.AutoConfig.from_pretrained(name, trust_remote_code=False, **where)
@@ -52,7 +55,12 @@ def load(spec: str) -> Source:
         described = _described(transformers, name, where)
     labels = getattr(config, "id2label", None) or {}
     names = tuple(str(labels[key]) for key in sorted(labels, key=int))
-    module = {"ForObjectDetection": _Detector, "ForSemanticSegmentation": _Segmenter}.get(kind, _Classifier)(network)
+    wrapped: dict[str, Callable[[], nn.Module]] = {
+        "ForImageClassification": lambda: _Classifier(network),
+        "ForSemanticSegmentation": lambda: _Segmenter(network),
+        "ForObjectDetection": lambda: _Detector(network, len(names)),
+    }
+    module = wrapped[kind]()
     return source_of(module, name.rstrip("/").rpartition("/")[2], labels=names or None, **described)
 
 
@@ -75,20 +83,24 @@ class _Segmenter(_Classifier):
         return functional.interpolate(super().forward(images), size=images.shape[2:], mode="bilinear")
 
 
-class _Detector(_Classifier):
+class _Detector(nn.Module):
     """Boxes (N, queries, 4) in pixels, x0 y0 x1 y1, and scores (N, queries, classes) in [0, 1], overlapping ones too.
 
     Networks whose last class stands for "nothing" choose one class for each box (Carion et al. 2020); the others judge
     each class by itself.
     """
 
-    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+    def __init__(self, network: nn.Module, classes: int) -> None:
+        super().__init__()
+        self.network, self.classes = network, classes
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         answer = self.network(pixel_values=images)
         height, width = images.shape[2:]
         middle, size = answer.pred_boxes.split(2, dim=-1)
         corners = torch.cat([middle - size / 2, middle + size / 2], dim=-1)
         boxes = corners * corners.new_tensor([width, height, width, height])
-        if answer.logits.shape[-1] > len(self.network.config.id2label):
+        if answer.logits.shape[-1] > self.classes:
             return boxes, answer.logits.softmax(dim=-1)[..., :-1]
         return boxes, answer.logits.sigmoid()
 
@@ -114,7 +126,10 @@ def _described(transformers: Any, name: str, where: Mapping[str, str]) -> dict[s
 def _sides(size: Any) -> tuple[int, int] | None:
     """Return height and width of what a preprocessing calls a size: a number, both sides, or the shorter one."""
     if isinstance(size, dict):
-        sides = (size.get("height", size.get("shortest_edge")), size.get("width", size.get("shortest_edge")))
+        shorter = size.get("shortest_edge")
+        height, width = size.get("height", shorter), size.get("width", shorter)
     else:
-        sides = (size, size)
-    return sides if all(isinstance(side, int) and side > 0 for side in sides) else None
+        height = width = size
+    if isinstance(height, int) and isinstance(width, int) and min(height, width) > 0:
+        return height, width
+    return None

@@ -1,0 +1,318 @@
+"""Networks by a library's name and in ONNX files: with small stand-ins, and with the libraries where they are."""
+
+from __future__ import annotations
+
+import json
+import sys
+import types
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from advsearch.errors import FileFormatError, ModelError, UnknownNameError
+from advsearch.models import ModelWarning, load_model
+
+IMAGES = torch.rand((2, 8, 8, 3), generator=torch.Generator().manual_seed(0))
+
+
+class Net(nn.Module):
+    """Logits of three classes; `num_classes` and `pretrained_cfg` are what timm gives its networks."""
+
+    num_classes = 3
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.pretrained_cfg: dict[str, Any] = {"label_names": ["mug", "bowl", "vase"]}
+        self.weight = nn.Parameter(torch.randn((3, 3), generator=torch.Generator().manual_seed(3)))
+        self.bias = nn.Parameter(torch.zeros(3))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x.mean(dim=(2, 3)) @ self.weight.T + self.bias
+
+
+class Pixels(Net):
+    """Logits of three classes for every pixel, as torchvision's networks give them."""
+
+    def forward(self, x: Tensor) -> Any:
+        return {"out": torch.einsum("nchw,kc->nkhw", x, self.weight), "aux": x}
+
+
+def expected(scale: float, shift: float, bias: Tensor) -> Tensor:
+    return ((IMAGES - shift) / scale).mean(dim=(1, 2)) @ Net().weight.detach().T + bias
+
+
+def unpickles(*_: object, **__: object) -> nn.Module:
+    """What a library does whose weights are a pickle."""
+    path = Path(sys.modules["torchvision"].weights)
+    torch.load(path, weights_only=False)
+    return Net()
+
+
+@pytest.fixture
+def torchvision(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+    class Weights:
+        meta: dict[str, Any] = {"categories": ["mug", "bowl", "vase"]}  # noqa: RUF012
+
+        @staticmethod
+        def transforms() -> Any:
+            return types.SimpleNamespace(crop_size=[8], mean=[0.5, 0.5, 0.5], std=[0.25, 0.25, 0.25])
+
+    def get_model(name: str, weights: object, weights_backbone: object = "default") -> nn.Module:
+        assert (name == "tiny_pixels") == (weights_backbone is None)
+        library.asked = weights
+        return Pixels() if name == "tiny_pixels" else Net()
+
+    library: Any = types.ModuleType("torchvision")
+    library.models = types.ModuleType("torchvision.models")
+    library.models.segmentation, library.models.detection = object(), object()
+    names = {library.models: ["tiny_net", "vgg11"], library.models.segmentation: ["tiny_pixels"]}
+    library.models.list_models = lambda module: names.get(module, [])
+    library.models.get_model = get_model
+    library.models.get_model_weights = lambda name: types.SimpleNamespace(DEFAULT=Weights())
+    library.weights = tmp_path / "weights.pth"
+    monkeypatch.setitem(sys.modules, "torchvision", library)
+    return library
+
+
+def test_torchvision_brings_its_weights_and_what_belongs_to_them(torchvision: Any) -> None:
+    model = load_model("torchvision:tiny_net")
+    assert type(torchvision.asked).__name__ == "Weights"
+    assert (model.name, model.labels, model.input_size) == ("tiny_net", ("mug", "bowl", "vase"), (8, 8))
+    torch.testing.assert_close(model(IMAGES), expected(0.25, 0.5, torch.zeros(3)))
+
+
+def test_torchvision_with_weights_of_ones_own(torchvision: Any, tmp_path: Path) -> None:
+    path = tmp_path / "tiny.safetensors"
+    save_file({"weight": Net().weight.detach(), "bias": torch.tensor([1.0, 2.0, 3.0])}, path)
+    model = load_model(f"torchvision:tiny_net@{path}")
+    assert torchvision.asked is None
+    torch.testing.assert_close(model(IMAGES), expected(0.25, 0.5, torch.tensor([1.0, 2.0, 3.0])))
+
+
+def test_torchvision_segments(torchvision: Any) -> None:
+    model = load_model("torchvision:tiny_pixels", read=lambda answer, count: answer)
+    assert model.labels == ("mug", "bowl", "vase")
+    assert model(IMAGES).shape == (2, 3, 8, 8)
+
+
+def test_what_a_library_unpickles_is_refused(torchvision: Any, tmp_path: Path) -> None:
+    class SideEffect:
+        def __reduce__(self) -> Any:
+            return Path.touch, (tmp_path / "executed",)
+
+    torch.save(SideEffect(), torchvision.weights)
+    torchvision.models.get_model = unpickles
+    with pytest.raises(ModelError, match=r"model torchvision:tiny_net: cannot be fetched or read .* never unpickled"):
+        load_model("torchvision:tiny_net")
+    assert not (tmp_path / "executed").exists()
+
+
+def test_torchvision_has_no_such_network(torchvision: Any) -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown torchvision network 'tinynet'. Did you mean 'tiny_net'"):
+        load_model("torchvision:tinynet")
+
+
+@pytest.fixture
+def timm(monkeypatch: pytest.MonkeyPatch) -> Any:
+    def create_model(name: str, pretrained: bool) -> nn.Module:
+        library.asked = (name, pretrained)
+        return Net()
+
+    library: Any = types.ModuleType("timm")
+    library.is_model = lambda name: name == "tiny_net"
+    library.list_models = lambda: ["tiny_net", "vgg11"]
+    library.create_model = create_model
+    library.data = types.SimpleNamespace(
+        resolve_model_data_config=lambda module: {"input_size": (3, 8, 8), "mean": (0.5,) * 3, "std": (0.25,) * 3},
+        infer_imagenet_subset=lambda module: None,
+    )
+    monkeypatch.setitem(sys.modules, "timm", library)
+    return library
+
+
+def test_timm_brings_its_weights_and_what_belongs_to_them(timm: Any, tmp_path: Path) -> None:
+    model = load_model("timm:tiny_net.a1_in1k")
+    assert timm.asked == ("tiny_net.a1_in1k", True)
+    assert (model.labels, model.input_size) == (("mug", "bowl", "vase"), (8, 8))
+    torch.testing.assert_close(model(IMAGES), expected(0.25, 0.5, torch.zeros(3)))
+    path = tmp_path / "tiny.safetensors"
+    save_file({"weight": Net().weight.detach(), "bias": torch.ones(3)}, path)
+    model = load_model(f"timm:tiny_net@{path}")
+    assert timm.asked == ("tiny_net", False)
+    torch.testing.assert_close(model(IMAGES), expected(0.25, 0.5, torch.ones(3)))
+    with pytest.raises(UnknownNameError, match=r"unknown timm network 'tinynet'. Did you mean 'tiny_net'"):
+        load_model("timm:tinynet")
+
+
+@pytest.mark.parametrize(
+    ("spec", "library", "command"),
+    [
+        ("torchvision:resnet18", "torchvision", r"pip install 'advsearch\[torchvision\]'"),
+        ("timm:resnet18", "timm", r"pip install 'advsearch\[timm\]'"),
+        ("hf:microsoft/resnet-50", "transformers", r"pip install 'advsearch\[hf\]'"),
+    ],
+)
+def test_an_absent_library_says_the_command(
+    monkeypatch: pytest.MonkeyPatch, spec: str, library: str, command: str
+) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ModelError, match=f"model {spec}: needs {library}, which is not installed: {command}"):
+        load_model(spec)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# transformers
+
+
+PREPROCESSING = {"size": {"height": 16, "width": 16}, "image_mean": [0.5] * 3, "image_std": [0.25] * 3}
+
+
+def published(folder: Path, architecture: str, **more: Any) -> str:
+    """Publish a tiny network of transformers into a folder, as `save_pretrained` does."""
+    transformers = pytest.importorskip("transformers", reason="transformers is not installed: advsearch[hf]")
+    sizes: dict[str, Any] = {"hidden_size": 8, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 8}
+    if "Segformer" in architecture:
+        sizes = {"num_encoder_blocks": 1, "depths": [1], "sr_ratios": [1], "hidden_sizes": [8], "strides": [2]}
+        sizes |= {"num_attention_heads": [1], "patch_sizes": [3], "mlp_ratios": [1], "decoder_hidden_size": 8}
+    family = architecture.partition("For")[0]
+    labels = {0: "mug", 1: "bowl", 2: "vase"}
+    config = getattr(transformers, f"{family}Config")(id2label=labels, **sizes, **more)
+    torch.manual_seed(0)
+    getattr(transformers, architecture)(config).save_pretrained(folder)
+    (folder / "preprocessor_config.json").write_text(json.dumps(PREPROCESSING))
+    return f"hf:{folder}"
+
+
+def test_transformers_classifies(tmp_path: Path) -> None:
+    model = load_model(published(tmp_path, "ViTForImageClassification", image_size=16, patch_size=8))
+    assert (model.labels, model.input_size, model.differentiable) == (("mug", "bowl", "vase"), (16, 16), True)
+    assert (model.preprocessing.mean, model.preprocessing.std) == ((0.5,) * 3, (0.25,) * 3)
+
+
+def test_transformers_segments(tmp_path: Path) -> None:
+    spec = published(tmp_path, "SegformerForSemanticSegmentation")
+    assert load_model(spec, read=lambda answer, count: answer)(IMAGES).shape == (2, 3, 16, 16)
+
+
+def test_transformers_finds_objects(tmp_path: Path) -> None:
+    more = {"image_size": [16, 16], "patch_size": 8, "num_detection_tokens": 5}
+    model = load_model(
+        published(tmp_path, "YolosForObjectDetection", **more),
+        read=lambda answer, count: list(zip(*answer, strict=True)),
+    )
+    boxes, scores = model(IMAGES)[0]
+    assert boxes.shape == (5, 4)
+    assert bool((boxes[:, :2] <= boxes[:, 2:]).all())
+    assert scores.shape == (5, 3)
+    assert 0.0 <= float(scores.min()) <= float(scores.max()) <= 1.0
+
+
+def test_transformers_never_unpickles(tmp_path: Path) -> None:
+    spec = published(tmp_path, "ViTForImageClassification", image_size=16, patch_size=8)
+    (tmp_path / "model.safetensors").unlink()
+    torch.save(Net().state_dict(), tmp_path / "pytorch_model.bin")
+    with pytest.raises(ModelError, match=r"cannot be fetched or read"):
+        load_model(spec)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# ONNX
+
+
+def test_onnx_absent(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "net.onnx").write_bytes(b"\x08\x09")
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(ModelError, match=r"needs onnxruntime, which is not installed: pip install 'advsearch\[onnx\]'"):
+        load_model(tmp_path / "net.onnx")
+
+
+class Session:
+    """The few functions of onnxruntime's sessions that are used."""
+
+    def __init__(self, path: str, options: object, providers: object) -> None:
+        if not Path(path).read_bytes():
+            raise RuntimeError("no graph was found in the protobuf")
+
+    def get_inputs(self) -> Any:
+        return [types.SimpleNamespace(name="x", type="tensor(float)", shape=["N", 3, 8, 8])]
+
+    def run(self, _: None, given: dict[str, Any]) -> list[Any]:
+        with torch.no_grad():
+            return [Net()(torch.from_numpy(given["x"])).numpy()]
+
+
+def test_onnx_answers_without_gradients(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    runtime: Any = types.ModuleType("onnxruntime")
+    runtime.SessionOptions, runtime.InferenceSession, runtime.__version__ = types.SimpleNamespace, Session, "0"
+    monkeypatch.setitem(sys.modules, "onnxruntime", runtime)
+    (tmp_path / "net.onnx").write_bytes(b"\x08\x09")
+    with pytest.warns(ModelWarning, match="no gradient of model net reaches its image"):
+        model = load_model(tmp_path / "net.onnx")
+    assert (model.input_size, model.differentiable) == ((8, 8), False)
+    torch.testing.assert_close(model(IMAGES), expected(1.0, 0.0, torch.zeros(3)))
+
+
+def onnx_file(path: Path, weights: str | None = None) -> Path:
+    """Write a network of three classes; its weights may be said to lie in another file."""
+    onnx = pytest.importorskip("onnx", reason="onnx is not installed: it writes the files of this test")
+    pytest.importorskip("onnxruntime", reason="onnxruntime is not installed: advsearch[onnx]")
+    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
+    numbers = torch.randn((3, 192), generator=torch.Generator().manual_seed(1))
+    tensor = helper.make_tensor("w", kind, [3, 192], numbers.flatten().tolist())
+    if weights is not None:
+        tensor.ClearField("float_data")
+        tensor.data_location = onnx.TensorProto.EXTERNAL
+        for key, value in (("location", weights), ("offset", "0"), ("length", str(numbers.numel() * 4))):
+            entry = tensor.external_data.add()
+            entry.key, entry.value = key, value
+    nodes = [helper.make_node("Flatten", ["x"], ["f"]), helper.make_node("Gemm", ["f", "w"], ["y"], transB=1)]
+    ends = [
+        helper.make_tensor_value_info(name, kind, shape) for name, shape in (("x", ["N", 3, 8, 8]), ("y", ["N", 3]))
+    ]
+    graph = helper.make_graph(nodes, "g", ends[:1], ends[1:], [tensor])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    path.write_bytes(model.SerializeToString())
+    return path
+
+
+def test_onnx_by_the_real_runtime(tmp_path: Path) -> None:
+    path = onnx_file(tmp_path / "net.onnx")
+    with pytest.warns(ModelWarning, match="no gradient"):
+        model = load_model(path)
+    weight = torch.randn((3, 192), generator=torch.Generator().manual_seed(1))
+    torch.testing.assert_close(model(IMAGES), IMAGES.permute(0, 3, 1, 2).flatten(1) @ weight.T)
+
+
+@pytest.mark.parametrize("elsewhere", ["../weights.bin", "/dev/zero"])
+def test_onnx_reads_nothing_elsewhere(tmp_path: Path, elsewhere: str) -> None:
+    (tmp_path / "weights.bin").write_bytes(bytes(4096))
+    (tmp_path / "inside").mkdir()
+    with pytest.raises(FileFormatError, match="cannot be read as ONNX"):
+        load_model(onnx_file(tmp_path / "inside" / "net.onnx", elsewhere))
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# gradients that do not say how answers change
+
+
+class Steps(nn.Module):
+    """Answers by colours that are rounded; a gradient comes from a slight slope."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        rounded = (4.0 * x).round() / 4.0
+        weight = torch.randn((192, 3), generator=torch.Generator().manual_seed(0))
+        return (rounded + 1e-3 * x).flatten(1) @ weight
+
+
+def test_a_masked_gradient_is_told() -> None:
+    with pytest.warns(ModelWarning, match="does not say how its answers change"):
+        load_model(Steps(), input_size=8)
+
+
+def test_a_true_gradient_is_not(recwarn: pytest.WarningsRecorder) -> None:
+    load_model(Net(), input_size=8)
+    assert not [warning for warning in recwarn if issubclass(warning.category, ModelWarning)]
