@@ -53,10 +53,11 @@ def main() -> None:
     yardstick = torch.rand(16, args.size, args.size, 3)
     for index in range(args.steps):
         begun = time.perf_counter()
-        proposal, state = policy.propose(state)
-        if proposal is None:  # nothing more to propose: go on measuring from where it stands
+        proposals, state = policy.propose(state, 1)
+        if not proposals:  # nothing more to propose: go on measuring from where it stands
             break
-        state = policy.update(state, proposal.u, evaluate(proposal.u, index=index, gradient=True))
+        u = proposals[0].u
+        state = policy.update(state, [(u, evaluate(u, index=index, gradient=True))])
         seconds.append(time.perf_counter() - begun)
         begun = time.perf_counter()
         with torch.no_grad():

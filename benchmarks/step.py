@@ -78,10 +78,9 @@ def steps(problem: Problem, count: int) -> Callable[[], None]:
 
     def step() -> None:
         nonlocal state, index
-        proposal, state = policy.propose(state)
-        assert proposal is not None
+        (proposal,), state = policy.propose(state, 1)
         evaluation = evaluate(proposal.u, index=index, gradient=True)
-        state = policy.update(state, proposal.u, evaluation)
+        state = policy.update(state, [(proposal.u, evaluation)])
         index += 1
 
     return step

@@ -260,16 +260,19 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
     in_a_row = 0
     while log.renders < steps:
         step = len(log.records)
-        proposal, state = policy.propose(state)
-        if proposal is None:
+        proposals, state = policy.propose(state, 1)
+        if not proposals:
             return Ending.STALLED
+        if len(proposals) > 1:
+            raise RuntimeError(f"policy {name!r} proposed {len(proposals)} configurations; expected at most 1")
+        (proposal,) = proposals
         _check_inside(proposal, log.domain, name)
         evaluation = log.render(affordable(proposal, log.domain, steps - log.renders), step, "search")
         in_a_row = 0 if evaluation.finite else in_a_row + 1
         if in_a_row == NON_FINITE_LIMIT:
             return Ending.NON_FINITE
         if log.renders < steps:
-            state = policy.update(state, proposal.u, evaluation)
+            state = policy.update(state, [(proposal.u, evaluation)])
             log.answer, log.counts = partial(answer_of, policy, state), partial(policy.counts, state)
         if late(len(log.records)):
             break

@@ -18,6 +18,7 @@ from advsearch.attacks import (
     Block,
     Domain,
     Ending,
+    Evaluated,
     Evaluation,
     Policy,
     Proposal,
@@ -44,12 +45,13 @@ class Script(Policy[int]):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> int:
         return 0
 
-    def propose(self, state: int) -> tuple[Proposal | None, int]:
-        return (Proposal(self.us[state], self.gradient) if state < len(self.us) else None), state + 1
+    def propose(self, state: int, n: int) -> tuple[tuple[Proposal, ...], int]:
+        return tuple(Proposal(u, self.gradient) for u in self.us[state : state + 1]), state + 1
 
-    def update(self, state: int, u: Tensor, evaluation: Evaluation) -> int:
-        assert math.isfinite(evaluation.objective) or evaluation.objective == -math.inf
-        assert evaluation.gradient is None or bool(torch.isfinite(evaluation.gradient).all())
+    def update(self, state: int, evaluated: Evaluated) -> int:
+        for _, evaluation in evaluated:
+            assert math.isfinite(evaluation.objective) or evaluation.objective == -math.inf
+            assert evaluation.gradient is None or bool(torch.isfinite(evaluation.gradient).all())
         return state
 
 
@@ -220,10 +222,10 @@ class Samples(Script):
 
     samples: tuple[int, ...] = ()
 
-    def propose(self, state: int) -> tuple[Proposal | None, int]:
+    def propose(self, state: int, n: int) -> tuple[tuple[Proposal, ...], int]:
         if state >= len(self.us):
-            return None, state
-        return Proposal(self.us[state], self.gradient, samples=self.samples[state]), state + 1
+            return (), state
+        return (Proposal(self.us[state], self.gradient, samples=self.samples[state]),), state + 1
 
 
 def sampled(log: list[tuple[bool, int]], extra: int = 0) -> Callable[..., Evaluation]:
@@ -290,12 +292,12 @@ def test_a_policy_that_knows_no_choices_never_sees_one() -> None:
             assert [block.options for block in domain.blocks] == [0]
             return domain, 0
 
-        def propose(self, state: tuple[Domain, int]) -> tuple[Proposal, tuple[Domain, int]]:
+        def propose(self, state: tuple[Domain, int], n: int) -> tuple[tuple[Proposal, ...], tuple[Domain, int]]:
             domain, count = state
-            return Proposal(domain.project(domain.begin + 0.1 * count)), (domain, count + 1)
+            return (Proposal(domain.project(domain.begin + 0.1 * count)),), (domain, count + 1)
 
-        def update(self, state: tuple[Domain, int], u: Tensor, evaluation: Evaluation) -> tuple[Domain, int]:
-            assert u.shape == (1,)
+        def update(self, state: tuple[Domain, int], evaluated: Evaluated) -> tuple[Domain, int]:
+            assert all(u.shape == (1,) for u, _ in evaluated)
             return state
 
     domain = Domain(torch.tensor([0.2, 0.1, 0.9]), (Block(1, options=3), Block(1), Block(1, options=2)))
@@ -448,6 +450,15 @@ def test_other_exceptions_pass_through() -> None:
 
 
 # ---- bugs and bad input
+
+
+def test_a_policy_that_proposes_more_than_it_was_asked_for_is_named() -> None:
+    class Eager(Script):
+        def propose(self, state: int, n: int) -> tuple[tuple[Proposal, ...], int]:
+            return (Proposal(at(0.1)),) * (n + 1), state
+
+    with pytest.raises(RuntimeError, match="policy 'script' proposed 2 configurations; expected at most 1"):
+        search(objective_is(lambda u, index: 0.0), DOMAIN, Eager(()), steps=5, seed=0)
 
 
 @pytest.mark.parametrize(

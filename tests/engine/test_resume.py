@@ -19,9 +19,8 @@ import pytest
 import torch
 from conftest import ROOT
 from stand_ins import StandInProblem, carry_out, configuration, rows
-from torch import Tensor
 
-from advsearch.attacks import Domain, Evaluation, Policy, Proposal, make_policy
+from advsearch.attacks import Domain, Evaluated, Policy, Proposal, make_policy
 from advsearch.config import AttackConfig
 from advsearch.engine.memory import Memory
 from advsearch.engine.record import Recorder, Stages
@@ -212,10 +211,10 @@ class Sleeper(Policy[Domain]):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Domain:
         return domain
 
-    def propose(self, state: Domain) -> tuple[Proposal, Domain]:
-        return Proposal(state.start), state
+    def propose(self, state: Domain, n: int) -> tuple[tuple[Proposal, ...], Domain]:
+        return (Proposal(state.start),) * n, state
 
-    def update(self, state: Domain, u: Tensor, evaluation: Evaluation) -> Domain:
+    def update(self, state: Domain, evaluated: Evaluated) -> Domain:
         return state
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from advsearch.attacks.policies.adam import Adam
 from advsearch.attacks.policies.auto import Auto
-from advsearch.attacks.policies.base import Distributional, Policy, Proposal, answer_of, draw_seed, seeded
+from advsearch.attacks.policies.base import Distributional, Evaluated, Policy, Proposal, answer_of, draw_seed, seeded
 from advsearch.attacks.policies.choices import Choices, with_choices
 from advsearch.attacks.policies.cmaes import CMAES
 from advsearch.attacks.policies.grid import Grid
@@ -119,6 +119,7 @@ __all__ = [
     "Auto",
     "Choices",
     "Distributional",
+    "Evaluated",
     "Grid",
     "Halving",
     "Policy",

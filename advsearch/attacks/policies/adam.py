@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.evaluation import Evaluation
-from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import NO_COUNTS, Counts, Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.clipping import clipped
 from advsearch.attacks.policies.pgd import PATIENCE
 from advsearch.attacks.policies.scaling import half_widths
@@ -100,12 +99,13 @@ class Adam(Policy[AdamState]):
         zero = torch.zeros_like(domain.start)
         return AdamState(domain, steps, draw_seed(generator), half_widths(domain), domain.begin, zero, zero)
 
-    def propose(self, state: AdamState) -> tuple[Proposal | None, AdamState]:
+    def propose(self, state: AdamState, n: int) -> tuple[tuple[Proposal, ...], AdamState]:
         if state.flat >= PATIENCE:
-            return None, state
-        return Proposal(state.u, gradient=True, step_size=self._rate(state)), state
+            return (), state
+        return (Proposal(state.u, gradient=True, step_size=self._rate(state)),), state
 
-    def update(self, state: AdamState, u: Tensor, evaluation: Evaluation) -> AdamState:
+    def update(self, state: AdamState, evaluated: Evaluated) -> AdamState:
+        ((u, evaluation),) = evaluated
         rate = self._rate(state)
         state = replace(state, count=state.count + 1)
         if not evaluation.finite:

@@ -10,8 +10,17 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.evaluation import Evaluation, Wanted
-from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, draw_seed, one_thread, seeded
+from advsearch.attacks.evaluation import Wanted
+from advsearch.attacks.policies.base import (
+    NO_COUNTS,
+    Counts,
+    Evaluated,
+    Policy,
+    Proposal,
+    draw_seed,
+    one_thread,
+    seeded,
+)
 from advsearch.attacks.policies.coordinates import Coordinates, box_coordinates
 from advsearch.attacks.policies.pgd import PGD, PGDState
 from advsearch.attacks.policies.surrogate import Scales, Surrogate, fit
@@ -137,33 +146,37 @@ class Auto(Policy[AutoState]):
             screen = box.screen(seed, max(0, plan.screen - 1))
         return AutoState(domain, box, plan, seed, screen, points)
 
-    def propose(self, state: AutoState) -> tuple[Proposal | None, AutoState]:
+    def propose(self, state: AutoState, n: int) -> tuple[tuple[Proposal, ...], AutoState]:
         state = replace(state, climbing=False, trial=None)
         if state.ascent is None and state.spent >= state.plan.until:
             with one_thread():
                 state = _begin_ascent(state)
         if state.ascent is not None:
-            proposal, _ = PGD().propose(state.ascent)
-            if proposal is not None:
-                return _climb(state, proposal)
+            steps, _ = PGD().propose(state.ascent, n)
+            if steps:
+                proposal, state = _climb(state, steps[0])
+                return (proposal,), state
             if state.box.count < state.domain.dim:
-                return None, state
-        if not state.values:
-            return Proposal(state.domain.begin), state
-        with one_thread():
-            x, state = _next_point(state)
-        return Proposal(state.domain.project(state.box.put(state.domain.begin, x))), state
+                return (), state
+        us = _screen(state, n)
+        if not us:
+            with one_thread():
+                x, state = _next_point(state)
+            us = [_at(state, x)]
+        return tuple(map(Proposal, us)), state
 
-    def update(self, state: AutoState, u: Tensor, evaluation: Evaluation) -> AutoState:
-        state = replace(state, spent=state.spent + evaluation.cost)
+    def update(self, state: AutoState, evaluated: Evaluated) -> AutoState:
+        state = replace(state, spent=state.spent + sum(evaluation.cost for _, evaluation in evaluated))
         if state.climbing and state.ascent is not None:
-            ascent = PGD().update(state.ascent, u, evaluation)
+            ((u, evaluation),) = evaluated
+            ascent = PGD().update(state.ascent, evaluated)
             if state.trial is not None and evaluation.objective < state.trial.objective:
                 u = state.domain.project(state.box.put(ascent.u, state.trial.x))
                 ascent = replace(ascent, u=u, counts=ascent.counts + Counts(rejected=1))
             return replace(state, ascent=ascent, last=evaluation.objective)
-        points = torch.cat([state.points, state.box.take(u)[None]])
-        return replace(state, points=points, values=(*state.values, evaluation.objective))
+        points = torch.cat([state.points, *(state.box.take(u)[None] for u, _ in evaluated)])
+        values = (*state.values, *(evaluation.objective for _, evaluation in evaluated))
+        return replace(state, points=points, values=values)
 
     def counts(self, state: AutoState) -> Counts:
         return NO_COUNTS if state.ascent is None else PGD().counts(state.ascent)
@@ -188,12 +201,22 @@ def make_plan(domain: Domain, box: Coordinates, steps: int) -> Plan:
 # ---- the surrogate --------------------------------------------------------------------------------------------------
 
 
+def _screen(state: AutoState, most: int) -> list[Tensor]:
+    """Return up to so many configurations (d,): the start, then the screen; none where both are done."""
+    done = len(state.values)
+    before = [] if done else [state.domain.begin]
+    rest = [_at(state, x) for x in state.screen[max(0, done - 1) :][: most - len(before)]]
+    return before + rest
+
+
+def _at(state: AutoState, x: Tensor) -> Tensor:
+    """Return the configuration (d,) whose box coordinates are x and whose norm balls are at their start."""
+    return state.domain.project(state.box.put(state.domain.begin, x))
+
+
 def _next_point(state: AutoState) -> tuple[Tensor, AutoState]:
-    """After the start, the screen, then what the surrogate likes; (k,) in the unit box."""
-    n = len(state.values)
-    if n <= len(state.screen):
-        return state.screen[n - 1], state
-    generator = seeded(state.seed, n)
+    """Return what the surrogate likes best: (k,) in the unit box."""
+    generator = seeded(state.seed, len(state.values))
     if not any(math.isfinite(value) for value in state.values):
         return state.box.tidy(torch.rand(state.box.count, generator=generator)), state
     surrogate, state = _surrogate(state)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import ClassVar, Generic, TypeVar
@@ -70,8 +70,12 @@ class Counts:
 NO_COUNTS = Counts()
 
 
+Evaluated = Sequence[tuple[Tensor, Evaluation]]
+"""Configurations with what a render of each said, in the order in which they were proposed."""
+
+
 class Policy(ABC, Generic[State]):
-    """Proposes configurations, one at a time. Write a new one by implementing the three methods below.
+    """Proposes configurations, in batches. Write a new one by implementing the three methods below.
 
     Attributes:
         name: for messages and the log.
@@ -99,15 +103,24 @@ class Policy(ABC, Generic[State]):
         """
 
     @abstractmethod
-    def propose(self, state: State) -> tuple[Proposal | None, State]:
-        """Return the next configuration, or None if there is nothing more to propose (a grid that is done, a flat
-        objective), and the state from then on."""
+    def propose(self, state: State, n: int) -> tuple[tuple[Proposal, ...], State]:
+        """Return the next configurations, and the state until `update`.
+
+        Args:
+            state: after the latest `update`, or as `start` returned it.
+            n: how many can be evaluated at the same time, at least 1.
+
+        Returns:
+            Up to n that do not wait for each other's evaluations: a sample of a population is one of many, a step
+            along a gradient is alone. None at all if there is nothing more to propose (a grid that is done, a flat
+            objective). Asked with another n, a policy proposes the same configurations in the same order.
+        """
 
     @abstractmethod
-    def update(self, state: State, u: Tensor, evaluation: Evaluation) -> State:
-        """Return the state after `u`, the latest proposal, was evaluated.
+    def update(self, state: State, evaluated: Evaluated) -> State:
+        """Return the state after what was proposed last was evaluated, all of it.
 
-        The evaluation is `usable`: its gradient (None where it was not asked for or could not be paid) is finite, and
+        Every evaluation is `usable`: its gradient (None where it was not asked for or could not be paid) is finite, and
         its objective is finite or -inf, which stands for "could not be evaluated". The objective is noisy: the same u
         with another seed gives another value, and a maximum over many is biased upwards.
         """

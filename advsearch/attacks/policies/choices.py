@@ -13,7 +13,7 @@ from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Block, Domain, centre_of_option
 from advsearch.attacks.evaluation import Evaluation
 from advsearch.attacks.policies import racing
-from advsearch.attacks.policies.base import Counts, Distributional, Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import Counts, Distributional, Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.racing import Race, Runner
 from advsearch.attacks.policies.stay import Stay
 
@@ -84,17 +84,15 @@ class Choices(Distributional[ChoicesState]):
         race = racing.line_up((runner,) * len(combinations), steps, seed, eta=ETA)
         return ChoicesState(domain, numbers, choices, combinations, race)
 
-    def propose(self, state: ChoicesState) -> tuple[Proposal | None, ChoicesState]:
-        proposal, race = racing.propose(state.race)
+    def propose(self, state: ChoicesState, n: int) -> tuple[tuple[Proposal, ...], ChoicesState]:
+        proposals, race = racing.propose(state.race, n)
         state = replace(state, race=race)
-        if proposal is None:
-            return None, state
-        return replace(proposal, u=_whole(state, proposal.u, race.field[race.turn])), state
+        asked = zip(proposals, race.asked, strict=True)
+        return tuple(replace(proposal, u=_whole(state, proposal.u, number)) for proposal, number in asked), state
 
-    def update(self, state: ChoicesState, u: Tensor, evaluation: Evaluation) -> ChoicesState:
-        if evaluation.gradient is not None:
-            evaluation = replace(evaluation, gradient=evaluation.gradient[state.numbers])
-        return replace(state, race=racing.update(state.race, u[state.numbers], evaluation))
+    def update(self, state: ChoicesState, evaluated: Evaluated) -> ChoicesState:
+        inner = [(u[state.numbers], _part(evaluation, state.numbers)) for u, evaluation in evaluated]
+        return replace(state, race=racing.update(state.race, inner))
 
     def counts(self, state: ChoicesState) -> Counts:
         return racing.counts(state.race)
@@ -125,6 +123,12 @@ def _without(domain: Domain, numbers: Tensor) -> Domain | None:
         return None
     first = None if domain.first is None else domain.first[numbers]
     return replace(domain, start=domain.start[numbers], blocks=blocks, first=first)
+
+
+def _part(evaluation: Evaluation, numbers: Tensor) -> Evaluation:
+    """Return the evaluation with the gradient of the numbers alone."""
+    gradient = evaluation.gradient
+    return evaluation if gradient is None else replace(evaluation, gradient=gradient[numbers])
 
 
 def _whole(state: ChoicesState, numbers: Tensor, combination: int) -> Tensor:

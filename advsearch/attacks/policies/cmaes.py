@@ -17,8 +17,7 @@ from torch import Tensor
 
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.evaluation import Evaluation
-from advsearch.attacks.policies.base import Distributional, Proposal, draw_seed, one_thread, seeded
+from advsearch.attacks.policies.base import Distributional, Evaluated, Proposal, draw_seed, one_thread, seeded
 from advsearch.attacks.policies.scaling import half_widths, wraps
 from advsearch.errors import InputError
 from advsearch.seeds import stream
@@ -122,14 +121,16 @@ class CMAES(Distributional[CMAESState]):
         scale, around, none = half_widths(domain), wraps(domain), np.empty((0, d))
         return _ask(CMAESState(domain, seed, domain.begin, scale, around, strategy, 0, none))
 
-    def propose(self, state: CMAESState) -> tuple[Proposal, CMAESState]:
-        return Proposal(_projected(state, state.points[len(state.values)])[0]), state
+    def propose(self, state: CMAESState, n: int) -> tuple[tuple[Proposal, ...], CMAESState]:
+        points = state.points[len(state.values) :][:n]
+        return tuple(Proposal(_projected(state, x)[0]) for x in points), state
 
-    def update(self, state: CMAESState, u: Tensor, evaluation: Evaluation) -> CMAESState:
-        outside = _projected(state, state.points[len(state.values)])[1]
-        values, best = (*state.values, evaluation.objective), max(state.best, evaluation.objective)
-        state = replace(state, values=values, outside=(*state.outside, outside), best=best)
-        if len(values) < len(state.points):
+    def update(self, state: CMAESState, evaluated: Evaluated) -> CMAESState:
+        values = [evaluation.objective for _, evaluation in evaluated]
+        outside = [_projected(state, x)[1] for x in state.points[len(state.values) :][: len(values)]]
+        best = max(state.best, *values)
+        state = replace(state, values=(*state.values, *values), outside=(*state.outside, *outside), best=best)
+        if len(state.values) < len(state.points):
             return state
         state = _tell(state)
         return _ask(state if float(_deviations(state).max()) > NARROWEST else _anew(state, self.sigma))

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Block, Domain
-from advsearch.attacks.evaluation import Evaluation
-from advsearch.attacks.policies.base import Policy, Proposal
+from advsearch.attacks.policies.base import Evaluated, Policy, Proposal
 from advsearch.errors import InputError
 
 
@@ -68,18 +67,22 @@ class Grid(Policy[GridState]):
         axes = tuple(map(_axis, blocks, counts, low.tolist(), high.tolist()))
         return GridState(domain, axes, _coarse_to_fine(blocks, counts), 0)
 
-    def propose(self, state: GridState) -> tuple[Proposal | None, GridState]:
-        if state.done == len(state.order):
-            return None, state
-        number, values = int(state.order[state.done]), []
-        for axis in reversed(state.axes):
-            number, place = divmod(number, len(axis))
-            values.append(axis[place])
-        u = state.domain.project(torch.stack(values[::-1]))
-        return Proposal(u), replace(state, done=state.done + 1)
+    def propose(self, state: GridState, n: int) -> tuple[tuple[Proposal, ...], GridState]:
+        numbers = state.order[state.done : state.done + n].tolist()
+        proposals = tuple(Proposal(_point(state, number)) for number in numbers)
+        return proposals, replace(state, done=state.done + len(numbers))
 
-    def update(self, state: GridState, u: Tensor, evaluation: Evaluation) -> GridState:
+    def update(self, state: GridState, evaluated: Evaluated) -> GridState:
         return state
+
+
+def _point(state: GridState, number: int) -> Tensor:
+    """Return the configuration (d,) of a point of the grid."""
+    values = []
+    for axis in reversed(state.axes):
+        number, place = divmod(number, len(axis))
+        values.append(axis[place])
+    return state.domain.project(torch.stack(values[::-1]))
 
 
 def _counts(domain: Domain, steps: int, points: int) -> list[int]:

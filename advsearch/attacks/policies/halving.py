@@ -81,8 +81,8 @@ class Halving(Raced):
         runners = tuple(Runner(policy, replace(domain, first=begin)) for begin in begins)
         return racing.line_up(runners, steps, seed, eta=self.eta, fresh=True)
 
-    def propose(self, state: Race) -> tuple[Proposal | None, Race]:
-        return racing.propose(state, self._samples)
+    def propose(self, state: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:
+        return racing.propose(state, n, self._samples)
 
     def _samples(self, race: Race) -> int:
         """Return all that is left of the turn, or what keeps the evaluations of a round as many as before."""

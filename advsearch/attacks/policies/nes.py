@@ -12,8 +12,7 @@ from torch import Tensor
 
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.evaluation import Evaluation
-from advsearch.attacks.policies.base import Distributional, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import Distributional, Evaluated, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.scaling import half_widths, wraps
 from advsearch.errors import InputError
 
@@ -97,12 +96,13 @@ class NES(Distributional[NESState]):
             population=self.population or default + default % 2,
         )
 
-    def propose(self, state: NESState) -> tuple[Proposal, NESState]:
-        noise = _noise(state, len(state.values))
-        return Proposal(state.domain.project(state.mean + state.scale * state.deviation * noise)), state
+    def propose(self, state: NESState, n: int) -> tuple[tuple[Proposal, ...], NESState]:
+        numbers = range(len(state.values), min(len(state.values) + n, state.population))
+        moves = (state.scale * state.deviation * _noise(state, number) for number in numbers)
+        return tuple(Proposal(state.domain.project(state.mean + move)) for move in moves), state
 
-    def update(self, state: NESState, u: Tensor, evaluation: Evaluation) -> NESState:
-        state = replace(state, values=(*state.values, evaluation.objective))
+    def update(self, state: NESState, evaluated: Evaluated) -> NESState:
+        state = replace(state, values=(*state.values, *(evaluation.objective for _, evaluation in evaluated)))
         return state if len(state.values) < state.population else _learn(state)
 
     def answer(self, state: NESState) -> Distribution:

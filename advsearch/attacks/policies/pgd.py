@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.evaluation import Evaluation
-from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import NO_COUNTS, Counts, Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.clipping import clipped
 from advsearch.errors import InputError
 
@@ -167,12 +166,13 @@ class PGD(Policy[PGDState]):
         window = Window(max(FEWEST, round(FIRST_WINDOW * steps)))
         return PGDState(domain, steps, seed, u, torch.zeros_like(u), self.step_size, None, window)
 
-    def propose(self, state: PGDState) -> tuple[Proposal | None, PGDState]:
+    def propose(self, state: PGDState, n: int) -> tuple[tuple[Proposal, ...], PGDState]:
         if state.flat >= PATIENCE:
-            return None, state
-        return Proposal(state.u, gradient=True, step_size=state.step_size), state
+            return (), state
+        return (Proposal(state.u, gradient=True, step_size=state.step_size),), state
 
-    def update(self, state: PGDState, u: Tensor, evaluation: Evaluation) -> PGDState:
+    def update(self, state: PGDState, evaluated: Evaluated) -> PGDState:
+        ((u, evaluation),) = evaluated
         state = replace(state, count=state.count + 1)
         if not evaluation.finite:
             return _retreat(state)

@@ -12,17 +12,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
-
-from torch import Tensor
 
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.evaluation import Evaluation
 from advsearch.attacks.policies.base import (
     NO_COUNTS,
     Counts,
     Distributional,
+    Evaluated,
     Policy,
     Proposal,
     affordable,
@@ -66,6 +66,7 @@ class Race:
         turn: position in `field`.
         spent: renders so far.
         turn_ends, round_ends: value of `spent` at which they do.
+        asked: numbers of the searches whose proposals wait for their evaluations, one for each.
     """
 
     runners: tuple[Runner, ...]
@@ -80,6 +81,7 @@ class Race:
     spent: int = 0
     turn_ends: int = 0
     round_ends: int = 0
+    asked: tuple[int, ...] = ()
 
     @property
     def running(self) -> Runner:
@@ -121,35 +123,43 @@ def once(race: Race) -> int:
     return 1
 
 
-def propose(race: Race, samples: Callable[[Race], int] = once) -> tuple[Proposal | None, Race]:
-    """Return the next proposal of whoever's turn it is, as far as the turn's renders allow.
+def propose(race: Race, n: int, samples: Callable[[Race], int] = once) -> tuple[tuple[Proposal, ...], Race]:
+    """Return the next proposals of whoever's turn it is, as far as the turn's renders allow.
+
+    Where they are all of its turn, whatever they are worth, those of the next in the same round come along.
 
     Args:
         race: as it is; the next turn begins where this one is over.
-        samples: from the race in that turn to what the proposal's samples are multiplied with.
+        n: so many at most.
+        samples: from the race in that turn to what a proposal's samples are multiplied with.
     """
-    while not all(runner.over for runner in race.runners):
-        runner = race.running
-        if not runner.over and race.spent < race.turn_ends:
-            if runner.state is None:
-                generator = seeded(race.seed, race.field[race.turn])
-                runner = replace(runner, state=runner.policy.start(runner.domain, generator, _planned(race)))
-            proposal, state = runner.policy.propose(runner.state)
-            race = _with(race, replace(runner, state=state, over=proposal is None))
-            if proposal is not None:
-                proposal = replace(proposal, samples=proposal.samples * samples(race))
-                return affordable(proposal, runner.domain, race.left + (race.round + 1 < race.rounds)), race
-        race = _next_turn(race)
-    return None, race
+    spent, batch, asked = race.spent, list[Proposal](), list[int]()
+    while len(batch) < n and not all(runner.over for runner in race.runners):
+        if race.running.over or race.left <= 0:
+            if batch and race.turn + 1 == len(race.field):  # who is in the next round, these evaluations say
+                break
+            race = _next_turn(race)
+            continue
+        if race.field[race.turn] in asked:
+            break
+        race, own = _ask(race, n - len(batch), samples)
+        batch += own
+        asked += [race.field[race.turn]] * len(own)
+        if any(proposal.cost(race.running.domain) > proposal.samples for proposal in own):  # it may cost less
+            break
+    return tuple(batch), replace(race, spent=spent, asked=tuple(asked))
 
 
-def update(race: Race, u: Tensor, evaluation: Evaluation) -> Race:
-    """Tell whoever's turn it is; u and the evaluation are as its own domain has them."""
-    runner = race.running
-    value = evaluation.objective
-    state = runner.policy.update(runner.state, u, evaluation)
-    runner = replace(runner, state=state, best=max(runner.best, value), lately=max(runner.lately, value))
-    return replace(_with(race, runner), spent=race.spent + evaluation.cost)
+def update(race: Race, evaluated: Evaluated) -> Race:
+    """Tell each search what it asked for; every u and its evaluation are as its own domain has them."""
+    for number, group in groupby(zip(race.asked, evaluated, strict=True), key=itemgetter(0)):
+        own = [pair for _, pair in group]
+        runner = race.runners[number]
+        reached = max(evaluation.objective for _, evaluation in own)
+        state = runner.policy.update(runner.state, own)
+        runner = replace(runner, state=state, best=max(runner.best, reached), lately=max(runner.lately, reached))
+        race = _with(race, number, runner)
+    return replace(race, spent=race.spent + sum(evaluation.cost for _, evaluation in evaluated), asked=())
 
 
 def leader(race: Race) -> int:
@@ -172,11 +182,11 @@ def counts(race: Race) -> Counts:
 class Raced(Distributional[Race]):
     """A policy that is a race; its `start` lines it up."""
 
-    def propose(self, state: Race) -> tuple[Proposal | None, Race]:
-        return propose(state)
+    def propose(self, state: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:
+        return propose(state, n)
 
-    def update(self, state: Race, u: Tensor, evaluation: Evaluation) -> Race:
-        return update(state, u, evaluation)
+    def update(self, state: Race, evaluated: Evaluated) -> Race:
+        return update(state, evaluated)
 
     def answer(self, state: Race) -> Distribution | None:
         return answer(state)
@@ -188,9 +198,30 @@ class Raced(Distributional[Race]):
 # ---- turns and rounds -----------------------------------------------------------------------------------------------
 
 
-def _with(race: Race, runner: Runner) -> Race:
-    k = race.field[race.turn]
+def _with(race: Race, k: int, runner: Runner) -> Race:
     return replace(race, runners=(*race.runners[:k], runner, *race.runners[k + 1 :]))
+
+
+def _ask(race: Race, n: int, samples: Callable[[Race], int]) -> tuple[Race, tuple[Proposal, ...]]:
+    """Let whoever's turn it is propose up to n, and return the race as it is when they have cost what they may."""
+    runner, later = race.running, race.round + 1 < race.rounds
+    if runner.state is None:
+        generator = seeded(race.seed, race.field[race.turn])
+        runner = replace(runner, state=runner.policy.start(runner.domain, generator, _planned(race)))
+    if samples(race) > 1:  # a race inside this one counts renders as it asks for them, and would begin turns too soon
+        n = 1
+    while True:
+        proposals, state = runner.policy.propose(runner.state, n)
+        ahead, own = race, list[Proposal]()
+        for proposal in proposals:
+            if ahead.left > 0:
+                more = replace(proposal, samples=proposal.samples * samples(ahead))
+                own.append(affordable(more, runner.domain, ahead.left + later))
+                ahead = replace(ahead, spent=ahead.spent + own[-1].cost(runner.domain))
+        if len(own) == len(proposals):
+            runner = replace(runner, state=state, over=not own)
+            return _with(ahead, race.field[race.turn], runner), tuple(own)
+        n = len(own)  # the turn does not pay for more
 
 
 def _planned(race: Race) -> int:
@@ -206,7 +237,8 @@ def _begin_turn(race: Race, turn: int) -> Race:
     """Give a search its share of what is left of the round."""
     race = replace(race, turn=turn)
     share = (race.round_ends - race.spent) // (len(race.field) - turn)
-    return replace(_with(race, replace(race.running, lately=-math.inf)), turn_ends=race.spent + max(1, share))
+    race = _with(race, race.field[turn], replace(race.running, lately=-math.inf))
+    return replace(race, turn_ends=race.spent + max(1, share))
 
 
 def _next_turn(race: Race) -> Race:

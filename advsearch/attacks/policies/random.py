@@ -6,11 +6,9 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
-from torch import Tensor
 
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.evaluation import Evaluation
-from advsearch.attacks.policies.base import Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, seeded
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +36,10 @@ class Random(Policy[RandomState]):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> RandomState:
         return RandomState(domain, draw_seed(generator), 0)
 
-    def propose(self, state: RandomState) -> tuple[Proposal, RandomState]:
-        extreme = state.drawn % 2 == 0
-        u = state.domain.sample(seeded(state.seed, state.drawn), extreme=extreme)[0]
-        return Proposal(u), replace(state, drawn=state.drawn + 1)
+    def propose(self, state: RandomState, n: int) -> tuple[tuple[Proposal, ...], RandomState]:
+        numbers = range(state.drawn, state.drawn + n)
+        us = (state.domain.sample(seeded(state.seed, k), extreme=k % 2 == 0)[0] for k in numbers)
+        return tuple(map(Proposal, us)), replace(state, drawn=state.drawn + n)
 
-    def update(self, state: RandomState, u: Tensor, evaluation: Evaluation) -> RandomState:
+    def update(self, state: RandomState, evaluated: Evaluated) -> RandomState:
         return state

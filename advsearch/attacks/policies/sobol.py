@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain, centre_of_option
-from advsearch.attacks.evaluation import Evaluation
-from advsearch.attacks.policies.base import Policy, Proposal, draw_seed
+from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed
 from advsearch.errors import InputError
 
 MOST = 21_201
@@ -68,14 +67,15 @@ class Sobol(Policy[SobolState]):
         count = 2 ** max(0, min(steps - 1, most - 1).bit_length())
         return SobolState(domain, seed, draw(size, seed, 0, count), 0, 0)
 
-    def propose(self, state: SobolState) -> tuple[Proposal, SobolState]:
+    def propose(self, state: SobolState, n: int) -> tuple[tuple[Proposal, ...], SobolState]:
         if state.done - state.begin == len(state.points):
             count, size = state.points.shape
             state = replace(state, points=draw(size, state.seed, state.done, count), begin=state.done)
-        u = to_domain(state.domain, state.points[state.done - state.begin])
-        return Proposal(u), replace(state, done=state.done + 1)
+        points = state.points[state.done - state.begin :][:n]
+        us = (to_domain(state.domain, x) for x in points)
+        return tuple(map(Proposal, us)), replace(state, done=state.done + len(points))
 
-    def update(self, state: SobolState, u: Tensor, evaluation: Evaluation) -> SobolState:
+    def update(self, state: SobolState, evaluated: Evaluated) -> SobolState:
         return state
 
 

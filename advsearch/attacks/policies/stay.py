@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.evaluation import Evaluation
-from advsearch.attacks.policies.base import Policy, Proposal
+from advsearch.attacks.policies.base import Evaluated, Policy, Proposal
 
 
 @dataclass(frozen=True)
@@ -24,8 +23,8 @@ class Stay(Policy[Tensor]):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Tensor:
         return domain.begin
 
-    def propose(self, state: Tensor) -> tuple[Proposal, Tensor]:
-        return Proposal(state), state
+    def propose(self, state: Tensor, n: int) -> tuple[tuple[Proposal, ...], Tensor]:
+        return (Proposal(state),) * n, state
 
-    def update(self, state: Tensor, u: Tensor, evaluation: Evaluation) -> Tensor:
+    def update(self, state: Tensor, evaluated: Evaluated) -> Tensor:
         return state

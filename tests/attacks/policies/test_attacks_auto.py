@@ -121,10 +121,10 @@ def test_old_states_replay_the_same_future() -> None:
     def play(state: object, steps: int, index: int) -> tuple[object, list[Tensor]]:
         seen = []
         for k in range(index, index + steps):
-            proposal, state = policy.propose(state)  # type: ignore[arg-type]
-            assert proposal is not None
+            (proposal,), state = policy.propose(state, 1)  # type: ignore[arg-type]
             seen.append(proposal.u)
-            state = policy.update(state, proposal.u, problem(proposal.u, index=k, gradient=proposal.gradient))
+            evaluation = problem(proposal.u, index=k, gradient=proposal.gradient)
+            state = policy.update(state, [(proposal.u, evaluation)])
         return state, seen
 
     state: object = policy.start(problem.domain, torch.Generator().manual_seed(0), 30)

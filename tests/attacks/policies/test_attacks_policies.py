@@ -21,6 +21,7 @@ from advsearch.attacks import (
     Block,
     Domain,
     Ending,
+    Evaluated,
     Evaluation,
     Policy,
     Proposal,
@@ -466,12 +467,12 @@ class Sampled(Policy[Any]):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> Any:
         return self.policy.start(domain, generator, steps)
 
-    def propose(self, state: Any) -> tuple[Proposal | None, Any]:
-        proposal, state = self.policy.propose(state)
-        return proposal and replace(proposal, samples=proposal.samples * self.samples), state
+    def propose(self, state: Any, n: int) -> tuple[tuple[Proposal, ...], Any]:
+        proposals, state = self.policy.propose(state, n)
+        return tuple(replace(proposal, samples=proposal.samples * self.samples) for proposal in proposals), state
 
-    def update(self, state: Any, u: Tensor, evaluation: Evaluation) -> Any:
-        return self.policy.update(state, u, evaluation)
+    def update(self, state: Any, evaluated: Evaluated) -> Any:
+        return self.policy.update(state, evaluated)
 
 
 @battery
@@ -539,11 +540,10 @@ def test_states_are_passed_and_not_kept(policy: Policy[Any]) -> None:
     def play(state: object, steps: int, index: int) -> tuple[object, Tensor]:
         seen = []
         for k in range(index, index + steps):
-            proposal, state = policy.propose(state)
-            assert proposal is not None
+            (proposal,), state = policy.propose(state, 1)
             seen.append(proposal.u)
             evaluation = evaluate(proposal.u, index=3 * k, gradient=proposal.gradient, samples=proposal.samples)
-            state = policy.update(state, proposal.u, evaluation)
+            state = policy.update(state, [(proposal.u, evaluation)])
         return state, torch.stack(seen)
 
     before = np.random.get_state(legacy=False)["state"]["key"].copy(), torch.random.get_rng_state()  # noqa: NPY002
@@ -580,10 +580,10 @@ def test_stored_evaluations_replay_a_search(policy: Policy[Any]) -> None:
     fresh = pickle.loads(pickle.dumps(policy))
     state = fresh.start(domain, torch.Generator().manual_seed(stream(11, "search")), 50)
     for record, u, evaluation in told:
-        proposal, state = fresh.propose(state)
+        (proposal,), state = fresh.propose(state, 1)
         assert torch.equal(proposal.u, u)
         assert min(proposal.samples, record.samples) == record.samples
-        state = fresh.update(state, u, evaluation)
+        state = fresh.update(state, [(u, evaluation)])
 
 
 @pytest.mark.parametrize("name", sorted(POLICIES))

@@ -144,8 +144,8 @@ def test_cmaes_is_separable_in_many_dimensions_and_refuses_more() -> None:
     state = CMAES().start(many, seeded(0, 0), 100)
     assert state.points.shape[1] == 3000
     for _ in range(len(state.points)):
-        proposal, state = CMAES().propose(state)
-        state = CMAES().update(state, proposal.u, Evaluation(float(proposal.u[0]), None, False))
+        (proposal,), state = CMAES().propose(state, 1)
+        state = CMAES().update(state, [(proposal.u, Evaluation(float(proposal.u[0]), None, False))])
     assert len(pickle.dumps(state)) < 200 * 8 * 3000  # a full matrix alone has 3000 x 8 x 3000
     over = Domain(torch.full((10_001,), 0.5), (Block(10_001, "linf", 0.1),))
     with pytest.raises(
@@ -214,8 +214,8 @@ def test_a_texture_takes_a_few_vectors_of_memory_only() -> None:
     policy = NES()
     state = policy.start(domain, seeded(0, 0), 100)
     for k in range(2 * state.population + 1):
-        proposal, state = policy.propose(state)
-        state = policy.update(state, proposal.u, Evaluation(float(k), None, False))
+        (proposal,), state = policy.propose(state, 1)
+        state = policy.update(state, [(proposal.u, Evaluation(float(k), None, False))])
     own = [value for value in vars(state).values() if isinstance(value, Tensor)]
     assert sum(value.numel() for value in own) <= 4 * d
     assert answer_of(policy, state) is not None

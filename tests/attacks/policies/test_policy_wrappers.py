@@ -21,6 +21,7 @@ from advsearch.attacks import (
     Choices,
     Domain,
     Ending,
+    Evaluated,
     Evaluation,
     Halving,
     Policy,
@@ -63,12 +64,13 @@ class Still(Policy[tuple[Tensor, int]]):
             plan.append(steps)
         return torch.tensor([self.value, float(domain.begin[1])]), 0
 
-    def propose(self, state: tuple[Tensor, int]) -> tuple[Proposal | None, tuple[Tensor, int]]:
+    def propose(self, state: tuple[Tensor, int], n: int) -> tuple[tuple[Proposal, ...], tuple[Tensor, int]]:
         u, done = state
-        return (Proposal(u, self.gradient) if done < self.times else None), (u, done + 1)
+        n = min(1 if self.gradient else n, self.times - done)
+        return (Proposal(u, self.gradient),) * n, (u, done + n)
 
-    def update(self, state: tuple[Tensor, int], u: Tensor, evaluation: Evaluation) -> tuple[Tensor, int]:
-        assert torch.equal(u, state[0])
+    def update(self, state: tuple[Tensor, int], evaluated: Evaluated) -> tuple[Tensor, int]:
+        assert all(torch.equal(u, state[0]) for u, _ in evaluated)
         return state
 
 
