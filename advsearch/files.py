@@ -21,6 +21,9 @@ FACTOR = "ADVSEARCH_LIMITS"
 Json = dict[str, Any]
 """What a file or a store holds as a JSON object, before a type has taken it, or once it has been written out."""
 
+JsonValue = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None
+"""Whatever JSON can hold."""
+
 DEPTH = 100
 """Deepest nesting of JSON, in lists and objects."""
 

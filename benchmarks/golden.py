@@ -135,6 +135,8 @@ def differences(kept: Any, found: Any, place: str = "") -> Iterator[str]:
         for key in sorted({*kept, *found}):
             inside = f"{place}.{key}" if place else key
             if key not in kept or key not in found:
+                if kept.get(key, found.get(key)) in (None, ""):
+                    continue  # an empty cell of a new column
                 yield f"{inside}: only {'before' if key in kept else 'now'}"
             else:
                 yield from differences(kept[key], found[key], inside)

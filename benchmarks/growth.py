@@ -46,7 +46,7 @@ def main() -> None:
     model = load_model("reference")
     renderer = make_renderer(description, space, args.size, "oidn", 0)
     task = Classification().on(model)
-    problem = Problem(renderer, space, model, task, lambda _: Facts("mug", "mug"), get_objective("margin"), 4, 0)
+    problem = Problem(renderer, space, model, task, lambda *_: Facts("mug", "mug"), get_objective("margin"), 4, 0)
     policy, evaluate = make_policy("pgd"), problem.evaluator("search")
     state = policy.start(problem.domain, torch.Generator().manual_seed(0), args.steps)
     ratios, seconds, memory = [], [], []

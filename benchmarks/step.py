@@ -57,7 +57,7 @@ def compare(size: int, denoise: str, spp: int, repeats: int) -> tuple[float, flo
     model = load_model("reference")
     task = Classification().on(model)
     renderer = make_renderer(description, space, size, denoise, 0)
-    problem = Problem(renderer, space, model, task, lambda _: Facts("mug", "mug"), get_objective("margin"), spp, 0)
+    problem = Problem(renderer, space, model, task, lambda *_: Facts("mug", "mug"), get_objective("margin"), spp, 0)
     floor = Floor(description, size, spp, denoise, lambda image: model(image)[0, model.label_set("mug").indices[0]])
     step = steps(problem, 3 + repeats)
     ratios = []

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
+from torch import Tensor
+
 from advsearch.config import SceneConfig
 from advsearch.controls.base import Value
 from advsearch.engine.loading import Scene
@@ -19,7 +21,11 @@ Described = Callable[[], Mapping[str, Value]]
 """What says the configuration in named values, when it is asked."""
 
 
-def facts_of(scene: Scene, name: str, label: str | None, describe: Described) -> Facts:
+Looked = Callable[[], Tensor]
+"""What says where the object is seen, (H, W) bool, when it is asked."""
+
+
+def facts_of(scene: Scene, name: str, label: str | None, describe: Described, look: Looked | None = None) -> Facts:
     """Return what a scene gives a task to judge by.
 
     Args:
@@ -27,6 +33,7 @@ def facts_of(scene: Scene, name: str, label: str | None, describe: Described) ->
         name: the object's, for messages.
         label: what was said to be right.
         describe: says the configuration; what it does not say has the value that the scene was given.
+        look: says where the object is seen in the configuration; None where there is none.
     """
     fixed = {key: value for key, value in scene.description.values.items() if value is not None}
 
@@ -34,7 +41,7 @@ def facts_of(scene: Scene, name: str, label: str | None, describe: Described) ->
         said = {key: one["value"] for key, one in describe().items()}
         return {key: float(v) for key, v in {**fixed, **said}.items() if isinstance(v, (int, float))}
 
-    return Facts(name, label, scene.description.object.label, numbers)
+    return Facts(name, label, scene.description.object.label, numbers, look)
 
 
 def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, config: SceneConfig) -> None:

@@ -7,7 +7,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from advsearch.engine.rows import judgement_of
 from advsearch.errors import InputError
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.replay import Entry
+from advsearch.runs.results.base import plain
 from advsearch.runs.store import Row
 from advsearch.scene.formation import to_8_bit
 from advsearch.tasks import Answer, Judgement
@@ -205,7 +206,7 @@ def _entry(
         "non_finite": found.non_finite,
         "cost": found.cost,
         "seconds": seconds,
-        "judgement": None if found.judgement is None else asdict(found.judgement),
+        "judgement": None if found.judgement is None else _told(found.judgement),
     }
     arrays = {}
     if found.gradient is not None:
@@ -213,6 +214,10 @@ def _entry(
     if picture is not None:
         arrays["picture"] = (picture * 255.0).round().to(torch.uint8).numpy()
     return Entry(kind, number, facts, arrays)
+
+
+def _told(judgement: Judgement) -> dict[str, object]:
+    return {**asdict(replace(judgement, payload=None)), "payload": plain(judgement.payload)}
 
 
 def _evaluation(entry: Entry) -> Evaluation:

@@ -190,6 +190,7 @@ def _summary(
         light_path_segments=PathSegments(search=problem.search_depth or depth, verification=depth),
         clean=CleanAnswer(
             **vars(judgement.answer),
+            payload=judgement.payload,
             correct=judgement.right,
             moved=[MovedValue.of(one) for one in problem.space.moved],
             control=_control(findings),
@@ -241,7 +242,8 @@ def _adversarial(problem: Problem, findings: Findings, picture: Tensor, u: Tenso
         return None
     verification = findings.verification
     trials = verification.adversarial_trials if verification else (problem.judge(picture, problem.whole(u)),)
-    return UsualAnswer.of(typical(trials).answer)
+    usual = typical(trials)
+    return UsualAnswer(**vars(usual.answer), payload=usual.payload)
 
 
 def _control(findings: Findings) -> ControlGroup | None:

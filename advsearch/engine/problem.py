@@ -15,7 +15,7 @@ from advsearch.attacks.evaluation import Wanted
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.controls import Space
 from advsearch.controls.base import Value
-from advsearch.engine.answers import Described
+from advsearch.engine.answers import Described, Looked
 from advsearch.engine.domains import domain_of
 from advsearch.models import Model
 from advsearch.runs.results.plan import PlannedGradient
@@ -51,7 +51,7 @@ class Problem:
         space: the controls behind the whole of u: those that are searched, then those that vary by chance.
         model: the network under test.
         task: judges the model's output; says what counts as success.
-        facts: what the scene gives it to judge by, from what describes the configuration.
+        facts: what the scene gives it to judge by, from what describes the configuration and what looks at it.
         objective: what is maximised.
         spp: samples a pixel while searching.
         seed: root of every stream.
@@ -68,7 +68,7 @@ class Problem:
     space: Space
     model: Model
     task: Task
-    facts: Callable[[Described], Facts]
+    facts: Callable[[Described, Looked], Facts]
     objective: Objective
     spp: int
     seed: int
@@ -158,7 +158,7 @@ class Problem:
         return self.task.truth(self._facts(whole))
 
     def _facts(self, whole: Tensor) -> Facts:
-        return self.facts(lambda: self.space.describe(whole))
+        return self.facts(lambda: self.space.describe(whole), lambda: self.renderer.mask(whole))
 
     def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Value]:
         """Say a configuration of the searched controls in named values with units, under the conditions of a draw.

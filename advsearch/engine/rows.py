@@ -53,6 +53,7 @@ def judged(row: Row, judgement: Judgement) -> Row:
         label=answer.label,
         label_index=answer.index,
         probability=answer.probability,
+        payload=judgement.payload,
     )
 
 
@@ -65,7 +66,7 @@ def judgement_of(row: Row) -> Judgement:
     score = math.nan if row.objective is None else row.objective
     margin = math.nan if row.margin is None else row.margin
     right = score <= 0.0 if row.correct is None else row.correct
-    return Judgement(score, margin, right, Answer(row.label or "", row.label_index, row.probability))
+    return Judgement(score, margin, right, Answer(row.label or "", row.label_index, row.probability), row.payload)
 
 
 def verified_rate(rate: Trials, trials: Sequence[Judgement]) -> VerifiedRate:

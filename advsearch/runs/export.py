@@ -2,7 +2,8 @@
 
 One line for each evaluated configuration, in the order in which they were evaluated. The columns of the store come
 first; then one for each value, with its unit in its name: ``pose.yaw [degrees]``. A value of several numbers has a
-column for each: ``camera.target[0]``. What a row has not is empty.
+column for each: ``camera.target[0]``. What a task keeps of an answer (``payload``) is nested in JSON and a JSON text in
+the others. What a row has not is empty.
 """
 
 from __future__ import annotations
@@ -23,9 +24,10 @@ from advsearch.runs.store import Row, Store
 
 FORMATS = ("csv", "json", "parquet")
 
+PAYLOAD = "payload"
 OWN = (
     *("id", "kind", "step", "seed", "spp", "objective", "success", "correct", "margin"),
-    *("label", "label_index", "probability"),
+    *("label", "label_index", "probability", PAYLOAD),
 )
 AFTER = ("renders", "seconds", "time")
 """Columns of the store before and after the values."""
@@ -113,8 +115,14 @@ def _csv(records: Iterable[Mapping[str, Any]], names: list[str], stream: IO[byte
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
     writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
     writer.writeheader()
-    writer.writerows({name: _cell(value) for name, value in one.items()} for one in records)
+    writer.writerows({name: _cell(value) for name, value in _flat(one).items()} for one in records)
     text.detach()
+
+
+def _flat(record: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The record with its payload as a text."""
+    payload = record[PAYLOAD]
+    return record if payload is None else {**record, PAYLOAD: json.dumps(payload, allow_nan=False, ensure_ascii=False)}
 
 
 def _cell(value: Any) -> Any:
@@ -135,7 +143,7 @@ def _parquet(records: Iterable[Mapping[str, Any]], names: list[str], stream: IO[
         import pyarrow.parquet
     except ImportError:
         raise InputError("format parquet: needs pyarrow; pip install pyarrow, or choose csv or json") from None
-    rows = iter(records)
+    rows = map(_flat, records)
     first = list(itertools.islice(rows, GROUP))
     schema = pyarrow.schema([(name, _arrow_type(name, first, pyarrow)) for name in names])
     with pyarrow.parquet.ParquetWriter(stream, schema) as writer:
@@ -148,6 +156,8 @@ def _parquet(records: Iterable[Mapping[str, Any]], names: list[str], stream: IO[
 def _arrow_type(name: str, rows: Sequence[Mapping[str, Any]], pyarrow: Any) -> Any:
     """Type of a column: by its name in the store, by its first values otherwise."""
     declared = {one.name: str(one.type) for one in fields(Row)}.get(name)
+    if name == PAYLOAD:
+        return pyarrow.string()
     if declared is not None:
         kinds = (("str", pyarrow.string()), ("bool", pyarrow.bool_()), ("int", pyarrow.int64()))
         return next((arrow for text, arrow in kinds if declared.startswith(text)), pyarrow.float64())

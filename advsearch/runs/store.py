@@ -22,7 +22,7 @@ from types import TracebackType
 from typing import Any, final, get_args, get_type_hints
 
 from advsearch.errors import FileFormatError
-from advsearch.files import open_regular, parse_json
+from advsearch.files import JsonValue, open_regular, parse_json
 from advsearch.runs.files import storage_errors
 from advsearch.runs.results.base import plain
 
@@ -81,6 +81,11 @@ MIGRATIONS = (
     ALTER TABLE evaluations ADD COLUMN margin REAL;     -- largest logit of a wrong class minus largest of a right one
     UPDATE evaluations SET correct = coalesce(success = 0, 0), margin = objective, success = NULL WHERE kind = 'sweep';
     """,
+    """
+    -- What a task keeps of an answer beside its words, as JSON (boxes, masks). NULL where it keeps nothing, and in
+    -- older rows.
+    ALTER TABLE evaluations ADD COLUMN payload_json TEXT;
+    """,
 )
 """What turns a file of version n into one of version n + 1. Never change one that was released; add another."""
 
@@ -102,6 +107,7 @@ class Row:
         label: what the model answered, in words.
         label_index: the number of that class; None where there are no classes.
         probability: the model's probability for it, in [0, 1]; None where it gives none.
+        payload: what the run's task keeps of the answer beside its words, as JSON values; None where there is nothing.
         values: parameter to ``{"value": ..., "unit": ...}``.
         seconds: that the evaluation took.
         renders: pictures that it took; None where that was not counted.
@@ -120,6 +126,7 @@ class Row:
     label: str | None = None
     label_index: int | None = None
     probability: float | None = None
+    payload: JsonValue = None
     values: Mapping[str, Any] = field(default_factory=dict)
     seconds: float | None = None
     renders: int | None = None
@@ -127,7 +134,8 @@ class Row:
     id: int | None = None
 
 
-_COLUMNS = tuple("values_json" if one.name == "values" else one.name for one in fields(Row))
+_AS_JSON = ("payload", "values")
+_COLUMNS = tuple(f"{one.name}_json" if one.name in _AS_JSON else one.name for one in fields(Row))
 _INSERT = f"INSERT INTO evaluations ({', '.join(_COLUMNS[:-1])}) VALUES ({', '.join('?' * (len(_COLUMNS) - 1))})"
 
 
@@ -347,7 +355,7 @@ def _check_version(db: sqlite3.Connection, path: Path) -> None:
 
 
 _NAMES = tuple(one.name for one in fields(Row) if one.name != "id")
-_FRONT = _NAMES[: _NAMES.index("values")]
+_FRONT = _NAMES[: _NAMES.index("payload")]
 _BACK = _NAMES[_NAMES.index("values") + 1 : -1]  # the last is the time
 _SIMPLE = frozenset({str, int, bool, type(None)})
 _JSON = json.JSONEncoder(allow_nan=False)
@@ -356,7 +364,8 @@ _JSON = json.JSONEncoder(allow_nan=False)
 def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
     """Return the row's columns but the id. Numbers of numpy and torch become Python's."""
     front = [_column(getattr(row, name)) for name in _FRONT]
-    return (*front, _values(row.values), *(_column(getattr(row, name)) for name in _BACK), stamp)
+    payload = None if row.payload is None else _json(row.payload)
+    return (*front, payload, _json(row.values), *(_column(getattr(row, name)) for name in _BACK), stamp)
 
 
 def _column(value: Any) -> Any:
@@ -364,19 +373,19 @@ def _column(value: Any) -> Any:
     return value if simple else plain(value)
 
 
-def _values(values: Mapping[str, Any]) -> str:
+def _json(value: object) -> str:
     try:
-        return _JSON.encode(values)
+        return _JSON.encode(value)
     except (TypeError, ValueError):
-        return json.dumps(plain(values), allow_nan=False)
+        return json.dumps(plain(value), allow_nan=False)
 
 
 def _column_types() -> dict[str, tuple[type, ...]]:
     """Return what each column of a row holds; SQLite itself takes anything anywhere."""
-    held: dict[Any, tuple[type, ...]] = {bool: (int,), float: (float, int), Mapping[str, Any]: (str,)}
-    hints = {name: get_args(hint) or (hint,) for name, hint in get_type_hints(Row).items() if name != "values"}
+    held: dict[Any, tuple[type, ...]] = {bool: (int,), float: (float, int)}
+    hints = {name: get_args(hint) or (hint,) for name, hint in get_type_hints(Row).items() if name not in _AS_JSON}
     types = {name: tuple(kind for part in parts for kind in held.get(part, (part,))) for name, parts in hints.items()}
-    return {**types, "values": (str,)}
+    return {**types, "payload": (str, type(None)), "values": (str,)}
 
 
 _TYPES = _column_types()
@@ -386,8 +395,7 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
     given = dict(zip((one.name for one in fields(Row)), values, strict=True))
     wrong = [name for name, value in given.items() if not isinstance(value, _TYPES[name])]
     if not wrong:
-        given["values"] = _decoded(given["values"])
-        wrong = ["values_json"] if given["values"] is None else []
+        wrong = [f"{name}_json" for name in _AS_JSON if not _read_json(given, name)]
     if wrong:
         raise FileFormatError(f"{path}: row {given['id']!r}: expected another type of {wrong[0]}; {_DAMAGED}")
     for name in ("success", "correct"):
@@ -395,10 +403,11 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
     return Row(**given)
 
 
-def _decoded(text: str) -> dict[str, Any] | None:
-    """Return the values of a row, None where they are not what `Row` says."""
+def _read_json(given: dict[str, Any], name: str) -> bool:
+    """Put a value in the place of its JSON text, and return whether it is what `Row` says."""
+    read = json.loads if name == "values" else parse_json  # the values, which every row has, are never nested deeply
     try:
-        values = json.loads(text)
+        given[name] = None if given[name] is None else read(given[name])
     except (ValueError, RecursionError):
-        return None
-    return values if isinstance(values, dict) else None
+        return False
+    return name == "payload" or isinstance(given[name], dict)

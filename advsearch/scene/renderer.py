@@ -22,6 +22,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.errors import InputError
 from advsearch.scene.assembly import ON_PICTURE
+from advsearch.scene.description import OBJECT
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients.differences import central, one_sided, random_directions
 from advsearch.scene.gradients.group import Group
@@ -137,6 +138,16 @@ class Renderer:
         """
         self._check(u, spp)
         return self._radiance(self._through(u), seed, spp)
+
+    def mask(self, u: Tensor) -> Tensor:
+        """Return the pixels in which the object is the first thing that the camera sees, (H, W) bool.
+
+        It is asked for at the middle of each pixel. What controls do to the finished picture moves nothing in it.
+        """
+        self._check(u, 1)
+        with torch.no_grad():
+            inputs = self._assembled(u)
+        return self.scene.first_hits({name: inputs[name] for name in inputs if name not in ON_PICTURE}, OBJECT)
 
     def gradient(
         self, loss: Callable[[Tensor], Tensor], u: Tensor, seed: int, spp: int, *, free: bool = False

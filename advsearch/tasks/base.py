@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
+from advsearch.files import JsonValue
 from advsearch.models import Model
 
 Output = Any
@@ -52,14 +53,14 @@ class Judgement:
         margin: how wrong the answer is, whatever is sought: over 0 exactly where it is not right.
         right: whether the answer is right. NaN is not right.
         answer: what the model says.
-        payload: what else is kept of it, as JSON values (boxes, masks); None where there is nothing.
+        payload: what else is kept of it in the run's rows, as JSON values (boxes, masks); None where there is nothing.
     """
 
     score: float
     margin: float
     right: bool
     answer: Answer
-    payload: Any = None
+    payload: JsonValue = None
 
     @property
     def success(self) -> bool:
@@ -76,12 +77,42 @@ class Facts:
         label: what was said to be right (the setting `label`); None if nothing was.
         own_label: what the object says it is; None if it does not.
         describe: the numbers of the configuration by parameter ("pose.yaw"), in the units that rows have.
+        look: says where the object is seen in the picture, see `mask`; None where no configuration is meant.
     """
 
     object: str
     label: str | None = None
     own_label: str | None = None
     describe: Callable[[], Mapping[str, float]] = dict
+    look: Callable[[], Tensor] | None = None
+
+    @cached_property
+    def mask(self) -> Tensor:
+        """The pixels of the picture in which the object is the first thing that the camera sees, (H, W) bool.
+
+        Each is asked for at its middle. Where something hides the object, it is not seen; an image corruption leaves
+        the mask as it is.
+
+        Raises:
+            InputError: no configuration is meant.
+        """
+        if self.look is None:
+            raise InputError(
+                f"the task needs to see {self.object}, which depends on the configuration; set `varies = True` on it"
+            )
+        return self.look()
+
+    @cached_property
+    def box(self) -> tuple[int, int, int, int] | None:
+        """The smallest box round what is seen of the object: x0, y0, x1, y1 in pixels from the top left.
+
+        The pixels have x0 <= x < x1 and y0 <= y < y1. None where nothing is seen.
+
+        Raises:
+            InputError: as for `mask`.
+        """
+        columns, rows = (self.mask.any(dim=side).nonzero().flatten().tolist() for side in (0, 1))
+        return (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1) if rows else None
 
     @cached_property
     def numbers(self) -> Mapping[str, float]:

@@ -132,7 +132,7 @@ def test_the_store_is_readable_beside_the_writer(run: RunDirectory) -> None:
 
 def test_the_file_is_versioned_commented_and_in_wal_mode(run: RunDirectory) -> None:
     with sqlite3.connect(run.path / "results.sqlite") as db:
-        assert db.execute("PRAGMA user_version").fetchone() == (3,)
+        assert db.execute("PRAGMA user_version").fetchone() == (len(MIGRATIONS),)
         assert db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
         (schema,) = db.execute("SELECT sql FROM sqlite_master WHERE name = 'evaluations'").fetchone()
         meta = dict(db.execute("SELECT key, value FROM meta"))
@@ -176,7 +176,7 @@ def test_a_file_of_version_1_is_brought_up_to_date(tmp_path: Path) -> None:
     db.close()
     before = path.read_bytes()
     with Store(path, read_only=True) as store:
-        assert [(row.step, row.renders) for row in store.rows()] == [(3, None)]
+        assert [(row.step, row.renders, row.payload) for row in store.rows()] == [(3, None, None)]
     assert path.read_bytes() == before, "reading changes nothing"
     with Store(path) as store:
         store.append([Row("search", 4, renders=13)])
@@ -193,7 +193,7 @@ def test_a_file_of_version_1_is_brought_up_to_date(tmp_path: Path) -> None:
         assert (old.renders, new.renders) == (None, 13)  # nobody counted then
         assert store.note("created") is not None
     with sqlite3.connect(path) as db:
-        assert db.execute("PRAGMA user_version").fetchone() == (3,)
+        assert db.execute("PRAGMA user_version").fetchone() == (len(MIGRATIONS),)
     db.close()
     with Store(path) as store:  # and not again
         assert [row.renders for row in store.rows()] == [None, 13]
@@ -231,7 +231,7 @@ def test_results_of_another_advsearch_or_none_are_refused(tmp_path: Path) -> Non
     with sqlite3.connect(path) as db:
         db.execute("PRAGMA user_version = 99")
     db.close()
-    with pytest.raises(FileFormatError, match=r"expected version 3 of the results, got 99; use a newer advsearch"):
+    with pytest.raises(FileFormatError, match=r"expected version 4 of the results, got 99; use a newer advsearch"):
         Store(path)
 
 
@@ -671,7 +671,7 @@ def filled(run: RunDirectory) -> Store:
 
 COLUMNS = [
     "id", "kind", "step", "seed", "spp", "objective", "success", "correct", "margin", "label", "label_index",
-    "probability",
+    "probability", "payload",
     "pose.yaw [degrees]", "camera.target[0] [sizes]", "camera.target[1] [sizes]", "backdrop.which",
     "renders", "seconds", "time",
 ]  # fmt: skip

@@ -9,7 +9,7 @@ from functools import cached_property
 from advsearch.config import SweepConfig
 from advsearch.controls import CONTROLS, Control, Space, make_space
 from advsearch.controls.base import Value
-from advsearch.engine.answers import check_truth, facts_of
+from advsearch.engine.answers import Looked, check_truth, facts_of
 from advsearch.engine.domains import domain_of
 from advsearch.engine.loading import Scene, framed
 from advsearch.engine.sweeps.axes import Axis, on_grid
@@ -88,18 +88,19 @@ class Job:
         config = self.config
         return Points(space, domain_of(space.controls), self.axes, self.samples, config.sampler, config.seed)
 
-    def truth(self, place: Place, model: int, values: Mapping[str, Value]) -> Truth:
+    def truth(self, place: Place, model: int, values: Mapping[str, Value], look: Looked | None = None) -> Truth:
         """What is true of a configuration, as the task of a model needs it.
 
         Args:
             place: the scene.
             model: number of the model.
             values: the configuration as it is described.
+            look: says where the object is seen in it; None where no configuration is meant.
         """
-        return self.tasks[model].truth(self._facts(place, values))
+        return self.tasks[model].truth(self._facts(place, values, look))
 
-    def _facts(self, place: Place, values: Mapping[str, Value]) -> Facts:
-        return facts_of(place.scene, place.object, self.config.label, lambda: values)
+    def _facts(self, place: Place, values: Mapping[str, Value], look: Looked | None = None) -> Facts:
+        return facts_of(place.scene, place.object, self.config.label, lambda: values, look)
 
     def check_truths(self, place: Place) -> None:
         """Refuse a scene of which a task cannot say what is right.

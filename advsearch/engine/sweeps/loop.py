@@ -249,15 +249,20 @@ class Sweep:
             return None
         index, seen = tally.worst
         points, picks, model = self._find(index)
-        values = points.values(points.configurations(picks), picks)[0]
+        u = points.configurations(picks)
+        values = points.values(u, picks)[0]
         row = self._row(picks.number, model, self._seeds(picks.number), seen, values, 0.0)
-        truth = self.job.truth(self.job.places[picks.number // self.per_scene], model, values)
+        task, scene = self.job.tasks[model], picks.number // self.per_scene
+        if task.varies:
+            truth = self._open(scene).truth(model, u[0], values)
+        else:
+            truth = self.job.truth(self.job.places[scene], model, values)
         return WorstConfiguration(
             configuration=index,
             values={name: DescribedValue.of(value) for name, value in row.values.items()},
             seed=row.seed or 0,
-            label_set=list(self.job.tasks[model].truth_names(truth)),
-            claimed=WorstClaim(**vars(seen.answer), margin=seen.margin),
+            label_set=list(task.truth_names(truth)),
+            claimed=WorstClaim(**vars(seen.answer), margin=seen.margin, payload=seen.payload),
             verified=None,
         )
 

@@ -16,6 +16,7 @@ from advsearch.engine.sweeps.points import Picks, Points
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
 from advsearch.tasks import Judgement
+from advsearch.tasks.base import Truth
 
 Values = dict[str, Value]
 
@@ -62,20 +63,34 @@ class SweptScene:
         Returns:
             For each model, what it says of each picture; and what is stored of each picture that it was shown.
         """
-        pictures, values = {}, {}
+        u, pictures, values = {}, {}, {}
         for size, renderer in self.renderers.items():
-            u = self.points[size].configurations(picks)
-            pictures[size] = self._pictures(renderer, u, noise, spp)
-            values[size] = self.points[size].values(u, picks)
+            u[size] = self.points[size].configurations(picks)
+            pictures[size] = self._pictures(renderer, u[size], noise, spp)
+            values[size] = self.points[size].values(u[size], picks)
         sizes = self._job.sizes
-        seen = [self._judged(model, pictures[size], values[size]) for model, size in enumerate(sizes)]
+        seen = [self._judged(model, pictures[size], u[size], values[size]) for model, size in enumerate(sizes)]
         return seen, [values[size] for size in sizes]
 
     def trial(self, number: int, u: Tensor, seed: int, spp: int) -> Judgement:
         """What one model says of one configuration."""
         size = self._job.sizes[number]
         picture = self._pictures(self.renderers[size], u[None], [seed], spp)
-        return self._judged(number, picture, [self._spaces[size].describe(u)])[0]
+        return self._judged(number, picture, u[None], [self._spaces[size].describe(u)])[0]
+
+    def truth(self, number: int, u: Tensor, values: Mapping[str, Value]) -> Truth:
+        """What is true of a configuration, as the task of one model needs it.
+
+        Args:
+            number: of the model.
+            u: (d,) the configuration.
+            values: as it is described.
+        """
+        job = self._job
+        if not job.tasks[number].varies:
+            return self._truths[number]
+        renderer = self.renderers[job.sizes[number]]
+        return job.truth(job.places[self.number], number, values, lambda: renderer.mask(u))
 
     def picture(self, number: int, u: Tensor, seed: int, spp: int) -> Tensor:
         """The picture (H, W, 3) that one model sees of one configuration."""
@@ -88,15 +103,16 @@ class SweptScene:
                 torch.stack([renderer(one, seed=seed, spp=spp) for one, seed in zip(u, noise, strict=True)])
             )
 
-    def _judged(self, number: int, pictures: Tensor, values: Sequence[Mapping[str, Value]]) -> list[Judgement]:
+    def _judged(
+        self, number: int, pictures: Tensor, u: Tensor, values: Sequence[Mapping[str, Value]]
+    ) -> list[Judgement]:
         """What one model says of pictures (n, H, W, 3); a margin that is not finite becomes NaN."""
-        job = self._job
-        task, place = job.tasks[number], job.places[self.number]
+        task = self._job.tasks[number]
         with torch.no_grad():
-            output = job.models[number](pictures)
+            output = self._job.models[number](pictures)
             if not task.varies:
                 return [_finite(one) for one in task.judge(output, self._truths[number])]
-            truths = [job.truth(place, number, one) for one in values]
+            truths = [self.truth(number, *one) for one in zip(u, values, strict=True)]
             return [_finite(task.judge(output[k : k + 1], one)[0]) for k, one in enumerate(truths)]
 
 

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, Number, RunResult
+from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, Number, Payload, RunResult
 from advsearch.runs.results.plan import PlannedGradient
 
 
@@ -23,6 +23,7 @@ class UsualAnswer(Fields):
     label: str
     index: int | None = Field(description="of the class")
     probability: Number | None = Field(description="the mean over the trials with that answer")
+    payload: Payload = Field(default=None, description="what the task keeps of the first of these; absent without")
 
 
 class ControlGroup(Fields):

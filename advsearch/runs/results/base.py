@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
 
 from advsearch.files import Json
 
@@ -101,6 +101,10 @@ class RunResult(Result):
             if name in values:
                 values[name] = values.pop(name)
         return values
+
+
+Payload = Annotated[JsonValue, BeforeValidator(lambda value: plain(value))]
+"""What a task keeps of an answer beside its words."""
 
 
 class MovedValue(Fields):

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field
 
 from advsearch.runs.results.attack import DescribedValue, VerifiedRate
-from advsearch.runs.results.base import Fields, Formation, Interval, Number, RunResult, having
+from advsearch.runs.results.base import Fields, Formation, Interval, Number, Payload, RunResult, having
 
 AxisValue = int | float | str | tuple[float, float]
 """A number, a name, or both ends of a part of a range."""
@@ -55,6 +55,7 @@ class WorstClaim(Fields):
     index: int | None
     probability: Number | None
     margin: Number
+    payload: Payload = Field(default=None, description="what else the task keeps of it; absent without")
 
 
 class WorstVerified(VerifiedRate):

@@ -6,6 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+import torch
+from torch import Tensor
+
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 
 Write = Callable[[Any], Any]
@@ -41,6 +45,23 @@ def transform(value: Any) -> Any:
     """A 4 x 4 matrix, row by row."""
     mi, found = mitsuba(), _entries(value, 16)
     return mi.Transform4f(mi.Matrix4f([found[4 * row : 4 * row + 4] for row in range(4)]))
+
+
+def contiguous(tensor: Tensor) -> Tensor:
+    """Return what Dr.Jit takes of a tensor: float32 in one piece, without a graph."""
+    return tensor.detach().to(torch.float32).contiguous()
+
+
+def as_torch(value: Any) -> Tensor:
+    """Return a Dr.Jit value as a torch tensor with memory of its own."""
+    mi = mitsuba()
+    if isinstance(value, (mi.Color3f, mi.Point3f)):  # Dr.Jit's own conversion gives a colour six entries
+        return torch.cat([as_torch(component) for component in value])
+    value = getattr(value, "matrix", value)
+    if hasattr(value, "torch"):
+        tensor: Tensor = value.torch()
+        return tensor.clone()
+    return torch.tensor(np.array(value, dtype=np.float32))
 
 
 def _entries(value: Any, count: int) -> list[Any]:

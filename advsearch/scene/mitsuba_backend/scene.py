@@ -11,7 +11,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,7 +19,8 @@ from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.dictionary import camera_inputs, scene_dict
-from advsearch.scene.mitsuba_backend.inputs import SceneInput, as_is, key_of
+from advsearch.scene.mitsuba_backend.first_hit import first_hits
+from advsearch.scene.mitsuba_backend.inputs import SceneInput, as_is, as_torch, contiguous, key_of
 from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS
 from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, leave_dark_lamps_out, mesh_translation, translation
 from advsearch.scene.mitsuba_backend.population import population
@@ -142,7 +142,7 @@ class MitsubaScene:
         """Return the base value of an input, as a fresh torch tensor of the input's shape."""
         key, one = self._inputs[name]
         self._apply({})
-        value = _torch(self._parameters[key])
+        value = as_torch(self._parameters[key])
         return value if one.shape is None else value.reshape(one.shape)
 
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int, *, hide: bool = False) -> Tensor:
@@ -165,6 +165,11 @@ class MitsubaScene:
         self._apply(inputs)
         both = self._render("guides", seed, spp)[..., -6:]
         return both[..., :3].clamp(0.0, 1.0), both[..., 3:6]
+
+    def first_hits(self, inputs: Mapping[str, Tensor], mesh: str) -> Tensor:
+        """Return where a mesh is the first thing that the camera sees, (H, W) bool, by the middle of each pixel."""
+        self._apply(inputs)
+        return first_hits(self._scene, self._sensor, mesh, self.resolution)
 
     def adjoint(
         self,
@@ -200,13 +205,13 @@ class MitsubaScene:
         values |= {name: inputs[name] for name in wanted}
         spp = next_count(self.sampler, spp)
         self._apply(inputs)
-        tracked = {name: mi.TensorXf(_contiguous(value)) for name, value in values.items()}
+        tracked = {name: mi.TensorXf(contiguous(value)) for name, value in values.items()}
         try:
             for name, value in tracked.items():
                 dr.enable_grad(value)
                 self._write(name, value)
             self._parameters.update()
-            shown = _contiguous(cotangent)
+            shown = contiguous(cotangent)
             if self._backdrop:
                 shown = torch.cat([shown, torch.zeros_like(shown[..., :1])], dim=-1)
             arriving = mi.TensorXf(shown)
@@ -214,11 +219,11 @@ class MitsubaScene:
                 self._integrator(method).render_backward(
                     self._scene, self._parameters, arriving, sensor=self._sensor, seed=seed, spp=spp
                 )
-            found = {name: _torch(dr.grad(value)).reshape(values[name].shape) for name, value in tracked.items()}
+            found = {name: as_torch(dr.grad(value)).reshape(values[name].shape) for name, value in tracked.items()}
             return {name: found[name] for name in wanted}
         finally:
             for name, value in values.items():
-                self._write(name, mi.TensorXf(_contiguous(value)))
+                self._write(name, mi.TensorXf(contiguous(value)))
             self._parameters.update()
 
     def material_adjoint(
@@ -296,7 +301,7 @@ class MitsubaScene:
             del self._applied[name]
             changed.add(name)
         for name, tensor in inputs.items():
-            value = _contiguous(tensor)
+            value = contiguous(tensor)
             held = self._applied.get(name)
             if held is not None and held.shape == value.shape and torch.equal(held, value):
                 continue
@@ -350,7 +355,7 @@ class MitsubaScene:
         spp = next_count(self.sampler, spp)
         integrator = self._integrator(what)
         function = self._function(what, spp, record)
-        return _torch(function(self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)))
+        return as_torch(function(self._scene, self._sensor, integrator, dr.opaque(mi.UInt32, seed)))
 
     def _function(self, what: str, spp: int, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return the recorded function for one job at one sample count, recording it on first use.
@@ -386,22 +391,6 @@ def _fewer_warnings() -> Iterator[None]:
         yield
     finally:
         mi.set_log_level(before)
-
-
-def _contiguous(tensor: Tensor) -> Tensor:
-    return tensor.detach().to(torch.float32).contiguous()
-
-
-def _torch(value: Any) -> Tensor:
-    """Return a Dr.Jit value as a torch tensor with memory of its own."""
-    mi = mitsuba()
-    if isinstance(value, (mi.Color3f, mi.Point3f)):  # Dr.Jit's own conversion gives a colour six entries
-        return torch.cat([_torch(component) for component in value])
-    value = getattr(value, "matrix", value)
-    if hasattr(value, "torch"):
-        tensor: Tensor = value.torch()
-        return tensor.clone()
-    return torch.tensor(np.array(value, dtype=np.float32))
 
 
 def _is_of_a_shape(key: str) -> bool:
