@@ -28,7 +28,8 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.config import SweepConfig  # noqa: E402
-from advsearch.engine.loading import as_controls, framed, load_scene  # noqa: E402
+from advsearch.engine.budget import verification_ladder  # noqa: E402
+from advsearch.engine.loading import PictureSettings, as_controls, framed, load_scene  # noqa: E402
 from advsearch.engine.sweeps import swept_scene  # noqa: E402
 from advsearch.engine.sweeps.axes import read_axes  # noqa: E402
 from advsearch.engine.sweeps.job import Job, Place  # noqa: E402
@@ -142,7 +143,26 @@ def job_of(config: SweepConfig, model) -> Job:  # type: ignore[no-untyped-def]
     axes = read_axes(config.grid, drawn)
     place = Place("mug", "studio", load_scene("mug", "studio"))
     task = Classification().on(model)
-    return Job(config, (place,), (model,), (task,), drawn, axes, config.samples or 1, ())
+    return Job(
+        object="mug",
+        environment="studio",
+        task=config.task,
+        label=None,
+        pictures=PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed),
+        spp=config.search_spp,
+        places=(place,),
+        models=(model,),
+        tasks=(task,),
+        controls=drawn,
+        axes=axes,
+        samples=config.samples or 1,
+        sampler=config.sampler,
+        batch=config.batch,
+        trials=config.trials,
+        ladder=verification_ladder(config.pixel_sampler, config.verify_spp),
+        command_line=config.command_line(),
+        said=(),
+    )
 
 
 # ---- beside rendering -----------------------------------------------------------------------------------------------
@@ -188,14 +208,14 @@ class Bare:
 
     def turn(self, count: int) -> float:
         """Render and classify so many pictures; return the seconds."""
-        config, points = self.job.config, self.job.points(self.space)
+        job, points = self.job, self.job.points(self.space)
         u = points.configurations(points.picks(0, count))
         inputs = [self.scene.assembly(self.space.inputs(one)) for one in u]
         begun = time.perf_counter()
         with torch.no_grad():
-            for begin in range(0, count, config.batch):
-                numbers = range(begin, min(count, begin + config.batch))
-                self.job.models[0](torch.stack([self.picture(inputs[n], n, config.search_spp) for n in numbers]))
+            for begin in range(0, count, job.batch):
+                numbers = range(begin, min(count, begin + job.batch))
+                job.models[0](torch.stack([self.picture(inputs[n], n, job.spp) for n in numbers]))
         return time.perf_counter() - begun
 
     def picture(self, inputs, seed: int, spp: int) -> Tensor:  # type: ignore[no-untyped-def]

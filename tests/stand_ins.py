@@ -11,7 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from advsearch.attacks import Block, Domain, Evaluation, make_policy
+from advsearch.api.attack import budget_of, preparation_of
+from advsearch.attacks import Block, Domain, Evaluation, Policy, make_policy
 from advsearch.attacks.verification import WORST_CASE, Rule
 from advsearch.config import AttackConfig
 from advsearch.engine.memory import Memory
@@ -94,6 +95,19 @@ def configuration(policy: str = "pgd", **more: Any) -> AttackConfig:
     )
 
 
+def attack_on(
+    problem: Any,
+    config: AttackConfig,
+    policy: Policy[Any],
+    memory: Memory,
+    stages: Stages,
+    run: RunDirectory | None = None,
+) -> Attack:
+    """An attack as a configuration describes it, on a problem of one's own."""
+    recorder = Recorder(run, problem, memory)
+    return Attack(problem, budget_of(config), policy, recorder, memory, stages, preparation_of(config))
+
+
 def carry_out(folder: Path, config: AttackConfig, *, pause: float = 0.0, resume: bool = False) -> Findings:
     """Carry out the attack in a folder, from the beginning or from where it is."""
     problem: Any = StandInProblem(pause)
@@ -103,10 +117,7 @@ def carry_out(folder: Path, config: AttackConfig, *, pause: float = 0.0, resume:
             run.write_config(config)
         memory = Memory(run)
         stages = Stages(NullProgress())
-        attack = Attack(
-            problem, config, make_policy(config.policy_name), Recorder(run, problem, memory), memory, stages
-        )
-        findings = attack.carry_out()
+        findings = attack_on(problem, config, make_policy(config.policy_name), memory, stages, run).carry_out()
         if not findings.interrupted:
             run.finish()
         return findings

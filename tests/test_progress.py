@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import torch
-from stand_ins import StandInProblem, carry_out, configuration, rows
+from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 from advsearch.api import plan as planning
 from advsearch.api.attack import attack_from_config
@@ -27,8 +27,7 @@ from advsearch.cli.plan import text as plan_text
 from advsearch.config import AttackConfig, PlanConfig, PrecisionConfig, RegionConfig, SweepConfig
 from advsearch.engine.memory import Memory
 from advsearch.engine.planning import cosine_samples, cosines
-from advsearch.engine.record import Findings, Recorder, Stages
-from advsearch.engine.stages import Attack
+from advsearch.engine.record import Findings, Stages
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.runs.directory import RunDirectory
 
@@ -80,8 +79,7 @@ def attacked(config: AttackConfig, problem: Any = None) -> tuple[Recorded, Findi
     progress, memory = Recorded(), Memory(None)
     problem = problem or StandInProblem()
     policy = make_policy(config.policy_name)
-    attack = Attack(problem, config, policy, Recorder(None, problem, memory), memory, Stages(progress))
-    return progress, attack.carry_out()
+    return progress, attack_on(problem, config, policy, memory, Stages(progress)).carry_out()
 
 
 @pytest.mark.parametrize("policy", ["pgd", "auto", "random", "cmaes"])

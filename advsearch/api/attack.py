@@ -21,14 +21,14 @@ from advsearch.controls import make_space
 from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
 from advsearch.engine.answers import check_truth, facts_of
-from advsearch.engine.loading import Controls, Scene, framed, load_scene, make_renderer, settings_of
+from advsearch.engine.budget import Preparation, RenderBudget, verification_ladder
+from advsearch.engine.loading import Controls, PictureSettings, Scene, framed, load_scene, make_renderer, settings_of
 from advsearch.engine.memory import Memory
 from advsearch.engine.naming import load_models, options_of, scene_settings
-from advsearch.engine.outcome import AttackResult, summarise
+from advsearch.engine.outcome import AttackResult, Question, summarise
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.run_settings import RunSettings
-from advsearch.engine.samples import search_samples
 from advsearch.engine.stages import Attack
 from advsearch.errors import InputError
 from advsearch.models import Model
@@ -36,6 +36,7 @@ from advsearch.models.features import features_of
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import CONFIG, RunDirectory, check_free, find_run, is_run, run_path
 from advsearch.scene.leaving_out import EVERYTHING, NOTHING
+from advsearch.scene.mitsuba_backend.samplers import next_count
 from advsearch.scene.renderer import Renderer
 from advsearch.tasks import Task, make_task
 
@@ -274,8 +275,9 @@ def _problem(job: _Job) -> Problem:
     description = job.scene.description
     task = job.task.on(model, target=config.target, minimise=config.minimise)
     facts = partial(facts_of, job.scene, config.object, config.label)
-    check_truth(task, model, job.scene, facts(dict), config)
-    resolution = config.resolution or (model.input_size[0], model.input_size[1])
+    pictures = PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed)
+    check_truth(task, model, job.scene, facts(dict), pictures)
+    resolution = pictures.size(model)
     description = framed(description, resolution)
     space = make_space((*job.controls, *job.over), description)
     renderer = make_renderer(
@@ -296,7 +298,7 @@ def _problem(job: _Job) -> Problem:
         task,
         facts,
         objective,
-        search_samples(config),
+        next_count(config.pixel_sampler, config.search_spp),
         config.seed,
         searched=len(job.controls),
         draws=config.draws if job.over else 1,
@@ -316,6 +318,30 @@ def _objective(job: _Job, task: Task, renderer: Renderer) -> Objective:
     return get_objective(job.objective, task, features=features, clean=clean)
 
 
+def budget_of(config: AttackConfig) -> RenderBudget:
+    """Return what an attack may spend."""
+    return RenderBudget(
+        steps=config.steps,
+        seconds=config.seconds,
+        close_looks=config.close_looks,
+        baseline=config.baseline,
+        smallest=config.smallest,
+        trials=config.trial_count,
+        ladder=verification_ladder(config.pixel_sampler, config.verify_spp),
+        average=config.average,
+    )
+
+
+def preparation_of(config: AttackConfig) -> Preparation:
+    """Return what an attack measures before its search."""
+    return Preparation(config.measure, config.specialise, config.deterministic, config.spp is None)
+
+
+def _question(config: AttackConfig) -> Question:
+    """What the summary repeats of the settings."""
+    return Question(config.object, config.lit_by, config.policy_name, config.objective, config.command_line())
+
+
 # ---- carrying it out ------------------------------------------------------------------------------------------------
 
 
@@ -331,9 +357,10 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
     policy = _policy(job, problem)
     with _directory(job, run) as kept:
         memory = Memory(kept)
-        attack = Attack(problem, job.config, policy, Recorder(kept, problem, memory), memory, stages)
+        recorder, prepared = Recorder(kept, problem, memory), preparation_of(job.config)
+        attack = Attack(problem, budget_of(job.config), policy, recorder, memory, stages, prepared)
         findings = attack.carry_out()
-        return summarise(job.config, problem, findings, attack.recorder, stages, said)
+        return summarise(_question(job.config), problem, findings, recorder, stages, said)
 
 
 def _policy(job: _Job, problem: Problem) -> Policy[Any]:

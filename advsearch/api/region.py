@@ -15,6 +15,7 @@ from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.attacks import make_policy
 from advsearch.attacks.region import ATTEMPTS, LEVELS, Part, Region, grow
 from advsearch.config import AttackConfig, RegionConfig, SceneConfig
+from advsearch.engine.budget import RenderBudget, verification_ladder
 from advsearch.engine.memory import ANSWER, Memory
 from advsearch.engine.naming import Named, options_of
 from advsearch.engine.problem import Problem
@@ -102,7 +103,7 @@ def region_from_config(
     stages.begin("setup", LOADING)
     as_attack = AttackConfig(**{name: getattr(config, name) for name in SceneConfig.model_fields})
     budget = {} if config.around is None else _budget(config.around)
-    as_attack = as_attack.model_copy(update={"measure": "no", "verify_spp": config.verify_spp, **budget})
+    as_attack = as_attack.model_copy(update=budget)
     problem, said = problem_from_config(as_attack)
     for text in said:
         stages.progress.message(text)
@@ -110,7 +111,8 @@ def region_from_config(
     centre = _centre(problem, config)
     with RunDirectory.of(config, resumed) as run:
         memory = Memory(run)
-        attack = Attack(problem, as_attack, make_policy("random"), Recorder(run, problem, memory), memory, stages)
+        spent = RenderBudget(ladder=verification_ladder(config.pixel_sampler, config.verify_spp))
+        attack = Attack(problem, spent, make_policy("random"), Recorder(run, problem, memory), memory, stages)
         try:
             found, ending = _found(attack, config, varied, centre, run), "done"
         except KeyboardInterrupt:

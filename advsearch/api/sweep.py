@@ -11,7 +11,8 @@ from torch import nn
 from advsearch.api.attack import LOADING
 from advsearch.config import SweepConfig
 from advsearch.engine.answers import one_label_for_several
-from advsearch.engine.loading import Controls, Scene, load_scene, settings_of
+from advsearch.engine.budget import verification_ladder
+from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, settings_of
 from advsearch.engine.naming import different, load_models, options_of, scene_settings
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.axes import read_axes
@@ -23,6 +24,7 @@ from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import CONFIG, RunDirectory, check_free, find_run, is_run, run_path
 from advsearch.runs.listing import finished
 from advsearch.scene.description import NO_MAP
+from advsearch.scene.mitsuba_backend.samplers import next_count
 from advsearch.settings import split_names
 from advsearch.tasks import Task, make_task
 
@@ -107,7 +109,7 @@ def sweep(
         check_free(config.run, overwrite=config.overwrite)
     asked = [name for one in networks for name in (split_names(one) if isinstance(one, str) else (one,))]
     job = _job(config, loaded or _places(config), asked, task, controls)
-    return _kept(job, progress, resumed) if config.run is not None else carry_out(job, None, progress)
+    return _kept(config, job, progress, resumed) if config.run is not None else carry_out(job, None, progress)
 
 
 def sweep_from_config(config: SweepConfig, *, progress: Progress | None = None) -> SweepResult:
@@ -116,7 +118,7 @@ def sweep_from_config(config: SweepConfig, *, progress: Progress | None = None) 
         check_free(config.run, overwrite=config.overwrite)
     progress = progress or NullProgress()
     progress.stage(LOADING)
-    return _kept(_job_of(config), progress, None)
+    return _kept(config, _job_of(config), progress, None)
 
 
 def resume_sweep(run: str | Path, *, progress: Progress | None = None) -> SweepResult:
@@ -133,7 +135,8 @@ def resume_sweep(run: str | Path, *, progress: Progress | None = None) -> SweepR
     progress = progress or NullProgress()
     path = find_run(run)
     progress.stage(LOADING)
-    return _kept(_job_of(SweepConfig.from_yaml(path / CONFIG)), progress, path)
+    config = SweepConfig.from_yaml(path / CONFIG)
+    return _kept(config, _job_of(config), progress, path)
 
 
 # ---- from names to things -------------------------------------------------------------------------------------------
@@ -201,7 +204,26 @@ def _job(
     said += one_label_for_several(networks, config.label, own)
     for place in places:
         said += place.scene.description.notes
-    return Job(config, tuple(places), networks, tasks, drawn, axes, samples, tuple(dict.fromkeys(said)))
+    return Job(
+        object=config.object,
+        environment=config.lit_by,
+        task=config.task,
+        label=config.label,
+        pictures=PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed),
+        spp=next_count(config.pixel_sampler, config.search_spp),
+        places=tuple(places),
+        models=networks,
+        tasks=tasks,
+        controls=drawn,
+        axes=axes,
+        samples=samples,
+        sampler=config.sampler,
+        batch=config.batch,
+        trials=config.trials,
+        ladder=verification_ladder(config.pixel_sampler, config.verify_spp),
+        command_line=config.command_line(),
+        said=tuple(dict.fromkeys(said)),
+    )
 
 
 def _places(config: SweepConfig) -> tuple[Place, ...]:
@@ -244,7 +266,7 @@ def _stopped(config: SweepConfig) -> Path | None:
     return path if same and not finished(path) else None
 
 
-def _kept(job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
+def _kept(config: SweepConfig, job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
     """Sweep in a run directory: a new one, or one that was begun."""
-    with RunDirectory.of(job.config, resumed) as run:
+    with RunDirectory.of(config, resumed) as run:
         return carry_out(job, run, progress)

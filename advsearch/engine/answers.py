@@ -6,9 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 from torch import Tensor
 
-from advsearch.config import SceneConfig
 from advsearch.controls.base import Value
-from advsearch.engine.loading import Scene
+from advsearch.engine.loading import PictureSettings, Scene
 from advsearch.engine.rendering import render
 from advsearch.errors import InputError
 from advsearch.models import Model
@@ -44,7 +43,7 @@ def facts_of(scene: Scene, name: str, label: str | None, describe: Described, lo
     return Facts(name, label, scene.description.object.label, numbers, look)
 
 
-def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, config: SceneConfig) -> None:
+def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, pictures: PictureSettings) -> None:
     """Refuse a scene of which the task cannot say what is right, before anything is prepared.
 
     Args:
@@ -52,7 +51,7 @@ def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, config: Sc
         model: whose answers it judges.
         scene: with the object.
         facts: of the scene.
-        config: how it is rendered.
+        pictures: how it is rendered.
 
     Raises:
         InputError: what `Task.truth` raises; where no label was given, with the model's first answers to a clean
@@ -63,9 +62,9 @@ def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, config: Sc
     try:
         task.truth(facts)
     except InputError as error:
-        if config.label is not None or not task.reads_logits:
+        if facts.label is not None or not task.reads_logits:
             raise
-        raise InputError(f"{error}; {_advice(task, model, scene, config)}") from None
+        raise InputError(f"{error}; {_advice(task, model, scene, pictures)}") from None
 
 
 def one_label_for_several(models: Sequence[Model], label: str | None, objects: Mapping[str, str | None]) -> list[str]:
@@ -99,18 +98,9 @@ def _differs(models: Sequence[Model], label: str, own: str) -> bool:
     return False
 
 
-def _advice(task: Task, model: Model, scene: Scene, config: SceneConfig) -> str:
+def _advice(task: Task, model: Model, scene: Scene, pictures: PictureSettings) -> str:
     """What the model answers to a clean picture, and how to take the first of these for right."""
-    looked = render(
-        scene,
-        model,
-        task=task,
-        resolution=config.resolution,
-        spp=LOOK_SPP,
-        denoise=config.denoise,
-        sampler=config.pixel_sampler,
-        seed=config.seed,
-    )
+    looked = render(scene, model, task=task, spp=LOOK_SPP, **vars(pictures))
     answers = looked.views[0].answers
     listed = ", ".join(f"{answer.label!r} {100 * (answer.probability or 0.0):.1f} %" for answer in answers)
     return (

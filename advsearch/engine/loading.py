@@ -9,6 +9,7 @@ from typing import final
 
 from advsearch.controls import Control, Space, gathered, make_control, make_space
 from advsearch.errors import InputError
+from advsearch.models import Model
 from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
 from advsearch.scene.description import SceneDescription, describe
@@ -79,6 +80,27 @@ class Scene:
         settings.resolve(given)
         own = self.description
         return Scene(replace(own, values={**own.values, **given}, given=own.given | set(given)))
+
+
+@dataclass(frozen=True)
+class PictureSettings:
+    """How a scene is shown to models.
+
+    Attributes:
+        resolution: (height, width) in pixels; None for what a model takes.
+        denoise: "oidn" or "none".
+        sampler: of pixels: "multijitter" or "independent".
+        seed: root of the noise.
+    """
+
+    resolution: tuple[int, int] | None
+    denoise: str
+    sampler: str
+    seed: int
+
+    def size(self, model: Model) -> tuple[int, int]:
+        """Height and width of the pictures that a model is shown, in pixels."""
+        return self.resolution or (model.input_size[0], model.input_size[1])
 
 
 def load_scene(

@@ -16,7 +16,6 @@ from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.smallest import Bracket
-from advsearch.config import AttackConfig
 from advsearch.engine.memory import ANSWER, MOST_NUMBERS
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
@@ -56,6 +55,25 @@ T = TypeVar("T")
 
 PICTURE_SPP = 64
 """Samples a pixel of the pictures that are kept, unless verification needed more."""
+
+
+@dataclass(frozen=True)
+class Question:
+    """What was asked, in the words of whoever asked it, as the summary repeats them.
+
+    Attributes:
+        object: its name or file.
+        environment: likewise; a control may have put another in its place.
+        policy: its name.
+        objective: its name; None for the task's own.
+        command_line: the command that asks the same again.
+    """
+
+    object: str
+    environment: str
+    policy: str
+    objective: str | None
+    command_line: str
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -116,14 +134,14 @@ class AttackResult:
 
 
 def summarise(
-    config: AttackConfig, problem: Problem, findings: Findings, recorder: Recorder, stages: Stages, said: Sequence[str]
+    asked: Question, problem: Problem, findings: Findings, recorder: Recorder, stages: Stages, said: Sequence[str]
 ) -> AttackResult:
     """Put the result together and, if there is a run directory, write its files."""
     search = findings.search
     start = problem.domain.start
     u = start if search is None else problem.domain.project(search.best_u)
     spp = max(PICTURE_SPP, findings.sample_count.spp if findings.sample_count else 0)
-    noise = seeds.stream(config.seed, "pictures")
+    noise = seeds.stream(problem.seed, "pictures")
     stages.progress.stage("making the pictures and the report", hint=f"pictures of {spp} samples a pixel")
     with torch.no_grad():
         linear = {
@@ -145,7 +163,7 @@ def summarise(
             write_bytes(run.path / "artifacts" / name, data)
         if u.numel() <= MOST_NUMBERS:
             run.store.set_note(ANSWER, json.dumps(u.tolist()))
-    summary = _summary(config, problem, findings, clean, adversarial, u)
+    summary = _summary(asked, problem, findings, clean, adversarial, u)
     where = {"run": None if run is None else str(run.path), "warnings": warnings}
     summary = summary.model_copy(update={**where, "seconds": {**stages.seconds, "total": stages.total}})
     if run is not None:
@@ -160,7 +178,7 @@ def summarise(
 
 
 def _summary(
-    config: AttackConfig, problem: Problem, findings: Findings, clean: Tensor, adversarial: Tensor, u: Tensor
+    asked: Question, problem: Problem, findings: Findings, clean: Tensor, adversarial: Tensor, u: Tensor
 ) -> AttackSummary:
     """All but where it is kept, how long it took and what there is to say."""
     task, search, baseline = problem.task, findings.search, findings.baseline
@@ -171,13 +189,13 @@ def _summary(
     count = findings.sample_count
     return AttackSummary(
         run=None,
-        object=config.object,
+        object=asked.object,
         model=problem.model.name,
         task=task.name,
-        environment=problem.space.environment or config.lit_by,
+        environment=problem.space.environment or asked.environment,
         controls=list(budgets),
-        policy=config.policy_name,
-        objective=config.objective or task.objective,
+        policy=asked.policy,
+        objective=asked.objective or task.objective,
         epsilon=_alone({name: budget.epsilon for name, budget in budgets.items()}),
         norm=_alone({name: budget.norm for name, budget in budgets.items()}),
         label_set=list(task.truth_names(problem.truth())),
@@ -226,8 +244,8 @@ def _summary(
         ),
         warnings=[],
         seconds={"total": 0.0},
-        seed=config.seed,
-        command_line=config.command_line(),
+        seed=problem.seed,
+        command_line=asked.command_line,
     )
 
 

@@ -30,14 +30,13 @@ from advsearch.attacks import search as run_search
 from advsearch.attacks import verify as run_verify
 from advsearch.attacks.sample_count import most_samples
 from advsearch.attacks.smallest import ATTEMPTS, MOST_CHECKS, ROUNDS, confirmed, scaled, smallest
-from advsearch.config import AttackConfig
 from advsearch.engine.bounces import WORTH, bounces_of, most_pictures
+from advsearch.engine.budget import Preparation, RenderBudget
 from advsearch.engine.gradients import inside
 from advsearch.engine.memory import PLAN, TRANSPORT, Frames, Memory
 from advsearch.engine.planning import cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
-from advsearch.engine.samples import search_samples, verification_ladder
 from advsearch.engine.transport import Transport, reason_against
 from advsearch.report.wording import count
 from advsearch.scene.transport.renderer import TransportTooLargeError
@@ -59,38 +58,43 @@ class Attack:
 
     Attributes:
         problem: what is attacked.
-        config: how.
+        budget: what it may spend.
         policy: what proposes.
         recorder: keeps rows.
         memory: what the run has stored already.
         stages: told which stage runs.
+        preparation: what is measured before.
         findings: filled by `carry_out`.
     """
 
     problem: Problem
-    config: AttackConfig
+    budget: RenderBudget
     policy: Policy[Any]
     recorder: Recorder
     memory: Memory
     stages: Stages
+    preparation: Preparation = field(default_factory=Preparation)
     findings: Findings = field(default_factory=Findings)
     _clean_spp: int = 0
     _probed: dict[tuple[str, int], Judgement] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self._asked_spp = self.problem.spp  # a preparation may choose another one for the search
+
     def carry_out(self) -> Findings:
         """Do everything; what an interrupt leaves undone is missing from the findings."""
-        if self.config.smallest:
+        if self.budget.smallest:
             scaled(self.problem.domain, 1.0)  # refuses what has no budget before anything is rendered
         try:
             self.plan()
             if self.worth_attacking():
                 self.collect_transport()
-                if self.config.smallest:
+                if self.budget.smallest:
                     find_smallest(self)
                 else:
                     self.search()
                 self.verify()
-            if self.config.average:
+            if self.budget.average:
                 self.average()
         except KeyboardInterrupt:
             self.findings.interrupted = True
@@ -113,8 +117,8 @@ class Attack:
 
     def _cut_paths(self) -> None:
         """Leave bounces of light out of the search's renders, where it is long enough for that to pay."""
-        problem, config = self.problem, self.config
-        if config.specialise and (config.measure == "full" or config.steps >= WORTH):
+        problem, wanted = self.problem, self.preparation
+        if wanted.specialise and (wanted.measure == "full" or self.budget.steps >= WORTH):
             self.stages.begin(
                 "setup",
                 "finding how many bounces of light the search needs",
@@ -122,15 +126,15 @@ class Attack:
                 hint="few samples each; `specialise=false` leaves it out",
                 at_most=True,
             )
-            problem.search_depth = bounces_of(problem, config.seed, tick=self._advance).depth
+            problem.search_depth = bounces_of(problem, problem.seed, tick=self._advance).depth
 
     def _measure(self) -> None:
-        """Replace the first gradient plan by a measured one, as far as the configuration wants that."""
-        problem, config = self.problem, self.config
-        if config.measure == "no" or not self.policy.uses_gradient:
+        """Replace the first gradient plan by a measured one, as far as the preparation wants that."""
+        problem, wanted = self.problem, self.preparation
+        if wanted.measure == "no" or not self.policy.uses_gradient:
             return
-        renderer, full = problem.renderer, config.measure == "full"
-        u, seed = inside(renderer), seeds.stream(config.seed, "measure")
+        renderer, full = problem.renderer, wanted.measure == "full"
+        u, seed = inside(renderer), seeds.stream(problem.seed, "measure")
         gradients = plan_gradients(renderer.plan, every=full)
         if gradients:
             self.stages.begin(
@@ -146,7 +150,7 @@ class Attack:
             seed=seed,
             spp=problem.spp,
             every=full,
-            counted=not full or config.deterministic,
+            counted=not full or wanted.counted,
             tick=self._advance,
         )
         if full:
@@ -160,29 +164,29 @@ class Attack:
             table = list(cosines(renderer, problem.loss, u, seed=seed, tick=self._advance))
             plan, spp = tuned(problem.plan, table)
             problem.plan = plan
-            problem.spp = problem.spp if config.spp is not None or spp is None else spp
+            problem.spp = spp if wanted.chosen_spp and spp is not None else problem.spp
 
     def worth_attacking(self) -> bool:
         """Look at the clean configuration; one that is wrong in every look goes through the full trials at once, as
         does one whose smallest change is wanted."""
-        problem, config, findings = self.problem, self.config, self.findings
-        seed, start = seeds.stream(config.seed, "first look"), problem.domain.start
+        problem, budget, findings = self.problem, self.budget, self.findings
+        seed, start = seeds.stream(problem.seed, "first look"), problem.domain.start
         self.stages.begin(
             "setup", "looking at the clean scene", FIRST_LOOK, hint="the first picture compiles the renderer's code"
         )
         findings.first_look = run_trials(
             problem.trial,
             start,
-            spp=search_samples(config),
+            spp=self._asked_spp,
             seed=seed,
             trials=FIRST_LOOK,
             on_trial=lambda *_: self._advance(),
         )
         looks_right = any(trial.right for trial in findings.first_look)
-        if not self.problem.rule.control or (looks_right and not config.smallest):
+        if not self.problem.rule.control or (looks_right and not budget.smallest):
             return True
         self.choose_spp({"clean": start})
-        self._begin_trials("checking the clean scene with fresh renders", config.trial_count)
+        self._begin_trials("checking the clean scene with fresh renders", budget.trials)
         self.clean_trials()
         return not self.problem.rule.already_wrong(count_right(findings.clean, findings.spp))
 
@@ -190,19 +194,20 @@ class Attack:
 
     def search(self) -> None:
         """The search, and the random one beside it, with as many renders."""
-        config, findings = self.config, self.findings
-        frames = Frames(config.steps)
+        budget, findings, seed = self.budget, self.findings, self.problem.seed
+        frames = Frames(budget.steps)
         findings.frames = frames.pictures
         self._begin_search(
-            "search", f"searching with {self.policy.name}", config.steps, "`steps` or `seconds` shorten it"
+            "search", f"searching with {self.policy.name}", budget.steps, "`steps` or `seconds` shorten it"
         )
-        findings.search = self.one_search("search", self.policy, config.steps, config.seed, frames, config.seconds)
-        if not config.baseline or self.policy.name == "random":
+        findings.search = self.one_search(
+            "search", self.policy, budget.steps, self.problem.seed, frames, budget.seconds
+        )
+        if not budget.baseline or self.policy.name == "random":
             return
-        steps = config.steps if config.seconds is None else _spent(findings.search)
+        steps = budget.steps if budget.seconds is None else _spent(findings.search)
         self._begin_search("baseline", "searching at random, to compare", steps, "`baseline=false` leaves it out")
-        seed = seeds.stream(config.seed, "baseline")
-        findings.baseline = self.one_search("baseline", make_policy("random"), steps, seed)
+        findings.baseline = self.one_search("baseline", make_policy("random"), steps, seeds.stream(seed, "baseline"))
 
     def one_search(
         self,
@@ -234,7 +239,7 @@ class Attack:
             policy,
             steps=steps,
             seed=seed,
-            close=self.config.close_looks,
+            close=self.budget.close_looks,
             late=self.memory.clock(kind, steps, seconds),
             on_step=on_step,
         )
@@ -252,14 +257,14 @@ class Attack:
 
     def collect_transport(self) -> None:
         """Make the matrix that predicts the pictures of the searches, where there can be one and it pays."""
-        problem, config, findings = self.problem, self.config, self.findings
-        findings.rendered_because = reason_against(problem, config.steps, config.specialise) or ""
+        problem, steps, findings = self.problem, self.budget.steps, self.findings
+        findings.rendered_because = reason_against(problem, steps, self.preparation.specialise) or ""
         if findings.rendered_because:
             return
         stored = self.memory.note(TRANSPORT) or {}
         findings.transport = Transport(
             problem,
-            config.steps,
+            steps,
             renewals=stored,
             keep=lambda renewals: self.memory.set_note(TRANSPORT, renewals),
         )
@@ -281,7 +286,7 @@ class Attack:
         answer = problem.domain.project(found.best_u)
         self.choose_spp({"clean": problem.domain.start, "adversarial": answer})
         groups = 1 + (baseline is not None) + (not self._clean_tried)
-        self._begin_trials("checking the answer with fresh renders", groups * self.config.trial_count)
+        self._begin_trials("checking the answer with fresh renders", groups * self.budget.trials)
         self.clean_trials()
         findings.verification = self.verified("verification", found)
         if findings.verification.ending is Ending.ALREADY_WRONG:
@@ -309,7 +314,7 @@ class Attack:
     def choose_spp(self, candidates: dict[str, Tensor]) -> None:
         """Raise the samples until no margin drifts, under the conditions that the scene comes with."""
 
-        ladder = verification_ladder(self.config)
+        ladder = self.budget.ladder
         if len(ladder) > 1:
             self.stages.begin(
                 "verification",
@@ -320,7 +325,7 @@ class Attack:
                 at_most=True,
             )
         margins = {name: self._probe(name, u) for name, u in candidates.items()}
-        self.findings.sample_count = choose_spp(margins, seed=self.config.seed, ladder=ladder)
+        self.findings.sample_count = choose_spp(margins, seed=self.problem.seed, ladder=ladder)
 
     def _probe(self, name: str, u: Tensor) -> Callable[[int, int], float]:
         """Margins of one configuration by sample count and seed; what was rendered before, in this life of the run or
@@ -355,8 +360,8 @@ class Attack:
             self._trial(kind),
             self.problem.domain.start,
             spp=self.findings.spp,
-            seed=self.config.seed,
-            trials=self.config.trial_count,
+            seed=self.problem.seed,
+            trials=self.budget.trials,
             group="clean",
             on_trial=self._teller(kind, self.problem.domain.start),
         )
@@ -374,8 +379,8 @@ class Attack:
             found.best_u,
             claim=found.ending,
             spp=self.findings.spp,
-            seed=self.config.seed,
-            trials=self.config.trial_count,
+            seed=self.problem.seed,
+            trials=self.budget.trials,
             clean=self.findings.clean,
             rule=self.problem.rule,
             on_trial=self._teller(kind, self.problem.domain.project(found.best_u)),
@@ -394,7 +399,7 @@ class Attack:
 
     def one_trial(self, kind: str, number: int, u: Tensor) -> Judgement:
         """One trial of a configuration of its own, with a seed of its own; read back if it is stored."""
-        seed, spp = seeds.stream(self.config.seed, kind, number), self.findings.spp
+        seed, spp = seeds.stream(self.problem.seed, kind, number), self.findings.spp
         trial = self.memory.trial(kind, number) or self.problem.trial(u, seed, spp)
         self.recorder.trial(kind, number, spp, trial, seed, u, described=self.problem.domain.dim <= MANY)
         self.findings.verification_renders += 1
@@ -404,10 +409,10 @@ class Attack:
         """Try configurations drawn from the whole space and budget: how often the model is wrong on average."""
         if self.findings.sample_count is None:
             self.choose_spp({"clean": self.problem.domain.start})
-        self._begin_trials("trying random configurations", self.config.average, name="average", flags="`average`")
+        self._begin_trials("trying random configurations", self.budget.average, name="average", flags="`average`")
         found: list[Judgement] = []
-        for number in range(self.config.average):
-            generator = torch.Generator().manual_seed(seeds.stream(self.config.seed, "draw", number))
+        for number in range(self.budget.average):
+            generator = torch.Generator().manual_seed(seeds.stream(self.problem.seed, "draw", number))
             u = self.problem.domain.sample(generator)[0]
             found.append(self.one_trial("average", number, u))
             self._advance()
@@ -415,7 +420,7 @@ class Attack:
 
     def _begin_search(self, name: str, title: str, steps: int, shorter: str) -> None:
         """Begin the stage of a search of at most so many steps, and its ranking."""
-        renders = planned_renders(steps, close=self.config.close_looks)
+        renders = planned_renders(steps, close=self.budget.close_looks)
         hint = f"{renders} pictures of {count(self.problem.spp, 'sample')} a pixel; {shorter}"
         if self.findings.transport is not None:
             hint = f"{steps} pictures predicted and {renders - steps} traced; {shorter}"
@@ -440,7 +445,7 @@ class Attack:
 
     def _teller(self, kind: str, u: Tensor) -> Callable[[str, int, Judgement], None]:
         def on_trial(group: str, number: int, trial: Judgement) -> None:
-            seed = seeds.stream(self.config.seed, "verification", number)
+            seed = seeds.stream(self.problem.seed, "verification", number)
             self.recorder.trial(kind, number, self.findings.spp, trial, seed, u)
             self.findings.verification_renders += 1
             self.stages.progress.advance(1)
@@ -469,31 +474,31 @@ def find_smallest(attack: Attack) -> None:
 
     What is verified at the end is the configuration at the upper end of the bracket.
     """
-    problem, config, findings = attack.problem, attack.config, attack.findings
+    problem, budget, findings = attack.problem, attack.budget, attack.findings
     results: list[SearchResult] = []
 
     def found(inside: Domain, number: int) -> Tensor:
         attack._begin_search(
-            "search", f"search {number + 1} of at most {ROUNDS}", config.steps, "`steps` shortens each search"
+            "search", f"search {number + 1} of at most {ROUNDS}", budget.steps, "`steps` shortens each search"
         )
-        kind, seed = f"search {number}" if number else "search", seeds.stream(config.seed, "smallest", number)
-        results.append(attack.one_search(kind, attack.policy, config.steps, seed, domain=inside))
-        attack._begin_trials("trying smaller changes", MOST_CHECKS * config.trial_count, at_most=True)
+        kind, seed = f"search {number}" if number else "search", seeds.stream(problem.seed, "smallest", number)
+        results.append(attack.one_search(kind, attack.policy, budget.steps, seed, domain=inside))
+        attack._begin_trials("trying smaller changes", MOST_CHECKS * budget.trials, at_most=True)
         return results[-1].best_u
 
     def passes(u: Tensor, check: int) -> bool:
-        failures, allowed = 0, problem.rule.allowed(config.trial_count)
-        for number in range(config.trial_count):
+        failures, allowed = 0, problem.rule.allowed(budget.trials)
+        for number in range(budget.trials):
             failures += not attack.one_trial(f"check {check}", number, u).success
             attack._advance()
             if failures > allowed:
                 return False
         return True
 
-    times = -(-CONFIRMED // config.trial_count)
+    times = -(-CONFIRMED // budget.trials)
     bracket = smallest(found, passes, problem.domain)
     if bracket.u is not None:
-        most = ATTEMPTS * times * config.trial_count
+        most = ATTEMPTS * times * budget.trials
         attack._begin_trials("checking the smallest change", most, at_most=True)
     bracket = confirmed(bracket, passes, problem.domain, times=times)
     renders, gradients = sum(one.renders for one in results), sum(one.gradients for one in results)

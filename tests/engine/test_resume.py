@@ -18,13 +18,12 @@ import numpy as np
 import pytest
 import torch
 from conftest import ROOT
-from stand_ins import StandInProblem, carry_out, configuration, rows
+from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 from advsearch.attacks import Domain, Evaluated, Policy, Proposal, make_policy
 from advsearch.config import AttackConfig
 from advsearch.engine.memory import Memory
-from advsearch.engine.record import Recorder, Stages
-from advsearch.engine.stages import Attack
+from advsearch.engine.record import Stages
 from advsearch.errors import FileFormatError, InputError, RunExistsError
 from advsearch.progress import NullProgress
 from advsearch.runs import store
@@ -97,9 +96,7 @@ def test_what_was_evaluated_is_not_evaluated_again(tmp_path: Path) -> None:
     with RunDirectory.create(tmp_path / "run") as run:
         run.write_config(config)
         memory = Memory(run)
-        attack = Attack(
-            problem, config, make_policy("pgd"), Recorder(run, problem, memory), memory, Stages(NullProgress())
-        )
+        attack = attack_on(problem, config, make_policy("pgd"), memory, Stages(NullProgress()), run)
         assert attack.carry_out().interrupted
     assert (tmp_path / "run" / "replay.bin").exists()
     found = carry_out(tmp_path / "run", config, resume=True)
@@ -222,7 +219,7 @@ class Sleeper(Policy[Domain]):
 def test_the_random_searchs_answer_is_taken_where_it_is_the_worse_one(policy: Policy[Any], beaten: bool) -> None:
     problem: Any = StandInProblem()
     memory = Memory(None)
-    attack = Attack(problem, configuration(), policy, Recorder(None, problem, memory), memory, Stages(NullProgress()))
+    attack = attack_on(problem, configuration(), policy, memory, Stages(NullProgress()))
     findings = attack.carry_out()
     assert findings.search is not None and findings.baseline is not None and findings.verification is not None
     assert (findings.beaten is not None) == beaten

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
-from advsearch.config import SweepConfig
 from advsearch.controls import CONTROLS, Control, Space, make_space
 from advsearch.controls.base import Value
 from advsearch.engine.answers import Looked, check_truth, facts_of
 from advsearch.engine.domains import domain_of
-from advsearch.engine.loading import Scene, framed
+from advsearch.engine.loading import PictureSettings, Scene, framed
 from advsearch.engine.sweeps.axes import Axis, on_grid
 from advsearch.engine.sweeps.points import BINS, Drawn, Points
 from advsearch.errors import InputError
@@ -49,29 +49,49 @@ class Job:
     """Everything that was asked for, found and loaded.
 
     Attributes:
-        config: what was asked for.
+        object: as it was asked for: all names, separated by commas.
+        environment: likewise.
+        task: name of the task.
+        label: what was said to be right; None for each object's own.
+        pictures: how the scenes are rendered.
+        spp: samples a pixel.
         places: the scenes.
         models: the networks, loaded.
         tasks: what judges the output of each.
         controls: what is drawn by chance.
         axes: of the grid.
         samples: draws at each point of the grid.
+        sampler: how they are made: "sobol" or "random".
+        batch: pictures that the models see at once.
+        trials: fresh renders that check the worst configuration; 0 for none.
+        ladder: sample counts that this climbs.
+        command_line: the command that asks the same again.
         said: warnings on the way.
     """
 
-    config: SweepConfig
+    object: str
+    environment: str
+    task: str
+    label: str | None
+    pictures: PictureSettings
+    spp: int
     places: tuple[Place, ...]
     models: tuple[Model, ...]
     tasks: tuple[Task, ...]
     controls: tuple[Control, ...]
     axes: tuple[Axis, ...]
     samples: int
+    sampler: Literal["sobol", "random"]
+    batch: int
+    trials: int
+    ladder: Sequence[int]
+    command_line: str
     said: tuple[str, ...]
 
     @cached_property
     def sizes(self) -> tuple[tuple[int, int], ...]:
         """(height, width) of the pictures for each model."""
-        return tuple(self.config.resolution or (one.input_size[0], one.input_size[1]) for one in self.models)
+        return tuple(map(self.pictures.size, self.models))
 
     def space(self, place: Place, size: tuple[int, int]) -> Space:
         """The controls, those of the grid as choices, bound to a scene.
@@ -85,8 +105,7 @@ class Job:
 
     def points(self, space: Space) -> Points:
         """The configurations of a space."""
-        config = self.config
-        return Points(space, domain_of(space.controls), self.axes, self.samples, config.sampler, config.seed)
+        return Points(space, domain_of(space.controls), self.axes, self.samples, self.sampler, self.pictures.seed)
 
     def truth(self, place: Place, model: int, values: Mapping[str, Value], look: Looked | None = None) -> Truth:
         """What is true of a configuration, as the task of a model needs it.
@@ -100,7 +119,7 @@ class Job:
         return self.tasks[model].truth(self._facts(place, values, look))
 
     def _facts(self, place: Place, values: Mapping[str, Value], look: Looked | None = None) -> Facts:
-        return facts_of(place.scene, place.object, self.config.label, lambda: values, look)
+        return facts_of(place.scene, place.object, self.label, lambda: values, look)
 
     def check_truths(self, place: Place) -> None:
         """Refuse a scene of which a task cannot say what is right.
@@ -109,7 +128,7 @@ class Job:
             InputError: a model has no such class, say, or the object has no label.
         """
         for task, model in zip(self.tasks, self.models, strict=True):
-            check_truth(task, model, place.scene, self._facts(place, {}), self.config)
+            check_truth(task, model, place.scene, self._facts(place, {}), self.pictures)
 
 
 def check_scenes(places: Sequence[Place], controls: Sequence[Control], axes: Sequence[Axis]) -> None:

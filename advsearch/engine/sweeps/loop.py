@@ -19,7 +19,6 @@ from advsearch.attacks.product import batches
 from advsearch.controls.base import Value
 from advsearch.engine.record import Stages
 from advsearch.engine.rows import judgement_of, trial_row
-from advsearch.engine.samples import search_samples
 from advsearch.engine.sweeps.job import Job, check_all
 from advsearch.engine.sweeps.points import Picks, Points
 from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally
@@ -116,8 +115,8 @@ class Sweep:
         self.points, self._shown = check_all(job)
         self.per_scene, self.models = self.points.count, len(job.models)
         self.total = len(job.places) * self.per_scene * self.models
-        self.samples = search_samples(job.config)
-        self._seeds = Seeds(job.config.seed, KIND)
+        self.samples = job.spp
+        self._seeds = Seeds(job.pictures.seed, KIND)
         self._kept: list[store.Row] = []
         self._view: SweptScene | None = None
         self._rendered = 0
@@ -164,7 +163,7 @@ class Sweep:
         begin_scene, begin = divmod(first // self.models, self.per_scene)
         for scene in range(begin_scene, len(self.job.places)):
             view = self._open(scene)
-            for numbers in batches(begin, self.per_scene, self.job.config.batch):
+            for numbers in batches(begin, self.per_scene, self.job.batch):
                 self._batch(view, numbers, tally)
             begin = 0
 
@@ -288,16 +287,15 @@ class Sweep:
 
     def _finish(self, tally: Tally, ending: str, worst: WorstConfiguration | None) -> SweepResult:
         """Put the summary together and write it."""
-        config, job = self.job.config, self.job
-        seconds = self.stages.seconds
+        job, seconds = self.job, self.stages.seconds
         view, checked = self._view, worst.verified if worst else None
         swept = seconds.get("sweep", 0.0)
         summary = SweepSummary(
             run=None if self.run is None else str(self.run.path),
-            object=config.object,
+            object=job.object,
             model=",".join(model.name for model in job.models),
-            task=config.task,
-            environment=self.points.environment or config.lit_by,
+            task=job.task,
+            environment=self.points.environment or job.environment,
             controls=[control.name for control in job.controls],
             ending=ending,
             image_formation=Formation.of(next(iter(view.renderers.values())).formation) if view else None,
@@ -306,7 +304,7 @@ class Sweep:
             worst=worst,
             grid={axis.name: len(axis.values) for axis in job.axes},
             samples=job.samples,
-            sampler=config.sampler if job.controls else None,
+            sampler=job.sampler if job.controls else None,
             spp=self.samples,
             renders={
                 "sweep": tally.seen // self.models * len(set(job.sizes)),
@@ -314,9 +312,9 @@ class Sweep:
             },
             renders_per_second=self._rendered / swept if self._rendered and swept else None,
             seconds={**seconds, "total": self.stages.total},
-            seed=config.seed,
+            seed=job.pictures.seed,
             warnings=[*job.said, *self._remarks(tally, checked)],
-            command_line=config.command_line(),
+            command_line=job.command_line,
         )
         if self.run is not None:
             self.run.write_summary(summary)

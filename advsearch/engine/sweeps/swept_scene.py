@@ -35,7 +35,7 @@ class SweptScene:
     """
 
     def __init__(self, job: Job, number: int) -> None:
-        place, config = job.places[number], job.config
+        place, pictures = job.places[number], job.pictures
         self.number, self._job = number, job
         self.points: dict[tuple[int, int], Points] = {}
         self.renderers: dict[tuple[int, int], Renderer] = {}
@@ -43,7 +43,7 @@ class SweptScene:
         for size, space in self._spaces.items():
             description = framed(place.scene.description, size)
             self.renderers[size] = make_renderer(
-                description, space, size, config.denoise, config.seed, sampler=config.pixel_sampler
+                description, space, size, pictures.denoise, pictures.seed, sampler=pictures.sampler
             )
             self.points[size] = job.points(space)
         self._truths = [None if task.varies else job.truth(place, k, {}) for k, task in enumerate(job.tasks)]

@@ -15,7 +15,6 @@ from advsearch.attacks.sample_count import most_samples
 from advsearch.attacks.verification import RenderTrial
 from advsearch.engine.record import Stages
 from advsearch.engine.rows import judgement_of, trial_row, verified_rate
-from advsearch.engine.samples import verification_ladder
 from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.runs.directory import RunDirectory
@@ -45,11 +44,9 @@ def check_worst(
     Returns:
         As `verified` in the summary; None without trials.
     """
-    config = job.config
-    if config.trials == 0:
+    if job.trials == 0:
         return None
-    ladder = verification_ladder(config)
-
+    seed, ladder = job.pictures.seed, job.ladder
     stages.begin(
         "verification",
         "finding how many samples the check needs",
@@ -69,19 +66,19 @@ def check_worst(
         stages.progress.advance(spp)
         return trial.score
 
-    count = choose_spp({"worst": margin_of}, seed=config.seed, ladder=ladder)
-    hint = f"{config.trials} pictures of {count.spp} samples a pixel; `trials` or `verify_spp` shorten it"
-    stages.begin("verification", "checking the worst configuration with fresh renders", config.trials, hint=hint)
+    count = choose_spp({"worst": margin_of}, seed=seed, ladder=ladder)
+    hint = f"{job.trials} pictures of {count.spp} samples a pixel; `trials` or `verify_spp` shorten it"
+    stages.begin("verification", "checking the worst configuration with fresh renders", job.trials, hint=hint)
     stored = _stored(run, KIND)
 
     def keep(group: str, number: int, trial: Judgement) -> None:
         stages.progress.advance(1)
         if run is not None and number >= len(stored):
-            seed = stream(config.seed, KIND, number)
-            run.record(trial_row(KIND, number, seed, count.spp, trial, sought=False))
+            own = stream(seed, KIND, number)
+            run.record(trial_row(KIND, number, own, count.spp, trial, sought=False))
 
     render = _after(stored, lambda at, seed, spp: view.trial(model, at, seed, spp))
-    trials = run_trials(render, u, spp=count.spp, seed=config.seed, trials=config.trials, on_trial=keep)
+    trials = run_trials(render, u, spp=count.spp, seed=seed, trials=job.trials, on_trial=keep)
     settled = count.converged or len(ladder) == 1
     renders = count.renders + len(trials)
     rate = verified_rate(Trials(sum(trial.success for trial in trials), len(trials), count.spp), trials)
