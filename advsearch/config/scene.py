@@ -91,7 +91,11 @@ class SceneConfig(Config):
         "package.module:callable",
     )
     labels: str | None = setting(
-        None, "model", "names of the model's classes", "a JSON or text file", otherwise="the model's own"
+        None,
+        "model",
+        "names of the model's classes",
+        "a JSON or text file, imagenet, cifar10, cifar100, coco, coco91 or voc",
+        otherwise="the model's own",
     )
     task: str = setting(
         "classification", "model", "what the model is to do, and how it is judged", "the name of a task"

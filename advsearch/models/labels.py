@@ -21,6 +21,11 @@ LONGEST = 1000
 MOST_SUGGESTIONS = 4
 """Labels that a message suggests for an unknown one."""
 
+DATA = Path(__file__).parent / "data"
+SETS = ("imagenet", "cifar10", "cifar100", "coco", "coco91", "voc")
+"""Names of the classes of data sets that many networks are trained on, in the order of their outputs. `coco91` has the
+background first and the numbers that its authors gave, of which 11 have no class; `voc` has the background first."""
+
 
 @dataclass(frozen=True)
 class LabelSet:
@@ -70,16 +75,29 @@ def find_label_set(text: str | int | Sequence[str | int], labels: Sequence[str],
 
 
 def matching_labels(word: str, labels: Sequence[str]) -> list[tuple[int, str]]:
-    """Return index and name of the classes whose names, or synonyms, are like `word`, best first; see `resembling`.
+    """Return index and name of the classes whose names are like `word`, best first, and then those that mean the same.
 
-    The name is the part of the label that matched: "frying pan" of "frying pan, frypan, skillet".
+    What is like a word says `resembling`; what means the same ("cup" for "mug") is a table of everyday things. The name
+    is the part of the label that matched: "frying pan" of "frying pan, frypan, skillet".
     """
     table = {name: indices for name, indices in _name_table(labels).items() if "," not in name}
+    same = [name for name in _synonyms(word) if name in table]
+    like = resembling(word, table)
+    if same and not any(_key(word) in name for name in like):  # nothing but other spellings
+        like = []
     parts: dict[int, str] = {}
-    for name in resembling(word, table):
+    for name in (*like, *same):
         for index in table[name]:
             parts.setdefault(index, name)
     return list(parts.items())
+
+
+def _synonyms(word: str) -> Iterator[str]:
+    """Yield what else an everyday thing is called, as a key of the table of names."""
+    for names in json.loads((DATA / "synonyms.json").read_text("utf-8")):
+        keys = [_key(name) for name in names]
+        if _key(word) in keys:
+            yield from keys
 
 
 def _find(term: str, table: dict[str, list[int]], labels: Sequence[str], named: bool) -> int:
@@ -141,14 +159,16 @@ def read_labels(source: str | Path | Sequence[str]) -> tuple[str, ...]:
     """Return label names in index order.
 
     Args:
-        source: the names themselves, or a path to a JSON list of names, a JSON object from index to name (every index
-            from 0 on, once), or a text file with one name per line (UTF-8).
+        source: the names themselves, one of `SETS`, or a path to a JSON list of names, a JSON object from index to name
+            (every index from 0 on, once), or a text file with one name per line (UTF-8).
 
     Raises:
         FileFormatError: the file is missing, empty or something else; the message names it.
         InputError: `source` is a sequence that holds something other than non-empty strings.
     """
     if isinstance(source, (str, Path)):
+        if str(source) in SETS:
+            return tuple(json.loads((DATA / "labels.json").read_text("utf-8"))[str(source)])
         return _read_file(Path(source))
     if not isinstance(source, Sequence):
         raise InputError(f"labels: expected a path or a list of names, got {type(source).__name__}")

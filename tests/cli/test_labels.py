@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,8 @@ import advsearch
 from advsearch import models
 from advsearch.cli.main import main
 from advsearch.errors import InputError, UnknownNameError, resembling
-from advsearch.models import find_label_set, matching_labels
+from advsearch.models import find_label_set, matching_labels, read_labels
+from advsearch.models.labels import SETS
 
 LABELS = ("pug", "coffee mug", "frying pan, frypan", "giant panda", "cup", "mosque", "crane", "crane", "glasses")
 
@@ -53,7 +55,7 @@ def test_a_name_of_any_length_is_compared_at_once() -> None:
 def test_labels_match_by_their_synonyms() -> None:
     assert matching_labels("pan", LABELS) == [(2, "frying pan"), (3, "giant panda")]
     assert matching_labels("crane", LABELS) == [(6, "crane"), (7, "crane")]
-    with pytest.raises(InputError, match=r"no label 'mug'\. Did you mean 'coffee mug' \(#1\)\?$"):
+    with pytest.raises(InputError, match=r"no label 'mug'\. Did you mean 'coffee mug' \(#1\) or 'cup' \(#4\)\?$"):
         find_label_set("mug", LABELS)
     with pytest.raises(InputError, match=r"no label 'pan'\. Did you mean 'frying pan' \(#2\) or 'giant panda'"):
         find_label_set("pan", LABELS)
@@ -66,7 +68,10 @@ def test_labels_are_listed_from_the_file_alone(
     file.write_text(json.dumps(LABELS), encoding="utf-8")
     monkeypatch.setattr(models, "load_model", None)
     assert main(["labels", "mug", "--model", "large.pt2", "--labels", str(file), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["labels"] == [{"index": 1, "label": "coffee mug"}]
+    assert json.loads(capsys.readouterr().out)["labels"] == [
+        {"index": 1, "label": "coffee mug"},
+        {"index": 4, "label": "cup"},
+    ]
     assert main(["labels", "pan", "--labels", str(file)]) == 0
     assert capsys.readouterr().out == "  #2   frying pan, frypan\n  #3   giant panda\n"
     assert main(["labels", "--labels", str(file), "--json"]) == 0
@@ -133,3 +138,46 @@ def test_the_command_line_says_which_flag_to_add(
     err = capsys.readouterr().err
     assert "--label: expected the right answers for thing.obj" in err and ' such as --label "' in err
     assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("word", "labels", "first"),
+    [
+        ("mug", "imagenet", ["coffee mug", "cup"]),
+        ("mug", "coco", ["cup"]),
+        ("sofa", "imagenet", ["studio couch"]),
+        ("couch", "voc", ["sofa"]),
+        ("plane", "cifar10", ["airplane"]),
+        ("aeroplane", "coco", ["airplane"]),
+        ("automobile", "coco91", ["car"]),
+        ("spectacles", "imagenet", ["sunglasses", "sunglass"]),
+    ],
+)
+def test_everyday_things_are_found_by_what_else_they_are_called(
+    word: str, labels: str, first: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["labels", word, "--labels", labels, "--json"]) == 0
+    found = [one["label"] for one in json.loads(capsys.readouterr().out)["labels"]]
+    assert set(first) <= set(found[:6]), found
+
+
+def test_label_sets_have_the_order_of_their_data_sets() -> None:
+    sizes = {"imagenet": 1000, "cifar10": 10, "cifar100": 100, "coco": 80, "coco91": 91, "voc": 21}
+    assert {name: len(read_labels(name)) for name in SETS} == sizes
+    assert [read_labels("imagenet")[index] for index in (0, 504, 968, 999)] == [
+        "tench", "coffee mug", "cup", "toilet tissue"
+    ]  # fmt: skip
+    assert [read_labels("coco91")[index] for index in (0, 1, 47, 90)] == ["background", "person", "cup", "toothbrush"]
+    assert [read_labels("coco")[index] for index in (0, 41, 79)] == ["person", "cup", "toothbrush"]
+    assert [read_labels("cifar100")[index] for index in (0, 99)] == ["apple", "worm"]
+    assert [read_labels("voc")[index] for index in (0, 5, 20)] == ["background", "bottle", "tvmonitor"]
+
+
+def test_the_names_of_real_networks_are_in_the_same_order(real_data: Path) -> None:
+    for name, file in (("imagenet", "imagenet_labels.json"), ("voc", "deeplabv3_mnv2_dm05_pascal_257.labels.json")):
+        real = read_labels(real_data / "models" / file)
+        ours = read_labels(name)
+        words = [set(re.findall(r"\w+", one.casefold())) for one in ours]
+        theirs = [set(re.findall(r"\w+", one.casefold())) for one in real]
+        same = sum(bool(a & b) for a, b in zip(words, theirs, strict=True))
+        assert same > 0.98 * len(real), name

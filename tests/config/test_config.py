@@ -46,7 +46,7 @@ WRONG: dict[str, tuple[Any, str]] = {
         "expected reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, "
         "or package.module:callable",
     ),
-    "labels": (True, "expected a JSON or text file, got True"),
+    "labels": (True, "expected a JSON or text file, imagenet, "),
     "task": ("  ", "expected the name of a task, got '  '"),
     "label": ("  ", "expected names of classes or their numbers, such as \"coffee mug,cup\" or #504, got '  '"),
     "controls": (
