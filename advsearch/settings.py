@@ -95,6 +95,8 @@ class Config(BaseModel):
 
     command: ClassVar[str]
     clashes: ClassVar[tuple[Clash, ...]] = ()
+    free: ClassVar[tuple[str, ...]] = (*PLACE, "threads")
+    """Settings that decide no number, so that they may be changed before a run goes on."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False)
 
@@ -178,9 +180,9 @@ class Config(BaseModel):
         return self.model_copy(update={**places, **PLACE})
 
     def deciding(self) -> dict[str, Any]:
-        """Return the settings that decide a run's numbers, as JSON values: not where it is kept and on how many threads
-        it runs. Files have their names only, since they may have been moved."""
-        given = {name: value for name, value in self.plain().items() if name not in (*PLACE, "threads")}
+        """Return the settings that decide a run's numbers, as JSON values: all that are not `free`. Files have their
+        names only, since they may have been moved."""
+        given = {name: value for name, value in self.plain().items() if name not in self.free}
         files = {name: _bare(given[name]) for name in FILES if isinstance(given.get(name), str)}
         return {**given, **files}
 

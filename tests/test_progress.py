@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ import pytest
 import torch
 from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
-from advsearch.api import plan as planning
 from advsearch.api.attack import attack_from_config
 from advsearch.api.plan import plan
 from advsearch.api.precision import precision
@@ -23,10 +21,9 @@ from advsearch.attacks import make_policy
 from advsearch.attacks.region import grow
 from advsearch.attacks.sample_count import choose_spp, most_samples
 from advsearch.cli.flags import with_flags
-from advsearch.cli.plan import text as plan_text
+from advsearch.cli.plan import answer as plan_text
 from advsearch.config import AttackConfig, PlanConfig, PrecisionConfig, RegionConfig, SweepConfig
 from advsearch.engine.memory import Memory
-from advsearch.engine.planning import cosine_samples, cosines
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.runs.directory import RunDirectory
@@ -197,42 +194,16 @@ def test_every_command_says_what_it_does_and_how_far_it_is(
     assert any("--" in one for one in hints) and not any("`" in one for one in hints)
 
 
-PLANNED = PlanConfig(**SMALL, controls={"environment.rotation": {}})
-
-
 @pytest.mark.slow
-def test_a_plan_counts_what_it_says() -> None:
+def test_a_plan_counts_what_it_says(tmp_path: Path) -> None:
     progress = Recorded()
-    whole = plan(PLANNED, progress=progress)
+    whole = plan(
+        PlanConfig(**SMALL, controls={"environment.rotation": {}}, run=str(tmp_path / "run")), progress=progress
+    )
     progress.check()
     assert whole.ending == "done" and whole.not_measured == [] and whole.gains
     assert sum("cosine" in text for text in progress.messages) == len(whole.cosines)
     assert plan_text(whole).startswith("How a search gets the derivative of each parameter")
-
-
-def test_a_plan_says_what_it_did_not_measure(monkeypatch: pytest.MonkeyPatch) -> None:
-    cut = plan(PLANNED.model_copy(update={"seconds": 1e-9}))
-    assert cut.ending == "out of time" and not cut.cosines and cut.gains is None
-    assert cut.not_measured[1:] == ["what can be left out", "environment with denoiser none"]
-    assert "not measured, the time was up:\n  step and samples of environment" in plan_text(cut)
-
-    def stopped(*_: Any, **__: Any) -> None:
-        raise KeyboardInterrupt
-
-    for function in (cosines, cosine_samples):
-        monkeypatch.setattr(planning, function.__name__, partial(function, counts=(8,), factors=(1.0,)))
-    monkeypatch.setattr("advsearch.engine.planning.CONVERGED", 4)
-    monkeypatch.setattr(planning, "leaving_out", stopped)
-    progress = Recorded()
-    half = plan(PLANNED, progress=progress)
-    progress.check()
-    assert half.ending == "interrupted" and half.cosines and half.not_measured == cut.not_measured[1:]
-    assert "not measured, it was stopped" in plan_text(half)
-    assert half.denoise.to_dict() == {
-        "asked": "oidn",
-        "advised": "oidn",
-        "reason": "the other one was not measured",
-    }
 
 
 # ---- what is stored is not rendered again ---------------------------------------------------------------------------

@@ -127,7 +127,7 @@ def check_from_config(
                 command_line=config.command_line(),
             )
 
-        return kept_rows(run, rows(), result)
+        return kept_rows(run, results, rows(), result)
 
 
 # ---- what is measured, and what was ---------------------------------------------------------------------------------

@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
-from advsearch.config import AttackConfig
+from advsearch.config import PlanConfig
 from advsearch.engine.bounces import bounces_of, most_pictures
 from advsearch.engine.gradients import inside
+from advsearch.engine.measuring import Results, kept_rows
+from advsearch.engine.memory import PLAN, Memory
 from advsearch.engine.planning import GOAL, cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.engine.problem import Problem
 from advsearch.evaluation.leaving_out import measured_gains, most_gradients, resolved_texels
+from advsearch.files import Json
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.wording import count
-from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME, Formation
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results.base import Formation
 from advsearch.runs.results.plan import (
     CosineRow,
     DenoiserAdvice,
@@ -26,165 +30,181 @@ from advsearch.runs.results.plan import (
     PlanResult,
     TexelRow,
 )
-from advsearch.scene.gradients.plan import BY_DIFFERENCES, GradientPlan
+from advsearch.scene.gradients.plan import BY_DIFFERENCES
+
+PlannedRow = CosineRow | PathLength | GainRow | TexelRow
 
 
-def plan(config: AttackConfig, *, progress: Progress | None = None) -> PlanResult:
+def plan(config: PlanConfig, *, progress: Progress | None = None, resumed: Path | None = None) -> PlanResult:
     """Choose how every derivative is obtained and what is left out, by measurement, and say why.
 
+    What is measured is kept at once in a run directory, so that a plan that was stopped, by Ctrl-C, by a kill or
+    because its `seconds` were over, goes on where it was and ends with the same rows; times differ, and what is chosen
+    by them (estimators, the better denoiser) may.
+
     Args:
-        config: scene, model, controls; after its `seconds` nothing more is measured.
+        config: scene, model, controls, and where the run is kept.
         progress: told how far it is.
+        resumed: the folder of a run to go on with.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
     """
-    progress, begun = progress or NullProgress(), time.monotonic()
-    progress.stage(LOADING)
-    problem, _ = problem_from_config(config)
-    work = _Measurements(problem, config, progress)
-    work.compare_estimators()
-    left, ending = work.steps(), "done"
-    try:
-        while left:
-            if config.seconds is not None and time.monotonic() - begun >= config.seconds:
-                ending = OUT_OF_TIME
-                break
-            left[0][1]()
-            left.pop(0)
-    except KeyboardInterrupt:
-        ending = INTERRUPTED
-    tables, (chosen, spp) = work.tables, work.chosen
-    used = {group.estimator for group in chosen.groups}
-    gradient = problem.plan_summary(chosen)
-    return PlanResult(
-        object=config.object,
-        environment=problem.space.environment or config.lit_by,
-        controls=list(config.controls),
-        model=problem.model.name,
-        ending=ending,
-        not_measured=[what for what, _ in left],
-        image_formation=Formation.of(problem.renderer.formation),
-        renders_per_gradient=gradient.renders_per_gradient,
-        spp=spp,
-        groups=gradient.groups,
-        cosines=[row for rows in tables.values() for row in rows],
-        denoise=quieter(tables, config.denoise),
-        left_out=_left_out(problem, used) if config.specialise else [],
-        specialised=config.specialise,
-        gains=work.gains,
-        bounces=work.bounces,
-        texels=work.texels,
-        limits=_limits() if "material" in used else [],
-    )
+    progress, begun = progress or NullProgress(), time.perf_counter()
+    with RunDirectory.of(config, resumed) as run:
+        progress.stage(LOADING)
+        problem, _ = problem_from_config(config)
+        results = Results(Memory(run), config.seconds)
+        work = _Measurements(problem, config, results, progress)
+
+        def result(rows: Sequence[PlannedRow], ending: str) -> PlanResult:
+            return work.result(rows, ending, str(run.path), time.perf_counter() - begun)
+
+        return kept_rows(run, results, work.rows(), result)
 
 
 class _Measurements:
-    """What a plan measures, one after the other.
+    """What a plan measures, one after the other, what matters most first.
 
     Args:
-        problem: whose renderer's plan is measured; it is replaced by the one that is chosen.
+        problem: whose derivatives are planned.
         config: of the plan.
+        results: what is known already.
         progress: told how far it is.
-
-    Attributes:
-        tables: denoiser to the cosines so far.
-        gains, bounces, texels: what leaving things out brings; None before it was measured.
     """
 
-    def __init__(self, problem: Problem, config: AttackConfig, progress: Progress) -> None:
-        self._problem, self._config, self._progress = problem, config, progress
+    def __init__(self, problem: Problem, config: PlanConfig, results: Results, progress: Progress) -> None:
+        self._problem, self._config, self._results, self._progress = problem, config, results, progress
         self._other = "none" if config.denoise == "oidn" else "oidn"
-        self._theirs: Problem | None = None
-        self.tables: dict[str, list[CosineRow]] = {config.denoise: [], self._other: []}
-        self.gains: list[GainRow] | None = None
-        self.bounces: PathLength | None = None
-        self.texels: list[TexelRow] | None = None
+        self._seed = seeds.stream(config.seed, "measure")
+        self._plan = problem.renderer.plan
+        self._controls = list(dict.fromkeys(one.control for one in self._plan.groups if one.estimator != "none"))
+        self._gradients = plan_gradients(self._plan, every=True)
+        self._left = ["ways to differentiate"] * bool(self._gradients)
+        self._left += [f"step and samples of {name}" for name in self._controls]
+        self._left += ["what can be left out"] * config.specialise
+        self._left += [f"{name} with denoiser {self._other}" for name in self._controls]
 
-    @property
-    def chosen(self) -> tuple[GradientPlan, int]:
-        """The plan and the samples a pixel that follow from what was measured so far."""
-        plan, spp = tuned(self._problem.renderer.plan, self.tables[self._config.denoise])
-        return plan, spp or self._problem.spp
+    def rows(self) -> Iterator[PlannedRow]:
+        """Measure, and yield each row as it comes.
 
-    def compare_estimators(self) -> None:
-        """Choose every contested estimator."""
-        renderer, seed = self._problem.renderer, seeds.stream(self._config.seed, "measure")
-        gradients = plan_gradients(renderer.plan, every=True)
-        if gradients:
-            hint = f"{gradients} gradients of {count(self._problem.spp, 'sample')} a pixel; `resolution` shortens it"
-            self._progress.stage("comparing ways to differentiate", gradients, hint=hint)
-        renderer.plan = measured_plan(
-            renderer,
-            self._problem.loss,
-            inside(renderer),
-            seed=seed,
-            spp=self._problem.spp,
-            every=True,
-            tick=lambda: self._progress.advance(1),
+        Raises:
+            OutOfTime: the time of the results is up.
+        """
+        if self._gradients:
+            self._compare_estimators()
+            self._left.pop(0)
+        own: list[CosineRow] = []
+        for control in self._controls:
+            for row in self._cosines(self._problem, control, f"choosing step and samples for {control}"):
+                own.append(row)
+                yield row
+            self._left.pop(0)
+        if self._config.specialise:
+            self._problem.renderer.plan, _ = tuned(self._plan, own)
+            yield from self._leaving_out()
+            self._left.pop(0)
+        if not self._controls:
+            return
+        self._results.check_time()
+        self._progress.stage("loading the scene for the other denoiser")
+        other, _ = problem_from_config(self._config, denoise=self._other)
+        other.plan = other.plan.with_estimator({one.name: one.estimator for one in self._plan.groups}, "as beside")
+        for control in self._controls:
+            yield from self._cosines(other, control, f"the same for {control} with denoiser {self._other}")
+            self._left.pop(0)
+
+    def result(self, rows: Sequence[PlannedRow], ending: str, run: str, seconds: float) -> PlanResult:
+        """Return what some rows come to.
+
+        Args:
+            rows: so far.
+            ending: how it ended.
+            run: the folder.
+            seconds: that it took.
+        """
+        problem, config = self._problem, self._config
+        table = [row for row in rows if isinstance(row, CosineRow)]
+        tables = {name: [row for row in table if row.denoise == name] for name in (config.denoise, self._other)}
+        chosen, spp = tuned(self._plan, tables[config.denoise])
+        used = {group.estimator for group in chosen.groups}
+        gradient = problem.plan_summary(chosen)
+        left_out = config.specialise and "what can be left out" not in self._left
+        return PlanResult(
+            run=run,
+            object=config.object,
+            environment=problem.space.environment or config.lit_by,
+            controls=list(config.controls),
+            model=problem.model.name,
+            ending=ending,
+            not_measured=list(self._left),
+            image_formation=Formation.of(problem.renderer.formation),
+            renders_per_gradient=gradient.renders_per_gradient,
+            spp=spp or problem.spp,
+            groups=gradient.groups,
+            cosines=table,
+            denoise=quieter(tables, config.denoise),
+            left_out=_left_out(problem, used) if config.specialise else [],
+            specialised=config.specialise,
+            gains=[row for row in rows if isinstance(row, GainRow)] or None,
+            bounces=next((row for row in rows if isinstance(row, PathLength)), None),
+            texels=[row for row in rows if isinstance(row, TexelRow)] if left_out else None,
+            limits=_limits() if "material" in used else [],
+            seconds={"total": seconds},
+            seed=config.seed,
+            command_line=config.command_line(),
         )
 
-    def steps(self) -> list[tuple[str, Callable[[], None]]]:
-        """What is to be measured then, by name, what matters most first."""
-        groups = self._problem.renderer.plan.groups
-        controls = dict.fromkeys(group.control for group in groups if group.estimator != "none")
-        own = [(f"step and samples of {name}", partial(self._compare, name)) for name in controls]
-        last = [(f"{name} with denoiser {self._other}", partial(self._compare_other, name)) for name in controls]
-        return own + [("what can be left out", self._leave_out)] * self._config.specialise + last
+    def _compare_estimators(self) -> None:
+        """Choose every contested estimator."""
+        problem, renderer = self._problem, self._problem.renderer
 
-    def _compare(self, control: str) -> None:
-        title = f"choosing step and samples for {control}"
-        self.tables[self._config.denoise] += self._cosines(self._problem, control, title)
+        def measured() -> Json:
+            hint = f"{self._gradients} gradients of {count(problem.spp, 'sample')} a pixel; `resolution` shortens it"
+            self._progress.stage("comparing ways to differentiate", self._gradients, hint=hint)
+            u, tick = inside(renderer), lambda: self._progress.advance(1)
+            found = measured_plan(renderer, problem.loss, u, seed=self._seed, spp=problem.spp, every=True, tick=tick)
+            return found.to_dict()
 
-    def _compare_other(self, control: str) -> None:
-        if self._theirs is None:
-            self._progress.stage("loading the scene for the other denoiser")
-            self._theirs, _ = problem_from_config(self._config, denoise=self._other)
-            estimators = {one.name: one.estimator for one in self._problem.renderer.plan.groups}
-            self._theirs.plan = self._theirs.plan.with_estimator(estimators, "as beside")
-        title = f"the same for {control} with denoiser {self._other}"
-        self.tables[self._other] += self._cosines(self._theirs, control, title)
+        self._plan = renderer.plan = self._plan.restored(self._results.get(PLAN, measured))
 
-    def _cosines(self, problem: Problem, control: str, title: str) -> list[CosineRow]:
+    def _cosines(self, problem: Problem, control: str, title: str) -> Iterator[CosineRow]:
         renderer, only = problem.renderer, (control,)
+
+        def kept(name: str, measure: Callable[[], Sequence[CosineRow]]) -> list[CosineRow]:
+            return self._results.rows(f"{renderer.formation.denoiser} {name}", CosineRow, measure)
+
         hint = "counted in samples a pixel; `resolution` shortens it, `seconds` ends it"
         self._progress.stage(title, cosine_samples(renderer.plan, controls=only), hint=hint, at_most=True)
-        seed, u = seeds.stream(self._config.seed, "measure"), inside(renderer)
-        rows = []
-        for row in cosines(renderer, problem.loss, u, seed=seed, controls=only, tick=self._progress.advance):
-            rows.append(row)
-            self._progress.message(
+        u, tick = inside(renderer), self._progress.advance
+        for row in cosines(renderer, problem.loss, u, seed=self._seed, controls=only, tick=tick, keep=kept):
+            yield row
+            self._progress.message(  # whoever reads it can stop the plan and find the row kept
                 f"{control}: a gradient of {row.spp} samples and {row.factor:g} x the step has a cosine of "
                 f"{row.cosine:.2f} with the converged one"
             )
-        return rows
 
-    def _leave_out(self) -> None:
-        before = self._problem.renderer.plan
-        self._problem.renderer.plan, _ = self.chosen
-        try:
-            self.gains, self.bounces, self.texels = leaving_out(self._problem, self._config, self._progress)
-        finally:
-            self._problem.renderer.plan = before
+    def _leaving_out(self) -> Iterator[PlannedRow]:
+        """What leaving things out of a search's renders brings, and the proof that it is safe."""
+        problem, renderer, progress = self._problem, self._problem.renderer, self._progress
+        seed, u = seeds.stream(self._config.seed, "leaving out"), inside(renderer)
 
+        def tick() -> None:
+            progress.advance(1)
 
-def leaving_out(
-    problem: Problem, config: AttackConfig, progress: Progress
-) -> tuple[list[GainRow], PathLength, list[TexelRow]]:
-    """Measure what leaving things out of a search's renders brings, and prove it safe.
+        def lengths() -> PathLength:
+            progress.stage("finding how many bounces of light matter", most_pictures(problem), hint=hint, at_most=True)
+            return bounces_of(problem, self._config.seed, tick=tick)
 
-    Returns:
-        A row for each item and one for all; the path length and why; what is searched beyond what a pixel shows.
-    """
-    renderer, seed = problem.renderer, seeds.stream(config.seed, "leaving out")
-    u = inside(renderer)
+        def gains() -> list[GainRow]:
+            progress.stage("measuring what leaving things out saves", most_gradients(), hint=hint, at_most=True)
+            depth = length.depth
+            return measured_gains(renderer, problem.loss, u, seed=seed, spp=problem.spp, depth=depth, tick=tick)
 
-    def tick() -> None:
-        progress.advance(1)
-
-    hint = "`specialise=false` leaves it out"
-    progress.stage("finding how many bounces of light matter", most_pictures(problem), hint=hint, at_most=True)
-    bounces = bounces_of(problem, config.seed, tick=tick)
-    progress.stage("measuring what leaving things out saves", most_gradients(), hint=hint, at_most=True)
-    gains = measured_gains(renderer, problem.loss, u, seed=seed, spp=problem.spp, depth=bounces.depth, tick=tick)
-    return gains, bounces, resolved_texels(renderer, u, seed=seed)
+        hint = "`specialise=false` leaves it out"
+        yield (length := self._results.row("bounces", PathLength, lengths))
+        yield from self._results.rows("gains", GainRow, gains)
+        yield from self._results.rows("texels", TexelRow, lambda: resolved_texels(renderer, u, seed=seed))
 
 
 def quieter(tables: Mapping[str, Sequence[CosineRow]], asked: str) -> DenoiserAdvice:

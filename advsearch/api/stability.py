@@ -44,4 +44,4 @@ def stability(
             )
 
         results = Results(Memory(run), config.seconds)
-        return kept_rows(run, run_cases(cases, results, progress or NullProgress()), result)
+        return kept_rows(run, results, run_cases(cases, results, progress or NullProgress()), result)

@@ -9,6 +9,9 @@ from advsearch.cli import output
 from advsearch.cli.check import FIELDS, GROUPS
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from advsearch.config import PlanConfig
     from advsearch.runs.results.plan import GroupDerivative, PlanResult
 
 HELP = "show how a search gets its derivatives and what it leaves out, measured on its scene, and why"
@@ -21,6 +24,12 @@ READING = (
 )
 """What a plan shows, and how to read it."""
 
+_EXAMPLES = """examples:
+  advsearch plan --object mug --control pose,texture
+  advsearch plan --object mug --control camera --seconds 60 --run derivatives
+  advsearch resume derivatives
+"""
+
 
 def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add the command."""
@@ -31,26 +40,33 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         "plan",
         help=HELP,
         description=HELP[0].upper() + HELP[1:] + ".",
-        epilog="examples:\n  advsearch plan --object mug --control pose,texture\n",
+        epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    add_settings(parser, groups=(*GROUPS, "check"), fields=(*FIELDS, "specialise"), config=PlanConfig)
+    add_settings(
+        parser, groups=(*GROUPS, "check"), fields=(*FIELDS, "specialise", "run", "overwrite"), config=PlanConfig
+    )
     output.add_flags(parser, quiet=True)
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure and print the plan."""
     from advsearch.cli.flags import config_from
-    from advsearch.cli.progress import at_work
     from advsearch.config import PlanConfig
 
-    config = config_from(args, PlanConfig, object="mug")
-    with at_work(as_json=args.json, quiet=args.quiet) as progress:
+    return carry_out(config_from(args, PlanConfig, object="mug"), as_json=args.json, quiet=args.quiet)
+
+
+def carry_out(config: PlanConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
+    """Measure what `config` describes, or go on with it; print the plan and return the exit status."""
+    from advsearch.cli.progress import at_work
+
+    with at_work(as_json=as_json, quiet=quiet) as progress:
         from advsearch.api.plan import plan
 
-        chosen = plan(config, progress=progress)
-    return output.finish(chosen, text, as_json=args.json)
+        chosen = plan(config, progress=progress, resumed=resumed)
+    return output.finish(chosen, answer, as_json=as_json)
 
 
 def _step(group: GroupDerivative) -> str:
@@ -70,8 +86,9 @@ def _steps(chosen: PlanResult) -> list[str]:
     return [f"step of {', '.join(names)}: {reason}" for reason, names in reasons.items()]
 
 
-def text(chosen: PlanResult) -> str:
-    """Return a plan as text."""
+def answer(chosen: PlanResult) -> str:
+    """Return a plan as text, and where the run is."""
+    from advsearch.report import wording
     from advsearch.runs.results.base import OUT_OF_TIME
 
     rows = [["parameter", "numbers", "estimator", "step", "why"]]
@@ -123,37 +140,32 @@ def text(chosen: PlanResult) -> str:
         lines += ["", f"not measured, {why}:", *(f"  {what}" for what in chosen.not_measured)]
     if chosen.limits:
         lines += ["", "limits of the material form:", *(f"  {limit.what}" for limit in chosen.limits)]
-    return "\n".join(lines)
+    time = wording.seconds_text(chosen.seconds["total"])
+    return "\n".join([*lines, "", output.columns([["time", time], ["run", str(chosen.run)]])])
 
 
 def _left_out(chosen: PlanResult) -> list[str]:
     """Lines on what the search doesn't compute: sentences, then what was measured."""
     if not chosen.specialised:
         return ["left out: nothing (--no-specialise)"]
-    if chosen.gains is None or chosen.bounces is None:
-        return ["not needed:", *(f"  {sentence}" for sentence in chosen.left_out)]
-    rows = [["left out", "a gradient with it takes", "picture differs", "gradient differs"]]
-    for row in chosen.gains:
-        agrees = _agreement(row.picture_difference), _agreement(row.gradient_difference)
-        rows.append([row.what, f"x {row.gain:.2f}", *agrees])
-    bounces = chosen.bounces
-    return [
-        "not needed:",
-        *(f"  {sentence}" for sentence in chosen.left_out),
-        "",
-        output.columns(rows),
-        "",
-        f"longest light path of the search: {bounces.depth} segments of {bounces.full}: {bounces.reason}",
-        *(
-            f"texels of {one.control}: {one.seen} are seen in {one.pixels} pixels; "
-            + (
-                f"--texture-resolution {one.enough} would resolve as much"
-                if one.enough < one.side
-                else f"{one.side} a side is what the pixels resolve"
-            )
-            for one in chosen.texels or ()
-        ),
-    ]
+    lines = ["not needed:", *(f"  {sentence}" for sentence in chosen.left_out)]
+    if chosen.gains:
+        rows = [["left out", "a gradient with it takes", "picture differs", "gradient differs"]]
+        for row in chosen.gains:
+            agrees = _agreement(row.picture_difference), _agreement(row.gradient_difference)
+            rows.append([row.what, f"x {row.gain:.2f}", *agrees, *([] if row.safe else ["MORE THAN ITS NOISE"])])
+        lines += ["", output.columns(rows), ""]
+    if chosen.bounces is not None:
+        depth, full = chosen.bounces.depth, chosen.bounces.full
+        lines.append(f"longest light path of the search: {depth} segments of {full}: {chosen.bounces.reason}")
+    for one in chosen.texels or ():
+        enough = (
+            f"--texture-resolution {one.enough} would resolve as much"
+            if one.enough < one.side
+            else f"{one.side} a side is what the pixels resolve"
+        )
+        lines.append(f"texels of {one.control}: {one.seen} are seen in {one.pixels} pixels; {enough}")
+    return lines
 
 
 def _agreement(share: float) -> str:

@@ -23,6 +23,7 @@ COMMANDS = {
     "region": "RegionConfig",
     "precision": "PrecisionConfig",
     "check": "CheckConfig",
+    "plan": "PlanConfig",
     "stability": "StabilityConfig",
 }
 """What the `command` of a file may say, and the configuration that it is."""

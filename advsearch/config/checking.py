@@ -15,10 +15,25 @@ OF_ALL: dict[str, Any] = {"object": "mug", "environment": None, "controls": {"te
 """What is as it is unless it is given, and has to be left so with `all`."""
 
 
+def _sitting() -> Any:
+    """The time of one sitting of a measurement that can go on."""
+    return setting(
+        None,
+        "check",
+        "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
+        "a number greater than 0 and at most 1e9",
+        otherwise="no limit",
+        unit="seconds",
+        gt=0.0,
+        le=1e9,
+    )
+
+
 class CheckConfig(AttackConfig):
     """Everything that decides what `check` does: gradients of a scene against differences."""
 
     command: ClassVar[str] = "check"
+    free: ClassVar[tuple[str, ...]] = (*AttackConfig.free, "seconds")
     several: ClassVar[tuple[str, ...]] = ()
 
     clashes: ClassVar[tuple[Clash, ...]] = (
@@ -42,16 +57,7 @@ class CheckConfig(AttackConfig):
         "what is differentiated: a smooth linear loss of the raw picture, the model's own, or both in turn",
         "linear, model or both",
     )
-    seconds: float | None = setting(
-        None,
-        "check",
-        "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
-        "a number greater than 0 and at most 1e9",
-        otherwise="no limit",
-        unit="seconds",
-        gt=0.0,
-        le=1e9,
-    )
+    seconds: float | None = _sitting()
 
     @property
     def title(self) -> tuple[str, ...]:
@@ -68,38 +74,28 @@ class PlanConfig(AttackConfig):
     """Everything that decides what `plan` does: how a search gets its derivatives, and what it leaves out."""
 
     command: ClassVar[str] = "plan"
+    free: ClassVar[tuple[str, ...]] = (*AttackConfig.free, "seconds")
 
-    seconds: float | None = setting(
-        None,
-        "check",
-        "time after which no measurement is begun any more; the plan says what it did not measure",
-        "a number greater than 0",
-        otherwise="no limit",
-        unit="seconds",
-        gt=0.0,
-    )
+    seconds: float | None = _sitting()
+
+    @property
+    def title(self) -> tuple[str, ...]:
+        """The object, and what is asked of it."""
+        return self.object, self.command
 
 
 class StabilityConfig(Config):
     """Everything that decides what `stability` does: which cases it tries, for how long, and where that is kept."""
 
     command: ClassVar[str] = "stability"
+    free: ClassVar[tuple[str, ...]] = (*Config.free, "seconds")
     clashes: ClassVar[tuple[Clash, ...]] = tuple(one for one in SceneConfig.clashes if one.setting == "overwrite")
 
     case: str | None = setting(None, "check", "cases to try, separated by commas", "names of cases", otherwise="all")
     group: str | None = setting(
         None, "check", "groups of cases to try, separated by commas", "names of groups", otherwise="all"
     )
-    seconds: float | None = setting(
-        None,
-        "check",
-        "time after which no case is begun any more; `advsearch resume` goes on for as long again",
-        "a number greater than 0 and at most 1e9",
-        otherwise="no limit",
-        unit="seconds",
-        gt=0.0,
-        le=1e9,
-    )
+    seconds: float | None = _sitting()
     run: str | None = setting(
         None,
         "run",

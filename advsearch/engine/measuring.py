@@ -28,12 +28,15 @@ class Results:
     Args:
         memory: of the run.
         seconds: after which nothing more is measured; one measurement is always made, so that it gets on.
+
+    Attributes:
+        made: how many measurements were made. What is stored is read back before the first.
     """
 
     def __init__(self, memory: Memory, seconds: float | None = None) -> None:
         self._memory = memory
         self._end = math.inf if seconds is None else time.monotonic() + seconds
-        self._made = 0
+        self.made = 0
 
     def get(self, key: str, measure: Callable[[], Any]) -> Any:
         """Return a JSON value: the one that is stored under a key, or what `measure` returns, which is stored then.
@@ -43,12 +46,20 @@ class Results:
         """
         stored = self._memory.note(key)
         if stored is None:
-            if self._made and time.monotonic() >= self._end:
-                raise OutOfTime
-            self._made += 1
+            self.check_time()
+            self.made += 1
             stored = json.loads(json.dumps(measure()))
             self._memory.set_note(key, stored)
         return stored
+
+    def check_time(self) -> None:
+        """Look whether there is time for another measurement.
+
+        Raises:
+            OutOfTime: there is none.
+        """
+        if self.made and time.monotonic() >= self._end:
+            raise OutOfTime
 
     def row(self, key: str, kind: type[Kind], measure: Callable[[], Kind]) -> Kind:
         """Return the fields that `measure` returns, or those of this kind that are stored; otherwise as `get`."""
@@ -67,22 +78,26 @@ class Results:
         return self._memory.note(key)
 
 
-def kept_rows(run: RunDirectory, rows: Iterable[Row], result: Callable[[Sequence[Row], str], Answer]) -> Answer:
+def kept_rows(
+    run: RunDirectory, results: Results, rows: Iterable[Row], result: Callable[[Sequence[Row], str], Answer]
+) -> Answer:
     """Take rows until they end, the time is up or there is an interrupt, and keep what they come to after each.
 
-    The summary never has fewer rows than an earlier sitting left in it: those are read back first.
+    The summary never has fewer rows than an earlier sitting left in it: those are read back before anything is
+    measured.
 
     Args:
         run: open.
+        results: what the rows are made from.
         rows: as they come.
         result: makes the result of the rows so far and of how it ended.
     """
     taken: list[Row] = []
-    told, ending = _told(run), INTERRUPTED
+    ending = INTERRUPTED
     try:
         for row in rows:
             taken.append(row)
-            if len(taken) > told:
+            if results.made:
                 run.write_summary(result(taken, ending))  # what a kill leaves
         ending = "done"
     except KeyboardInterrupt:
@@ -90,10 +105,8 @@ def kept_rows(run: RunDirectory, rows: Iterable[Row], result: Callable[[Sequence
     except OutOfTime:
         ending = OUT_OF_TIME
     answer = result(taken, ending)
+    if ending == INTERRUPTED and not results.made and (run.path / NAME).is_file():
+        before = read_result(run.path)
+        return before if isinstance(before, type(answer)) else answer
     run.write_summary(answer)
     return answer
-
-
-def _told(run: RunDirectory) -> int:
-    """How many rows the summary has that an earlier sitting left."""
-    return len(getattr(read_result(run.path), "rows", ())) if (run.path / NAME).is_file() else 0

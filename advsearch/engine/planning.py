@@ -318,8 +318,9 @@ def _cosine(one: Tensor, other: Tensor) -> float:
 def tuned(plan: GradientPlan, table: Sequence[CosineRow]) -> tuple[GradientPlan, int | None]:
     """Return the plan with each control's step chosen from measured cosines, and the sample count that all then need.
 
-    The cheapest setting that reaches the goal wins; where none does, the one with the greatest cosine, and the reason
-    says so. The sample count is None where nothing was measured.
+    Of the settings that reach the goal, the one with the fewest samples wins (all take as many renders), of equal ones
+    that with the greatest cosine; where none does, the one with the greatest cosine, and the reason says so. The sample
+    count is None where nothing was measured.
     """
     counts = []
     for control in dict.fromkeys(row.control for row in table):
@@ -327,7 +328,7 @@ def tuned(plan: GradientPlan, table: Sequence[CosineRow]) -> tuple[GradientPlan,
         if not rows:
             continue
         good = [row for row in rows if row.status == "ok"]
-        chosen = min(good, key=lambda row: row.seconds) if good else max(rows, key=lambda row: row.cosine)
+        chosen = min(good, key=lambda row: (row.spp, -row.cosine)) if good else max(rows, key=lambda row: row.cosine)
         counts.append(chosen.spp)
         said = f"cosine {chosen.cosine:.2f} with the converged gradient at {chosen.spp} samples"
         said += f" and {chosen.factor:g} x the step" + ("" if good else f": {_shortfall(chosen)}")

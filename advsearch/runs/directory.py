@@ -58,8 +58,8 @@ CONTENTS = (
 class RunDirectory:
     """The directory of one run, locked against other processes until `close`. Make one with `create`.
 
-    Used in a `with` block it is closed at the end; when the block raises before there is any result, the directory is
-    removed again, so that bad input leaves nothing behind.
+    Used in a `with` block it is closed at the end; when the block raises before there is any result, the directory of a
+    new run is removed again, so that bad input leaves nothing behind.
 
     Attributes:
         path: the directory.
@@ -69,6 +69,7 @@ class RunDirectory:
     def __init__(self, path: Path, held: lock.RunLock) -> None:
         self.path = path
         self._lock = held
+        self._began = True
         self._replay: replay.ReplayLog | None = None
         self.store = store.Store(path / store.NAME)
 
@@ -163,6 +164,7 @@ class RunDirectory:
         except BaseException:
             held.release()
             raise
+        opened._began = False
         try:
             if config is not None:
                 opened._check_same(config)
@@ -175,7 +177,9 @@ class RunDirectory:
         """Refuse settings that decide other numbers than those that are stored: the rest would not fit to them."""
         before, now = self._begun_with(), config.deciding()
         changed = [
-            f"{name} was {value!r} and is {now.get(name)!r}" for name, value in before.items() if value != now.get(name)
+            f"{name} was {value!r} and is {now[name]!r}"
+            for name, value in before.items()
+            if name in now and value != now[name]
         ]
         if changed:
             raise InputError(
@@ -284,8 +288,8 @@ class RunDirectory:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        kept = (summary.NAME, PARTS)
-        if error is not None and not any((self.path / name).exists() for name in kept) and self.store.count() == 0:
+        kept = not self._began or any((self.path / name).exists() for name in (summary.NAME, PARTS))
+        if error is not None and not kept and self.store.count() == 0:
             self.discard()
         else:
             self.close()

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +21,11 @@ from advsearch.cli.main import main
 from advsearch.config import CheckConfig
 from advsearch.engine.measuring import OutOfTime, Results
 from advsearch.engine.memory import Memory
+from advsearch.progress import Progress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed
 from advsearch.runs.results.base import Result
-from advsearch.runs.results.check import CheckResult
+from advsearch.runs.results.check import CheckedRow, CheckResult
 from advsearch.runs.summary import read_result
 
 FLAGS = "check --object mug --control camera.azimuth,environment.rotation --loss linear --resolution 16 --spp 1"
@@ -100,8 +102,14 @@ def test_a_summary_never_forgets_what_an_earlier_one_had(
 ) -> None:
     both = [checking.CheckedPart(number, CheckConfig(**SMALL), "linear") for number in (1, 2)]
     told: list[int] = []
+
+    def measured(part: checking.CheckedPart, title: str, results: Results, progress: Progress) -> Iterator[CheckedRow]:
+        for number, row in enumerate(whole.rows):
+            results.get(f"{part.key} {number}", row.to_dict)
+            yield row
+
     monkeypatch.setattr(checking, "_parts", lambda *_: both)
-    monkeypatch.setattr(checking, "_linear", lambda *_: iter(whole.rows))
+    monkeypatch.setattr(checking, "_linear", measured)
     write = RunDirectory.write_summary
 
     def written(run: RunDirectory, answer: CheckResult) -> Path:

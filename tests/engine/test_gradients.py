@@ -453,6 +453,8 @@ def test_the_cheapest_setting_that_reaches_the_goal_is_taken() -> None:
     ]
     chosen, spp = tuned(plan, rows)
     assert spp == 16 and chosen.groups[0].step == pytest.approx(3.0 * SEARCH_STEP)
+    luck = rows[1].model_copy(update={"spp": 16, "cosine": 0.91, "seconds": 0.1})
+    assert tuned(plan, [luck, rows[2]])[0] == tuned(plan, [rows[2]])[0]  # times are of the machine
     poor, spp = tuned(plan, rows[:1])
     assert spp == 8 and "below 0.9, the best that was found" in poor.groups[0].reason
     assert tuned(plan, [])[1] is None

@@ -21,7 +21,7 @@ from conftest import ROOT
 from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
 from advsearch.attacks import Domain, Evaluated, Policy, Proposal, make_policy
-from advsearch.config import AttackConfig
+from advsearch.config import AttackConfig, CheckConfig, PlanConfig, StabilityConfig
 from advsearch.engine.memory import Memory
 from advsearch.engine.record import Stages
 from advsearch.errors import FileFormatError, InputError, RunExistsError
@@ -30,6 +30,7 @@ from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.replay import Entry, ReplayLog
 from advsearch.runs.store import Row
+from advsearch.settings import Config
 
 POLICIES = ("pgd", "auto", "random", "cmaes")
 
@@ -149,6 +150,21 @@ def test_a_run_goes_on_elsewhere_on_other_threads_and_with_files_that_were_moved
         pass
     with pytest.raises(InputError, match=r"model was 'net\.pt2' and is 'other\.pt2' now"):
         RunDirectory.resume(tmp_path / "run", configuration(model="other.pt2"))
+
+
+@pytest.mark.parametrize("config", [CheckConfig(object="mug"), PlanConfig(object="mug"), StabilityConfig()])
+def test_a_sitting_may_be_longer_than_the_one_before(tmp_path: Path, config: Config) -> None:
+    with RunDirectory.create(tmp_path / "run") as run:
+        run.write_config(config.model_copy(update={"seconds": 5.0}))
+    for seconds in (9.0, None):
+        with RunDirectory.resume(tmp_path / "run", config.model_copy(update={"seconds": seconds})):
+            pass
+    with RunDirectory.create(tmp_path / "search") as run:
+        run.write_config(configuration(seconds=5.0))
+    with pytest.raises(
+        InputError, match=r"seconds was 5\.0 and is 9\.0 now"
+    ):  # how long it searches decides the answer
+        RunDirectory.resume(tmp_path / "search", configuration(seconds=9.0))
 
 
 def test_a_run_that_is_older_than_the_note_goes_on_and_a_damaged_note_is_named(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -10,8 +11,8 @@ import torch
 from advsearch import attack, load_scene
 from advsearch.api.attack import problem_from_config
 from advsearch.api.plan import plan
-from advsearch.cli.plan import text
-from advsearch.config import AttackConfig
+from advsearch.cli.plan import answer
+from advsearch.config import AttackConfig, PlanConfig
 from advsearch.controls import LightControl, TextureControl
 from advsearch.engine.gradients import inside, smooth_loss
 from advsearch.engine.path_length import BOUND, measured_bounces
@@ -152,17 +153,18 @@ def test_texels_beyond_what_a_pixel_shows_are_counted() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("specialise", [True, False])
-def test_the_plan_shows_what_is_left_out(specialise: bool) -> None:
-    config = AttackConfig(
+def test_the_plan_shows_what_is_left_out(specialise: bool, tmp_path: Path) -> None:
+    config = PlanConfig(
         object="mug",
         controls={"texture": {"resolution": 32}},
         resolution=(32, 32),
         spp=2,
         denoise="none",
         specialise=specialise,
+        run=str(tmp_path / "run"),
     )
     found = plan(config)
-    said = text(found)
+    said = answer(found)
     assert found.specialised is specialise
     if specialise:
         assert {row.item for row in found.gains or ()} >= {*ITEMS, ALL}

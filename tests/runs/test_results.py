@@ -6,7 +6,7 @@ import json
 import math
 from typing import ClassVar
 
-from advsearch.cli.plan import text as plan_text
+from advsearch.cli.plan import answer as plan_text
 from advsearch.runs.results.base import Fields, Interval, Number, Result
 from advsearch.runs.results.plan import DenoiserAdvice, EstimatorLimit, PlanResult
 
@@ -43,7 +43,10 @@ def test_limits_of_a_plan_are_sentences() -> None:
     plan = PlanResult.of(
         {
             **{name: [] for name in ("controls", "not_measured", "groups", "cosines", "left_out")},
-            **{name: "" for name in ("object", "environment", "model", "ending")},
+            **{name: "" for name in ("object", "environment", "model", "ending", "command_line")},
+            "run": "runs/mug-plan-001",
+            "seconds": {"total": 1.0},
+            "seed": 0,
             "image_formation": {**formation, "resolution": [8, 8]},
             "renders_per_gradient": 0,
             "spp": 1,
@@ -52,4 +55,4 @@ def test_limits_of_a_plan_are_sentences() -> None:
             "limits": [limit],
         }
     )
-    assert plan_text(plan).endswith("limits of the material form:\n  a mirror's reflections stay")
+    assert "limits of the material form:\n  a mirror's reflections stay\n" in plan_text(plan)

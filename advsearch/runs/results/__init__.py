@@ -7,6 +7,7 @@ from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.check import CheckResult
 from advsearch.runs.results.gap import CurveResult, GapResult
+from advsearch.runs.results.plan import PlanResult
 from advsearch.runs.results.precision import PrecisionResult
 from advsearch.runs.results.region import RegionResult
 from advsearch.runs.results.stability import StabilityResult
@@ -18,6 +19,7 @@ KEPT: tuple[type[Result], ...] = (
     GapResult,
     RegionResult,
     CheckResult,
+    PlanResult,
     PrecisionResult,
     StabilityResult,
 )

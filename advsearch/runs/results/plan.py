@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.runs.results.base import Fields, Formation, Number, Result
+from advsearch.runs.results.base import Fields, Formation, Number, RunResult
 from advsearch.runs.results.check import GradientStatus
 
 
@@ -109,16 +109,13 @@ class EstimatorLimit(Fields):
     measured: str
 
 
-class PlanResult(Result):
-    """How a search gets its derivatives, what it leaves out, and why."""
+class PlanResult(RunResult):
+    """How a search gets its derivatives, what it leaves out, and why, as far as that is measured."""
 
     command: ClassVar[str] = "plan"
 
     object: str
-    environment: str
-    controls: list[str]
     model: str
-    ending: str
     not_measured: list[str] = Field(description="what the time did not suffice for")
     image_formation: Formation
     renders_per_gradient: int
@@ -132,3 +129,8 @@ class PlanResult(Result):
     bounces: PathLength | None = None
     texels: list[TexelRow] | None = None
     limits: list[EstimatorLimit] = Field(description="of the material form, where it is used")
+
+    @property
+    def brief(self) -> str:
+        """What it comes to."""
+        return f"{self.renders_per_gradient} renders a gradient, {self.spp} samples"
