@@ -70,7 +70,7 @@ study: $(STAMP) ## the slow studies: policies at equal renders, stated budgets, 
 	@set -e; for name in $(STUDIES); do echo "== $$name"; $(BIN)/python benchmarks/$$name.py $(ARGS); done
 
 reference: $(STAMP) ## render, train and evaluate the bundled classifier again (some 45 minutes)
-	@$(BIN)/python -m advsearch.evaluation.reference all $(ARGS)
+	@$(BIN)/python tools/reference_model.py all $(ARGS)
 
 wheel: $(STAMP) ## build the wheel into dist/
 	@$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist .

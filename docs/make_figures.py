@@ -50,7 +50,7 @@ DOCS = Path(__file__).resolve().parent
 DIAGRAM = "images/reliability.svg"
 
 Record = Mapping[str, Any]
-"""What `advsearch.evaluation.reference` keeps in reference.json, or a part of that."""
+"""What `tools/reference_model.py` keeps in reference.json, or a part of that."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

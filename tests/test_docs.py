@@ -16,6 +16,8 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+import reference_calibration as calibration
+import reference_scenes
 import torch
 from PIL import Image
 from samples import attack
@@ -57,9 +59,8 @@ from advsearch.engine import stages
 from advsearch.engine.loading import as_controls
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.axes import read_axes
-from advsearch.evaluation import reference_scenes
 from advsearch.evaluation.stability.suite import chosen
-from advsearch.models import calibration, loading, reference
+from advsearch.models import loading, reference
 from advsearch.runs import directory, export, store
 from advsearch.runs.results import KEPT
 from advsearch.runs.results.base import Result
@@ -497,7 +498,7 @@ def test_the_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def made_up_record() -> dict[str, Any]:
-    """A record as `advsearch.evaluation.reference` writes it, of a model that is right nine times in ten."""
+    """A record as `tools/reference_model.py` writes it, of a model that is right nine times in ten."""
     labels = ["ball", "mug", "wine glass"]
     truth = [index % 3 for index in range(300)]
     logits = torch.nn.functional.one_hot(torch.tensor(truth), 3).float() * 3.0

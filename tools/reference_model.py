@@ -1,6 +1,6 @@
 """Makes the reference model: renders its pictures, trains it, and measures it on held-out instances and environments.
 
-    python -m advsearch.evaluation.reference all          (or `make reference`)
+    python tools/reference_model.py all          (or `make reference`)
 
 Everything comes from one seed. Pictures are kept in a cache folder in blocks, so that a stopped run goes on where it
 was. It takes about three quarters of an hour on two cores, two thirds of it rendering.
@@ -33,7 +33,7 @@ Pictures = np.ndarray[tuple[int, ...], np.dtype[np.uint8]]
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one step, or all of them."""
-    parser = argparse.ArgumentParser(prog="python -m advsearch.evaluation.reference", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python tools/reference_model.py", description=__doc__)
     parser.add_argument("step", choices=["render", "train", "evaluate", "all"])
     parser.add_argument("--cache", type=Path, default=Path(".cache/reference"), help="folder for the pictures")
     parser.add_argument("--seed", type=int, default=0, help="root of all randomness (default 0)")
@@ -71,7 +71,7 @@ def render(split: str, count: int, cache: Path, seed: int) -> None:
 def _render_block(job: tuple[str, int, int, int, str]) -> None:
     split, first, last, seed, path = job
     threads.configure(1)
-    from advsearch.evaluation.reference_scenes import picture
+    from reference_scenes import picture
 
     pictures = np.stack([picture(split, index, seed) for index in range(first, last)])
     part = Path(path).with_suffix(".part.npy")
@@ -89,7 +89,7 @@ def _complete(path: Path, count: int) -> bool:
 
 def pictures(cache: Path, split: str, count: int, seed: int) -> tuple[Pictures, list[int]]:
     """Return the pictures (N, 128, 128, 3) of a split and their class indices."""
-    from advsearch.evaluation.reference_scenes import class_of
+    from reference_scenes import class_of
 
     blocks = [np.load(_block(cache, split, seed, first)) for first in range(0, count, BLOCK)]
     return np.concatenate(blocks)[:count], [class_of(index) for index in range(count)]
@@ -101,37 +101,42 @@ def pictures(cache: Path, split: str, count: int, seed: int) -> tuple[Pictures, 
 def train(cache: Path, counts: dict[str, int], epochs: int, seed: int) -> None:
     """Train on the rendered pictures, calibrate on the validation split, and store the weights in the package."""
     threads.configure(rendering=False)
-    from advsearch.evaluation.reference_scenes import labels
-    from advsearch.models import calibration, reference, training
+    import reference_calibration as calibration
+    import reference_training as training
+    from reference_scenes import labels
+
+    from advsearch.models import reference
 
     images, truth = pictures(cache, "train", counts["train"], seed)
     held, held_truth = pictures(cache, "validation", counts["validation"], seed)
 
-    def say(state: training.TrainingState) -> None:
-        if state.step % 50 == 0:
+    def say(at: training.TrainingState) -> None:
+        if at.step % 50 == 0:
             print(
-                f"step {state.step} of {state.steps}, loss {state.loss:.3f}, {state.seconds_left / 60:.1f} min left",
+                f"step {at.step} of {at.steps}, loss {at.loss:.3f}, {at.seconds_left / 60:.1f} min left",
                 file=sys.stderr,
                 flush=True,
             )
 
-    trained = training.train(
+    state = training.train(
         images, truth, classes=len(labels()), epochs=epochs, lr=LEARNING_RATE, seed=seed, progress=say
     )
     folder = reference.data_folder()
     folder.mkdir(exist_ok=True)
-    reference.save(folder, trained.state, labels())
+    reference.save(folder, state, labels())
     logits = calibration.predict(reference.load(folder), held)
     temperature = calibration.fit_temperature(logits, held_truth)
     figures = {"pictures": counts["train"], "epochs": epochs, "seed": seed, "temperature": temperature}
-    reference.save(folder, reference.with_temperature(trained.state, temperature), labels(), figures)
+    reference.save(folder, reference.with_temperature(state, temperature), labels(), figures)
 
 
 def evaluate(cache: Path, count: int, seed: int) -> None:
     """Measure the stored model on held-out pictures and on the default view of every object; keep the figures."""
     threads.configure()
-    from advsearch.evaluation.reference_scenes import labels
-    from advsearch.models import calibration, reference
+    import reference_calibration as calibration
+    from reference_scenes import labels
+
+    from advsearch.models import reference
 
     folder = reference.data_folder()
     record = json.loads((folder / reference.RECORD).read_text(encoding="utf-8"))
@@ -149,9 +154,9 @@ def evaluate(cache: Path, count: int, seed: int) -> None:
 def default_views(spp: int = 64) -> dict[str, float]:
     """Return the probability that the reference model gives each bundled object in its default view."""
     import torch
+    from reference_scenes import SIZE
 
     from advsearch.controls import Space
-    from advsearch.evaluation.reference_scenes import SIZE
     from advsearch.models import reference
     from advsearch.scene import library
     from advsearch.scene.description import describe

@@ -10,48 +10,28 @@ from dataclasses import dataclass, field
 import numpy as np
 import torch
 import torch.nn.functional as F
+from reference_augmentation import Augmentation
+from reference_calibration import Images, as_floats
 from torch import Tensor, nn
 
 from advsearch.errors import InputError
-from advsearch.models.augmentation import Augmentation
-from advsearch.models.calibration import Images, Report, as_floats, evaluate
 from advsearch.models.reference import ReferenceNet, build
 
 WARM_UP = 0.05
 WEIGHT_DECAY = 0.05
 LARGEST_GRADIENT_NORM = 2.0
+LABEL_SMOOTHING = 0.02
+"""Part of the target that is spread over all classes; more would cap the confidence."""
 
 
 @dataclass(frozen=True)
 class TrainingState:
     """Where a training is: told to the callback after every step."""
 
-    epoch: int
     step: int
     steps: int
     loss: float
-    images_per_second: float
     seconds_left: float
-
-
-@dataclass(frozen=True)
-class Epoch:
-    """What one epoch did. `accuracy` is on its own augmented images, `validation` of the averaged weights."""
-
-    epoch: int
-    loss: float
-    accuracy: float
-    learning_rate: float
-    seconds: float
-    validation: Report | None
-
-
-@dataclass(frozen=True)
-class Trained:
-    """The averaged weights (a state dict of `ReferenceNet`) and the history."""
-
-    state: dict[str, Tensor] = field(repr=False)
-    history: tuple[Epoch, ...]
 
 
 def train(
@@ -63,14 +43,12 @@ def train(
     batch_size: int = 64,
     lr: float = 1e-3,
     seed: int = 0,
-    label_smoothing: float = 0.02,
     augmentation: Augmentation | None = None,
     average_decay: float = 0.998,
     bfloat16: bool = True,
-    validation: tuple[Images, Sequence[int] | Tensor] | None = None,
     progress: Callable[[TrainingState], None] | None = None,
-) -> Trained:
-    """Train a reference network from nothing.
+) -> dict[str, Tensor]:
+    """Train a reference network from nothing and return its weights, a state dict of `ReferenceNet`.
 
     The learning rate rises linearly over the first 5 % of the steps and falls to 0 along a cosine. The returned weights
     are an exponential moving average. All randomness (first weights, order, augmentation, dropout) comes from `seed`;
@@ -85,30 +63,25 @@ def train(
         batch_size: images a step; a remainder smaller than that is left out of its epoch.
         lr: the highest learning rate.
         seed: at least 0.
-        label_smoothing: part of the target that is spread over all classes, in [0, 0.05]; more caps the confidence.
         augmentation: default `Augmentation()`.
         average_decay: weight of the past in the moving average, per step; less in the first steps.
         bfloat16: run convolutions in bfloat16, weights stay in float32. About 1.5 times faster on processors with it.
-        validation: images and labels that are evaluated after every epoch.
         progress: called after every step.
 
     Raises:
         InputError: arguments that do not fit each other or are out of range.
     """
     truth = torch.as_tensor(labels).long()
-    _check(images, truth, classes, epochs, batch_size, lr, label_smoothing)
+    _check(images, truth, classes, epochs, batch_size, lr)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         net = build(classes)
         average = _Average(net, average_decay)
         generator = torch.Generator().manual_seed(seed + 1)
-        loop = _Loop(
-            net, average, images, truth, generator, augmentation or Augmentation(), lr, label_smoothing, bfloat16
-        )
-        history = [
-            loop.epoch(number, epochs, batch_size, validation, progress or (lambda _: None)) for number in range(epochs)
-        ]
-    return Trained({key: value.detach().clone() for key, value in average.net.state_dict().items()}, tuple(history))
+        loop = _Loop(net, average, images, truth, generator, augmentation or Augmentation(), lr, bfloat16)
+        for _ in range(epochs):
+            loop.epoch(epochs, batch_size, progress or (lambda _: None))
+    return {key: value.detach().clone() for key, value in average.net.state_dict().items()}
 
 
 class _Average:
@@ -131,11 +104,6 @@ class _Average:
             else:
                 old.copy_(new[key])
 
-    def __call__(self, images: Tensor) -> Tensor:
-        """Logits of images (n, H, W, 3) in [0, 1]."""
-        logits: Tensor = self.net(images.permute(0, 3, 1, 2))
-        return logits
-
 
 @dataclass
 class _Loop:
@@ -148,7 +116,6 @@ class _Loop:
     generator: torch.Generator
     augmentation: Augmentation
     lr: float
-    label_smoothing: float
     bfloat16: bool
     started: float = field(default_factory=time.perf_counter)
     step: int = 0
@@ -160,55 +127,39 @@ class _Loop:
         groups = [{"params": decayed, "weight_decay": WEIGHT_DECAY}, {"params": others, "weight_decay": 0.0}]
         self.optimiser = torch.optim.AdamW(groups, lr=self.lr)
 
-    def epoch(
-        self,
-        number: int,
-        epochs: int,
-        batch_size: int,
-        validation: tuple[Images, Sequence[int] | Tensor] | None,
-        progress: Callable[[TrainingState], None],
-    ) -> Epoch:
-        """Run one epoch and return what it did."""
-        begun = time.perf_counter()
+    def epoch(self, epochs: int, batch_size: int, progress: Callable[[TrainingState], None]) -> None:
+        """Run one epoch of so many."""
         per_epoch = len(self.labels) // batch_size
         steps = per_epoch * epochs
         order = torch.randperm(len(self.labels), generator=self.generator).numpy()
-        losses: list[float] = []
-        hits = 0
         for batch in range(per_epoch):
             # Ascending indices: a memory map is then read forwards.
             chosen = np.sort(order[batch * batch_size : (batch + 1) * batch_size])
             self._set_rate(schedule(self.step, steps))
-            loss, right = self._train_on(chosen)
-            losses.append(loss)
-            hits += right
+            loss = self._train_on(chosen)
             self.step += 1
             elapsed = time.perf_counter() - self.started
             left = elapsed / self.step * (steps - self.step)
-            progress(TrainingState(number, self.step, steps, loss, self.step * batch_size / elapsed, left))
-        checked = evaluate(self.average, *validation) if validation else None
-        seconds = time.perf_counter() - begun
-        rate = self.optimiser.param_groups[0]["lr"]
-        return Epoch(number, sum(losses) / len(losses), hits / (per_epoch * batch_size), rate, seconds, checked)
+            progress(TrainingState(self.step, steps, loss, left))
 
     def _set_rate(self, factor: float) -> None:
         for group in self.optimiser.param_groups:
             group["lr"] = self.lr * factor
 
-    def _train_on(self, indices: np.ndarray[tuple[int], np.dtype[np.int64]]) -> tuple[float, int]:
-        """Take one step; return the loss and the number of right answers."""
+    def _train_on(self, indices: np.ndarray[tuple[int], np.dtype[np.int64]]) -> float:
+        """Take one step; return the loss."""
         self.net.train()
         x = self.augmentation(as_floats(self.images, indices).permute(0, 3, 1, 2), self.generator)
         labels = self.labels[torch.from_numpy(indices)]
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.bfloat16):
             logits = self.net(x).float()
-        loss = F.cross_entropy(logits, labels, label_smoothing=self.label_smoothing)
+        loss = F.cross_entropy(logits, labels, label_smoothing=LABEL_SMOOTHING)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         nn.utils.clip_grad_norm_(self.net.parameters(), LARGEST_GRADIENT_NORM)
         self.optimiser.step()
         self.average.update(self.net)
-        return float(loss.detach()), int((logits.detach().argmax(dim=1) == labels).sum())
+        return float(loss.detach())
 
 
 def schedule(step: int, steps: int) -> float:
@@ -219,9 +170,7 @@ def schedule(step: int, steps: int) -> float:
     return 0.5 * (1.0 + math.cos(math.pi * (step - warm + 1) / max(1, steps - warm)))
 
 
-def _check(
-    images: Images, labels: Tensor, classes: int, epochs: int, batch_size: int, lr: float, label_smoothing: float
-) -> None:
+def _check(images: Images, labels: Tensor, classes: int, epochs: int, batch_size: int, lr: float) -> None:
     if str(images.dtype).removeprefix("torch.") != "uint8" or len(images.shape) != 4 or images.shape[3] != 3:
         raise InputError(f"images: expected 8-bit images (N, H, W, 3), got {images.dtype} {tuple(images.shape)}")
     if labels.shape != (len(images),):
@@ -234,5 +183,3 @@ def _check(
         raise InputError(f"epochs: expected at least 1, got {epochs}")
     if not (math.isfinite(lr) and lr > 0):
         raise InputError(f"lr: expected a finite number greater than 0, got {lr}")
-    if not 0 <= label_smoothing <= 0.05:
-        raise InputError(f"label_smoothing: expected 0 to 0.05 (more would cap the confidence), got {label_smoothing}")

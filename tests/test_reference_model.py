@@ -1,0 +1,132 @@
+"""What makes the reference model: its training, its augmentation and the figures that are kept of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import reference_calibration as calibration
+import reference_training as training
+import torch
+from reference_augmentation import Augmentation
+from torch import Tensor
+
+from advsearch.errors import InputError
+from advsearch.models import reference
+
+
+def images(count: int = 2, height: int = 8, width: int = 8, seed: int = 0) -> Tensor:
+    return torch.rand((count, height, width, 3), generator=torch.Generator().manual_seed(seed))
+
+
+def _coloured(count: int, size: int = 32) -> tuple[Tensor, Tensor]:
+    """Images whose class is the channel that is brightest, with noise: learnt in a few steps."""
+    generator = torch.Generator().manual_seed(0)
+    labels = torch.randint(0, 3, (count,), generator=generator)
+    values = 60 + 60 * torch.rand((count, size, size, 3), generator=generator)
+    values[torch.arange(count), :, :, labels] += 90
+    return values.to(torch.uint8), labels
+
+
+def test_training_learns_and_repeats_bit_for_bit() -> None:
+    data, labels = _coloured(64)
+    plain = Augmentation(colour=0.02, brightness=0.05, contrast=0.1, cutout=0.1)
+    told: list[training.TrainingState] = []
+    state = torch.random.get_rng_state()
+
+    def run(array: Any) -> dict[str, Tensor]:
+        return training.train(
+            array, labels, classes=3, epochs=4, batch_size=16, lr=4e-3, seed=5, augmentation=plain, average_decay=0.8,
+            bfloat16=False, progress=told.append,
+        )  # fmt: skip
+
+    first, second = run(data), run(data.numpy())
+    assert torch.equal(state, torch.random.get_rng_state())
+    assert all(torch.equal(value, second[key]) for key, value in first.items())
+    net = reference.build(3).eval()
+    net.load_state_dict(first)
+    assert calibration.evaluate(lambda x: net(x.permute(0, 3, 1, 2)), data, labels).accuracy > 0.95
+    assert told[15].loss < told[0].loss
+    assert len(told) == 32 and told[15].step == told[15].steps == 16 and told[15].seconds_left == 0.0
+
+
+def test_training_in_bfloat16_runs() -> None:
+    data, labels = _coloured(8)
+    state = training.train(data, labels, classes=3, epochs=1, batch_size=4)
+    assert all(torch.isfinite(value).all() for value in state.values())
+    assert state["head.weight"].dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    "changed, message",
+    [
+        ({"batch_size": 100}, r"batch_size: expected 2 to 8 \(the number of images\), got 100"),
+        ({"epochs": 0}, "epochs: expected at least 1, got 0"),
+        ({"lr": float("nan")}, "lr: expected a finite number"),
+        ({"classes": 2}, "labels: expected class indices from 0 to 1"),
+        ({"labels": [0]}, "labels: expected one for each of 8 images"),
+        ({"images": torch.zeros(8, 3, 32, 32)}, "images: expected 8-bit images"),
+    ],
+)
+def test_training_arguments(changed: dict[str, Any], message: str) -> None:
+    data, labels = _coloured(8)
+    arguments = {"images": data, "labels": labels, "classes": 3, "epochs": 1, "batch_size": 4, **changed}
+    with pytest.raises(InputError, match=message):
+        training.train(arguments.pop("images"), arguments.pop("labels"), **arguments)
+
+
+def test_schedule_warms_up_and_ends_at_zero() -> None:
+    factors = [training.schedule(step, 100) for step in range(100)]
+    assert factors[:5] == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0]) and factors[-1] == pytest.approx(0.0)
+    assert max(factors) == 1.0 and factors[4:] == sorted(factors[4:], reverse=True)
+
+
+def test_augmentation_is_seeded_bounded_and_leaves_its_input_alone() -> None:
+    batch = images(32, 24, 24).permute(0, 3, 1, 2)
+    before = batch.clone()
+    generator = torch.Generator()
+    first = Augmentation()(batch, generator.manual_seed(1))
+    assert torch.equal(batch, before) and first.shape == batch.shape
+    assert float(first.min()) >= 0.0 and float(first.max()) <= 1.0
+    assert torch.equal(first, Augmentation()(batch, generator.manual_seed(1)))
+    assert not torch.equal(first, Augmentation()(batch, generator.manual_seed(2)))
+    still = Augmentation(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    torch.testing.assert_close(still(batch, generator), batch, rtol=0, atol=1e-5)
+    mirrored = Augmentation(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)(batch, generator)
+    torch.testing.assert_close(mirrored, batch.flip(3), rtol=0, atol=1e-5)
+
+
+def test_figures_of_known_answers() -> None:
+    logits = torch.tensor([[2.0, 0.0], [2.0, 0.0], [0.0, 2.0], [0.0, 2.0]])
+    got = calibration.report(logits, [0, 1, 1, 1], bins=10)
+    confidence = float(torch.tensor([2.0, 0.0]).softmax(0)[0])
+    assert got.accuracy == 0.75 and got.per_class == pytest.approx((1.0, 2 / 3))
+    assert got.confusion == ((1, 0), (1, 2))
+    assert got.confidence == pytest.approx(confidence) and got.error == pytest.approx(confidence - 0.75)
+    assert [b.count for b in got.bins] == [0] * 8 + [4, 0]
+
+
+def test_evaluate_asks_for_float_images_in_batches() -> None:
+    data, labels = _coloured(7)
+    seen: list[tuple[int, ...]] = []
+
+    def brightest(x: Tensor) -> Tensor:
+        seen.append(tuple(x.shape))
+        assert x.dtype == torch.float32 and float(x.max()) <= 1.0
+        return 50 * x.mean(dim=(1, 2))
+
+    assert calibration.evaluate(brightest, data.numpy(), labels, batch_size=4).accuracy == 1.0
+    assert seen == [(4, 32, 32, 3), (3, 32, 32, 3)]
+    with pytest.raises(InputError, match=r"images: expected 8-bit images"):
+        calibration.evaluate(brightest, data.float(), labels)
+    with pytest.raises(InputError, match=r"labels: expected one class index for each of 7 images"):
+        calibration.evaluate(brightest, data, labels[:3])
+
+
+@pytest.mark.parametrize("temperature", [0.5, 1.0, 3.0])
+def test_temperature_is_recovered(temperature: float) -> None:
+    generator = torch.Generator().manual_seed(0)
+    logits = 2 * torch.randn((20_000, 4), generator=generator)
+    labels = torch.multinomial(logits.softmax(1), 1, generator=generator)[:, 0]
+    # 20,000 samples leave about 1.5 % of sampling error
+    assert calibration.fit_temperature(logits * temperature, labels) == pytest.approx(temperature, rel=0.06)
