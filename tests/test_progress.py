@@ -17,8 +17,7 @@ from advsearch.api.plan import plan
 from advsearch.api.precision import precision
 from advsearch.api.region import region_from_config
 from advsearch.api.sweep import resume_sweep, sweep_from_config
-from advsearch.attacks import make_policy
-from advsearch.attacks.region import grow
+from advsearch.attacks import make_policy, region
 from advsearch.attacks.sample_count import choose_spp, most_samples
 from advsearch.cli.flags import with_flags
 from advsearch.cli.plan import answer as plan_text
@@ -146,10 +145,18 @@ def test_samples_of_the_ladder_have_a_bound() -> None:
     assert not count.converged and spent == most_samples(2) == 2 * 8 * 340
 
 
-def test_growing_a_box_tells_its_parts() -> None:
-    told: list[str] = []
-    grow(lambda u, number: bool(u.sum() < 1.2), torch.full((2,), 0.5), seed=0, samples=20, on_part=told.append)
-    assert told[:6] == ["level"] * 6 and set(told[6:]) == {"check"} and len(told) <= 10
+@pytest.mark.parametrize("most", [region.MOST_PROBED, 60])
+def test_the_pictures_of_growing_a_box_have_a_bound(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    generator, pictures, checked = torch.Generator().manual_seed(0), 0, list[int]()
+
+    def same(u: torch.Tensor, number: int) -> bool:
+        nonlocal pictures
+        pictures += 1
+        return float(u.mean()) + 0.05 * float(torch.randn((), generator=generator)) < 0.6
+
+    monkeypatch.setattr(region, "MOST_PROBED", most)
+    region.grow(same, torch.full((3,), 0.5), seed=0, samples=20, on_check=lambda: checked.append(pictures))
+    assert 100 < checked[0] <= 3 * most and 1 <= len(checked) <= region.ATTEMPTS
 
 
 # ---- with the renderer ----------------------------------------------------------------------------------------------

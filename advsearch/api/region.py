@@ -13,7 +13,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.attacks import make_policy
-from advsearch.attacks.region import ATTEMPTS, LEVELS, Part, Region, grow
+from advsearch.attacks.region import ATTEMPTS, MOST_PROBED, Region, grow
 from advsearch.config import AttackConfig, RegionConfig, SceneConfig
 from advsearch.engine.budget import RenderBudget, verification_ladder
 from advsearch.engine.memory import ANSWER, Memory
@@ -150,29 +150,25 @@ def _found(attack: Attack, config: RegionConfig, varied: Varied, centre: Tensor,
         u[varied.places] = values
         return u
 
-    hint = f"in rounds, pictures of {spp} samples a pixel; fewer parameters in `vary` or `verify_spp` shorten it"
-    stages.begin("search", "growing the box", LEVELS, hint=hint)
-    checks = 0
+    hint = f"pictures of {spp} samples a pixel; fewer parameters in `vary` or `verify_spp` shorten it"
+    stages.begin("search", "growing the box", MOST_PROBED * len(varied.names), hint=hint, at_most=True)
+    checking = False
 
-    def on_part(part: Part) -> None:
-        nonlocal checks
-        if part == "level":
-            stages.progress.advance(1)
-            return
-        if checks == 0:
+    def on_check() -> None:
+        nonlocal checking
+        if not checking:
             most = ATTEMPTS * config.samples
             hint = f"{config.samples} pictures, and as many again where one is an exception; `samples` shortens it"
             stages.begin("search", "checking the box with fresh samples", most, hint=hint, at_most=True)
-        checks += 1
+        checking = True
 
     def same(values: Tensor, number: int) -> bool:
         trial = attack.one_trial("region", number, at(values))
-        if checks:
-            stages.progress.advance(1)
+        stages.progress.advance(1)
         return trial.success == verdict
 
     seed = seeds.stream(config.seed, "region")
-    found = grow(same, centre[varied.places], seed=seed, samples=config.samples, on_part=on_part)
+    found = grow(same, centre[varied.places], seed=seed, samples=config.samples, on_check=on_check)
     box = _box(problem, found, at, varied)
     return {
         "verdict": "wrong" if verdict else "right",

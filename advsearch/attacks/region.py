@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -58,8 +57,10 @@ class Region:
 
 LEVELS, ATTEMPTS = 6, 4
 """How often the step of the faces is halved, and final checks at most."""
-
-Part = Literal["level", "check"]
+PROBES = 8
+"""Random points at which what a face would win is probed."""
+MOST_PROBED = 400
+"""Pictures of growing at most, for each parameter: more than twice what boxes, balls, planes and noise have taken."""
 
 
 def grow(
@@ -68,17 +69,18 @@ def grow(
     *,
     seed: int,
     samples: int = 200,
-    probes: int = 8,
+    probes: int = PROBES,
     levels: int = LEVELS,
     attempts: int = ATTEMPTS,
-    on_part: Callable[[Part], None] = lambda part: None,
+    on_check: Callable[[], None] = lambda: None,
 ) -> Region:
     """Grow a box around the centre, then check it with samples that nothing was fitted to.
 
     Each face in turn tries to move out by a share of what is left to the bound (1/2 at first, halved at every level at
     which no face can move any more). The slab that it would win is probed at random points; if all have the centre's
-    answer, it moves. Then the box is sampled; on an exception, the face that cuts off the least of the box moves in to
-    it and the box is sampled anew, with other seeds, `attempts` times at most.
+    answer, it moves. Growing ends after `MOST_PROBED` pictures for each parameter at the latest. Then the box is
+    sampled; on an exception, the face that cuts off the least of the box moves in to it and the box is sampled anew,
+    with other seeds, `attempts` times at most.
 
     Args:
         same: judges a configuration.
@@ -88,7 +90,7 @@ def grow(
         probes: of a slab.
         levels: how often the step of the faces is halved.
         attempts: final checks at most; the last one counts whatever it shows.
-        on_part: told the end of each of the levels, and the beginning of each final check.
+        on_check: told the beginning of each final check.
 
     Raises:
         InputError: the centre is not in the unit box, or samples is under 1.
@@ -99,14 +101,14 @@ def grow(
         raise InputError("the centre of a region has to lie inside the ranges of its parameters")
     judge = _Judge(same, seed)
     low, high = centre.clone(), centre.clone()
-    share = 0.5
+    share, faces = 0.5, range(2 * centre.numel())
+    last = MOST_PROBED * centre.numel() - len(faces) * probes
     for _ in range(levels):
-        while any([_push(judge, low, high, face, share, probes) for face in range(2 * centre.numel())]):
+        while judge.count <= last and any([_push(judge, low, high, face, share, probes) for face in faces]):
             pass
         share /= 2.0
-        on_part("level")
     for attempt in range(attempts):
-        on_part("check")
+        on_check()
         points = judge.points(low, high, samples)
         wrong = points[[not judge(point) for point in points]]
         if len(wrong) == 0 or attempt == attempts - 1:

@@ -115,7 +115,6 @@ class Rendering:
             task=self.task,
             spp=self.spp,
             image_formation=Formation.of(self.formation),
-            gain=self.formation.gain,
             up=None if self.scene.object.up is None else MeshUp.of(self.scene.object.up),
             views=[ViewAnswers.of(view) for view in self.views],
             warnings=list(warnings),

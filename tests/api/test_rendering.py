@@ -41,6 +41,7 @@ def test_a_picture_and_the_five_first_answers(tmp_path: Path, capsys: pytest.Cap
     png, exr = tmp_path / "new" / "a.png", tmp_path / "a.exr"
     found = render(capsys, "--object", "mug", "--out", str(png))
     assert (found["out"], found["size"], found["object"]) == (str(png), [16, 16], "mug")
+    assert found["image_formation"]["gain"] > 0.0 and not found.keys() & found["image_formation"].keys()
     (view,) = found["views"]
     answers = view["answers"]
     model = advsearch.load_model("reference")

@@ -44,7 +44,6 @@ class RenderResult(Result):
     task: str = Field(description="what judges the answers")
     spp: int = Field(description="samples a pixel")
     image_formation: Formation
-    gain: float = Field(description="as in `image_formation`")
     up: MeshUp | None = Field(description="null for an object without a mesh file")
     views: list[ViewAnswers]
     warnings: list[str] = Field(description="sentences that a reader has to know")
