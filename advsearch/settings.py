@@ -39,6 +39,10 @@ FILES = ("object", "environment", "model", "labels")
 """The settings that may name files."""
 
 
+NAMED = ("policy", "task")
+"""The settings that are a name, or a `name` with options."""
+
+
 class SettingsError(InputError):
     """One or more settings have values that are not allowed.
 
@@ -398,7 +402,7 @@ def _put(data: dict[str, Any], name: str, value: Any) -> None:
     if isinstance(inner, list):
         inner = {key: None for key in inner}
     elif isinstance(inner, str):
-        inner = {"name": inner} if first == "policy" else {inner: None}
+        inner = {"name": inner} if first in NAMED else {inner: None}
     else:
         inner = dict(inner) if isinstance(inner, dict) else {}
     if first in ("set", "grid"):
@@ -461,7 +465,7 @@ def _as_flags(setting: Setting, value: Any) -> list[str]:
     if setting.field == "epsilon" and isinstance(value, (dict, tuple)):
         pairs = [f"{name}={_number(given)}" for name, given in value.items()] if isinstance(value, dict) else value
         return [setting.flag, ",".join(str(one) for one in pairs)]
-    if setting.field == "policy" and isinstance(value, dict):
+    if setting.field in NAMED and isinstance(value, dict):
         options = {name: given for name, given in value.items() if name != "name"}
         return [setting.flag, f"{value['name']}={_flow(options)}"]
     if setting.field == "resolution":

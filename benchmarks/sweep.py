@@ -146,7 +146,7 @@ def job_of(config: SweepConfig, model) -> Job:  # type: ignore[no-untyped-def]
     return Job(
         object="mug",
         environment="studio",
-        task=config.task,
+        task=config.task_name,
         label=None,
         pictures=PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed),
         spp=config.search_spp,

@@ -402,7 +402,7 @@ def check_names(config: Config) -> None:
         make_policy(config.policy_name, **config.policy_options)
         check_objective(
             config.objective or make_task(config.task).objective,
-            config.task,
+            config.task_name,
             targeted=config.target is not None,
             minimise=config.minimise,
         )

@@ -143,6 +143,10 @@ def test_its_task_is_searched_swept_and_rendered(installed: Path, tmp_path: Path
     assert (swept["task"], swept["correct"], swept["configurations"]) == ("fading", 2, 3)
     assert swept["worst"]["values"]["fade.amount"]["value"] == 1.0 and swept["worst"]["label_set"] == ["1.0"]
 
+    wide = [word.replace("fading", "fading={tolerance: 2}") for word in sweep]
+    swept = advsearch(installed, *wide, "--overwrite")
+    assert (swept["task"], swept["correct"]) == ("fading", 3) and "'fading={tolerance: 2}'" in swept["command_line"]
+
     picture = ["render", *given, "--control", "fade={amount: 0.4}", "--out", str(tmp_path / "mug.png")]
     (view,) = advsearch(installed, *picture)["views"]
     assert view["answers"][0]["probability"] is None and 0.3 < float(view["answers"][0]["label"].split()[0]) < 0.5

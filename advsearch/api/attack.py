@@ -33,12 +33,13 @@ from advsearch.engine.stages import Attack
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.models.features import features_of
+from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import CONFIG, RunDirectory, check_free, find_run, is_run, run_path
 from advsearch.scene.leaving_out import EVERYTHING, NOTHING
 from advsearch.scene.mitsuba_backend.samplers import next_count
 from advsearch.scene.renderer import Renderer
-from advsearch.tasks import Task, make_task
+from advsearch.tasks import AnyTask, Task, make_task
 
 OVER_CONDITIONS = {"momentum": 0.9, "step_size": 0.2}
 """Options of `pgd` where conditions vary."""
@@ -58,7 +59,7 @@ def attack(
     scene: Scene | str | Path,
     model: Model | nn.Module | str | Path = "reference",
     *,
-    task: str | Task = "classification",
+    task: AnyTask = "classification",
     controls: Controls = ("texture",),
     objective: str | Callable[..., Tensor] | None = None,
     policy: str | Policy[Any] = "auto",
@@ -103,7 +104,7 @@ def attack(
     Args:
         scene: from `load_scene`, or what that takes.
         model: from `load_model`, or what that takes.
-        task: what judges the model's output: a name, or an instance with options of its own.
+        task: what judges the model's output: a name, a mapping with a `name` and options, or an instance.
         controls: what may vary: names, instances, or a mapping from names to settings.
         objective: "margin", "log_odds", "cross_entropy", "dlr", "feature_distance", "score", or a function of (output,
             images (N, H, W, 3), truth, or the target where there is one) that returns (N,) values, which are maximised;
@@ -131,7 +132,7 @@ def attack(
         "model": model if isinstance(model, str) else getattr(model, "name", None) or type(model).__name__,
         "controls": settings_of(controls),
         "over": settings_of(over),
-        "task": task if isinstance(task, str) else task.name,
+        "task": as_setting(task) if isinstance(task, Task) else task,
         "objective": getattr(objective, "__name__", "custom") if callable(objective) else objective,
         "policy": policy if isinstance(policy, str) else policy.name,
         "set": _set_by(scene, options),
@@ -252,7 +253,7 @@ Wanted = str | Callable[..., Tensor]
 """An objective: its name, or the user's own function."""
 
 
-def _asked(config: AttackConfig, task: str | Task, objective: Wanted | None) -> tuple[Task, Wanted]:
+def _asked(config: AttackConfig, task: AnyTask, objective: Wanted | None) -> tuple[Task, Wanted]:
     """The task, and the objective that was asked for or else the task's own, checked before anything is loaded."""
     made = make_task(task)
     wanted = made.objective if objective is None else objective

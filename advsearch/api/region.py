@@ -63,7 +63,7 @@ def region(
     resolution: int | str | tuple[int, int] | None = None,
     labels: str | Path | None = None,
     label: str | int | Sequence[str] | None = None,
-    task: str = "classification",
+    task: str | Mapping[str, object] = "classification",
     controls: Named = "texture",
     texture_resolution: int | None = None,
     spp: int | Literal["auto"] | None = None,

@@ -20,13 +20,14 @@ from advsearch.engine.sweeps.job import Job, Place, check_scenes
 from advsearch.engine.sweeps.loop import SweepResult, carry_out
 from advsearch.errors import InputError
 from advsearch.models import Model
+from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import CONFIG, RunDirectory, check_free, find_run, is_run, run_path
 from advsearch.runs.listing import finished
 from advsearch.scene.description import NO_MAP
 from advsearch.scene.mitsuba_backend.samplers import next_count
 from advsearch.settings import split_names
-from advsearch.tasks import Task, make_task
+from advsearch.tasks import AnyTask, Task, make_task
 
 SAMPLES = 100
 """Draws where there is no grid and nothing is said."""
@@ -40,7 +41,7 @@ def sweep(
     model: AnyModel | Sequence[AnyModel] = "reference",
     grid: Mapping[str, Any] | None = None,
     *,
-    task: str | Task = "classification",
+    task: AnyTask = "classification",
     samples: int | None = None,
     controls: Controls = (),
     run: str | Path | None = None,
@@ -72,7 +73,7 @@ def sweep(
     Args:
         scene: from `load_scene`, or what that takes; or several.
         model: from `load_model`, or what that takes; or several, which are shown the same pictures.
-        task: what judges the models' outputs: a name, or an instance with options of its own.
+        task: what judges the models' outputs: a name, a mapping with a `name` and options, or an instance.
         grid: parameter to its values: a list, a range, or "FIRST:LAST:COUNT".
         samples: draws of `controls` at each point of the grid; by default 1, or 100 without a grid.
         controls: what is drawn by chance, as for `attack`.
@@ -92,7 +93,7 @@ def sweep(
         raise InputError("scene: expected scenes from load_scene or names of objects, got some of each")
     described: dict[str, Any] = {
         "model": ",".join(_model_name(one) for one in networks),
-        "task": task if isinstance(task, str) else task.name,
+        "task": as_setting(task) if isinstance(task, Task) else task,
         "controls": settings_of(controls),
         "grid": dict(grid or {}),
         "samples": samples,
@@ -179,7 +180,7 @@ def _job_of(config: SweepConfig) -> Job:
 
 
 def _job(
-    config: SweepConfig, places: Sequence[Place], models: Sequence[AnyModel], task: str | Task, controls: Controls
+    config: SweepConfig, places: Sequence[Place], models: Sequence[AnyModel], task: AnyTask, controls: Controls
 ) -> Job:
     shared = RunSettings(texture_resolution=config.texture_resolution)
     shared.check(config.controls)
@@ -207,7 +208,7 @@ def _job(
     return Job(
         object=config.object,
         environment=config.lit_by,
-        task=config.task,
+        task=config.task_name,
         label=config.label,
         pictures=PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed),
         spp=next_count(config.pixel_sampler, config.search_spp),

@@ -1,4 +1,4 @@
-"""`advsearch show`: what a run found, or what a control can vary."""
+"""`advsearch show`: what a run found, what a control can vary, or the options of a policy or a task."""
 
 from __future__ import annotations
 
@@ -12,29 +12,34 @@ from advsearch.errors import InputError, UnknownNameError
 if TYPE_CHECKING:
     from advsearch.runs.listing import Listed
 
-HELP = "show what a run found, or the parameters of a control"
+HELP = "show what a run found, the parameters of a control, or the options of a policy or a task"
 
 
 def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
         "show",
-        usage="advsearch show [--json] RUN | control NAME",
+        usage="advsearch show [--json] RUN | control NAME | policy NAME | task NAME",
         help=HELP,
         description=HELP[0].upper() + HELP[1:] + ".",
     )
-    parser.add_argument("what", nargs="+", metavar="WHAT", help="a run's name or folder; or: control NAME")
+    parser.add_argument(
+        "what", nargs="+", metavar="WHAT", help="a run's name or folder; or: control NAME, policy NAME, task NAME"
+    )
     output.add_flags(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the answer of a run, or a control's parameters."""
+    """Print the answer of a run, a control's parameters, or the options of a policy or a task."""
     match args.what:
         case ["control", name]:
             return _show_control(name, args.json)
+        case ["policy" | "task" as kind, name]:
+            return _show_options(kind, name, args.json)
         case [name]:
             return show_run(name, args.json)
-    raise InputError(f"expected the name of a run, or: control NAME, got {' '.join(args.what)!r}")
+    kinds = "control NAME, policy NAME, task NAME"
+    raise InputError(f"expected the name of a run, or one of {kinds}, got {' '.join(args.what)!r}")
 
 
 def show_run(name: str, as_json: bool) -> int:
@@ -101,6 +106,34 @@ def _show_control(name: str, as_json: bool) -> int:
     for heading, declared in (("parameters, searched or fixed", parameters), ("settings, chosen", choices)):
         if declared:
             print(f"\n{heading}:\n{_table([_short(one) for one in declared])}")
+    return 0
+
+
+def _show_options(kind: str, name: str, as_json: bool) -> int:
+    from advsearch.cli.progress import at_work
+
+    with at_work(as_json=True, quiet=False):
+        from advsearch.attacks import POLICIES
+        from advsearch.cli.list import first_line
+        from advsearch.options import default_of, options_of, type_of
+        from advsearch.runs.results.base import plain
+        from advsearch.tasks import TASKS
+
+    registry: Mapping[str, type[Any]] = POLICIES if kind == "policy" else TASKS
+    if name not in registry:
+        raise UnknownNameError(kind, name, registry)
+    entry = registry[name]
+    declared = [
+        {"name": option, "type": type_of(one), "default": plain(getattr(default_of(one), "name", default_of(one)))}
+        for option, one in options_of(entry).items()
+    ]
+    if as_json:
+        output.print_json({"schema": 1, kind: name, "options": declared})
+        return 0
+    print(f"{name}: {first_line(entry)}\n")
+    print(
+        f"options, as in --{kind} '{name}={{OPTION: VALUE}}':\n{_table(declared)}" if declared else "It has no options."
+    )
     return 0
 
 

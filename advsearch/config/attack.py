@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator, model_validator
 
+from advsearch.config.named import name_in, read_named
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import Clash, check_once, parse_assignment, setting
 
@@ -214,21 +215,17 @@ class AttackConfig(SceneConfig):
     @classmethod
     def _policy_with_steps(cls, data: Any) -> Any:
         """Accept ``policy: {name: pgd, steps: 80, momentum: 0.9}``, ``pgd={momentum: 0.9}`` and a name."""
-        policy = data.get("policy")
-        if isinstance(policy, str) and "=" in policy:
-            name, options = parse_assignment(policy, "policy")
-            policy = {"name": name, **(options if isinstance(options, Mapping) else {"": options})}
+        policy = read_named(data.get("policy"), "policy", "auto")
         if not isinstance(policy, Mapping):
-            return data
-        options = dict(policy)
-        steps = {"steps": options.pop("steps")} if "steps" in options else {}
-        name = options.pop("name", "auto")
-        return {**data, **steps, "policy": {"name": name, **options} if options else name}
+            return data if policy is None else {**data, "policy": policy}
+        steps = {"steps": policy["steps"]} if "steps" in policy else {}
+        rest = {option: value for option, value in policy.items() if option != "steps"}
+        return {**data, **steps, "policy": read_named(rest, "policy", "auto")}
 
     @property
     def policy_name(self) -> str:
         """Name of the policy."""
-        return self.policy if isinstance(self.policy, str) else str(self.policy["name"])
+        return name_in(self.policy)
 
     @property
     def policy_options(self) -> dict[str, Any]:

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from pydantic import field_validator, model_validator
+from pydantic import JsonValue, field_validator, model_validator
 
+from advsearch.config.named import name_in, read_named
 from advsearch.errors import InputError
 from advsearch.settings import Clash, Config, check_once, number_or_text, setting, split_names
 
@@ -97,8 +98,11 @@ class SceneConfig(Config):
         "a JSON or text file, imagenet, cifar10, cifar100, coco, coco91 or voc",
         otherwise="the model's own",
     )
-    task: str = setting(
-        "classification", "model", "what the model is to do, and how it is judged", "the name of a task"
+    task: str | dict[str, JsonValue] = setting(
+        "classification",
+        "model",
+        "what the model is to do, and how it is judged",
+        "the name of a task, or NAME={OPTION: VALUE}",
     )
     label: str | None = setting(
         None,
@@ -177,6 +181,11 @@ class SceneConfig(Config):
         return self.object, *self.controls
 
     @property
+    def task_name(self) -> str:
+        """Name of the task."""
+        return name_in(self.task)
+
+    @property
     def used_threads(self) -> int | None:
         """Processor threads that are taken; None for all."""
         return 1 if self.deterministic else self.threads
@@ -231,6 +240,12 @@ class SceneConfig(Config):
         if isinstance(text, str) and (not text.strip(" ,\t\n") or "\0" in text):
             raise ValueError("an empty name")
         return text
+
+    @field_validator("task", mode="before")
+    @classmethod
+    def _task_with_options(cls, value: Any) -> Any:
+        """Accept ``{name: yaw, tolerance: 5}``, ``yaw={tolerance: 5}`` and a name."""
+        return read_named(value, "task", cls.model_fields["task"].default)
 
     @field_validator("spp")
     @classmethod

@@ -26,7 +26,7 @@ from advsearch.runs.results.render import MeshUp, RenderResult, ViewAnswers
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import ImageFormation, to_8_bit
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER
-from advsearch.tasks import Answer, Task, make_task
+from advsearch.tasks import Answer, AnyTask, make_task
 
 MOST_ANSWERS = 5
 """Answers of the model that are kept of a picture."""
@@ -125,7 +125,7 @@ def render(
     scene: Scene | str | Path,
     model: Model | nn.Module | str | Path = "reference",
     *,
-    task: str | Task = "classification",
+    task: AnyTask = "classification",
     controls: Controls = (),
     around: int | None = None,
     resolution: int | tuple[int, int] | None = None,
@@ -140,7 +140,7 @@ def render(
     Args:
         scene: from `load_scene`, or what that takes.
         model: from `load_model`, or what that takes.
-        task: what says the model's answers: a name, or an instance.
+        task: what says the model's answers: a name, a mapping with a `name` and options, or an instance.
         controls: what differs from the scene: names, instances, or a mapping from names to settings. A parameter with
             a range stays where a search would start.
         around: number of views, from azimuths all around the object; None for one, from the scene's own camera.

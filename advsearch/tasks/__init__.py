@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from advsearch.errors import UnknownNameError
+from advsearch.options import check_options
 from advsearch.registry import Registry
 from advsearch.tasks.base import Answer, Facts, Judgement, Task
 from advsearch.tasks.classification import Classification
@@ -16,17 +20,26 @@ TASKS: Registry[type[Task]] = Registry(
 """Every task that has a name."""
 
 
-def make_task(task: str | Task) -> Task:
-    """Return the task of that name with its own options, or the task itself.
+AnyTask = str | Mapping[str, object] | Task
+"""A task: its name, a mapping with its `name` and options, or the task itself."""
+
+
+def make_task(task: AnyTask) -> Task:
+    """Return the task of that name, of that `name` with these options, which are its dataclass's fields, or the task
+    itself.
 
     Raises:
-        UnknownNameError: no such name.
+        UnknownNameError: no such task, or it has no such option.
+        InputError: an option's value is of another type, or outside its range.
     """
     if isinstance(task, Task):
         return task
-    if task not in TASKS:
-        raise UnknownNameError("task", task, TASKS)
-    return TASKS[task]()
+    options: dict[str, Any] = {} if isinstance(task, str) else dict(task)
+    name = task if isinstance(task, str) else str(options.pop("name", Classification.name))
+    if name not in TASKS:
+        raise UnknownNameError("task", name, TASKS)
+    check_options("task", name, TASKS[name], options)
+    return TASKS[name](**options)
 
 
-__all__ = ["TASKS", "Answer", "Classification", "Facts", "Judgement", "Task", "make_task"]
+__all__ = ["TASKS", "Answer", "AnyTask", "Classification", "Facts", "Judgement", "Task", "make_task"]

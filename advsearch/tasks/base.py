@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar, TypeVar
 
@@ -19,6 +19,7 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
+from advsearch.options import FROM_RUN
 
 Output = Any
 """What a model answers to N pictures: a tensor (N, ...), or a list with one thing for each picture."""
@@ -137,7 +138,8 @@ class Facts:
 class Task(ABC):
     """How a model's output is judged against what is true of the scene. Write one by the three abstract methods.
 
-    A task is a dataclass; its fields are its options. `on` gives the one that a run works with.
+    A task is a dataclass; its fields are its options, but for those marked `FROM_RUN`: `on` gives the one that a run
+    works with.
 
     Attributes:
         minimise: success is a right answer: the object is to be made easier to recognise.
@@ -154,8 +156,8 @@ class Task(ABC):
     reads_logits: ClassVar[bool] = False
     varies: ClassVar[bool] = False
 
-    minimise: bool = False
-    target: Truth = None
+    minimise: bool = field(default=False, metadata=FROM_RUN)
+    target: Truth = field(default=None, metadata=FROM_RUN)
 
     # ---- what a task has to say -------------------------------------------------------------------------------------
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
 from advsearch.models import Model, find_label_set
+from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Answer, Facts, Task
 
 Labels = tuple[int, ...]
@@ -35,9 +36,9 @@ class Classification(Task):
     objective = "margin"
     reads_logits = True
 
-    labels: tuple[str, ...] = ()
-    named: bool = True
-    target: Labels | None = None
+    labels: tuple[str, ...] = field(default=(), metadata=FROM_RUN)
+    named: bool = field(default=True, metadata=FROM_RUN)
+    target: Labels | None = field(default=None, metadata=FROM_RUN)
 
     def __post_init__(self) -> None:
         if self.target is not None and self.minimise:

@@ -178,7 +178,7 @@ def test_no_command_prints_help_and_version_is_told(capsys: pytest.CaptureFixtur
         (["run"], "the following arguments are required: FILE"),
         (["run", "no.yaml"], "no.yaml: expected a YAML file, got No such file or directory; check the path"),
         (["show", "no-run"], "unknown run 'no-run'."),
-        (["show", "control", "a", "b"], "expected the name of a run, or: control NAME, got 'control a b'"),
+        (["show", "control", "a", "b"], "expected the name of a run, or one of control NAME, policy NAME, "),
         (["list", "cups"], "argument kind: invalid choice: 'cups'"),
     ],
 )  # fmt: skip

@@ -31,6 +31,7 @@ from advsearch.config import (
     StabilityConfig,
     SweepConfig,
 )
+from advsearch.config.scene import SceneConfig
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.settings import Config, all_finite, flag, parse_assignment, read_yaml, settings
 
@@ -47,7 +48,7 @@ WRONG: dict[str, tuple[Any, str]] = {
         "or package.module:callable",
     ),
     "labels": (True, "expected a JSON or text file, imagenet, "),
-    "task": ("  ", "expected the name of a task, got '  '"),
+    "task": ("  ", "expected the name of a task, or NAME={OPTION: VALUE}, got '  '"),
     "label": ("  ", "expected names of classes or their numbers, such as \"coffee mug,cup\" or #504, got '  '"),
     "controls": (
         {"texture": 3},
@@ -471,6 +472,22 @@ def test_a_policy_has_options_and_its_steps_are_the_runs(given: Any) -> None:
     config = AttackConfig(object="mug", policy=given)
     assert (config.policy_name, config.policy_options, config.steps) == ("pgd", {"momentum": 0.9}, 80)
     assert of_command_line(config.command_line()) == config
+
+
+@pytest.mark.parametrize("given", ["yaw={tolerance: 5}", {"name": "yaw", "tolerance": 5}])
+@pytest.mark.parametrize("config", [AttackConfig, SweepConfig, GapConfig, RegionConfig, RenderConfig])
+def test_a_task_has_options_as_a_policy_has(given: Any, config: type[SceneConfig], tmp_path: Path) -> None:
+    needed: dict[Any, dict[str, Any]] = {SweepConfig: {"grid": {"pose.yaw": [0, 1]}}, RenderConfig: {"out": "a.png"}}
+    own = needed.get(config, {})
+    made = config(object="mug", task=given, **own)
+    assert (made.task_name, made.task) == ("yaw", {"name": "yaw", "tolerance": 5})
+    (tmp_path / "run.yaml").write_text(made.to_yaml())
+    assert config.from_yaml(tmp_path / "run.yaml") == made
+    assert config.from_yaml(tmp_path / "run.yaml", {"task.tolerance": 7}).task == {"name": "yaw", "tolerance": 7}
+    assert made.deciding()["task"] == made.task, "a run with other options is not gone on with"
+    assert of_command_line(made.command_line(), config) == made
+    plain = config(object="mug", task="yaw={}", **own)
+    assert (plain.task_name, plain.task) == ("yaw", "yaw")
 
 
 @pytest.mark.parametrize(

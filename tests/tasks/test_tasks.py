@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,8 +16,11 @@ from torch import Tensor, nn
 
 import advsearch
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective, get_objective
+from advsearch.cli.main import main
+from advsearch.config import AttackConfig
 from advsearch.errors import InputError, ModelError, UnknownNameError
 from advsearch.models import load_model
+from advsearch.options import as_setting
 from advsearch.tasks import TASKS, Answer, Classification, Facts, Judgement, Task, make_task
 from advsearch.tasks.base import typical
 
@@ -199,3 +205,48 @@ def test_tasks_have_names() -> None:
     assert make_task(mine) is mine
     with pytest.raises(UnknownNameError, match="classification"):
         make_task("clasification")
+
+
+@pytest.fixture
+def named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`yaw` is the name of a task."""
+    monkeypatch.setattr(TASKS, "_own", {"classification": Classification, "yaw": Yaw})
+
+
+def test_a_task_is_made_with_options(named: None) -> None:
+    assert make_task("yaw") == make_task({"name": "yaw"}) == Yaw()
+    assert make_task({"name": "yaw", "tolerance": 5}) == Yaw(tolerance=5.0)
+    with pytest.raises(UnknownNameError, match=r"unknown option of task 'yaw': 'tolerence'. Did you mean 'tolerance'"):
+        make_task({"name": "yaw", "tolerence": 5})
+    with pytest.raises(InputError, match=r"tolerance of task yaw: expected a finite number .*, got 'wide'"):
+        make_task({"name": "yaw", "tolerance": "wide"})
+    for option in ("minimise", "target", "labels", "named"):
+        with pytest.raises(UnknownNameError, match="unknown option of task 'classification'"):
+            make_task({option: True})
+
+
+def test_options_are_shown_and_a_file_says_those_that_are_not_the_default(
+    named: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert as_setting(Yaw(tolerance=5.0)) == {"name": "yaw", "tolerance": 5.0}
+    assert as_setting(Yaw()) == as_setting(Yaw(minimise=True, tolerance=math.inf)) == "yaw"
+    assert main(["show", "task", "yaw", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["options"] == [{"name": "tolerance", "type": "float", "default": 10.0}]
+    assert main(["show", "policy", "restarts"]) == 0
+    shown = capsys.readouterr().out
+    assert "--policy 'restarts={OPTION: VALUE}'" in shown and re.search(r"policy +Policy\[Any\] +pgd", shown)
+    assert main(["show", "task", "classification"]) == 0
+    assert capsys.readouterr().out.endswith("It has no options.\n")
+    assert main(["show", "task", "yow"]) == 2
+    assert "unknown task 'yow'. Did you mean 'yaw'?" in capsys.readouterr().err
+
+
+def test_options_of_an_instance_are_kept_and_a_run_with_others_is_not_gone_on_with(named: None, tmp_path: Path) -> None:
+    network, run = load_model(Level(), input_size=8, read=Yaw().reader), tmp_path / "run"
+    given: dict[str, Any] = {"controls": {"pose": {"yaw": [0, 90]}}, "policy": "random", "steps": 2, "trials": 6}
+    given |= {"spp": 1, "denoise": "none", "resolution": 16, "verify_spp": 1, "measure": "no", "run": run}
+    advsearch.attack("mug", network, task={"name": "yaw", "tolerance": 1000}, **given)
+    assert AttackConfig.from_yaml(run / "run.yaml").task == {"name": "yaw", "tolerance": 1000}
+    with pytest.raises(InputError, match="task"):
+        advsearch.attack("mug", network, task=Yaw(tolerance=5.0), resume=True, **given)
+    assert main(["show", str(run)]) == 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from typing import Any
 
 from advsearch.attacks.policies.adam import Adam
@@ -20,6 +20,7 @@ from advsearch.attacks.policies.random import Random
 from advsearch.attacks.policies.restarts import Restarts
 from advsearch.attacks.policies.sobol import Sobol
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.options import check_options
 from advsearch.registry import Registry
 
 
@@ -68,11 +69,7 @@ def make_policy(name: str, **options: Any) -> Policy[Any]:
     if name not in POLICIES:
         raise UnknownNameError("policy", name, POLICIES)
     policy = POLICIES[name]
-    known = {field.name: str(getattr(field.type, "__name__", field.type)) for field in fields(policy)}  # type: ignore[arg-type]
-    for option, value in options.items():
-        if option not in known:
-            raise UnknownNameError(f"option of policy {name!r}:", option, known)
-        _check_type(f"{option} of policy {name}", known[option], value)
+    check_options("policy", name, policy, options)
     if options.get("policy") is not None:
         options["policy"] = _nested(options["policy"], f"policy of {name}")
     if "policies" in options:
@@ -81,22 +78,6 @@ def make_policy(name: str, **options: Any) -> Policy[Any]:
             given = [given]
         options["policies"] = tuple(_nested(one, f"policies of {name}") for one in given)
     return policy(**options)
-
-
-MOST = 1_000_000
-"""Of whatever a policy counts: no budget has more renders."""
-
-
-def _check_type(where: str, kind: str, value: Any) -> None:
-    """Refuse a value of another type than an option's field has; its range is the policy's own business."""
-    number = isinstance(value, (int, float)) and not isinstance(value, bool) and not abs(value) > MOST
-    wrong = {
-        "float": None if number else f"a finite number from {-MOST} to {MOST}",
-        "int": None if number and value % 1 == 0 else f"a whole number from {-MOST} to {MOST}",
-        "bool": None if isinstance(value, bool) else "true or false",
-    }.get(kind)
-    if wrong:
-        raise InputError(f"{where}: expected {wrong}, got {value!r:.80}")
 
 
 def _nested(spec: Spec, where: str) -> Policy[Any]:

@@ -1,0 +1,81 @@
+"""Options of what has a name on the command line, a policy or a task: the fields of its dataclass."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import MISSING, Field, fields
+from typing import Any
+
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.files import JsonValue
+
+FROM_RUN = {"set by": "the run"}
+"""Metadata of a field that is no option: what a run works with decides it."""
+
+MOST = 1_000_000
+"""Of whatever an option counts: no budget has more renders."""
+
+
+def options_of(kind: type[Any]) -> dict[str, Field[Any]]:
+    """Return the options of a dataclass by name."""
+    return {one.name: one for one in fields(kind) if one.init and one.metadata != FROM_RUN}
+
+
+def check_options(what: str, name: str, kind: type[Any], given: Mapping[str, object]) -> None:
+    """Check that there are such options, and that a number, a truth value or a text is one; ranges are theirs.
+
+    Args:
+        what: "policy", say.
+        name: of it.
+        kind: its dataclass.
+        given: option to value.
+
+    Raises:
+        UnknownNameError: there is no such option.
+        InputError: a value is of another type.
+    """
+    known = options_of(kind)
+    for option, value in given.items():
+        if option not in known:
+            raise UnknownNameError(f"option of {what} {name!r}:", option, known)
+        expected = _expected(type_of(known[option]), value)
+        if expected:
+            raise InputError(f"{option} of {what} {name}: expected {expected}, got {value!r:.80}")
+
+
+def type_of(option: Field[Any]) -> str:
+    """Return the type of an option as it is written."""
+    return str(getattr(option.type, "__name__", option.type))
+
+
+def default_of(option: Field[Any]) -> Any:
+    """Return what an option is by default; None where it has to be given."""
+    if option.default is not MISSING:
+        return option.default
+    return None if option.default_factory is MISSING else option.default_factory()
+
+
+def _expected(kind: str, value: object) -> str | None:
+    """What a value of a type should be, if it is not."""
+    number = isinstance(value, (int, float)) and not isinstance(value, bool) and not abs(value) > MOST
+    return {
+        "float": None if number else f"a finite number from {-MOST} to {MOST}",
+        "int": None if number and value % 1 == 0 else f"a whole number from {-MOST} to {MOST}",  # type: ignore[operator]
+        "bool": None if isinstance(value, bool) else "true or false",
+        "str": None if isinstance(value, str) else "a text",
+    }.get(kind)
+
+
+def as_setting(entry: Any) -> str | dict[str, JsonValue]:
+    """Return what a file says of a policy or a task: its name, with the options that differ from their defaults.
+
+    An option that is no finite number, truth value or text has no form there and is left out.
+    """
+    name, given = str(entry.name), {}
+    for option, declared in options_of(type(entry)).items():
+        value = getattr(entry, option)
+        plain = isinstance(value, (bool, int, str)) or (isinstance(value, float) and math.isfinite(value))
+        if plain and value != default_of(declared):
+            given[option] = value
+    return {"name": name, **given} if given else name
