@@ -17,7 +17,7 @@ from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import TOLERANCE, Domain
 from advsearch.attacks.ending import Ending
 from advsearch.attacks.evaluation import Evaluate, Evaluation, usable
-from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, affordable, answer_of
+from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, affordable
 from advsearch.attacks.policies.choices import with_choices
 from advsearch.errors import InputError
 from advsearch.seeds import stream
@@ -273,7 +273,7 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
             return Ending.NON_FINITE
         if log.renders < steps:
             state = policy.update(state, [(proposal.u, evaluation)])
-            log.answer, log.counts = partial(answer_of, policy, state), partial(policy.counts, state)
+            log.answer, log.counts = partial(policy.answer, state), partial(policy.counts, state)
         if late(len(log.records)):
             break
     return Ending.BUDGET_SPENT

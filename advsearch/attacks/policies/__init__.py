@@ -8,7 +8,7 @@ from typing import Any
 
 from advsearch.attacks.policies.adam import Adam
 from advsearch.attacks.policies.auto import Auto
-from advsearch.attacks.policies.base import Distributional, Evaluated, Policy, Proposal, answer_of, draw_seed, seeded
+from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.choices import Choices, with_choices
 from advsearch.attacks.policies.cmaes import CMAES
 from advsearch.attacks.policies.grid import Grid
@@ -99,7 +99,6 @@ __all__ = [
     "Adam",
     "Auto",
     "Choices",
-    "Distributional",
     "Evaluated",
     "Grid",
     "Halving",
@@ -110,7 +109,6 @@ __all__ = [
     "Restarts",
     "Sobol",
     "Spec",
-    "answer_of",
     "draw_seed",
     "make_policy",
     "seeded",

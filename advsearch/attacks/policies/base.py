@@ -129,18 +129,10 @@ class Policy(ABC, Generic[State]):
         """Return what the policy did about the evaluations so far; nothing where it takes them as they come."""
         return NO_COUNTS
 
-
-class Distributional(Policy[State]):
-    """A policy whose answer is, beside the best configuration it met, a distribution of them."""
-
-    @abstractmethod
     def answer(self, state: State) -> Distribution | None:
-        """Return the distribution that the search has reached, or None if there is none (yet)."""
-
-
-def answer_of(policy: Policy[State], state: State) -> Distribution | None:
-    """Return the distribution of any policy; None if it has none."""
-    return policy.answer(state) if isinstance(policy, Distributional) else None
+        """Return the distribution that the search has reached, where that is its answer beside the best configuration
+        that it met; None where there is none (yet)."""
+        return None
 
 
 def affordable(proposal: Proposal, domain: Domain, left: int) -> Proposal:

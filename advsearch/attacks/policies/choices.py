@@ -13,7 +13,7 @@ from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Block, Domain, centre_of_option
 from advsearch.attacks.evaluation import Evaluation
 from advsearch.attacks.policies import racing
-from advsearch.attacks.policies.base import Counts, Distributional, Evaluated, Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import Counts, Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.racing import Race, Runner
 from advsearch.attacks.policies.stay import Stay
 
@@ -47,7 +47,7 @@ class ChoicesState:
 
 
 @dataclass(frozen=True)
-class Choices(Distributional[ChoicesState]):
+class Choices(Policy[ChoicesState]):
     """Searches combinations of options outside and, with another policy, the numbers inside.
 
     Every combination of options has a search of its own over the numbers, and the combinations race: see `racing`, with

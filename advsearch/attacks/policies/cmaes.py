@@ -17,7 +17,7 @@ from torch import Tensor
 
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.policies.base import Distributional, Evaluated, Proposal, draw_seed, one_thread, seeded
+from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
 from advsearch.attacks.policies.scaling import half_widths, wraps
 from advsearch.errors import InputError
 from advsearch.seeds import stream
@@ -69,7 +69,7 @@ class CMAESState:
 
 
 @dataclass(frozen=True)
-class CMAES(Distributional[CMAESState]):
+class CMAES(Policy[CMAESState]):
     """CMA-ES (Hansen and Ostermeier 2001; Hansen 2016, "The CMA evolution strategy: a tutorial") as pycma has it.
 
     Each generation draws points from a normal distribution and moves its mean, its step size and its covariance towards

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.policies.base import Distributional, Evaluated, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.scaling import half_widths, wraps
 from advsearch.errors import InputError
 
@@ -46,7 +46,7 @@ class NESState:
 
 
 @dataclass(frozen=True)
-class NES(Distributional[NESState]):
+class NES(Policy[NESState]):
     """Separable natural evolution strategy (SNES; Wierstra, Schaul, Glasmachers, Sun, Peters and Schmidhuber 2014,
     "Natural evolution strategies", algorithm 6).
 

@@ -21,12 +21,10 @@ from advsearch.attacks.domain import Domain
 from advsearch.attacks.policies.base import (
     NO_COUNTS,
     Counts,
-    Distributional,
     Evaluated,
     Policy,
     Proposal,
     affordable,
-    answer_of,
     seeded,
 )
 
@@ -170,7 +168,7 @@ def leader(race: Race) -> int:
 def answer(race: Race) -> Distribution | None:
     """Return the leader's distribution, if it has one."""
     runner = race.runners[leader(race)]
-    return None if runner.state is None else answer_of(runner.policy, runner.state)
+    return None if runner.state is None else runner.policy.answer(runner.state)
 
 
 def counts(race: Race) -> Counts:
@@ -179,7 +177,7 @@ def counts(race: Race) -> Counts:
     return sum((runner.policy.counts(runner.state) for runner in begun), NO_COUNTS)
 
 
-class Raced(Distributional[Race]):
+class Raced(Policy[Race]):
     """A policy that is a race; its `start` lines it up."""
 
     def propose(self, state: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:

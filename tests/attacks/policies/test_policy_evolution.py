@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks import CMAES, NES, Block, Domain, Ending, Evaluation, Policy, Random, make_policy, search, seeded
-from advsearch.attacks.policies.base import answer_of
 from advsearch.attacks.policies.nes import WIDEST, utilities
 from advsearch.errors import InputError
 
@@ -218,8 +217,8 @@ def test_a_texture_takes_a_few_vectors_of_memory_only() -> None:
         state = policy.update(state, [(proposal.u, Evaluation(float(k), None, False))])
     own = [value for value in vars(state).values() if isinstance(value, Tensor)]
     assert sum(value.numel() for value in own) <= 4 * d
-    assert answer_of(policy, state) is not None
-    assert answer_of(Random(), Random().start(domain, seeded(0, 0), 1)) is None
+    assert policy.answer(state) is not None
+    assert Random().answer(Random().start(domain, seeded(0, 0), 1)) is None
 
 
 @pytest.mark.parametrize(
