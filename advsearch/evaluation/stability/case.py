@@ -6,17 +6,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-GROUPS: Mapping[str, str] = {
-    "radiometric": "light that is very strong, absent or impossible, and pictures at the ends of their range",
-    "materials": "surfaces at the ends of their range",
-    "geometry": "meshes, places and views that break naive code",
-    "objective": "what a model may answer: huge logits, ties, certainty, NaN, a constant, noise",
-    "stiff": "controls whose scales differ by a million",
-    "precision": "32-bit numbers, many steps, several threads",
-    "noise": "one sample a pixel, and gradients with heavy tails",
-}
-"""Every group, in the order in which they run."""
-
 OK, FELL_SHORT = "ok", "fell short"
 
 
@@ -90,26 +79,51 @@ class Outcome:
         return str(deciding[0]) if deciding else ""
 
 
+Find = Callable[[], Outcome]
+
+
 @dataclass(frozen=True)
 class Case:
     """One extreme.
 
     Attributes:
         name: unique; what `--case` takes.
-        group: a key of `GROUPS`.
-        what: the words of the list that asked for it.
+        group: name of its group.
         holds: what must hold, in a sentence.
         rule: what handles it.
-        find: does it.
         control: the controls that it moves; empty where there is no scene.
         cheap: takes about a second or less on two quiet cores, so the tests run it every time.
+        find: does it.
     """
 
     name: str
     group: str
-    what: str
     holds: str
     rule: str
-    find: Callable[[], Outcome]
-    control: str = ""
-    cheap: bool = True
+    control: str
+    cheap: bool
+    find: Find
+
+
+@dataclass(frozen=True)
+class Group:
+    """Cases about one thing, in the order in which they run.
+
+    Attributes:
+        name: what `--group` takes.
+        cases: those that `case` has added.
+    """
+
+    name: str
+    cases: list[Case] = field(default_factory=list)
+
+    def case(
+        self, name: str, holds: str, rule: str, control: str = "", *, cheap: bool = True
+    ) -> Callable[[Find], Find]:
+        """Make a function a case of the group; arguments as the attributes of `Case`."""
+
+        def added(find: Find) -> Find:
+            self.cases.append(Case(name, self.name, holds, rule, control, cheap, find))
+            return find
+
+        return added

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from advsearch.engine.gradients import smooth_loss
-from advsearch.evaluation.stability.case import Case, Check, Outcome, holds
+from advsearch.evaluation.stability.case import Check, Group, Outcome, holds
 from advsearch.evaluation.stability.scene import (
     BARE,
     SPP,
@@ -38,12 +38,26 @@ SAME_PICTURE = 2e-3
 """Mean difference of two pictures that should be one: an 8-bit level is 4e-3."""
 FAR = 1e4
 
+GROUP = Group("geometry")
+_SCENE = "counted and set to zero where they arise (Renderer.non_finite); none is expected"
+_IMPORT = "the import removes faces without area and says so; the renderer never hits one"
+_NORMAL = "the import brings every object to size 1 at the origin, in 64-bit numbers"
+_PIXEL = "a difference is as wide as moves the outline by a pixel, whatever the units"
+_WRAP = "periodic blocks wrap (Domain.project, Renderer differences)"
+
 
 def mesh(made: Mesh) -> Outcome:
     """A mesh of our own, seen from the front: painted and shifted."""
     return examine(small(thing(made), PAINTED, settings=FRONT)).findings()
 
 
+@GROUP.case(
+    "degenerate-triangles",
+    "Faces without area change neither the picture nor the gradient.",
+    _IMPORT,
+    "texture, pose",
+    cheap=False,
+)
 def degenerate() -> Outcome:
     """A square with faces that have no area: a repeated corner, three points on a line, one point three times."""
     line = [[0.0, 0.0, 0.5], [0.0, 0.1, 0.5], [0.0, 0.2, 0.5]]
@@ -63,11 +77,19 @@ def degenerate() -> Outcome:
     return Outcome((*found.checks, *more), found.finite, found.relative_error, found.ending, found.measured)
 
 
+@GROUP.case(
+    "sliver-triangles",
+    "A triangle a million times as long as wide leaves everything finite and right.",
+    _SCENE,
+    "texture, pose",
+    cheap=False,
+)
 def sliver() -> Outcome:
     """A square with a triangle across it that is a million times as long as wide."""
     return mesh(mesh_of([*QUAD, [0.0, -0.5, 0.5], [0.0, 0.5, 0.5], [0.0, 0.5, 0.5 + 1e-6]], [*HALVES, [4, 5, 6]]))
 
 
+@GROUP.case("coincident-faces", "Two faces in one place look like one.", _SCENE, "texture, pose", cheap=False)
 def coincident() -> Outcome:
     """Two squares in one place: which is hit is chance, but not what the picture is."""
     twice = _mesh(QUAD + QUAD, [*HALVES, [4, 5, 6], [4, 6, 7]])
@@ -76,11 +98,19 @@ def coincident() -> Outcome:
     return Outcome((*found.checks, same), found.finite, found.relative_error, found.ending, found.measured)
 
 
+@GROUP.case("one-triangle", "Finite, and both gradients are right.", _SCENE, "texture, pose", cheap=False)
 def one_triangle() -> Outcome:
     """A mesh of one triangle."""
     return mesh(_mesh([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 1.0]], [[0, 1, 2]]))
 
 
+@GROUP.case(
+    "million-triangles",
+    "Finite, right, and like the coarse mesh of the same shape.",
+    _SCENE,
+    "texture, pose",
+    cheap=False,
+)
 def million() -> Outcome:
     """A sphere of a million triangles: painted, and moved once each way."""
     fine = sphere(501, 1000)
@@ -103,6 +133,10 @@ def sized(scale: float) -> Outcome:
     return examine(renderer, torch.tensor([0.0 if scale < 1.0 else 1.0]), compare=False).findings()
 
 
+for scale in (0.01, 100.0):
+    GROUP.case(f"scale-{scale:g}", "Picture and gradient are finite.", _SCENE, "pose")(partial(sized, scale))
+
+
 def file_units(scale: float, shift: float = 0.0) -> Outcome:
     """A file in other units, or far from its origin, is the same object."""
     points = np.array([[x, y, z] for x in (-0.3, 0.3) for y in (-0.5, 0.5) for z in (0.0, 1.0)])
@@ -120,6 +154,24 @@ def file_units(scale: float, shift: float = 0.0) -> Outcome:
     return found.findings(Check("mean difference from the same box at home", apart, most=SAME_PICTURE))
 
 
+for scale in (0.01, 100.0):
+    GROUP.case(f"file-in-units-of-{scale:g}", "A file in other units gives the same picture.", _NORMAL, "pose")(
+        partial(file_units, scale)
+    )
+GROUP.case(
+    "file-10000-sizes-off",
+    "A mesh that its file puts 10,000 sizes from the origin gives the same picture.",
+    _NORMAL,
+    "pose",
+)(partial(file_units, 1.0, FAR))
+
+
+@GROUP.case(
+    "translation-10000",
+    "The picture is that of the scene without the object, and the gradient is zero.",
+    _SCENE,
+    "pose",
+)
 def far_away() -> Outcome:
     """The object 10,000 sizes away: gone from the picture, and so is its derivative."""
     renderer = small("mug", {"pose": {"y": [9e3, FAR]}})
@@ -138,6 +190,27 @@ def view(controls: Controls, u: Sequence[float], *, black: bool = True, compare:
     return examine(renderer, torch.tensor(u, dtype=torch.float32), compare=compare).findings()
 
 
+GROUP.case("grazing-view", "Looking along the ground, the gradient by the elevation is right.", _PIXEL, "camera")(
+    partial(view, {"camera": {"elevation": [-10.0, 10.0]}}, [0.5])
+)
+GROUP.case("near-plane", "With the camera inside the object, picture and gradient are finite.", _SCENE, "camera")(
+    partial(view, {"camera": {"distance": [0.05, 0.2]}}, [0.5], black=False, compare=False)
+)
+GROUP.case("object-fills-the-frame", "Finite where nothing but the object is seen.", _SCENE, "camera")(
+    partial(view, {"camera": {"distance": [0.5, 0.8], "fov": 10.0}}, [0.5], black=False, compare=False)
+)
+GROUP.case("object-leaves-the-frame", "Half outside, the gradient by the shift is right.", _PIXEL, "pose")(
+    partial(view, {"pose": {"x": [0.0, 2.0]}}, [0.5])
+)
+
+
+@GROUP.case(
+    "gimbal-angles",
+    "At a pitch of 90 degrees the gradients by angles and by the rotation vector are right.",
+    "differences of each number; the rotation vector does not lock",
+    "pose",
+    cheap=False,
+)
 def gimbal() -> Outcome:
     """At a pitch of 90 degrees yaw and roll turn about one axis: angles lock, the rotation vector does not."""
     angles = {"pose": {"yaw": [-90.0, 90.0], "pitch": [45.0, 135.0], "roll": [-90.0, 90.0], "on_ground": "no"}}
@@ -174,6 +247,15 @@ def full_turn(controls: Controls) -> Outcome:
     )
 
 
+for name in ("pose.yaw", "camera.azimuth", "environment.rotation"):
+    GROUP.case(
+        f"full-turn-{name.replace('.', '-')}",
+        "0 and 360 degrees give one picture and one gradient, and a step goes on across the seam.",
+        _WRAP,
+        name.partition(".")[0],
+    )(partial(full_turn, {name.partition(".")[0]: {name.partition(".")[2]: [0.0, 360.0]}}))
+
+
 # ---- inside ---------------------------------------------------------------------------------------------------------
 
 
@@ -199,164 +281,3 @@ def _difference(one: Mesh, other: Mesh) -> float:
 def _obj(vertices: np.ndarray, faces: Sequence[Sequence[int]]) -> str:
     points = "".join(f"v {x:.12g} {y:.12g} {z:.12g}\n" for x, y, z in vertices)
     return points + "".join("f " + " ".join(str(1 + corner) for corner in face) + "\n" for face in faces)
-
-
-_SCENE = "counted and set to zero where they arise (Renderer.non_finite); none is expected"
-_IMPORT = "the import removes faces without area and says so; the renderer never hits one"
-_NORMAL = "the import brings every object to size 1 at the origin, in 64-bit numbers"
-_PIXEL = "a difference is as wide as moves the outline by a pixel, whatever the units"
-_WRAP = "periodic blocks wrap (Domain.project, Renderer differences)"
-
-CASES = (
-    Case(
-        "degenerate-triangles",
-        "geometry",
-        "degenerate and sliver triangles",
-        "Faces without area change neither the picture nor the gradient.",
-        _IMPORT,
-        degenerate,
-        "texture, pose",
-        cheap=False,
-    ),
-    Case(
-        "sliver-triangles",
-        "geometry",
-        "degenerate and sliver triangles",
-        "A triangle a million times as long as wide leaves everything finite and right.",
-        _SCENE,
-        sliver,
-        "texture, pose",
-        cheap=False,
-    ),
-    Case(
-        "coincident-faces",
-        "geometry",
-        "coincident faces",
-        "Two faces in one place look like one.",
-        _SCENE,
-        coincident,
-        "texture, pose",
-        cheap=False,
-    ),
-    Case(
-        "one-triangle",
-        "geometry",
-        "a mesh of one triangle and of a million",
-        "Finite, and both gradients are right.",
-        _SCENE,
-        one_triangle,
-        "texture, pose",
-        cheap=False,
-    ),
-    Case(
-        "million-triangles",
-        "geometry",
-        "a mesh of one triangle and of a million",
-        "Finite, right, and like the coarse mesh of the same shape.",
-        _SCENE,
-        million,
-        "texture, pose",
-        cheap=False,
-    ),
-    *(
-        Case(
-            f"scale-{scale:g}",
-            "geometry",
-            "scale 0.01 and 100",
-            "Picture and gradient are finite.",
-            _SCENE,
-            partial(sized, scale),
-            "pose",
-        )
-        for scale in (0.01, 100.0)
-    ),
-    *(
-        Case(
-            f"file-in-units-of-{scale:g}",
-            "geometry",
-            "scale 0.01 and 100",
-            "A file in other units gives the same picture.",
-            _NORMAL,
-            partial(file_units, scale),
-            "pose",
-        )
-        for scale in (0.01, 100.0)
-    ),
-    Case(
-        "translation-10000",
-        "geometry",
-        "translation by 10,000 object sizes",
-        "The picture is that of the scene without the object, and the gradient is zero.",
-        _SCENE,
-        far_away,
-        "pose",
-    ),
-    Case(
-        "file-10000-sizes-off",
-        "geometry",
-        "translation by 10,000 object sizes",
-        "A mesh that its file puts 10,000 sizes from the origin gives the same picture.",
-        _NORMAL,
-        partial(file_units, 1.0, FAR),
-        "pose",
-    ),
-    Case(
-        "grazing-view",
-        "geometry",
-        "grazing views",
-        "Looking along the ground, the gradient by the elevation is right.",
-        _PIXEL,
-        partial(view, {"camera": {"elevation": [-10.0, 10.0]}}, [0.5]),
-        "camera",
-    ),
-    Case(
-        "near-plane",
-        "geometry",
-        "near-plane intersection",
-        "With the camera inside the object, picture and gradient are finite.",
-        _SCENE,
-        partial(view, {"camera": {"distance": [0.05, 0.2]}}, [0.5], black=False, compare=False),
-        "camera",
-    ),
-    Case(
-        "object-fills-the-frame",
-        "geometry",
-        "the object filling or leaving the frame",
-        "Finite where nothing but the object is seen.",
-        _SCENE,
-        partial(view, {"camera": {"distance": [0.5, 0.8], "fov": 10.0}}, [0.5], black=False, compare=False),
-        "camera",
-    ),
-    Case(
-        "object-leaves-the-frame",
-        "geometry",
-        "the object filling or leaving the frame",
-        "Half outside, the gradient by the shift is right.",
-        _PIXEL,
-        partial(view, {"pose": {"x": [0.0, 2.0]}}, [0.5]),
-        "pose",
-    ),
-    Case(
-        "gimbal-angles",
-        "geometry",
-        "gimbal angles",
-        "At a pitch of 90 degrees the gradients by angles and by the rotation vector are right.",
-        "differences of each number; the rotation vector does not lock",
-        gimbal,
-        "pose",
-        cheap=False,
-    ),
-    *(
-        Case(
-            f"full-turn-{name.replace('.', '-')}",
-            "geometry",
-            "a full turn meeting itself",
-            "0 and 360 degrees give one picture and one gradient, and a step goes on across the seam.",
-            _WRAP,
-            partial(full_turn, {name.partition(".")[0]: {name.partition(".")[2]: [0.0, 360.0]}}),
-            name.partition(".")[0],
-        )
-        for name in ("pose.yaw", "camera.azimuth", "environment.rotation")
-    ),
-)
-"""Every case about geometry."""

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from advsearch.engine.gradients import smooth_loss
-from advsearch.evaluation.stability.case import Case, Check, Outcome, holds
+from advsearch.evaluation.stability.case import Check, Group, Outcome, holds
 from advsearch.evaluation.stability.scene import ERROR, REFERENCE_SPP, SPP, Controls, examine, small
 from advsearch.scene import library
 from advsearch.scene.description import describe
@@ -18,6 +18,10 @@ from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.parts import Translation, translation
 from advsearch.scene.parts import ScenePart
 from advsearch.scene.renderer import Renderer
+
+GROUP = Group("materials")
+_SCENE = "counted and set to zero where they arise (Renderer.non_finite); none is expected"
+_MOVED = "values are rendered inside the range in which the adjoint is right (metallic at most 0.999)"
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +51,38 @@ def surface(searched: dict[str, list[float]], **values: float) -> Outcome:
     return examine(small("mug", {"material": searched}, settings=settings)).findings()
 
 
+GROUP.case(
+    "roughness-0",
+    "Finite, and the gradient by the roughness is right, at the polished end.",
+    "Mitsuba's lobe is never narrower than a roughness of 0.03, so the derivative is finite",
+    "material",
+)(partial(surface, {"roughness": [0.0, 1.0]}, roughness=0.0))
+GROUP.case(
+    "roughness-1",
+    "Finite, and the gradient by the roughness is right, at the matt end.",
+    _SCENE,
+    "material",
+    cheap=False,
+)(partial(surface, {"roughness": [0.0, 1.0]}, roughness=1.0, metallic=1.0))
+GROUP.case(
+    "metallic-1",
+    "Finite, and the gradient has the right sign and size at a metallic of exactly 1.",
+    _MOVED,
+    "material",
+    cheap=False,
+)(partial(surface, {"metallic": [0.0, 1.0]}, metallic=1.0))
+GROUP.case(
+    "perfect-mirror", "A metal of roughness 0 is finite, and both gradients are right.", _MOVED, "material", cheap=False
+)(partial(surface, {"roughness": [0.0, 1.0], "metallic": [0.0, 1.0]}, roughness=0.0, metallic=1.0))
+
+
+@GROUP.case(
+    "clear-glass",
+    "A texel behind clear glass has the right gradient, and nothing is NaN.",
+    _SCENE,
+    "texture, environment",
+    cheap=False,
+)
 def clear_glass() -> Outcome:
     """The object behind a ball of clear glass: light bends twice, and a texel still has its gradient."""
     camera = camera_to_world(describe("mug"))
@@ -59,6 +95,12 @@ def clear_glass() -> Outcome:
     return examine(glass).findings(Check("mean change of the picture by the glass", moved, least=0.01))
 
 
+@GROUP.case(
+    "texels-0-and-1",
+    "Texels at the ends of the range have a gradient, and the search moves them inwards only.",
+    "the straight piece of the sRGB curve at 0; projection onto the bounds",
+    "texture",
+)
 def texels_at_the_ends() -> Outcome:
     """A texture of texels that are exactly 0 and exactly 1: the gradient is there, and the search moves inwards."""
     checks = np.indices((8, 8)).sum(axis=0) % 2
@@ -91,69 +133,3 @@ def _inward_error(renderer: Renderer, repeats: int = 8, step: float = 0.04) -> f
             here, near, far = (float(loss(renderer(u + k * step * inwards, seed, REFERENCE_SPP))) for k in range(3))
         wanted.append((4.0 * near - 3.0 * here - far) / (2.0 * step))
     return abs(fmean(found) / fmean(wanted) - 1.0)
-
-
-_SCENE = "counted and set to zero where they arise (Renderer.non_finite); none is expected"
-_MOVED = "values are rendered inside the range in which the adjoint is right (metallic at most 0.999)"
-
-CASES = (
-    Case(
-        "roughness-0",
-        "materials",
-        "roughness 0 and 1",
-        "Finite, and the gradient by the roughness is right, at the polished end.",
-        "Mitsuba's lobe is never narrower than a roughness of 0.03, so the derivative is finite",
-        partial(surface, {"roughness": [0.0, 1.0]}, roughness=0.0),
-        "material",
-    ),
-    Case(
-        "roughness-1",
-        "materials",
-        "roughness 0 and 1",
-        "Finite, and the gradient by the roughness is right, at the matt end.",
-        _SCENE,
-        partial(surface, {"roughness": [0.0, 1.0]}, roughness=1.0, metallic=1.0),
-        "material",
-        cheap=False,
-    ),
-    Case(
-        "metallic-1",
-        "materials",
-        "metallic 1",
-        "Finite, and the gradient has the right sign and size at a metallic of exactly 1.",
-        _MOVED,
-        partial(surface, {"metallic": [0.0, 1.0]}, metallic=1.0),
-        "material",
-        cheap=False,
-    ),
-    Case(
-        "perfect-mirror",
-        "materials",
-        "perfect mirror",
-        "A metal of roughness 0 is finite, and both gradients are right.",
-        _MOVED,
-        partial(surface, {"roughness": [0.0, 1.0], "metallic": [0.0, 1.0]}, roughness=0.0, metallic=1.0),
-        "material",
-        cheap=False,
-    ),
-    Case(
-        "clear-glass",
-        "materials",
-        "clear glass",
-        "A texel behind clear glass has the right gradient, and nothing is NaN.",
-        _SCENE,
-        clear_glass,
-        "texture, environment",
-        cheap=False,
-    ),
-    Case(
-        "texels-0-and-1",
-        "materials",
-        "texels at exactly 0 and 1",
-        "Texels at the ends of the range have a gradient, and the search moves them inwards only.",
-        "the straight piece of the sRGB curve at 0; projection onto the bounds",
-        texels_at_the_ends,
-        "texture",
-    ),
-)
-"""Every case about materials."""

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from advsearch.attacks import Block, Domain, make_policy, search
 from advsearch.engine.gradients import probes, reference, smooth_loss
-from advsearch.evaluation.stability.case import Case, Check, Outcome, holds
+from advsearch.evaluation.stability.case import Check, Group, Outcome, holds
 from advsearch.evaluation.stability.scene import REFERENCE_SPP, Controls, compared, examine, small
 from advsearch.evaluation.stability.search import Toy
 
@@ -36,6 +36,12 @@ TAIL = 1.5
 
 Estimator = Callable[[Tensor], Tensor]
 """From samples (..., n, d) to their centre (..., d)."""
+
+GROUP = Group("noise")
+_RULE = (
+    "outliers are clipped: elements at 3 medians in an l-infinity ball and 10 in an l2 ball, the whole gradient at 3 "
+    "medians of the latest lengths"
+)
 
 
 def plain_mean(samples: Tensor) -> Tensor:
@@ -111,6 +117,14 @@ def estimators(kind: str) -> Outcome:
     )
 
 
+for kind in ("symmetric", "skewed"):
+    GROUP.case(
+        f"heavy-tails-{kind}",
+        "Median of means and clipping beat the mean; their bias and that of normalisation are known.",
+        "median of means of 6 groups; clipping at 3 median lengths; normalisation",
+    )(partial(estimators, kind))
+
+
 def heavy_search(kind: str) -> Outcome:
     """Searches with noisy gradients, the noise in the median twice as large as the gradient.
 
@@ -130,6 +144,14 @@ def heavy_search(kind: str) -> Outcome:
         checks.append(Check(f"{name}: share with gaussian noise over that with tails", usual / share, most=RATIO))
     error = 1.0 - min(value for key, value in measured.items() if key.endswith("optimum"))
     return Outcome(tuple(checks), relative_error=error, measured=measured)
+
+
+for kind, result in (
+    ("elements", "the result with gaussian noise of the same median, with a heavy tail in every element."),
+    ("lengths", "the result with gaussian noise of the same median, with a heavy tail in its size."),
+    ("spike", "the optimum, with one gradient 1e12 times too large."),
+):
+    GROUP.case(f"heavy-tailed-search-{kind}", "Within 1.25 of " + result, _RULE)(partial(heavy_search, kind))
 
 
 def _share_of_optimum(name: str, kind: str, seeds: int = 9) -> float:
@@ -166,6 +188,13 @@ def _disturbance(kind: str, index: int, size: int, generator: torch.Generator) -
     return normal * float(_noise("symmetric", (1,), generator).abs()) if kind == "lengths" else normal
 
 
+@GROUP.case(
+    "one-sample-a-pixel",
+    "Finite; the mean of 48 gradients is right; the denoiser copes.",
+    "a new seed at every step, and momentum over steps",
+    "texture, environment, pose",
+    cheap=False,
+)
 def one_sample() -> Outcome:
     """One sample a pixel: the mean of many gradients is that of a quiet one, and the denoiser takes such a picture."""
     controls: Controls = {
@@ -183,6 +212,13 @@ def one_sample() -> Outcome:
     return findings
 
 
+@GROUP.case(
+    "heavy-tails-of-a-moving-mesh",
+    "The plan takes the estimator without the tail; the bias of each rule on the other is printed.",
+    "the plan prefers differences of the loss for what moves a mesh",
+    "pose",
+    cheap=False,
+)
 def heavy_render(count: int = SAMPLES) -> Outcome:
     """Gradients of a shift at 4 samples a pixel: how heavy their tails are, and what each estimator makes of them.
 
@@ -222,59 +258,3 @@ def heavy_render(count: int = SAMPLES) -> Outcome:
         holds("the plan takes secant", plan.groups[0].estimator == "secant"),
     ]
     return Outcome(tuple(checks), bad["secant"] == 0, off, measured=measured)
-
-
-_RULE = (
-    "outliers are clipped: elements at 3 medians in an l-infinity ball and 10 in an l2 ball, the whole gradient at 3 "
-    "medians of the latest lengths"
-)
-
-CASES = (
-    Case(
-        "one-sample-a-pixel",
-        "noise",
-        "1 sample per pixel",
-        "Finite; the mean of 48 gradients is right; the denoiser copes.",
-        "a new seed at every step, and momentum over steps",
-        one_sample,
-        "texture, environment, pose",
-        cheap=False,
-    ),
-    *(
-        Case(
-            f"heavy-tails-{kind}",
-            "noise",
-            "heavy-tailed gradients: median of means or clipping, its bias measured",
-            "Median of means and clipping beat the mean; their bias and that of normalisation are known.",
-            "median of means of 6 groups; clipping at 3 median lengths; normalisation",
-            partial(estimators, kind),
-        )
-        for kind in ("symmetric", "skewed")
-    ),
-    *(
-        Case(
-            f"heavy-tailed-search-{kind}",
-            "noise",
-            "heavy-tailed gradients: median of means or clipping, its bias measured",
-            "Within 1.25 of " + result,
-            _RULE,
-            partial(heavy_search, kind),
-        )
-        for kind, result in (
-            ("elements", "the result with gaussian noise of the same median, with a heavy tail in every element."),
-            ("lengths", "the result with gaussian noise of the same median, with a heavy tail in its size."),
-            ("spike", "the optimum, with one gradient 1e12 times too large."),
-        )
-    ),
-    Case(
-        "heavy-tails-of-a-moving-mesh",
-        "noise",
-        "heavy-tailed gradients: median of means or clipping, its bias measured",
-        "The plan takes the estimator without the tail; the bias of each rule on the other is printed.",
-        "the plan prefers differences of the loss for what moves a mesh",
-        heavy_render,
-        "pose",
-        cheap=False,
-    ),
-)
-"""Every case about noise."""

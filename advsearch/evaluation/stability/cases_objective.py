@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from advsearch.attacks import POLICIES, Ending, make_policy, search, verify
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
-from advsearch.evaluation.stability.case import Case, Check, Outcome, holds
+from advsearch.evaluation.stability.case import Check, Group, Outcome, holds
 from advsearch.evaluation.stability.search import Toy, numbers, quadratic
 from advsearch.models.model import Model
 from advsearch.models.preprocessing import Preprocessing
@@ -30,6 +30,11 @@ WITH_OPTIONS: dict[str, dict[str, Any]] = {
 }
 FORMS = {name: kind.plain for name, kind in OBJECTIVE_KINDS.items() if kind.plain is not None}
 Logits = Callable[[], Tensor]
+
+GROUP = Group("objective")
+_NAN = "an objective that is not finite counts as -inf, its gradient as zero; three in a row end the search"
+_LOGITS = "objectives are written for it: no overflow, shared gradients, tangents where a slope would be lost"
+_FLAT = "a zero gradient gives a random step; the fifth in a row ends the search as 'stalled'"
 
 
 def _differentiated(logits: Tensor, objective: Any, dtype: torch.dtype) -> tuple[float, Tensor]:
@@ -65,6 +70,12 @@ def logits_like(rows: list[list[float]], *, same: float = 1e-5) -> Outcome:
     )
 
 
+GROUP.case(
+    "logits-of-10000", "Every objective and its gradient are finite, not lost, and as in double precision.", _LOGITS
+)(partial(logits_like, [[1e4, -1e4, 0.0, 5e3], [-1e4, 1e4, 9e3, 0.0], [1e4, 9999.0, 9998.0, -1e4]], same=SPACING))
+
+
+@GROUP.case("ties", "Tied logits share the gradient, and a tie is no success.", _LOGITS)
 def ties() -> Outcome:
     """The largest logits are equal: the gradient is shared, and a tie is no success."""
     rows = [[1.0, 1.0, 0.0, -1.0], [2.0, 2.0, 2.0, 2.0], [0.0, 3.0, 3.0, 3.0]]
@@ -96,6 +107,11 @@ class _Certain(nn.Module):
         return torch.stack([light, 0.5 - light, torch.zeros_like(light)], dim=1).mul(self.sharpness).softmax(dim=1)
 
 
+@GROUP.case(
+    "probabilities-0-and-1",
+    "Nothing is infinite, and where the model is flat the search goes elsewhere or says so.",
+    _LOGITS,
+)
 def certain() -> Outcome:
     """A model that answers with probabilities of exactly 0 and 1: finite, and its flatness is named."""
     model = Model(_Certain(1e4), "certain", ("a", "b", "c"), Preprocessing((8, 8)), probabilities=True)
@@ -151,6 +167,16 @@ def nan_at(steps: frozenset[int], *, ends: bool) -> Outcome:
     )
 
 
+GROUP.case("nan-at-step-0", "Every policy counts it and goes on.", _NAN)(partial(nan_at, frozenset({0}), ends=False))
+GROUP.case("nan-at-steps-7-and-8", "Every policy counts them and goes on.", _NAN)(
+    partial(nan_at, frozenset({7, 8}), ends=False)
+)
+GROUP.case("nan-three-times-in-a-row", "Every search ends as non-finite, with what it had.", _NAN)(
+    partial(nan_at, frozenset({3, 4, 5}), ends=True)
+)
+
+
+@GROUP.case("constant-model", "Nothing is found; policies that follow gradients end as stalled.", _FLAT)
 def constant() -> Outcome:
     """A model whose answer never changes: nothing is found, and who follows gradients says that there are none."""
     wrong, endings = [], set()
@@ -194,77 +220,9 @@ def chance(rate: float, runs: int = 100) -> Outcome:
     )
 
 
-_NAN = "an objective that is not finite counts as -inf, its gradient as zero; three in a row end the search"
-_LOGITS = "objectives are written for it: no overflow, shared gradients, tangents where a slope would be lost"
-_FLAT = "a zero gradient gives a random step; the fifth in a row ends the search as 'stalled'"
-
-CASES = (
-    Case(
-        "logits-of-10000",
-        "objective",
-        "logits of 1e4",
-        "Every objective and its gradient are finite, not lost, and as in double precision.",
-        _LOGITS,
-        partial(logits_like, [[1e4, -1e4, 0.0, 5e3], [-1e4, 1e4, 9e3, 0.0], [1e4, 9999.0, 9998.0, -1e4]], same=SPACING),
-    ),
-    Case(
-        "ties",
-        "objective",
-        "ties",
-        "Tied logits share the gradient, and a tie is no success.",
-        _LOGITS,
-        ties,
-    ),
-    Case(
-        "probabilities-0-and-1",
-        "objective",
-        "probabilities 0 and 1",
-        "Nothing is infinite, and where the model is flat the search goes elsewhere or says so.",
-        _LOGITS,
-        certain,
-    ),
-    Case(
-        "nan-at-step-0",
-        "objective",
-        "NaN from the model at step k",
-        "Every policy counts it and goes on.",
-        _NAN,
-        partial(nan_at, frozenset({0}), ends=False),
-    ),
-    Case(
-        "nan-at-steps-7-and-8",
-        "objective",
-        "NaN from the model at step k",
-        "Every policy counts them and goes on.",
-        _NAN,
-        partial(nan_at, frozenset({7, 8}), ends=False),
-    ),
-    Case(
-        "nan-three-times-in-a-row",
-        "objective",
-        "NaN from the model at step k",
-        "Every search ends as non-finite, with what it had.",
-        _NAN,
-        partial(nan_at, frozenset({3, 4, 5}), ends=True),
-    ),
-    Case(
-        "constant-model",
-        "objective",
-        "constant model",
-        "Nothing is found; policies that follow gradients end as stalled.",
-        _FLAT,
-        constant,
-    ),
-    *(
-        Case(
-            f"random-model-wrong-{round(100 * rate)}-percent",
-            "objective",
-            "random model",
-            "What the search claims is never verified.",
-            "fresh trials of the answer and of the clean configuration (advsearch.attacks.verification)",
-            partial(chance, rate),
-        )
-        for rate in (0.1, 0.5, 0.9)
-    ),
-)
-"""Every case about what a model answers."""
+for rate in (0.1, 0.5, 0.9):
+    GROUP.case(
+        f"random-model-wrong-{round(100 * rate)}-percent",
+        "What the search claims is never verified.",
+        "fresh trials of the answer and of the clean configuration (advsearch.attacks.verification)",
+    )(partial(chance, rate))

@@ -22,7 +22,7 @@ from advsearch.attacks import Block, Domain, make_policy, search
 from advsearch.attacks.policies.base import one_thread
 from advsearch.attacks.projections import project_l2_box
 from advsearch.engine.gradients import smooth_loss
-from advsearch.evaluation.stability.case import Case, Check, Outcome, holds
+from advsearch.evaluation.stability.case import Check, Group, Outcome, holds
 from advsearch.evaluation.stability.scene import SIZE, Controls, small
 from advsearch.evaluation.stability.search import Toy
 from advsearch.models import load_model
@@ -41,7 +41,14 @@ BISECTIONS = 24
 TEXTURE: Controls = {"texture": {"resolution": 16}}
 SHIFT: Controls = {"pose": {"x": [-0.3, 0.3]}}
 
+GROUP = Group("precision")
 
+
+@GROUP.case(
+    "verdicts-in-single-precision",
+    "The model's answers in single and double precision differ only where the margin is under 0.001 logits.",
+    "20 trials with fresh noise, which moves margins a thousand times more",
+)
 def verdicts() -> Outcome:
     """The reference model in single and in double precision, on pictures on its own decision boundaries.
 
@@ -91,6 +98,11 @@ def verdicts() -> Outcome:
     )
 
 
+@GROUP.case(
+    "bytes-in-single-precision",
+    "The 8-bit picture is the same but for ties, and the model does not notice.",
+    "values on the edge of two levels take either",
+)
 def picture_bytes() -> Outcome:
     """The tone curve and the rounding to 8 bits in single and in double precision, and what that does to the model."""
     model = load_model("reference")
@@ -110,6 +122,11 @@ def picture_bytes() -> Outcome:
     )
 
 
+@GROUP.case(
+    "ball-of-a-million-numbers",
+    "A projection in single precision lies inside the ball in double precision.",
+    "Domain.TOLERANCE: 2e-6 of the radius",
+)
 def large_ball(size: int = 1_000_000) -> Outcome:
     """The projection of a million numbers onto an L2 ball, its norm in double precision."""
     generator = torch.Generator().manual_seed(0)
@@ -166,6 +183,20 @@ def many_steps(name: str) -> Outcome:
     )
 
 
+for name in ("pgd", "adam"):
+    GROUP.case(
+        f"ten-thousand-steps-{name}",
+        "The search stays inside its budget and at its peak.",
+        "momentum forgets; each step is projected anew",
+        cheap=False,
+    )(partial(many_steps, name))
+
+
+@GROUP.case(
+    "ten-thousand-turns",
+    "An angle that goes round in small steps does not drift, and no two steps have one seed.",
+    "wrapped at every step, so it stays small",
+)
 def accumulation() -> Outcome:
     """10,000 small steps of an angle around its circle, in single against double precision, and 10,000 seeds."""
     domain = Domain(torch.zeros(1), (Block(1, periodic=True, name="angle"),))
@@ -204,6 +235,13 @@ def rendered(path: str, count: int) -> None:
     np.savez(path, **arrays)
 
 
+@GROUP.case(
+    "one-and-two-threads",
+    "The same bits every time with one thread; with two, moved meshes and adjoints may differ in the last.",
+    "box filter; `deterministic` takes one thread",
+    "texture, pose",
+    cheap=False,
+)
 def one_and_two_threads() -> Outcome:
     """Pictures, pictures of a moved mesh and an adjoint: twice with one thread and once with two, in processes each.
 
@@ -250,6 +288,13 @@ def changed_threads(counts: Sequence[int] = (2, 1, 2, 1, 2, 1)) -> None:
             renderer(renderer.start, 0, 8)
 
 
+@GROUP.case(
+    "threads-change-under-a-scene",
+    "Changing the number of threads while a scene is in use does not end the process.",
+    "a recorded kernel is made anew when the number of threads changes",
+    "pose",
+    cheap=False,
+)
 def threads_under_a_scene() -> Outcome:
     """A scene that lives while the number of threads is changed, as a deterministic second search does."""
     status, said = _in_a_process(f"from {__name__} import changed_threads; changed_threads()")
@@ -264,72 +309,3 @@ def _in_a_process(code: str) -> tuple[int, str]:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=120)
     lines = done.stderr.strip().splitlines()
     return done.returncode, lines[-1][:80] if done.returncode and lines else ""
-
-
-CASES = (
-    Case(
-        "verdicts-in-single-precision",
-        "precision",
-        "single against double where the difference can change a verdict",
-        "The model's answers in single and double precision differ only where the margin is under 0.001 logits.",
-        "20 trials with fresh noise, which moves margins a thousand times more",
-        verdicts,
-    ),
-    Case(
-        "bytes-in-single-precision",
-        "precision",
-        "single against double where the difference can change a verdict",
-        "The 8-bit picture is the same but for ties, and the model does not notice.",
-        "values on the edge of two levels take either",
-        picture_bytes,
-    ),
-    Case(
-        "ball-of-a-million-numbers",
-        "precision",
-        "single against double where the difference can change a verdict",
-        "A projection in single precision lies inside the ball in double precision.",
-        "Domain.TOLERANCE: 2e-6 of the radius",
-        large_ball,
-    ),
-    *(
-        Case(
-            f"ten-thousand-steps-{name}",
-            "precision",
-            "accumulation over 10,000 steps",
-            "The search stays inside its budget and at its peak.",
-            "momentum forgets; each step is projected anew",
-            partial(many_steps, name),
-            cheap=False,
-        )
-        for name in ("pgd", "adam")
-    ),
-    Case(
-        "ten-thousand-turns",
-        "precision",
-        "accumulation over 10,000 steps",
-        "An angle that goes round in small steps does not drift, and no two steps have one seed.",
-        "wrapped at every step, so it stays small",
-        accumulation,
-    ),
-    Case(
-        "one-and-two-threads",
-        "precision",
-        "determinism under 1 and 2 threads",
-        "The same bits every time with one thread; with two, moved meshes and adjoints may differ in the last.",
-        "box filter; `deterministic` takes one thread",
-        one_and_two_threads,
-        "texture, pose",
-        cheap=False,
-    ),
-    Case(
-        "threads-change-under-a-scene",
-        "precision",
-        "determinism under 1 and 2 threads",
-        "Changing the number of threads while a scene is in use does not end the process.",
-        "a recorded kernel is made anew when the number of threads changes",
-        threads_under_a_scene,
-        "pose",
-        cheap=False,
-    ),
-)
-"""Every case about arithmetic."""

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advsearch.attacks import PGD, Adam, Auto, Policy, search
 from advsearch.errors import InputError
-from advsearch.evaluation.stability.case import Case, Check, Outcome, holds
+from advsearch.evaluation.stability.case import Check, Group, Outcome, holds
 from advsearch.evaluation.stability.scene import Controls, Evaluator, domain_of, examine, small
 from advsearch.scene.assets import EnvironmentAsset, Floats
 from advsearch.scene.environments import import_environment
@@ -23,6 +23,12 @@ BRIGHT = 1e5
 PLATEAU_STEPS = 40
 """Evaluations in which a search has to be off a plateau."""
 POLICIES: tuple[Policy[Any], ...] = (PGD(), Adam(), Auto())
+
+GROUP = Group("radiometric")
+_SCENE = "counted and set to zero where they arise (Renderer.non_finite); none is expected"
+_FLAT = "a zero gradient gives a random step; the fifth in a row ends the search as 'stalled'"
+_REFUSED = "import_environment counts the texels that are not light and refuses the map"
+_ASSET = "an environment with such a texel is refused, wherever it comes from"
 
 
 def _radiance(value: float, texel: float | None = None) -> Floats:
@@ -37,6 +43,13 @@ def _map(value: float, texel: float | None = None) -> EnvironmentAsset:
     return EnvironmentAsset("made", _radiance(value, texel))
 
 
+@GROUP.case(
+    "hdri-texel-100000",
+    "Pictures and gradients are finite, raw and denoised, and gradients are right.",
+    _SCENE,
+    "environment, texture",
+    cheap=False,
+)
 def bright_texel() -> Outcome:
     """A sky of 0.3 with one texel of 100,000, raw and denoised."""
     flash = _map(0.3, BRIGHT)
@@ -51,6 +64,9 @@ def bright_texel() -> Outcome:
     )
 
 
+@GROUP.case(
+    "black-environment", "The picture is black, the gradient zero, and the search ends as stalled.", _FLAT, "texture"
+)
 def black_environment() -> Outcome:
     """Nothing shines: the picture is black, no texel matters, and the search has to say that it is stuck."""
     seen = examine(
@@ -63,6 +79,12 @@ def black_environment() -> Outcome:
     )
 
 
+@GROUP.case(
+    "lamp-in-the-dark",
+    "A lamp lights a scene that has no other light.",
+    "the lamp's power is in multiples of the environment's metered light",
+    "light",
+)
 def lamp_in_the_dark() -> Outcome:
     """A black environment and a lamp: the lamp has to be able to light the scene."""
     controls = {"light": {"type": "point", "power": [0.0, 20.0], "x": 1.0, "y": 1.0, "z": 2.0}}
@@ -90,6 +112,16 @@ def refused(value: float, *, as_file: bool) -> Outcome:
     return Outcome((holds("refused", False),), ending="rendered all the same")
 
 
+for word, value in (("negative", -1.0), ("infinite", np.inf), ("nan", np.nan)):
+    for as_file in (True, False):
+        GROUP.case(
+            f"{word}-texel-{'file' if as_file else 'array'}",
+            "The map is refused before anything is rendered.",
+            _REFUSED if as_file else _ASSET,
+            "environment",
+        )(partial(refused, value, as_file=as_file))
+
+
 def exposure(control: str, stops: float) -> Outcome:
     """A picture ten stops over or under."""
     low, high = sorted((stops, stops - np.sign(stops)))
@@ -99,6 +131,17 @@ def exposure(control: str, stops: float) -> Outcome:
     u = renderer.start.clone()
     u[0] = share
     return examine(renderer, u).findings()
+
+
+for control in ("camera", "environment"):
+    for stops in (10.0, -10.0):
+        GROUP.case(
+            f"{control}-exposure-{'up' if stops > 0.0 else 'down'}",
+            "Picture and gradient are finite; the gradient of the linear picture is right.",
+            _SCENE,
+            f"{control}, texture",
+            cheap=control == "camera",
+        )(partial(exposure, control, stops))
 
 
 def plateau(low: float, high: float) -> Outcome:
@@ -130,84 +173,12 @@ def plateau(low: float, high: float) -> Outcome:
     )
 
 
-_SCENE = "counted and set to zero where they arise (Renderer.non_finite); none is expected"
-_FLAT = "a zero gradient gives a random step; the fifth in a row ends the search as 'stalled'"
-_REFUSED = "import_environment counts the texels that are not light and refuses the map"
-_ASSET = "an environment with such a texel is refused, wherever it comes from"
-
-CASES = (
-    Case(
-        "hdri-texel-100000",
-        "radiometric",
-        "one HDRI texel at 100,000",
-        "Pictures and gradients are finite, raw and denoised, and gradients are right.",
-        _SCENE,
-        bright_texel,
-        "environment, texture",
-        cheap=False,
-    ),
-    Case(
-        "black-environment",
-        "radiometric",
-        "a black environment",
-        "The picture is black, the gradient zero, and the search ends as stalled.",
-        _FLAT,
-        black_environment,
-        "texture",
-    ),
-    Case(
-        "lamp-in-the-dark",
-        "radiometric",
-        "a black environment",
-        "A lamp lights a scene that has no other light.",
-        "the lamp's power is in multiples of the environment's metered light",
-        lamp_in_the_dark,
-        "light",
-    ),
-    *(
-        Case(
-            f"{word}-texel-{'file' if as_file else 'array'}",
-            "radiometric",
-            "negative or infinite texels refused",
-            "The map is refused before anything is rendered.",
-            _REFUSED if as_file else _ASSET,
-            partial(refused, value, as_file=as_file),
-            "environment",
-        )
-        for word, value in (("negative", -1.0), ("infinite", np.inf), ("nan", np.nan))
-        for as_file in (True, False)
-    ),
-    *(
-        Case(
-            f"{control}-exposure-{'up' if stops > 0.0 else 'down'}",
-            "radiometric",
-            "exposure of +-10 stops",
-            "Picture and gradient are finite; the gradient of the linear picture is right.",
-            _SCENE,
-            partial(exposure, control, stops),
-            f"{control}, texture",
-            cheap=control == "camera",
-        )
-        for control in ("camera", "environment")
-        for stops in (10.0, -10.0)
-    ),
-    Case(
-        "saturated-plateau",
-        "radiometric",
-        "saturated and black images",
-        f"From a white picture without a gradient every policy gets away within {PLATEAU_STEPS} evaluations.",
-        _FLAT,
-        partial(plateau, -10.0, 10.0),
-        "camera",
-    ),
-    Case(
-        "saturated-plateau-narrow-way-out",
-        "radiometric",
-        "saturated and black images",
-        "The same where the way out is a tenth of the range.",
-        _FLAT,
-        partial(plateau, 1.0, 10.0),
-        "camera",
-    ),
+GROUP.case(
+    "saturated-plateau",
+    f"From a white picture without a gradient every policy gets away within {PLATEAU_STEPS} evaluations.",
+    _FLAT,
+    "camera",
+)(partial(plateau, -10.0, 10.0))
+GROUP.case("saturated-plateau-narrow-way-out", "The same where the way out is a tenth of the range.", _FLAT, "camera")(
+    partial(plateau, 1.0, 10.0)
 )
-"""Every radiometric case."""

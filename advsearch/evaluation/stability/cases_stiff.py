@@ -17,7 +17,7 @@ from advsearch.attacks import PGD, Policy, SearchResult, make_policy, search
 from advsearch.controls.base import Parameter
 from advsearch.controls.values import Range, read, to_unit, to_value
 from advsearch.engine.gradients import smooth_loss
-from advsearch.evaluation.stability.case import Case, Check, Outcome
+from advsearch.evaluation.stability.case import Check, Group, Outcome
 from advsearch.evaluation.stability.scene import SHARPNESS, Controls, Evaluator, domain_of, examine, small
 from advsearch.evaluation.stability.search import Toy, Value, condition_number, hessian, numbers, quadratic, valley
 from advsearch.scene.renderer import Renderer
@@ -34,6 +34,10 @@ SAME = 1e-5
 SLOWER = 1.5
 """Factor by which a rate may depend on the scale."""
 
+GROUP = Group("stiff")
+_BOX = "controls map their units to the unit box; policies know nothing else"
+_BLOCKS = "a step has the length of each block's own radius (Domain.steepest); adam divides by each number's own scale"
+
 
 def path(toy: Toy, policy: Policy[Any], *, steps: int = STEPS, seed: int = 0) -> tuple[SearchResult, Tensor]:
     """Search, and return the result and the configurations (n, d) that were evaluated."""
@@ -47,6 +51,11 @@ def path(toy: Toy, policy: Policy[Any], *, steps: int = STEPS, seed: int = 0) ->
 # ---- units ----------------------------------------------------------------------------------------------------------
 
 
+@GROUP.case(
+    "rescaled-units",
+    "A search in milliwatts and radians goes through the same configurations as in watts and degrees.",
+    _BOX,
+)
 def rescaled_units() -> Outcome:
     """A lamp and a rotation, in watts and degrees or in milliwatts and radians: the same search.
 
@@ -85,6 +94,11 @@ def _lamp_and_rotation(watt: float, degree: float) -> Toy:
     return Toy(value, numbers(start))
 
 
+@GROUP.case(
+    "rescaled-objective",
+    "A search of the objective times a million goes through the same configurations.",
+    "steps are normalised, ranks and standardised values have no unit",
+)
 def objective_units() -> Outcome:
     """The same objective times a millionth and a million: the same search."""
     worst = 0.0
@@ -100,6 +114,7 @@ def objective_units() -> Outcome:
 # ---- curvatures -----------------------------------------------------------------------------------------------------
 
 
+@GROUP.case("curvatures-1e6", "A search takes no more evaluations than where the curvatures are equal.", _BLOCKS)
 def curvatures(ratio: float = RATIO) -> Outcome:
     """Two numbers whose curvatures differ by a million: evaluations until both are at the peak, against equal ones."""
     checks, measured, start, peak = [], {}, [0.15, 0.9], [0.63, 0.37]
@@ -139,6 +154,7 @@ def _until_there(name: str, value: Value, start: list[float], peak: list[float],
     return sum(counts) / len(counts)
 
 
+@GROUP.case("scaled-derivative", "One control's derivative times a million changes nothing about the rate.", _BLOCKS)
 def scaled_block() -> Outcome:
     """The gradient of one number times a million or a millionth, the objective as it is: the rate has to stay.
 
@@ -158,6 +174,12 @@ def scaled_block() -> Outcome:
 # ---- valleys and boxes ----------------------------------------------------------------------------------------------
 
 
+@GROUP.case(
+    "curved-valley",
+    "auto, adam and cmaes are no worse than random search, auto or cmaes reaches the peak, pgd the valley.",
+    "auto models the objective, cmaes learns the valley's shape; pgd steps by signs and is slow",
+    cheap=False,
+)
 def curved_valley(steps: int = 400) -> Outcome:
     """Rosenbrock's valley: what policies have left to its peak after 400 renders, beside random search.
 
@@ -186,6 +208,12 @@ def curved_valley(steps: int = 400) -> Outcome:
     return Outcome(tuple(checks), measured=measured)
 
 
+@GROUP.case(
+    "badly-scaled-box",
+    "A peak a thousandth of the range wide is found by what converges.",
+    "step sizes fall until the peak is resolved",
+    cheap=False,
+)
 def wide_box(width: float = 1e-3) -> Outcome:
     """A box a thousand times as wide as the objective's own scale in one number, and just right in the other."""
     peak, start = [0.63, 0.3712], [0.2, 0.9]
@@ -208,6 +236,12 @@ def wide_box(width: float = 1e-3) -> Outcome:
     return Outcome(tuple(checks), measured=measured)
 
 
+@GROUP.case(
+    "badly-scaled-range",
+    "The derivative does not depend on how wide the searched range is.",
+    "a difference is as wide as moves the outline by a pixel, but at least 1e-6 of the range",
+    "pose",
+)
 def wide_range() -> Outcome:
     """A shift searched over 20,000 object sizes: its derivative has to be that of a sensible range."""
     wide, narrow = (small("mug", {"pose": {"x": [-reach, reach]}}) for reach in (1e4, 0.3))
@@ -228,6 +262,13 @@ def wide_range() -> Outcome:
 # ---- a scene --------------------------------------------------------------------------------------------------------
 
 
+@GROUP.case(
+    "light-rotation-texel",
+    "All three move, the condition number is printed, and the objective's unit does not matter.",
+    _BLOCKS,
+    "light, pose, texture",
+    cheap=False,
+)
 def light_rotation_texel() -> Outcome:
     """A lamp's power beside a rotation beside texels, rendered: how stiff it is, and whether each of them moves."""
     controls: Controls = {
@@ -283,80 +324,3 @@ def _walk(renderer: Renderer, u: Tensor, loss: Value, scale: float) -> tuple[Sea
     evaluate = Evaluator(renderer, scaled, 8)
     result = search(evaluate, domain_of(renderer, u), PGD(), steps=18, seed=0, candidates=0, on_step=note)
     return result, torch.stack(seen)
-
-
-_BOX = "controls map their units to the unit box; policies know nothing else"
-_BLOCKS = "a step has the length of each block's own radius (Domain.steepest); adam divides by each number's own scale"
-
-CASES = (
-    Case(
-        "rescaled-units",
-        "stiff",
-        "same trajectory in rescaled units",
-        "A search in milliwatts and radians goes through the same configurations as in watts and degrees.",
-        _BOX,
-        rescaled_units,
-    ),
-    Case(
-        "rescaled-objective",
-        "stiff",
-        "same trajectory in rescaled units",
-        "A search of the objective times a million goes through the same configurations.",
-        "steps are normalised, ranks and standardised values have no unit",
-        objective_units,
-    ),
-    Case(
-        "curvatures-1e6",
-        "stiff",
-        "two controls whose curvatures differ by 1e6",
-        "A search takes no more evaluations than where the curvatures are equal.",
-        _BLOCKS,
-        curvatures,
-    ),
-    Case(
-        "scaled-derivative",
-        "stiff",
-        "a rate that does not depend on the units",
-        "One control's derivative times a million changes nothing about the rate.",
-        _BLOCKS,
-        scaled_block,
-    ),
-    Case(
-        "curved-valley",
-        "stiff",
-        "narrow curved valleys",
-        "auto, adam and cmaes are no worse than random search, auto or cmaes reaches the peak, pgd the valley.",
-        "auto models the objective, cmaes learns the valley's shape; pgd steps by signs and is slow",
-        curved_valley,
-        cheap=False,
-    ),
-    Case(
-        "badly-scaled-box",
-        "stiff",
-        "badly scaled boxes",
-        "A peak a thousandth of the range wide is found by what converges.",
-        "step sizes fall until the peak is resolved",
-        wide_box,
-        cheap=False,
-    ),
-    Case(
-        "badly-scaled-range",
-        "stiff",
-        "badly scaled boxes",
-        "The derivative does not depend on how wide the searched range is.",
-        "a difference is as wide as moves the outline by a pixel, but at least 1e-6 of the range",
-        wide_range,
-        "pose",
-    ),
-    Case(
-        "light-rotation-texel",
-        "stiff",
-        "a light in watts beside a rotation in degrees beside a texel",
-        "All three move, the condition number is printed, and the objective's unit does not matter.",
-        _BLOCKS,
-        light_rotation_texel,
-        "light, pose, texture",
-        cheap=False,
-    ),
-)
-"""Every case about scales."""

@@ -21,19 +21,22 @@ from advsearch.evaluation.stability import (
     cases_radiometric,
     cases_stiff,
 )
-from advsearch.evaluation.stability.case import FELL_SHORT, GROUPS, OK, Case, Check, Outcome
+from advsearch.evaluation.stability.case import FELL_SHORT, OK, Case, Check, Outcome
 from advsearch.progress import Progress
 from advsearch.runs.results.stability import CaseRow, DecidingNumber
 
-CASES: tuple[Case, ...] = (
-    *cases_radiometric.CASES,
-    *cases_materials.CASES,
-    *cases_geometry.CASES,
-    *cases_objective.CASES,
-    *cases_stiff.CASES,
-    *cases_precision.CASES,
-    *cases_noise.CASES,
+_MODULES = (
+    cases_radiometric,
+    cases_materials,
+    cases_geometry,
+    cases_objective,
+    cases_stiff,
+    cases_precision,
+    cases_noise,
 )
+GROUPS: tuple[str, ...] = tuple(module.GROUP.name for module in _MODULES)
+"""Every group, in the order in which they run."""
+CASES: tuple[Case, ...] = tuple(case for module in _MODULES for case in module.GROUP.cases)
 """Every case, in the order in which they run."""
 
 
