@@ -96,7 +96,7 @@ def one(scene: str, args: argparse.Namespace) -> bool:
 
 def measured(config: PrecisionConfig, found: Recommended) -> tuple[float, bool]:
     """The error of a recommended setting with other seeds, and whether the new reference can tell it."""
-    problem, _ = problem_from_config(config.as_attack())
+    problem, _ = problem_from_config(config)
     renderer, budget = problem.renderer, TimeBudget(config.seconds / 3.0)
     assert found.estimator is not None and found.spp is not None
     setting = MeasuredSetting(found.quantity, found.estimator, found.spp, 1.0, found.control or "")

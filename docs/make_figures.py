@@ -25,17 +25,7 @@ from pydantic.fields import FieldInfo
 
 from advsearch.cli.flags import GROUPS, help_text
 from advsearch.cli.main import COMMANDS
-from advsearch.config import (
-    AttackConfig,
-    CheckConfig,
-    GapConfig,
-    PlanConfig,
-    PrecisionConfig,
-    RegionConfig,
-    RenderConfig,
-    StabilityConfig,
-    SweepConfig,
-)
+from advsearch.config import CONFIGS, AttackConfig
 from advsearch.controls import OWN
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import END, Fields, Result
@@ -44,7 +34,7 @@ from advsearch.runs.results.region import RegionResult
 from advsearch.runs.results.stability import CaseRow
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.scene.settings import SETTINGS
-from advsearch.settings import Config, Setting, settings
+from advsearch.settings import Setting, settings
 
 DOCS = Path(__file__).resolve().parent
 DIAGRAM = "images/reliability.svg"
@@ -115,18 +105,6 @@ def flags(record: Record) -> str:
 
 
 FLAG_HEADS = ("flag", "what", "values", "default")
-
-CONFIGS: dict[str, type[Config]] = {
-    "render": RenderConfig,
-    "sweep": SweepConfig,
-    "gap": GapConfig,
-    "region": RegionConfig,
-    "plan": PlanConfig,
-    "check": CheckConfig,
-    "stability": StabilityConfig,
-    "precision": PrecisionConfig,
-}
-"""The commands whose flags are settings, some of them the same as those of `attack`."""
 
 
 def own_flags(command: str) -> Callable[[Record], str]:
@@ -435,7 +413,7 @@ def _text(x: float, y: float, text: str, anchor: str, *, turned: bool = False) -
 
 PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("command-line.md", "flags"): flags,
-    **{("command-line.md", f"{command}-flags"): own_flags(command) for command in CONFIGS},
+    **{("command-line.md", f"{command}-flags"): own_flags(command) for command in CONFIGS if command != "attack"},
     ("scenes.md", "parameters"): scene_parameters,
     ("scenes.md", "objects"): objects,
     ("scenes.md", "environments"): environments,

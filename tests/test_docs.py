@@ -42,9 +42,9 @@ from advsearch.attacks.verification import WORST_CASE
 from advsearch.cli.flags import config_from
 from advsearch.cli.list import REGISTRIES
 from advsearch.cli.main import COMMANDS, _parse
-from advsearch.cli.run import COMMANDS as IN_FILES
 from advsearch.cli.sweep import axes_as_text
 from advsearch.config import (
+    CONFIGS,
     TRIALS,
     TRIALS_OVER,
     AttackConfig,
@@ -375,10 +375,6 @@ def lines(page: Path) -> list[list[str]]:
     return [words for line in joined if (words := shlex.split(line, comments=True))]
 
 
-CONFIGS: dict[str, type[Config]] = {"attack": AttackConfig, **script("make_figures").CONFIGS}
-"""What the flags of a command become."""
-
-
 def check_names(config: Config) -> None:
     """Look up every name in a configuration, as its command would; nothing is loaded."""
     if isinstance(config, StabilityConfig):
@@ -418,7 +414,7 @@ def check_advsearch(words: list[str], folder: Path) -> None:
     if args.command in CONFIGS:
         if "grid" in args:
             args.grid = axes_as_text(args.grid)
-        otherwise = {} if args.command in ("attack", "render", "stability", "sweep", "gap") else {"object": "mug"}
+        otherwise = {"object": "mug"} if "around" in args and args.command == "region" else {}
         check_names(config_from(args, CONFIGS[args.command], **otherwise))
     if args.command == "run":
         recipe = folder / "run.yaml"
@@ -457,7 +453,7 @@ def test_every_yaml_example_is_a_configuration(page: Path, tmp_path: Path) -> No
         named = re.match(r"# (\S+\.yaml)\n", block)  # others on the page may build on it
         path = tmp_path / (named[1] if named else "example.yaml")
         path.write_text(block, encoding="utf-8")
-        config = getattr(advsearch.config, IN_FILES[read_yaml(path).get("command", "attack")])
+        config = CONFIGS[str(read_yaml(path).get("command", "attack"))]
         check_names(config.from_yaml(path))
 
 

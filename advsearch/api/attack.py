@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from advsearch import seeds
 from advsearch.attacks import Objective, Policy, get_objective, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
-from advsearch.config import AttackConfig
+from advsearch.config import AttackConfig, SceneConfig
 from advsearch.config.scene import one_only
 from advsearch.controls import make_space
 from advsearch.controls.base import Control
@@ -174,14 +174,14 @@ def resume_attack(run: str | Path, *, progress: Progress | None = None) -> Attac
     return _go_on(_job(config), path, progress)
 
 
-def problem_from_config(config: AttackConfig, *, denoise: str | None = None) -> tuple[Problem, list[str]]:
+def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> tuple[Problem, list[str]]:
     """Load what a configuration describes without searching: the problem, and warnings on the way.
 
     Args:
         config: what.
         denoise: another denoiser than the configuration's.
     """
-    job = _job(config if denoise is None else config.model_copy(update={"denoise": denoise}))
+    job = _job(AttackConfig.of(config, denoise=denoise or config.denoise))
     problem = _problem(job)
     return problem, [*job.loaded[1], *sentences(problem.space.moved)]
 

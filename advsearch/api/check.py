@@ -10,7 +10,7 @@ from pathlib import Path
 
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
-from advsearch.config import AttackConfig, CheckConfig
+from advsearch.config import CheckConfig
 from advsearch.controls import CONTROLS
 from advsearch.engine.gradients import (
     EXPENSIVE,
@@ -68,7 +68,7 @@ IN_PARAMETERS = "one for each parameter; `resolution` or fewer controls shorten 
 
 
 def check(
-    config: AttackConfig, *, losses: Sequence[str] = LOSSES, everything: bool = False, progress: Progress | None = None
+    config: CheckConfig, *, losses: Sequence[str] = LOSSES, everything: bool = False, progress: Progress | None = None
 ) -> list[CheckedRow]:
     """Compare the gradient of every parameter with differences, on the actual scene.
 
@@ -144,7 +144,7 @@ class CheckedPart:
     """
 
     number: int
-    config: AttackConfig
+    config: CheckConfig
     loss: str
 
     @property
@@ -153,12 +153,12 @@ class CheckedPart:
         return f"check {self.number}"
 
 
-def _parts(config: AttackConfig, losses: Sequence[str], everything: bool) -> list[CheckedPart]:
+def _parts(config: CheckConfig, losses: Sequence[str], everything: bool) -> list[CheckedPart]:
     asked = [(one, loss) for one in _configurations(config, everything) for loss in losses]
     return [CheckedPart(number, one, loss) for number, (one, loss) in enumerate(asked, start=1)]
 
 
-def _configurations(config: AttackConfig, everything: bool) -> Iterator[AttackConfig]:
+def _configurations(config: CheckConfig, everything: bool) -> Iterator[CheckConfig]:
     if not everything:
         yield config
         return

@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 from advsearch.api.attack import attack_from_config, resume_attack
 from advsearch.attacks import clopper_pearson
@@ -202,12 +202,6 @@ class _Parts:
         return None if self.interrupted else summary
 
 
-def _as_attack(config: AttackConfig, **update: Any) -> AttackConfig:
-    """One attack of a study."""
-    fields = {name: getattr(config, name) for name in AttackConfig.model_fields}
-    return AttackConfig.model_construct(**{**fields, **update})
-
-
 # ---- robust accuracy against epsilon --------------------------------------------------------------------------------
 
 
@@ -220,7 +214,7 @@ def _curve(config: AttackConfig, parts: _Parts) -> Json:
             label = f"{place:02d}-" + default_name(
                 name, [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")]
             )
-            one = _as_attack(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)
+            one = AttackConfig.of(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)
             summary = parts.attack(one, label)
             if summary is None:
                 break
@@ -291,7 +285,7 @@ def _gap(config: GapConfig, parts: _Parts) -> list[GapRow]:
     for place, name in enumerate(different(config.objects, "object")):
         for number, (control, settings) in enumerate(config.controls.items()):
             own = vars(shared.alone(control, settings))
-            one = _as_attack(config, object=name, controls={control: settings}, **own)
+            one = AttackConfig.of(config, object=name, controls={control: settings}, **own)
             summary = parts.attack(one, f"{place:02d}-{number:02d}-" + default_name(name, [control]))
             if summary is not None and summary.average is not None:
                 rows.append(_compared(name, control, summary, summary.average))

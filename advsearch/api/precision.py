@@ -66,7 +66,7 @@ def precision(config: PrecisionConfig, *, progress: Progress | None = None) -> P
     begun = time.perf_counter()
     progress.stage(LOADING, hint=f"then {config.seconds:g} seconds of measurements; `seconds` sets them")
     policies = {name: make_policy(name) for name in split_names(config.policies)}
-    problem, said = problem_from_config(config.as_attack())
+    problem, said = problem_from_config(config)
     for text in said:
         progress.message(text)
     job = _Measurement(config, problem, progress, TimeBudget(config.seconds))
@@ -284,7 +284,7 @@ def _head(config: PrecisionConfig, problem: Problem) -> Json:
         "image_formation": Formation.of(problem.renderer.formation),
         "depth": problem.renderer.scene.max_depth,
         "loss": config.loss,
-        "objective": config.objective,
+        "objective": config.objective or problem.task.objective,
         "spp": problem.spp,
         "seed": config.seed,
         "machine": machine(),

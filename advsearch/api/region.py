@@ -14,7 +14,7 @@ from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.attacks import make_policy
 from advsearch.attacks.region import ATTEMPTS, MOST_PROBED, Region, grow
-from advsearch.config import AttackConfig, RegionConfig, SceneConfig
+from advsearch.config import AttackConfig, RegionConfig
 from advsearch.engine.budget import RenderBudget, verification_ladder
 from advsearch.engine.memory import ANSWER, Memory
 from advsearch.engine.naming import Named, options_of
@@ -101,10 +101,8 @@ def region_from_config(
     """
     stages = Stages(progress or NullProgress())
     stages.begin("setup", LOADING)
-    as_attack = AttackConfig(**{name: getattr(config, name) for name in SceneConfig.model_fields})
     budget = {} if config.around is None else _budget(config.around)
-    as_attack = as_attack.model_copy(update=budget)
-    problem, said = problem_from_config(as_attack)
+    problem, said = problem_from_config(AttackConfig.of(config, **budget))
     for text in said:
         stages.progress.message(text)
     varied = _varied(problem, config)

@@ -16,20 +16,6 @@ if TYPE_CHECKING:
     from advsearch.runs.results.check import CheckedRow, CheckResult, DerivativeRow
 
 HELP = "check the gradient of every parameter of a scene against differences"
-GROUPS = ("scene", "model")
-FIELDS = (
-    "controls",
-    "estimators",
-    "spp",
-    "denoise",
-    "pixel_sampler",
-    "objective",
-    "seed",
-    "threads",
-    "epsilon",
-    "norm",
-)
-"""The settings of `attack` that matter here, beside those of scene and model."""
 FELL_SHORT = 3
 READING = (
     "Each row sets a derivative as a search gets it (gradient) beside one that takes far more renders (reference).\n"
@@ -73,7 +59,7 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    add_settings(parser, groups=(*GROUPS, "check"), fields=(*FIELDS, "run", "overwrite"), config=CheckConfig)
+    add_settings(parser, config=CheckConfig)
     output.add_flags(parser, quiet=True)
 
 
@@ -82,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     from advsearch.cli.flags import config_from
     from advsearch.config import CheckConfig
 
-    return carry_out(config_from(args, CheckConfig, object="mug"), as_json=args.json, quiet=args.quiet)
+    return carry_out(config_from(args, CheckConfig), as_json=args.json, quiet=args.quiet)
 
 
 def carry_out(config: CheckConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:

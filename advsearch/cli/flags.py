@@ -10,8 +10,7 @@ import re
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
-from advsearch import config as configurations
-from advsearch.config import AttackConfig
+from advsearch.config import CONFIGS, AttackConfig
 from advsearch.settings import Config, Setting, check_once, parse_assignment, settings
 
 GROUPS = {
@@ -107,8 +106,7 @@ def with_flags(message: str) -> str:
     or without. ``epsilon: ...; lower `steps` or use `denoise=none` `` becomes
     ``--epsilon: ...; lower --steps or use --denoise none``.
     """
-    every = [getattr(configurations, name) for name in configurations.__all__ if name.endswith("Config")]
-    known = [one for config in every for one in settings(config)]
+    known = [one for config in CONFIGS.values() for one in settings(config)]
     flags = {**_NO_SETTINGS, **{one.name: one.flag for one in known}}
     switches = {one.name for one in known if one.is_switch}
 

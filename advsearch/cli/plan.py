@@ -6,7 +6,6 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
-from advsearch.cli.check import FIELDS, GROUPS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -44,9 +43,7 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    add_settings(
-        parser, groups=(*GROUPS, "check"), fields=(*FIELDS, "specialise", "run", "overwrite"), config=PlanConfig
-    )
+    add_settings(parser, config=PlanConfig)
     output.add_flags(parser, quiet=True)
 
 
@@ -55,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     from advsearch.cli.flags import config_from
     from advsearch.config import PlanConfig
 
-    return carry_out(config_from(args, PlanConfig, object="mug"), as_json=args.json, quiet=args.quiet)
+    return carry_out(config_from(args, PlanConfig), as_json=args.json, quiet=args.quiet)
 
 
 def carry_out(config: PlanConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:

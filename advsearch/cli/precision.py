@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     from advsearch.cli.flags import config_from
     from advsearch.config import PrecisionConfig
 
-    return carry_out(config_from(args, PrecisionConfig, object="mug"), as_json=args.json, quiet=args.quiet)
+    return carry_out(config_from(args, PrecisionConfig), as_json=args.json, quiet=args.quiet)
 
 
 def carry_out(config: PrecisionConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:

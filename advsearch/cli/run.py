@@ -16,17 +16,8 @@ if TYPE_CHECKING:
 
 HELP = "do what a YAML file describes: a run.yaml repeats its run"
 
-COMMANDS = {
-    "attack": "AttackConfig",
-    "sweep": "SweepConfig",
-    "gap": "GapConfig",
-    "region": "RegionConfig",
-    "precision": "PrecisionConfig",
-    "check": "CheckConfig",
-    "plan": "PlanConfig",
-    "stability": "StabilityConfig",
-}
-"""What the `command` of a file may say, and the configuration that it is."""
+COMMANDS = ("attack", "sweep", "gap", "region", "precision", "check", "plan", "stability")
+"""What the `command` of a file may say."""
 
 
 def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
@@ -66,12 +57,11 @@ def command_in(file: str | Path) -> str:
 
 def described(command: str, file: str | Path, changes: Mapping[str, Any]) -> Config:
     """Return the configuration that a file describes; arguments and errors as for `carry_out`."""
-    from advsearch import config
+    from advsearch.config import CONFIGS
 
     if command not in COMMANDS:
         raise UnknownNameError("command", command, COMMANDS, f"It stands in {file}.")
-    made: Config = getattr(config, COMMANDS[command]).from_yaml(file, changes)
-    return made
+    return CONFIGS[command].from_yaml(file, changes)
 
 
 def carry_out(

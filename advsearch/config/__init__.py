@@ -9,15 +9,34 @@ from __future__ import annotations
 
 from advsearch.config.attack import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.config.checking import CheckConfig, PlanConfig, StabilityConfig
+from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.precision import QUANTITIES, SAMPLERS, PrecisionConfig
 from advsearch.config.questions import FEWEST_SAMPLES, GapConfig, RegionConfig
 from advsearch.config.rendering import RenderConfig
 from advsearch.config.scene import AUTO_SHARE, CLOSE_LOOKS, SEARCH_SPP, SceneConfig
 from advsearch.config.sweep import SweepConfig
+from advsearch.settings import Config
+
+CONFIGS: dict[str, type[Config]] = {
+    one.command: one
+    for one in (
+        AttackConfig,
+        RenderConfig,
+        SweepConfig,
+        GapConfig,
+        RegionConfig,
+        PlanConfig,
+        CheckConfig,
+        StabilityConfig,
+        PrecisionConfig,
+    )
+}
+"""What the settings of each command are, in the order in which the docs show them."""
 
 __all__ = [
     "AUTO_SHARE",
     "CLOSE_LOOKS",
+    "CONFIGS",
     "FEWEST_SAMPLES",
     "FEWEST_TRIALS",
     "QUANTITIES",
@@ -27,6 +46,7 @@ __all__ = [
     "TRIALS_OVER",
     "AttackConfig",
     "CheckConfig",
+    "DerivativeConfig",
     "GapConfig",
     "PlanConfig",
     "PrecisionConfig",

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from pydantic import field_validator, model_validator
+from pydantic import model_validator
 
+from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.named import name_in, read_named
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import Clash, check_once, parse_assignment, setting
+from advsearch.settings import PLACE, Clash, setting
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 TRIALS, TRIALS_OVER = 20, 200
 """Fresh renders that check an answer, and one that holds for many conditions."""
@@ -17,18 +21,15 @@ TRIALS, TRIALS_OVER = 20, 200
 FEWEST_TRIALS = 6
 """With fewer, nothing can be called found: `attacks.verification.Rule.fewest`, which a test holds this to."""
 
-LARGEST_EPSILON = 1e6
-"""No control has a distance of that size; far above it, its square is none in float32."""
 
-
-class AttackConfig(SceneConfig):
+class AttackConfig(DerivativeConfig):
     """Everything that decides what `attack` does. Frozen; unknown names are refused."""
 
     command: ClassVar[str] = "attack"
-    several: ClassVar[tuple[str, ...]] = ("object",)
+    several: ClassVar[tuple[str, ...]] = ("object", "epsilon")
 
     clashes: ClassVar[tuple[Clash, ...]] = (
-        *SceneConfig.clashes,
+        *DerivativeConfig.clashes,
         Clash(
             "smallest",
             lambda one: one.epsilons,
@@ -76,24 +77,6 @@ class AttackConfig(SceneConfig):
         "what the model should recognise; several, separated by commas, are attacked one after the other",
         "the name of an object or a .obj, .ply, .glb, .gltf or .stl file",
     )
-    epsilon: float | dict[str, float] | tuple[float, ...] | None = setting(
-        None,
-        "search",
-        "how far a control may go from where it starts, in its own unit (or CONTROL=NUMBER,...; or NUMBER,NUMBER,... "
-        "for a curve)",
-        f"a number greater than 0 and at most {LARGEST_EPSILON:g}",
-        otherwise="the control's own",
-    )
-    norm: Literal["linf", "l2"] | None = setting(
-        None, "search", "how that distance is measured", "linf or l2", otherwise="the control's own"
-    )
-    estimators: dict[str, str] = setting(
-        dict,
-        "search",
-        "force how derivatives are obtained",
-        "NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME; `advsearch plan` shows the names",
-        alias="estimator",
-    )
     measure: Literal["no", "quick", "full"] = setting(
         "quick",
         "search",
@@ -130,9 +113,6 @@ class AttackConfig(SceneConfig):
         gt=0.0,
         le=2.0,
     )
-    objective: str | None = setting(
-        None, "search", "what is maximised", "the name of an objective", otherwise="the task's own: margin"
-    )
     target: str | None = setting(
         None,
         "search",
@@ -162,7 +142,6 @@ class AttackConfig(SceneConfig):
         ge=0,
         le=1_000_000,
     )
-    specialise: bool = setting(True, "search", "leave out what the scene and the search don't need", "true or false")
     baseline: bool = setting(True, "search", "run a random search with as many renders beside it", "true or false")
 
     verify_spp: int | None = setting(
@@ -186,31 +165,6 @@ class AttackConfig(SceneConfig):
         le=100_000,
     )
 
-    @field_validator("epsilon", mode="before")
-    @classmethod
-    def _epsilon_from_text(cls, value: Any) -> Any:
-        """Accept ``0.05``, ``0.01,0.02`` and ``texture=0.05,geometry=0.01``; numbers in range, and none twice."""
-        if isinstance(value, str):
-            parts = [part.strip() for part in value.split(",")]
-            if "=" in value:
-                pairs = [parse_assignment(part, "epsilon") for part in parts]
-                check_once((name for name, _ in pairs), "epsilon")
-                value = dict(pairs)
-            else:
-                value = tuple(parts)
-        if isinstance(value, (list, tuple)) and len(value) == 1:
-            value = value[0]
-        if isinstance(value, Mapping):
-            numbers = [_positive(one) for one in value.values()]
-        elif isinstance(value, (list, tuple)):
-            numbers = [_positive(one) for one in value]
-            check_once((f"{one:g}" for one in numbers), "epsilon")
-        else:
-            numbers = [1.0 if value is None else _positive(value)]
-        if not numbers:
-            raise ValueError("nothing is named")
-        return value
-
     @model_validator(mode="before")
     @classmethod
     def _policy_with_steps(cls, data: Any) -> Any:
@@ -222,6 +176,18 @@ class AttackConfig(SceneConfig):
         rest = {option: value for option, value in policy.items() if option != "steps"}
         return {**data, **steps, "policy": read_named(rest, "policy", "auto")}
 
+    @classmethod
+    def of(cls, config: SceneConfig, **other: Any) -> Self:
+        """Return an attack on what another command's configuration describes, in a place of its own.
+
+        Args:
+            config: gives the settings that its command and this one have from the same class.
+            **other: settings that are different.
+        """
+        both = next(one for one in cls.__mro__ if issubclass(one, SceneConfig) and isinstance(config, one))
+        shared = {name: getattr(config, name) for name in both.model_fields if name not in PLACE}
+        return cls(**{**shared, **other})
+
     @property
     def policy_name(self) -> str:
         """Name of the policy."""
@@ -231,11 +197,6 @@ class AttackConfig(SceneConfig):
     def policy_options(self) -> dict[str, Any]:
         """Options of the policy."""
         return {} if isinstance(self.policy, str) else {k: v for k, v in self.policy.items() if k != "name"}
-
-    @property
-    def epsilons(self) -> tuple[float, ...]:
-        """The several epsilons of a curve; empty where there is one."""
-        return self.epsilon if isinstance(self.epsilon, tuple) else ()
 
     @property
     def is_study(self) -> bool:
@@ -252,14 +213,3 @@ def instance(asked: str) -> str:
     """The name of a control's instance as it is asked for: `key` of `light:key`, `camera` of `camera.azimuth`."""
     kind, _, own = asked.partition(":")
     return (own or kind).partition(".")[0]
-
-
-def _positive(value: Any) -> float:
-    """A number of an epsilon."""
-    try:
-        number = float("nan") if isinstance(value, bool) else float(value)
-    except (TypeError, OverflowError):
-        raise ValueError("not a number") from None
-    if not 1e-30 < number <= LARGEST_EPSILON:  # what is smaller has no square in float32
-        raise ValueError("out of range")
-    return number

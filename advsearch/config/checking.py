@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator
 
-from advsearch.config.attack import AttackConfig
+from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import Clash, Config, check_once, setting, split_names
 
@@ -29,15 +29,14 @@ def _sitting() -> Any:
     )
 
 
-class CheckConfig(AttackConfig):
+class CheckConfig(DerivativeConfig):
     """Everything that decides what `check` does: gradients of a scene against differences."""
 
     command: ClassVar[str] = "check"
-    free: ClassVar[tuple[str, ...]] = (*AttackConfig.free, "seconds")
-    several: ClassVar[tuple[str, ...]] = ()
+    free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "seconds")
 
     clashes: ClassVar[tuple[Clash, ...]] = (
-        *AttackConfig.clashes,
+        *DerivativeConfig.clashes,
         Clash(
             "all",
             lambda one: any(getattr(one, name) != value for name, value in OF_ALL.items()),
@@ -70,11 +69,11 @@ class CheckConfig(AttackConfig):
         return ("linear", "model") if self.loss == "both" else (self.loss,)
 
 
-class PlanConfig(AttackConfig):
+class PlanConfig(DerivativeConfig):
     """Everything that decides what `plan` does: how a search gets its derivatives, and what it leaves out."""
 
     command: ClassVar[str] = "plan"
-    free: ClassVar[tuple[str, ...]] = (*AttackConfig.free, "seconds")
+    free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "seconds")
 
     seconds: float | None = _sitting()
 

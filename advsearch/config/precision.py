@@ -7,9 +7,8 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator
 
-from advsearch.config.attack import LARGEST_EPSILON, AttackConfig
-from advsearch.config.scene import SceneConfig
-from advsearch.settings import PLACE, Clash, check_once, setting, split_names
+from advsearch.config.derivative import DerivativeConfig
+from advsearch.settings import Clash, check_once, setting, split_names
 
 QUANTITIES = ("image", "gradient", "objective")
 SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
@@ -20,12 +19,12 @@ def _without(quantity: str) -> Callable[[Any], object]:
     return lambda one: quantity not in split_names(one.quantities)
 
 
-class PrecisionConfig(SceneConfig):
+class PrecisionConfig(DerivativeConfig):
     """Everything that decides what `precision` does: error against run time, for a scene, its controls and a model."""
 
     command: ClassVar[str] = "precision"
     clashes: ClassVar[tuple[Clash, ...]] = (
-        *SceneConfig.clashes,
+        *DerivativeConfig.clashes,
         *(
             Clash(name, _without(quantity), f"is of the {quantity}, which `quantities` leaves out; leave it out too")
             for name, quantity in (
@@ -85,16 +84,6 @@ class PrecisionConfig(SceneConfig):
         "whose gradient is measured: a smooth linear loss of the raw picture, or the model's in its image formation",
         "linear or model",
     )
-    objective: str = setting("margin", "search", "what policies maximise", "the name of an objective")
-    epsilon: float | None = setting(
-        None,
-        "search",
-        "how far a control may go from where it starts, in its own unit",
-        f"a number greater than 0 and at most {LARGEST_EPSILON:g}",
-        otherwise="the control's own",
-        gt=0.0,
-        le=LARGEST_EPSILON,
-    )
     policies: str = setting(
         "auto,random", "search", "policies that are compared, separated by commas", "names of policies"
     )
@@ -141,8 +130,3 @@ class PrecisionConfig(SceneConfig):
     def title(self) -> tuple[str, ...]:
         """The object, and what is asked of it."""
         return self.object, self.command
-
-    def as_attack(self) -> AttackConfig:
-        """Return the settings that an attack shares."""
-        shared = {name: getattr(self, name) for name in SceneConfig.model_fields if name not in PLACE}
-        return AttackConfig(**shared, objective=self.objective, epsilon=self.epsilon)

@@ -17,6 +17,7 @@ class GapConfig(AttackConfig):
     """Everything that decides what `gap` does: the worst case beside the average, for each object and each control."""
 
     command: ClassVar[str] = "gap"
+    several: ClassVar[tuple[str, ...]] = ("object",)
     clashes: ClassVar[tuple[Clash, ...]] = (
         *AttackConfig.clashes,
         Clash(
@@ -24,7 +25,6 @@ class GapConfig(AttackConfig):
             lambda one: True,
             "is not for `advsearch gap`, which compares over one space; leave it out",
         ),
-        Clash("epsilon", lambda one: one.epsilons, "`advsearch gap` compares over one space; give one epsilon"),
     )
 
     average: int = setting(

@@ -121,7 +121,7 @@ def test_a_gap_gives_each_control_its_own_budget(asked: list[AttackConfig]) -> N
     assert [(one.epsilon, one.average, list(one.controls)) for one in asked] == [
         ({"texture": 0.05}, 7, ["texture"]), (None, 7, ["pose"]),
     ]  # fmt: skip
-    with pytest.raises(InputError, match="epsilon: `advsearch gap` compares over one space"):
+    with pytest.raises(InputError, match="epsilon: several make a curve"):
         studies.gap_from_config(GapConfig(object="mug", epsilon="0.1,0.2", run="other"))
 
 

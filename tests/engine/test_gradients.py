@@ -15,7 +15,7 @@ from advsearch import load_scene
 from advsearch.api.attack import problem_from_config
 from advsearch.api.check import attempts, check
 from advsearch.cli.check import table
-from advsearch.config import AttackConfig
+from advsearch.config import AttackConfig, CheckConfig
 from advsearch.controls import make_control
 from advsearch.engine.gradients import (
     Estimate,
@@ -614,7 +614,7 @@ def test_the_smooth_loss_does_not_see_the_edge_of_the_picture() -> None:
 
 
 def test_a_check_says_of_both_losses_how_good_a_gradient_is() -> None:
-    config = AttackConfig(object="mug", controls={"background": {}}, resolution=(24, 24), spp=4)
+    config = CheckConfig(controls={"background": {}}, resolution=(24, 24), spp=4)
     rows = check(config)
     linear = [row for row in rows if row.loss == "linear"]
     assert {row.parameter for row in linear} >= {"hue", "saturation", "value"}

@@ -14,7 +14,7 @@ import pytest
 
 from advsearch.cli.main import main
 from advsearch.cli.precision import answer as precision_text
-from advsearch.config import PrecisionConfig
+from advsearch.config import AttackConfig, PrecisionConfig
 from advsearch.errors import InputError
 from advsearch.evaluation.precision.fits import (
     FURTHEST,
@@ -489,8 +489,10 @@ def test_settings_go_through_yaml_and_the_command_line(tmp_path: Path) -> None:
     path = tmp_path / "run.yaml"
     path.write_text(config.to_yaml(), encoding="utf-8")
     assert PrecisionConfig.from_yaml(path) == config
-    assert config.command_line() == "advsearch precision --object mug --control pose --depths 3,9 --policies random"
-    assert config.as_attack().controls == {"pose": {}} and config.as_attack().objective == "margin"
+    assert config.command_line() == "advsearch precision --control pose --depths 3,9 --policies random"
+    shared = AttackConfig.of(config, norm="l2")
+    assert (shared.object, shared.controls, shared.objective, shared.norm) == ("mug", {"pose": {}}, None, "l2")
+    assert (shared.steps, shared.seconds) == (40, None), "what only has the same name is not shared"
 
 
 def test_the_machine_is_named(tmp_path: Path) -> None:

@@ -44,15 +44,9 @@ def load_labels(path: Path) -> None:
 
 def load_settings(path: Path) -> None:
     """Read a YAML file as `advsearch run` does."""
-    from advsearch import config
-    from advsearch.cli.run import COMMANDS
-    from advsearch.errors import UnknownNameError
-    from advsearch.settings import read_yaml
+    from advsearch.cli.run import command_in, described
 
-    command = str(read_yaml(path).get("command", "attack"))
-    if command not in COMMANDS:
-        raise UnknownNameError("command", command, COMMANDS, f"It stands in {path}.")
-    getattr(config, COMMANDS[command]).from_yaml(path, {})
+    described(command_in(path), path, {})
 
 
 def load_run(path: Path) -> None:
