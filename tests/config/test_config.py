@@ -27,6 +27,7 @@ from advsearch.config import (
     GapConfig,
     PrecisionConfig,
     RegionConfig,
+    RenderConfig,
     StabilityConfig,
     SweepConfig,
 )
