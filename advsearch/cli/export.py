@@ -13,11 +13,12 @@ from advsearch.cli import output
 from advsearch.cli.screen import output_errors
 from advsearch.errors import InputError
 
-HELP = "write a run's evaluated configurations as a table: CSV, JSON or Parquet"
+HELP = "write a run's evaluated configurations as a table (CSV, JSON or Parquet), or its texture or patch for printing"
 
 _EXAMPLES = """examples:
   advsearch export mug-texture-001
   advsearch export runs/mug-texture-001 --kind search --out search.parquet
+  advsearch export mug-patch-001 --format print --size 95 --out sheets.pdf
 """
 
 
@@ -32,12 +33,15 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         allow_abbrev=False,
     )
     parser.add_argument("run", metavar="RUN", help="a run's name or folder")
-    parser.add_argument("--format", help="csv, json or parquet (default: by the name of --out, or csv)")
+    parser.add_argument("--format", help="csv, json, parquet or print (default: by the name of --out, or csv)")
     parser.add_argument("--out", metavar="FILE", help="the file to write (default: standard output)")
     parser.add_argument(
         "--json", action="store_true", help="the same as --format json; with --out, tell what was written"
     )
     parser.add_argument("--kind", help="only rows of this kind: search, baseline, sweep, ... (default: all)")
+    parser.add_argument("--size", metavar="MM", type=float, help="print: the real object's longest side in millimetres")
+    parser.add_argument("--paper", help="print: a4, a3 or letter (default: a4)")
+    parser.add_argument("--icc", metavar="FILE", help="print: ICC profile of an RGB printer (default: sRGB)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -47,6 +51,11 @@ def run(args: argparse.Namespace) -> int:
     from advsearch.runs.store import NAME, Store
 
     out = None if args.out is None else Path(args.out)
+    if args.format == "print" or (args.format is None and out is not None and out.suffix.lower() == ".pdf"):
+        return _print(args, out)
+    for name in ("size", "paper", "icc"):
+        if getattr(args, name) is not None:
+            raise InputError(f"--{name}: belongs to --format print; leave it out")
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
     otherwise = by_name if by_name in FORMATS else "json" if args.json and out is None else "csv"
     format = args.format or otherwise
@@ -67,4 +76,34 @@ def run(args: argparse.Namespace) -> int:
         output.print_json({"schema": 1, "command": "export", "rows": count, "format": format, "out": str(out)})
     elif out is not None:
         print(f"{count} rows in {out}", file=sys.stderr)
+    return 0
+
+
+def _print(args: argparse.Namespace, out: Path | None) -> int:
+    """Write the sheets."""
+    from advsearch.cli.progress import at_work
+
+    if out is None:
+        raise InputError("--out: print writes a PDF file; give its name")
+    if args.size is None:
+        raise InputError("--size: how large is the real object? Give its longest side in millimetres: --size 95")
+    if args.kind is not None:
+        raise InputError("--kind: belongs to tables of rows; leave it out")
+    with at_work(as_json=True, quiet=False):
+        from advsearch.engine.printing import printable
+        from advsearch.report.sheets import write_sheets
+        from advsearch.runs.files import placed_by, replacing
+
+        pieces = printable(args.run, args.size)
+        profile = None if args.icc is None else Path(args.icc)
+        title = f"{Path(args.run).name}, object of {args.size:g} mm"
+        with placed_by("out"), replacing(out) as part:
+            pages = write_sheets(part, pieces, title, paper=(args.paper or "a4").lower(), profile=profile)
+    sizes = [{"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]} for piece in pieces]
+    if args.json:
+        output.print_json(
+            {"schema": 1, "command": "export", "format": "print", "pages": pages, "pieces": sizes, "out": str(out)}
+        )
+    else:
+        print(f"{pages} pages in {out}; print them at 100 % and measure the square on the first", file=sys.stderr)
     return 0

@@ -334,12 +334,11 @@ class BoundPatch(BoundControl):
 
     def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         pixels = self.pixels(u.detach())
-        return {self.name: enlarged(pixels, PRINT_SIDE), f"{self.name}-pixels": pixels}
+        return {self.name: enlarged(pixels, -(-PRINT_SIDE // len(pixels))), f"{self.name}-pixels": pixels}
 
 
-def enlarged(pixels: Tensor, least: int) -> Tensor:
-    """Return a picture (n, n, 3) sRGB at a whole multiple of its size, interpolated as the renderer does it."""
-    factor = -(-least // len(pixels))
+def enlarged(pixels: Tensor, factor: int) -> Tensor:
+    """Return a picture (h, w, 3) sRGB at a whole multiple of its size, interpolated as the renderer does it."""
     linear = srgb_to_linear(pixels).permute(2, 0, 1)[None]
     larger = F.interpolate(linear, scale_factor=factor, mode="bilinear", align_corners=False)
     return linear_to_srgb(larger[0].permute(1, 2, 0))

@@ -1,0 +1,264 @@
+"""Pictures as PDF sheets in true millimetres, to print, cut out and stick on.
+
+A first page has a square and a ruler to measure, and says what follows. Then come the pieces, each at its own size with
+bleed around it and marks where it is cut; one that is larger than a page goes on as many as it takes.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_pdf import PdfPages
+from matplotlib.figure import Figure
+from PIL import Image, ImageCms
+
+from advsearch.errors import FileFormatError, InputError
+from advsearch.files import read_bytes
+
+Bytes = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
+
+INCH = 25.4
+PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
+"""Width and height in millimetres."""
+MARGIN, FOOT = 15.0, 20.0
+"""White around what is printed, and more below for the ruler, millimetres."""
+SQUARE = 50.0
+"""Side of the square that is measured with a ruler, millimetres."""
+RULER = 100.0
+MARK, AWAY = 5.0, 1.0
+"""Length of a mark where to cut, and its distance from the bleed, millimetres."""
+MOST_PAGES = 200
+LARGEST_PROFILE = 16 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A picture with its size.
+
+    Attributes:
+        name: what it is, as is printed beside it.
+        picture: (h, w, 3) uint8 sRGB, bleed included.
+        pixel: width and height of one pixel, millimetres.
+        bleed: pixels on each side that belong to the bleed, in columns and in rows.
+        inside: (h, w) what is cut out, where it is less than the rectangle within the bleed.
+    """
+
+    name: str
+    picture: Bytes
+    pixel: tuple[float, float]
+    bleed: tuple[int, int] = (0, 0)
+    inside: Mask | None = None
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Width and height within the bleed, millimetres."""
+        height, width = self.picture.shape[:2]
+        return (width - 2 * self.bleed[0]) * self.pixel[0], (height - 2 * self.bleed[1]) * self.pixel[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A part of a piece on a page.
+
+    Attributes:
+        piece: whose.
+        name: what is printed beside it.
+        trim: first and last column and row of the part within the piece's picture, half-open: x0, x1, y0, y1.
+        x, y: left and upper edge of the trim on the page, millimetres from its upper left corner.
+    """
+
+    piece: Piece
+    name: str
+    trim: tuple[int, int, int, int]
+    x: float = 0.0
+    y: float = 0.0
+
+
+def write_sheets(
+    path: Path, pieces: Sequence[Piece], title: str, *, paper: str = "a4", profile: Path | None = None
+) -> int:
+    """Write the PDF and return how many pages it has.
+
+    Args:
+        path: of the file.
+        pieces: at least one.
+        title: of the first page.
+        paper: one of `PAPERS`.
+        profile: an ICC profile of an RGB printer, into which the colours are converted; None leaves them sRGB.
+
+    Raises:
+        InputError: there is no such paper, or there would be more than `MOST_PAGES` pages.
+        FileFormatError: the profile is none of an RGB printer.
+    """
+    if paper not in PAPERS:
+        raise InputError(f"paper: expected one of {', '.join(PAPERS)}, got {paper!r}")
+    convert = None if profile is None else _conversion(profile)
+    pages = list(pages_of(pieces, PAPERS[paper]))
+    with PdfPages(path, metadata={"Title": title, "CreationDate": None}) as file:
+        file.savefig(_cover(pieces, title, PAPERS[paper], len(pages), profile))
+        for number, page in enumerate(pages, 1):
+            file.savefig(_page(page, f"{title}: sheet {number} of {len(pages)}", PAPERS[paper], convert))
+    return len(pages) + 1
+
+
+def pages_of(pieces: Sequence[Piece], paper: tuple[float, float]) -> Iterator[list[Placed]]:
+    """Yield what is on each page: rows of parts, the highest first, from the upper left.
+
+    Raises:
+        InputError: it would take more than `MOST_PAGES` pages.
+    """
+    width, height = paper[0] - 2 * MARGIN, paper[1] - 2 * MARGIN - FOOT
+    parts = [part for piece in pieces for part in _parts(piece, width, height)]
+    parts.sort(key=lambda part: -_extent(part)[1])
+    page: list[Placed] = []
+    x = y = row = 0.0
+    count = 1
+    for part in parts:
+        across, down = _extent(part)
+        if x + across > width and x > 0.0:
+            x, y, row = 0.0, y + row, 0.0
+        if y + down > height and page:
+            yield page
+            page, x, y, row = [], 0.0, 0.0, 0.0
+            count += 1
+            if count > MOST_PAGES:
+                raise InputError(f"size: it would take more than {MOST_PAGES} sheets; give a smaller one")
+        frame = _frame(part.piece)
+        page.append(Placed(part.piece, part.name, part.trim, MARGIN + x + frame[0], MARGIN + y + frame[1]))
+        x, row = x + across, max(row, down)
+    if page:
+        yield page
+
+
+def _parts(piece: Piece, width: float, height: float) -> Iterator[Placed]:
+    """Cut a piece into parts that fit on a page with bleed and marks, in whole pixels."""
+    frame, (left, top) = _frame(piece), piece.bleed
+    high, wide = piece.picture.shape[0] - 2 * top, piece.picture.shape[1] - 2 * left
+    columns = _cuts(wide, (width - 2 * frame[0]) / piece.pixel[0])
+    rows = _cuts(high, (height - 2 * frame[1]) / piece.pixel[1])
+    several = len(columns) * len(rows) > 1
+    for i, (y0, y1) in enumerate(rows):
+        for j, (x0, x1) in enumerate(columns):
+            name = f"{piece.name}, row {i + 1} of {len(rows)}, column {j + 1} of {len(columns)}"
+            yield Placed(piece, name if several else piece.name, (left + x0, left + x1, top + y0, top + y1))
+
+
+def _cuts(length: int, most: float) -> list[tuple[int, int]]:
+    """Cut so many pixels into equal parts of at most so many; the first and the end of each."""
+    if most < 1.0 or length / most > MOST_PAGES:
+        raise InputError(f"size: it would take more than {MOST_PAGES} sheets; give a smaller one")
+    count = math.ceil(length / math.floor(most))
+    ends = [round(length * number / count) for number in range(count + 1)]
+    return list(itertools.pairwise(ends))
+
+
+def _frame(piece: Piece) -> tuple[float, float]:
+    """Bleed and marks on each side, millimetres: across and down."""
+    return piece.bleed[0] * piece.pixel[0] + AWAY + MARK, piece.bleed[1] * piece.pixel[1] + AWAY + MARK
+
+
+def _extent(part: Placed) -> tuple[float, float]:
+    """Width and height that a part takes with bleed and marks, millimetres."""
+    x0, x1, y0, y1 = part.trim
+    frame, pixel = _frame(part.piece), part.piece.pixel
+    return (x1 - x0) * pixel[0] + 2 * frame[0], (y1 - y0) * pixel[1] + 2 * frame[1]
+
+
+# ---- drawing --------------------------------------------------------------------------------------------------------
+
+
+def _blank(paper: tuple[float, float]) -> tuple[Figure, Axes]:
+    """A page and its axes in millimetres from the upper left corner."""
+    figure = Figure(figsize=(paper[0] / INCH, paper[1] / INCH))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.set_axis_off()
+    axes.set_xlim(0.0, paper[0])
+    axes.set_ylim(paper[1], 0.0)
+    return figure, axes
+
+
+def _line(axes: Axes, xs: Sequence[float], ys: Sequence[float]) -> None:
+    axes.plot(xs, ys, color="black", linewidth=0.4, solid_capstyle="butt", clip_on=False)
+
+
+def _cover(
+    pieces: Sequence[Piece], title: str, paper: tuple[float, float], sheets: int, profile: Path | None
+) -> Figure:
+    figure, axes = _blank(paper)
+    x, y = MARGIN, MARGIN + 5.0
+    axes.text(x, y, title, fontsize=14, va="top")
+    colours = "sRGB" if profile is None else f"converted from sRGB by {profile.name}"
+    lines = [
+        f'{sheets} sheets follow. Print all pages at 100 % ("actual size"), then measure this square: '
+        f"{SQUARE:g} mm a side.",
+        "Cut along the lines between the marks; the colour beyond them is bleed.",
+        f"Colours: {colours}.",
+        "",
+        *[f"{piece.name}: {piece.size[0]:.1f} x {piece.size[1]:.1f} mm" for piece in pieces[:30]],
+        *([f"and {len(pieces) - 30} more"] if len(pieces) > 30 else []),
+    ]
+    top = y + 15.0
+    _line(axes, [x, x + SQUARE, x + SQUARE, x, x], [top, top, top + SQUARE, top + SQUARE, top])
+    axes.text(x, top + SQUARE + 10.0, "\n".join(lines), fontsize=9, va="top", linespacing=1.6)
+    _ruler(axes, paper)
+    return figure
+
+
+def _ruler(axes: Axes, paper: tuple[float, float]) -> None:
+    x, y = MARGIN, paper[1] - MARGIN
+    _line(axes, [x, x + RULER], [y, y])
+    for step in range(int(RULER) // 10 + 1):
+        _line(axes, [x + 10.0 * step] * 2, [y, y - (4.0 if step % 5 == 0 else 2.5)])
+    axes.text(x + RULER + 3.0, y, f"{RULER:g} mm", fontsize=7, va="bottom")
+
+
+def _page(page: Sequence[Placed], title: str, paper: tuple[float, float], convert: Any) -> Figure:
+    figure, axes = _blank(paper)
+    for part in page:
+        _draw(axes, part, convert)
+    axes.text(paper[0] - MARGIN, paper[1] - MARGIN, title, fontsize=7, ha="right", va="bottom")
+    _ruler(axes, paper)
+    return figure
+
+
+def _draw(axes: Axes, part: Placed, convert: Any) -> None:
+    """One part: its picture with bleed, marks at its corners, the line to cut where it is no rectangle, its name."""
+    piece, (x0, x1, y0, y1) = part.piece, part.trim
+    (left, top), (wide, high) = piece.bleed, piece.pixel
+    picture = piece.picture[y0 - top : y1 + top, x0 - left : x1 + left]
+    if convert is not None:
+        picture = np.asarray(ImageCms.applyTransform(Image.fromarray(picture), convert))
+    right, bottom = part.x + (x1 - x0) * wide, part.y + (y1 - y0) * high
+    outer = (part.x - left * wide, right + left * wide, part.y - top * high, bottom + top * high)
+    axes.imshow(picture, extent=(outer[0], outer[1], outer[3], outer[2]), interpolation="none", aspect="auto")
+    for x, away in ((part.x, -1.0), (right, 1.0)):
+        for y, up in ((part.y, -1.0), (bottom, 1.0)):
+            edge_x = outer[0] - AWAY if away < 0 else outer[1] + AWAY
+            edge_y = outer[2] - AWAY if up < 0 else outer[3] + AWAY
+            _line(axes, [edge_x, edge_x + away * MARK], [y, y])
+            _line(axes, [x, x], [edge_y, edge_y + up * MARK])
+    if piece.inside is not None:
+        inside = np.pad(piece.inside[y0:y1, x0:x1].astype(float), 1)
+        xs = part.x + (np.arange(-1, x1 - x0 + 1) + 0.5) * wide
+        ys = part.y + (np.arange(-1, y1 - y0 + 1) + 0.5) * high
+        axes.contour(xs, ys, inside, levels=[0.5], colors="black", linewidths=0.3)
+    axes.text(part.x, outer[2] - AWAY, part.name, fontsize=6, va="bottom")
+
+
+def _conversion(profile: Path) -> Any:
+    data = read_bytes(profile, "an ICC profile", LARGEST_PROFILE)
+    try:
+        printer = ImageCms.ImageCmsProfile(io.BytesIO(data))
+        return ImageCms.buildTransform(ImageCms.createProfile("sRGB"), printer, "RGB", "RGB")
+    except (ImageCms.PyCMSError, OSError, ValueError) as error:
+        raise FileFormatError(f"{profile}: expected the ICC profile of an RGB printer ({error})") from None
