@@ -19,14 +19,16 @@ from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Wanted
 from advsearch.engine.problem import OnImage, Problem
-from advsearch.scene.transport.renderer import SPP, LinearRenderer, samples_to_collect, why_not
+from advsearch.scene.transport.renderer import LinearRenderer, samples_to_collect, why_not
 
 WORTH = 16
-"""Evaluations from which a search pays for the matrix, which costs as much as some 10 rendered ones with gradients
+"""Evaluations from which a search pays for the matrix, which costs as much as some 6 rendered ones with gradients
 (`benchmarks/transport.py`)."""
 EVERY = 20
 BOUND = 1.0
 """Levels of 255, root mean square over the picture."""
+CHECK_SPP = 64
+"""Samples a pixel of the traced pictures of a comparison."""
 Tick = Callable[[int], None]
 
 
@@ -55,6 +57,21 @@ def reason_against(problem: Problem, steps: int, specialise: bool) -> str | None
     return why_not(problem.renderer)
 
 
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """A matrix and where it was made.
+
+    Attributes:
+        u: the configuration.
+        index: of the evaluation there.
+        renderer: None until it is needed, where a run goes on.
+    """
+
+    u: Tensor
+    index: int
+    renderer: LinearRenderer | None = None
+
+
 @dataclass
 class Transport:
     """The matrices of a run's searches.
@@ -75,8 +92,8 @@ class Transport:
     keep: Callable[[dict[str, list[int]]], None] = lambda renewals: None
     deviations: list[Deviation] = field(default_factory=list)
     seconds: float = 0.0
-    _start: LinearRenderer | None = None
-    _present: dict[str, LinearRenderer | Tensor] = field(default_factory=dict)
+    _start: Linearised | None = None
+    _present: dict[str, Linearised] = field(default_factory=dict)
 
     @property
     def samples(self) -> int:
@@ -90,6 +107,10 @@ class Transport:
     @property
     def start(self) -> LinearRenderer:
         """Where every search begins."""
+        return self._ready(self._begin, "start")[1]
+
+    @property
+    def _begin(self) -> Linearised:
         if self._start is None:
             self.prepare()
         assert self._start is not None
@@ -98,7 +119,7 @@ class Transport:
     def passed(self, kind: str, index: int, u: Tensor) -> None:
         """Remember an evaluation that was read back: it may be one at which the matrix was made anew."""
         if index in self.renewals.get(kind, ()):
-            self._present[kind] = torch.cat([u.detach().clone(), torch.tensor([float(index)])])
+            self._present[kind] = Linearised(u.detach().clone(), index)
 
     def evaluator(self, kind: str, on_image: OnImage | None = None) -> Evaluate:
         """Return the evaluation of configurations of one search."""
@@ -115,34 +136,38 @@ class Transport:
 
     def _compared(self, kind: str, index: int, u: Tensor) -> LinearRenderer:
         """The matrix to predict this evaluation with, compared and made anew where that is due."""
-        present = self._present.get(kind, self.start)
-        if isinstance(present, Tensor):
-            present = self._made(present[:-1], kind, int(present[-1]))
+        present, renderer = self._ready(self._present.get(kind, self._begin), kind)
         if index and index % EVERY == 0 and kind.startswith("search"):
-            found = self.deviation(present, u, index)
+            found = self.deviation(renderer, present.u, u, index)
             self.deviations.append(found)
             if found.levels > BOUND:
                 present = self._made(u, kind, index)
                 self.renewals.setdefault(kind, []).append(index)
                 self.keep(self.renewals)
-        self._present[kind] = present
-        return present
+        self._present[kind], renderer = self._ready(present, kind)
+        return renderer
 
-    def _made(self, u: Tensor, kind: str, index: int, tick: Tick = lambda samples: None) -> LinearRenderer:
+    def _ready(self, place: Linearised, kind: str) -> tuple[Linearised, LinearRenderer]:
+        made = place if place.renderer is not None else self._made(place.u, kind, place.index)
+        assert made.renderer is not None
+        return made, made.renderer
+
+    def _made(self, u: Tensor, kind: str, index: int, tick: Tick = lambda samples: None) -> Linearised:
         begun = time.perf_counter()
         seed = seeds.stream(self.problem.seed, f"transport {kind}", index)
         made = LinearRenderer(self.problem.renderer, u, seed, tick)
         self.seconds += time.perf_counter() - begun
-        return made
+        return Linearised(u.detach().clone(), index, made)
 
-    def deviation(self, linear: LinearRenderer, u: Tensor, index: int) -> Deviation:
-        """Compare what a prediction says of the change since its matrix was made with what two traced pictures do."""
+    def deviation(self, linear: LinearRenderer, at: Tensor, u: Tensor, index: int) -> Deviation:
+        """Compare what a prediction says of the change since its matrix was made at `at` with what two traced pictures
+        do."""
         begun, problem = time.perf_counter(), self.problem
         seed = seeds.stream(problem.seed, "transport check", index)
         with torch.no_grad():
-            before, after = (problem.renderer(one, seed=seed, spp=SPP) for one in (linear.at, u))
+            before, after = (problem.renderer(one, seed=seed, spp=CHECK_SPP) for one in (at, u))
             predicted = linear(u)
-            off = float((((predicted - linear(linear.at)) - (after - before)) ** 2).mean())
+            off = float((((predicted - linear(at)) - (after - before)) ** 2).mean())
             logits = float(problem.loss(predicted) - problem.loss(after))
         self.seconds += time.perf_counter() - begun
         return Deviation(255.0 * math.sqrt(off), logits)

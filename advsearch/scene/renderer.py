@@ -208,7 +208,10 @@ class Renderer:
         return self.space.picture(through, self.formation.display(self._radiance(through, seed, spp)))
 
     def _radiance(self, u: Tensor, seed: int, spp: int) -> Tensor:
-        inputs = self.scene.assembly(self.space.inputs(u))
+        return self._formed(self._assembled(u), seed, spp)
+
+    def _formed(self, inputs: dict[str, Tensor], seed: int, spp: int) -> Tensor:
+        """Radiance of scene inputs with exposure and backdrop."""
         applied = {name: inputs.pop(name) for name in ON_PICTURE if name in inputs}
         hide = "backdrop.color" in applied
         rendered = self._rendered(inputs, seed, spp, hide)

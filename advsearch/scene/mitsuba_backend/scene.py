@@ -25,7 +25,7 @@ from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS
 from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, leave_dark_lamps_out, mesh_translation, translation
 from advsearch.scene.mitsuba_backend.population import population
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER, next_count
-from advsearch.scene.mitsuba_backend.transport import Vertices, collect
+from advsearch.scene.mitsuba_backend.transport import Paths, collect
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 
 MAX_DEPTH = 6
@@ -259,8 +259,9 @@ class MitsubaScene:
         found = {f"{name}.vertices": one for name, one in zip(names, by_vertices, strict=True)}
         return found | {f"{name}.normals": one for name, one in zip(names, by_normals, strict=True)}
 
-    def transport(self, inputs: Mapping[str, Tensor], name: str, seed: int, spp: int) -> list[Vertices]:
-        """Return what the vertices of light paths add to their pixels for a unit more of a base colour.
+    def transport(self, inputs: Mapping[str, Tensor], name: str, seed: int, spp: int) -> Paths:
+        """Return what the vertices of light paths add to their pixels for a unit more of a base colour, and the picture
+        of these paths.
 
         Args:
             inputs: as in `radiance`.
@@ -268,11 +269,15 @@ class MitsubaScene:
             seed: number of the noise.
             spp: samples a pixel.
         """
+        mi = mitsuba()
+        import drjit as dr
+
         self._apply(inputs)
         key, spp = self._inputs[name][0], next_count(self.sampler, spp)
-        return collect(
-            self._scene, self._parameters, key, depth=self.max_depth, seed=seed, spp=spp, sampler=self.sampler
-        )
+        noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
+        noise.set_samples_per_wavefront(spp)
+        noise.seed(dr.opaque(mi.UInt32, seed), self.resolution[0] * self.resolution[1] * spp)
+        return collect(self._scene, self._parameters, key, noise, self.resolution, depth=self._depth, spp=spp)
 
     # ---- inside -----------------------------------------------------------------------------------------------------
 

@@ -6,13 +6,15 @@ the power heuristic; Veach 1997, section 9.2) and keeps, for each vertex on a su
     weight = throughput before the vertex x d BSDF / d base colour x radiance that arrives there,
 
 so that, to first order, the radiance of the pixel changes by the sum of weight x change of the base colour at the
-vertex. The derivative of the BSDF comes from Dr.Jit's forward mode with a tangent of one on all texels; for a base
-colour in which the BSDF is affine (the diffuse and the metallic lobe of the principled BSDF) it is exact, otherwise it
-holds at the base colour that the scene has. The whole path is one kernel.
+vertex. The derivative of the BSDF is a difference: it is evaluated with all texels `STEP` larger too. For a base colour
+in which the BSDF is affine (the diffuse and the metallic lobe of the principled BSDF) that is exact. Dr.Jit's forward
+mode finds the same, at the price of more kernels. The whole path is one kernel, which also makes the picture itself and
+what guides its denoiser.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +22,11 @@ import torch
 from torch import Tensor
 
 from advsearch.scene.mitsuba_backend.variant import mitsuba
+
+STEP = 0.0625
+"""How much the base colour is changed for the derivative of a BSDF with respect to it."""
+ROUNDING = 1e-4
+"""Relative change of a BSDF under which it counts as none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,45 +44,80 @@ class Vertices:
     weight: Tensor
 
 
-def collect(scene: Any, parameters: Any, key: str, *, depth: int, seed: int, spp: int, sampler: str) -> list[Vertices]:
-    """Trace one pass and return the vertices at which a base colour takes part, one entry for each place in a path.
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """What the paths of one picture say.
+
+    Attributes:
+        radiance: (H, W, 3) float32, with the same noise as the weights; the environment is in it.
+        coverage: (H, W, 1), the share of each pixel that shows surfaces.
+        background: (H, W, 3), what of the radiance is the environment as the camera sees it.
+        albedo: (H, W, 3), first-hit reflectance in [0, 1].
+        normal: (H, W, 3), first-hit shading normal.
+        vertices: by their place in the path.
+    """
+
+    radiance: Tensor
+    coverage: Tensor
+    background: Tensor
+    albedo: Tensor
+    normal: Tensor
+    vertices: list[Vertices]
+
+
+def mean_of(passes: Sequence[Paths]) -> Paths:
+    """Return the mean pictures of passes with as many samples each; it has no vertices."""
+
+    def mean(name: str) -> Tensor:
+        return torch.stack([getattr(one, name) for one in passes]).mean(dim=0)
+
+    return Paths(mean("radiance"), mean("coverage"), mean("background"), mean("albedo"), mean("normal"), [])
+
+
+def collect(scene: Any, parameters: Any, key: str, noise: Any, size: tuple[int, int], *, depth: int, spp: int) -> Paths:
+    """Trace one pass. It is not recorded: Dr.Jit 1.5.0 crashes when it replays so long a kernel.
 
     Args:
         scene: Mitsuba's, with its camera.
         parameters: of the scene.
         key: Mitsuba's name of the texture, (h, w, 3).
+        noise: the sampler, seeded.
+        size: height and width in pixels.
         depth: segments of the longest path.
-        seed: number of the noise.
-        spp: samples a pixel, a count that the sampler takes.
-        sampler: name of the sampler.
+        spp: samples a pixel, those of the sampler.
     """
     mi = mitsuba()
     import drjit as dr
 
+    height, width = size
     sensor = scene.sensors()[0]
-    width, height = sensor.film().crop_size()
-    count = width * height * spp
-    noise = mi.load_dict({"type": sampler, "sample_count": spp})
-    noise.set_samples_per_wavefront(spp)
-    noise.seed(seed, count)
-    texture = mi.TensorXf(parameters[key])
-    dr.enable_grad(texture)
-    parameters[key] = texture
-    parameters.update()
+    pixel = dr.arange(mi.UInt32, height * width * spp) // spp
+    corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
+    place = (corner + noise.next_2d()) / mi.Point2f(width, height)
+    aperture = noise.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
+    ray, _ = sensor.sample_ray(0.0, 0.5, place, aperture)
+    first, steps = _walk(scene, ray, noise, depth)
+    there = mi.TensorXf(parameters[key])
     try:
-        with dr.suspend_grad():  # type: ignore[no-untyped-call]
-            pixel = dr.arange(mi.UInt32, count) // spp
-            corner = mi.Point2f(mi.Float(pixel % width), mi.Float(pixel // width))
-            place = (corner + noise.next_2d()) / mi.Point2f(width, height)
-            aperture = noise.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-            ray, _ = sensor.sample_ray(0.0, 0.5, place, aperture)
-            vertices = _trace(scene, texture, ray, noise, depth)
-            taking_part = [dr.any(one != 0.0) & dr.all(dr.isfinite(one)) for _, one in vertices]
-            dr.eval(vertices, taking_part)
-            return [_kept(*one, taken, spp) for one, taken in zip(vertices, taking_part, strict=True)]
-    finally:
-        parameters[key] = mi.TensorXf(dr.detach(texture))
+        parameters[key] = there + STEP
         parameters.update()
+        for one in steps:
+            one.slopes()
+    finally:
+        parameters[key] = there
+        parameters.update()
+    radiance, vertices = _gathered(steps)
+    pictures = [*(radiance + first.shown), *first.others]
+    taking_part = [dr.any(one != 0.0) & dr.all(dr.isfinite(one)) for _, one in vertices]
+    dr.eval(pictures, vertices, taking_part)
+    means = [dr.block_sum(channel, spp) / spp for channel in pictures]
+    dr.eval(means)
+    picture = torch.stack([one.torch() for one in means], dim=1).reshape(*size, -1)
+    radiance, coverage, background, albedo, normal = (
+        one.contiguous() for one in torch.split(picture, [3, 1, 3, 3, 3], dim=-1)
+    )
+    found = [_kept(uv, weight, taken, spp) for (uv, weight), taken in zip(vertices, taking_part, strict=True)]
+    return Paths(radiance, coverage, background, albedo, normal, found)
 
 
 def _kept(uv: Any, weight: Any, taking_part: Any, spp: int) -> Vertices:
@@ -91,8 +133,57 @@ def _kept(uv: Any, weight: Any, taking_part: Any, spp: int) -> Vertices:
     return Vertices(pixel.torch().long(), places, torch.stack([one.torch() for one in weight], dim=1))
 
 
-def _trace(scene: Any, texture: Any, ray: Any, noise: Any, depth: int) -> list[tuple[Any, Any]]:
-    """Return texture coordinates and weights of the vertices of each path, first vertex first."""
+@dataclass
+class _First:
+    """What the camera sees: light that it sees directly, and the other pictures of `Paths` by channel."""
+
+    shown: Any
+    others: list[Any]
+
+
+@dataclass
+class _Step:
+    """One vertex of all paths.
+
+    Attributes:
+        through: throughput before it.
+        to_light, on: directions to the light that was sampled and of the path; with which of them count.
+        arriving: radiance that arrives from the light over the density, weighted.
+        value, value_on: the BSDF times the cosine for both.
+        factor: throughput of the vertex.
+        hit: radiance that the path's next vertex emits, weighted.
+    """
+
+    bsdf: Any
+    at: Any
+    through: Any
+    to_light: Any
+    lit: Any
+    arriving: Any
+    value: Any
+    on: Any
+    going_on: Any
+    pdf: Any
+    value_on: Any
+    factor: Any
+    hit: Any
+    slope: Any = None
+    slope_on: Any = None
+
+    def slopes(self) -> None:
+        """Find the derivatives of the BSDF, now that the base colour is larger by `STEP`."""
+        mi = mitsuba()
+        import drjit as dr
+
+        context = mi.BSDFContext()
+        value = self.bsdf.eval(context, self.at, self.to_light, self.lit)
+        self.slope = _difference(value, self.value, self.lit)
+        value = self.bsdf.eval(context, self.at, self.on, self.going_on)
+        self.slope_on = _difference(value, self.value_on, self.going_on) / dr.select(self.going_on, self.pdf, 1.0)
+
+
+def _walk(scene: Any, ray: Any, noise: Any, depth: int) -> tuple[_First, list[_Step]]:
+    """Trace paths; return what the camera sees, and the vertices, the first one first."""
     mi = mitsuba()
     import drjit as dr
 
@@ -100,19 +191,23 @@ def _trace(scene: Any, texture: Any, ray: Any, noise: Any, depth: int) -> list[t
     through = mi.Spectrum(1.0)
     active = mi.Bool(True)
     last, last_pdf, last_delta = dr.zeros(mi.SurfaceInteraction3f), mi.Float(1.0), mi.Bool(True)
-    steps: list[dict[str, Any]] = []
+    steps: list[_Step] = []
+    first: _First | None = None
     for segment in range(depth):
         hit = scene.ray_intersect(ray, active)
         emitter = hit.emitter(scene, active)
         towards = mi.DirectionSample3f(scene, hit, last)
         by_light = scene.pdf_emitter_direction(last, towards, active & ~last_delta)
         shown = dr.select(last_delta, 1.0, _balance(last_pdf, by_light)) * emitter.eval(hit, active)
+        shown = dr.select(active, shown, 0.0)
         if steps:
-            steps[-1]["hit"] = dr.select(active, shown, 0.0)
+            steps[-1].hit = shown
+        bsdf = hit.bsdf(ray)
+        if first is None:
+            first = _seen(hit, bsdf, shown)
         active &= hit.is_valid() & mi.Bool(segment + 1 < depth)
         if segment + 1 == depth:
             break
-        bsdf = hit.bsdf(ray)
         light, arriving = scene.sample_emitter_direction(hit, noise.next_2d(active), True, active)
         lit = active & (light.pdf > 0.0)
         to_light = hit.to_local(light.d)
@@ -121,40 +216,64 @@ def _trace(scene: Any, texture: Any, ray: Any, noise: Any, depth: int) -> list[t
         sampled, factor = bsdf.sample(context, hit, noise.next_1d(active), noise.next_2d(active), active)
         going = active & (sampled.pdf > 0.0)
         delta = mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta)
-        on = going & ~delta
-        slope_on = _slope(bsdf, context, hit, sampled.wo, on, texture) / dr.select(on, sampled.pdf, 1.0)
-        steps.append(
-            {
-                "through": through,
-                "direct": value * arriving,
-                "slope_direct": _slope(bsdf, context, hit, to_light, lit, texture) * arriving,
-                "slope_on": dr.select(on, slope_on, 0.0),
-                "factor": dr.select(going, factor, 0.0),
-                "hit": mi.Spectrum(0.0),
-                "uv": mi.Point2f(hit.uv),
-            }
+        factor = dr.select(going, factor, 0.0)
+        made = _Step(
+            bsdf=bsdf,
+            at=hit,
+            through=through,
+            to_light=to_light,
+            lit=lit,
+            arriving=arriving,
+            value=value,
+            on=sampled.wo,
+            going_on=going & ~delta,
+            pdf=sampled.pdf,
+            value_on=factor * sampled.pdf,
+            factor=factor,
+            hit=mi.Spectrum(0.0),
         )
-        through = through * steps[-1]["factor"]
+        steps.append(made)
+        through = through * factor
         active &= going
         last, last_pdf, last_delta = hit, sampled.pdf, delta
         ray = hit.spawn_ray(hit.to_world(sampled.wo))
-    beyond = mi.Spectrum(0.0)
-    found = []
-    for one in reversed(steps):
-        incoming = one["hit"] + beyond
-        found.append((one["uv"], one["through"] * (one["slope_direct"] + one["slope_on"] * incoming)))
-        beyond = one["direct"] + one["factor"] * incoming
-    return found[::-1]
+    assert first is not None
+    return first, steps
 
 
-def _slope(bsdf: Any, context: Any, hit: Any, direction: Any, active: Any, texture: Any) -> Any:
-    """The derivative of a BSDF times the cosine, for a unit more of every texel."""
+def _seen(hit: Any, bsdf: Any, shown: Any) -> _First:
+    """What the camera sees at the first vertices, and the radiance that these emit."""
+    mi = mitsuba()
     import drjit as dr
 
-    with dr.resume_grad():  # type: ignore[no-untyped-call]
-        dr.set_grad(texture, 1.0)
-        value = bsdf.eval(context, hit, direction, active)
-        return dr.detach(dr.forward_to(value, flags=dr.ADFlag.ClearInterior | dr.ADFlag.AllowNoGrad))
+    covered = hit.is_valid()
+    albedo = dr.select(covered, bsdf.eval_diffuse_reflectance(hit, covered), 0.0)
+    normal = dr.select(covered, hit.sh_frame.n, 0.0)
+    behind = dr.select(covered, 0.0, shown)
+    return _First(shown, [dr.select(covered, mi.Float(1.0), 0.0), *behind, *albedo, *normal])
+
+
+def _gathered(steps: list[_Step]) -> tuple[Any, list[tuple[Any, Any]]]:
+    """Return the radiance that leaves the first vertices, and texture coordinates and weights of all."""
+    mi = mitsuba()
+    import drjit as dr
+
+    beyond = mi.Spectrum(0.0)
+    found: list[tuple[Any, Any]] = []
+    for one in reversed(steps):
+        incoming = one.hit + beyond
+        weight = one.through * (one.slope * one.arriving + one.slope_on * incoming)
+        found.append((mi.Point2f(one.at.uv), weight))
+        beyond = one.value * one.arriving + one.factor * incoming
+    return dr.select(dr.isfinite(beyond), beyond, 0.0), found[::-1]
+
+
+def _difference(after: Any, before: Any, active: Any) -> Any:
+    """The derivative of a BSDF from two values; zero where they differ by rounding alone, as on other surfaces."""
+    import drjit as dr
+
+    change = after - before
+    return dr.select(active & (dr.max(dr.abs(change)) > ROUNDING * dr.max(dr.abs(before))), change / STEP, 0.0)
 
 
 def _balance(one: Any, other: Any) -> Any:

@@ -5,12 +5,13 @@ Where camera, meshes and lights stand still, the radiance of a pixel is, to firs
     radiance = base + J (base colour - base colour there),        J: pixels x texels, one weight a colour channel,
 
 and J is sparse: a pixel sees few texels directly (bilinear lookups of the first vertices of its paths) and many a
-little (light from the object to the object), for which coarse cells of `COARSE` texels a side are enough.
+little (light from the object to the object), for which coarse cells of `COARSE` texels a side are enough. What a pixel
+sees of the texels hardly depends on the colour of the light, so that a row of J is kept as shares of texels, which add
+up to one, times a colour.
 """
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -28,12 +29,10 @@ Smooth = Callable[[Tensor], Tensor]
 """From a noisy picture (H, W, 3) to one without noise."""
 COARSE = 8
 """Side of the cells of later vertices, in texels."""
-MOST = 4.0
-"""Factor by which a row is scaled at most."""
 
 
-class SparseMatrix:
-    """A sparse matrix for each colour channel, summed up from entries and then kept in CSR both ways.
+class ColouredRows:
+    """A sparse matrix for three colour channels whose rows are shares times a colour; filled by `add`, then finished.
 
     Args:
         rows, columns: its size.
@@ -41,57 +40,60 @@ class SparseMatrix:
 
     def __init__(self, rows: int, columns: int) -> None:
         self._shape = (rows, columns)
-        self._sums = [scipy.sparse.csr_matrix(self._shape, dtype=np.float32) for _ in range(3)]
-        self._forward: list[Tensor] = []
-        self._back: list[Tensor] = []
+        self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
+        self._kept: tuple[npt.NDArray[np.float16], npt.NDArray[np.int32], npt.NDArray[np.int32]] | None = None
+        self._colours: Floats = np.zeros((rows, 3), dtype=np.float32)
 
     @property
     def entries(self) -> int:
-        """Entries of a channel, the mean of the three."""
-        return int(sum(one.nnz for one in self._sums)) // 3
+        return int(self._sum.nnz) if self._kept is None else len(self._kept[0])
 
     @property
     def bytes(self) -> int:
-        """Memory of all channels, both ways."""
-        return 2 * 3 * (8 * self.entries + 4 * (self._shape[0] + self._shape[1]))
+        """Memory when it is finished: a share and its column an entry, a beginning and a colour a row."""
+        return 6 * self.entries + (4 + 12) * self._shape[0]
 
-    def add(self, rows: Ints, columns: Ints, weights: Floats) -> None:
-        """Add entries: (n,) places, several of which may be the same, and (n, 3) weights."""
+    def add(self, rows: Ints, columns: Ints, shares: Floats, weights: Floats) -> None:
+        """Add entries.
+
+        Args:
+            rows: (n,), ascending.
+            columns: (n, k) that take part in each, several of which may be the same.
+            shares: (n, k), how much each of them has of it.
+            weights: (n, 3).
+        """
+        begin = np.searchsorted(rows, np.arange(self._shape[0] + 1)) * columns.shape[1]
+        values = (shares * np.abs(weights).mean(axis=1, keepdims=True)).ravel()
+        more = scipy.sparse.csr_matrix((values, columns.ravel().astype(np.int32), begin.astype(np.int32)), self._shape)
+        more.sum_duplicates()
+        self._sum = self._sum + more if self._sum.nnz else more
         for channel in range(3):
-            more = scipy.sparse.coo_matrix((weights[:, channel], (rows, columns)), shape=self._shape).tocsr()
-            self._sums[channel] = self._sums[channel] + more
+            self._colours[:, channel] += np.bincount(rows, weights[:, channel], minlength=self._shape[0])
 
     def finish(self, picture: tuple[int, int], smooth: Smooth | None) -> None:
-        """Scale each row so that its sum is what the picture of all sums is without noise, and be ready to multiply."""
-        sums = np.stack([np.asarray(one.sum(axis=1)).ravel() for one in self._sums], axis=1).astype(np.float32)
-        ratio = np.ones_like(sums)
+        """Be ready to multiply; `smooth` takes the noise out of the picture of all colours."""
+        sums = np.asarray(self._sum.sum(axis=1)).ravel()
+        factors = np.where(sums > 0.0, 1.0 / np.maximum(sums, 1e-30), 0.0)
+        shares = self._sum.data * np.repeat(factors, np.diff(self._sum.indptr))
+        self._kept = shares.astype(np.float16), self._sum.indices, self._sum.indptr
+        self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
         if smooth is not None:
-            wanted = smooth(torch.from_numpy(sums).reshape(*picture, 3)).reshape(-1, 3).numpy()
-            ratio = np.where(sums > 0.0, wanted / np.maximum(sums, 1e-12), 1.0).clip(1.0 / MOST, MOST)
-        for channel, one in enumerate(self._sums):
-            one.data *= np.repeat(ratio[:, channel], np.diff(one.indptr))
-            self._forward.append(_torch(one))
-            self._back.append(_torch(one.T.tocsr()))
+            self._colours = smooth(torch.from_numpy(self._colours).reshape(*picture, 3)).reshape(-1, 3).numpy()
 
-    def times(self, values: Tensor) -> Tensor:
+    def times(self, values: Floats) -> Floats:
         """Return the matrix times (columns, 3): (rows, 3)."""
-        return torch.stack([one @ values[:, channel] for channel, one in enumerate(self._forward)], dim=1)
+        found: Floats = (self._shares() @ values) * self._colours
+        return found
 
-    def transposed_times(self, values: Tensor) -> Tensor:
+    def transposed_times(self, values: Floats) -> Floats:
         """Return the transpose times (rows, 3): (columns, 3)."""
-        return torch.stack([one @ values[:, channel] for channel, one in enumerate(self._back)], dim=1)
+        found: Floats = self._shares().T @ (values * self._colours)
+        return found
 
-
-def _torch(matrix: scipy.sparse.csr_matrix) -> Tensor:
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta")
-        return torch.sparse_csr_tensor(
-            torch.from_numpy(matrix.indptr.astype(np.int32)),
-            torch.from_numpy(matrix.indices.astype(np.int32)),
-            torch.from_numpy(matrix.data.astype(np.float32)),
-            size=matrix.shape,
-            check_invariants=False,
-        )
+    def _shares(self) -> scipy.sparse.csr_matrix:
+        assert self._kept is not None, "finish it first"
+        shares, columns, begin = self._kept
+        return scipy.sparse.csr_matrix((shares.astype(np.float32), columns, begin), self._shape)
 
 
 class TextureTransport:
@@ -106,8 +108,8 @@ class TextureTransport:
         self._picture, self._texture = picture, texture
         self._cells = (-(-texture[0] // COARSE), -(-texture[1] // COARSE))
         pixels = picture[0] * picture[1]
-        self._first = SparseMatrix(pixels, texture[0] * texture[1])
-        self._later = SparseMatrix(pixels, self._cells[0] * self._cells[1])
+        self._first = ColouredRows(pixels, texture[0] * texture[1])
+        self._later = ColouredRows(pixels, self._cells[0] * self._cells[1])
 
     @property
     def entries(self) -> int:
@@ -127,8 +129,8 @@ class TextureTransport:
         """End the collecting.
 
         Args:
-            smooth: takes the noise out of a picture. What a change of all texels by one does to the picture is one,
-                and each row of the matrix is scaled to what it says; None leaves rows as they were sampled.
+            smooth: takes the noise out of a picture: what a change of all texels by one does to the picture is one.
+                None leaves the colours of the rows as they were sampled.
         """
         self._first.finish(self._picture, smooth)
         self._later.finish(self._picture, smooth)
@@ -140,18 +142,18 @@ class TextureTransport:
 
     def times(self, change: Tensor) -> Tensor:
         """Return J times (h, w, 3), as (H, W, 3)."""
-        near = self._first.times(change.reshape(-1, 3))
-        far = self._later.times(self._pooled(change).reshape(-1, 3))
-        return (near + far).reshape(*self._picture, 3)
+        near = self._first.times(change.reshape(-1, 3).numpy())
+        far = self._later.times(self._pooled(change).reshape(-1, 3).numpy())
+        return torch.from_numpy(near + far).reshape(*self._picture, 3)
 
     def transposed_times(self, cotangent: Tensor) -> Tensor:
         """Return the transpose of J times (H, W, 3), as (h, w, 3)."""
-        flat = cotangent.reshape(-1, 3)
-        near = self._first.transposed_times(flat).reshape(*self._texture, 3)
+        flat = cotangent.reshape(-1, 3).numpy()
+        near = torch.from_numpy(self._first.transposed_times(flat)).reshape(*self._texture, 3)
         with torch.enable_grad():
             probe = torch.zeros(*self._texture, 3, requires_grad=True)
             pooled = self._pooled(probe)
-        far = self._later.transposed_times(flat).reshape(pooled.shape)
+        far = torch.from_numpy(self._later.transposed_times(flat)).reshape(pooled.shape)
         return near + torch.autograd.grad(pooled, probe, far)[0]
 
     def _pooled(self, texture: Tensor) -> Tensor:
@@ -173,26 +175,26 @@ class _Product(torch.autograd.Function):
         return None, ctx.transport.transposed_times(cotangent.contiguous())  # type: ignore[attr-defined]
 
 
-def _bilinear(vertices: Vertices, texture: tuple[int, int], share: float) -> tuple[Ints, Ints, Floats]:
-    """Spread entries over the four texels of a bilinear lookup that repeats at the border."""
+def _bilinear(vertices: Vertices, texture: tuple[int, int], share: float) -> tuple[Ints, Ints, Floats, Floats]:
+    """The four texels of the bilinear lookup of each vertex, which repeats at the border, and their shares."""
     height, width = texture
-    pixel, uv, weight = vertices.pixel.numpy(), vertices.uv.numpy(), vertices.weight.numpy() * share
+    uv: Floats = vertices.uv.numpy()
     x, y = uv[:, 0] * width - 0.5, uv[:, 1] * height - 0.5
     left, low = np.floor(x), np.floor(y)
     right_share, high_share = (x - left).astype(np.float32), (y - low).astype(np.float32)
-    columns, shares = [], []
-    for down in (0, 1):
-        for across in (0, 1):
-            row = (low.astype(np.int64) + down) % height
-            columns.append(row * width + (left.astype(np.int64) + across) % width)
-            shares.append((right_share if across else 1.0 - right_share) * (high_share if down else 1.0 - high_share))
-    weights = np.concatenate([weight * one[:, None] for one in shares])
-    return np.tile(pixel, 4), np.concatenate(columns), weights
+    across = [left.astype(np.int64) % width, (left.astype(np.int64) + 1) % width]
+    down = [low.astype(np.int64) % height, (low.astype(np.int64) + 1) % height]
+    columns = np.stack([row * width + column for row in down for column in across], axis=1)
+    beside, above = [1.0 - right_share, right_share], [1.0 - high_share, high_share]
+    shares: Floats = np.stack([tall * wide for tall in above for wide in beside], axis=1)
+    return vertices.pixel.numpy(), columns, shares, vertices.weight.numpy() * np.float32(share)
 
 
-def _nearest(vertices: Vertices, cells: tuple[int, int], share: float) -> tuple[Ints, Ints, Floats]:
-    """Give each entry to the cell that its vertex lies in."""
+def _nearest(vertices: Vertices, cells: tuple[int, int], share: float) -> tuple[Ints, Ints, Floats, Floats]:
+    """The cell that each vertex lies in, which has all of it."""
     uv = vertices.uv.numpy() % 1.0
     column = np.floor(uv[:, 0] * cells[1]).astype(np.int64).clip(0, cells[1] - 1)
     row = np.floor(uv[:, 1] * cells[0]).astype(np.int64).clip(0, cells[0] - 1)
-    return vertices.pixel.numpy(), row * cells[1] + column, vertices.weight.numpy() * np.float32(share)
+    columns = (row * cells[1] + column)[:, None]
+    shares: Floats = np.ones_like(columns, dtype=np.float32)
+    return vertices.pixel.numpy(), columns, shares, vertices.weight.numpy() * np.float32(share)

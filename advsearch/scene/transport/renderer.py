@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -12,15 +13,17 @@ from advsearch import seeds
 from advsearch.files import scaled
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.gradients.group import Group
+from advsearch.scene.mitsuba_backend.transport import Paths, mean_of
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.matrix import Smooth, TextureTransport
+from advsearch.scene.transport.matrix import TextureTransport
 
-BASE_SPP = 128
-"""Samples a pixel of the base picture, whose noise all predicted pictures have."""
-SPP = 64
-"""Samples a pixel of the paths whose vertices become the matrix; its rows lose their noise in the denoiser."""
+SPP = 128
+"""Samples a pixel of the paths whose vertices become the matrix and which make the base picture; what noise the
+denoiser leaves in it is in all predicted pictures."""
 PASS = 2**20
 """Samples of all pixels in one pass; its vertices are held in memory."""
+MOST = 4.0
+"""Factor by which the noise of the base picture corrects a row at most."""
 MOST_BYTES = 2**30
 """Memory of the matrix of one input, times `ADVSEARCH_LIMITS`."""
 LINEAR = ".base_color"
@@ -41,29 +44,43 @@ class LinearRenderer(Renderer):
         u: where the picture is linearised.
         seed: number of the noise.
         tick: told of samples a pixel as they are traced, `samples_to_collect` in all.
+        spp: samples a pixel.
+        quick: take the noise out of the rows of the matrix as it was taken out of the base picture, which they
+            resemble, and not by the denoiser.
 
     Attributes:
-        at: the configuration where it was linearised.
         products: pictures it has made.
         transports: by input.
+        there: the inputs where it was linearised.
 
     Raises:
         TransportTooLargeError: a matrix would take more than `MOST_BYTES`.
     """
 
     def __init__(
-        self, renderer: Renderer, u: Tensor, seed: int, tick: Callable[[int], None] = lambda samples: None
+        self,
+        renderer: Renderer,
+        u: Tensor,
+        seed: int,
+        tick: Callable[[int], None] = lambda samples: None,
+        *,
+        spp: int = SPP,
+        quick: bool = False,
     ) -> None:
         vars(self).update(vars(copy.copy(renderer)))
-        self.paths, self.at, self.products = renderer, u.detach().clone(), 0
+        self.products = 0
         with torch.no_grad():
-            inputs = self._assembled(self.at)
-            hide = "backdrop.color" in inputs
-            self._there = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
-            self._base = renderer.primal(self._there, seeds.stream(seed, "base picture"), BASE_SPP, hide)
-            tick(BASE_SPP)
-            linear = [name for name in self._there if name in linear_inputs(renderer)]
-            self.transports = {name: self._collected(name, seed, tick) for name in linear}
+            inputs = self._assembled(u)
+            self._applied = {name: value for name, value in inputs.items() if name in ON_PICTURE}
+            traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
+            linear = [name for name in traced if name in linear_inputs(renderer)]
+            self.there = {name: traced[name].clone() for name in linear}
+            self.transports = {
+                name: TextureTransport(self.formation.resolution, (value.shape[0], value.shape[1]))
+                for name, value in self.there.items()
+            }
+            seen = self._traced(traced, seed, tick, spp)
+            self._base = self._finished(seen, quick).half()
 
     @property
     def entries(self) -> int:
@@ -75,38 +92,58 @@ class LinearRenderer(Renderer):
         """Memory of all matrices."""
         return sum(one.bytes for one in self.transports.values())
 
-    def _collected(self, name: str, seed: int, tick: Callable[[int], None]) -> TextureTransport:
-        """Trace paths and build the matrix of one input.
+    @property
+    def _hide(self) -> bool:
+        return "backdrop.color" in self._applied
+
+    def _traced(self, inputs: Mapping[str, Tensor], seed: int, tick: Callable[[int], None], spp: int) -> Paths:
+        """Trace paths, fill the matrices with their vertices, and return the mean of their pictures.
 
         Raises:
-            TransportTooLargeError: it would take more than `MOST_BYTES`.
+            TransportTooLargeError: a matrix would take more than `MOST_BYTES`.
         """
-        (height, width), picture = self._there[name].shape[:2], self.formation.resolution
-        made = TextureTransport(picture, (height, width))
-        samples, passes = _passes(self)
-        for number in range(passes):
-            noise = seeds.stream(seed, f"transport {name}", number)
-            made.add(self.scene.transport(self._there, name, noise, samples), 1.0 / passes)
-            if made.bytes > scaled(MOST_BYTES):
-                raise TransportTooLargeError(f"the matrix would take more than {scaled(MOST_BYTES) / 2**30:g} GiB")
-            tick(samples)
-        made.finish(self._smooth(seed))
-        return made
+        samples, passes = _passes(self, spp)
+        found: list[Paths] = []
+        for name, transport in self.transports.items():
+            for number in range(passes):
+                noise = seeds.stream(seed, f"transport {name}", number)
+                paths = self.scene.transport(inputs, name, noise, samples)
+                transport.add(paths.vertices, 1.0 / passes)
+                if self.bytes > scaled(MOST_BYTES):
+                    raise TransportTooLargeError(f"the matrix would take more than {scaled(MOST_BYTES) / 2**30:g} GiB")
+                found.append(replace(paths, vertices=[]))
+                tick(samples)
+        return mean_of(found)
 
-    def _smooth(self, seed: int) -> Smooth | None:
-        """The denoiser, guided by what the pixels see."""
-        if self.formation.denoiser != "oidn":
-            return None
-        albedo, normal = self.scene.guides(self._there, seeds.stream(seed, "guides"), SPP)
-        even = (albedo.sum(dim=-1, keepdim=True) > 0.0).to(albedo.dtype).expand(-1, -1, 3).contiguous()
-        return lambda picture: self._denoise(picture.contiguous(), even, normal)
+    def _finished(self, seen: Paths, quick: bool) -> Tensor:
+        """Take the noise out of the matrices and the base picture, and return that, times the gain."""
+        radiance = self._finite(seen.radiance - seen.background if self._hide else seen.radiance)
+        clean = radiance
+        if self.formation.denoiser == "oidn":
+            clean = self._denoise(radiance, seen.albedo.clamp(0.0, 1.0), seen.normal)
+        ratio = (clean / radiance.clamp_min(1e-12)).clamp(1.0 / MOST, MOST)
+        even = (seen.albedo.sum(dim=-1, keepdim=True) > 0.0).to(torch.float32).expand(-1, -1, 3).contiguous()
+
+        def smooth(picture: Tensor) -> Tensor:
+            return picture * ratio if quick else self._denoise(picture.contiguous(), even, seen.normal)
+
+        for transport in self.transports.values():
+            transport.finish(smooth if self.formation.denoiser == "oidn" else None)
+        shown = torch.cat([clean, seen.coverage], dim=-1) if self._hide else clean
+        return shown
 
     def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
-        radiance = self._base[..., :3]
+        base = self._base.float()
+        radiance = base[..., :3]
         for name, transport in self.transports.items():
-            radiance = radiance + transport(inputs[name] - self._there[name])
+            radiance = radiance + transport(inputs[name] - self.there[name])
         self.products += 1
-        return torch.cat([radiance, self._base[..., 3:]], dim=-1) if hide else radiance
+        return torch.cat([radiance, base[..., 3:]], dim=-1) if hide else radiance
+
+    def shown(self, inputs: Mapping[str, Tensor], u: Tensor) -> Tensor:
+        """The picture (H, W, 3) sRGB of scene inputs, of which only those to which radiance is linear count; what
+        controls do to the finished picture comes from `u`."""
+        return self.space.picture(u, self.formation.display(self._formed({**inputs, **self._applied}, 0, 1)))
 
     def _through(self, u: Tensor) -> Tensor:
         return u
@@ -142,12 +179,12 @@ def why_not(renderer: Renderer) -> str | None:
 def samples_to_collect(renderer: Renderer) -> int:
     """Samples a pixel that a linear renderer traces before it can begin."""
     inputs = {name for group in renderer.plan.groups for name in renderer.routes.get(group.name, ())}
-    samples, passes = _passes(renderer)
-    return BASE_SPP + samples * passes * len(inputs)
+    samples, passes = _passes(renderer, SPP)
+    return samples * passes * len(inputs & linear_inputs(renderer))
 
 
-def _passes(renderer: Renderer) -> tuple[int, int]:
+def _passes(renderer: Renderer, spp: int) -> tuple[int, int]:
     """Samples a pixel of a pass, and how many passes there are."""
     height, width = renderer.formation.resolution
-    samples = max(1, min(SPP, PASS // (height * width)))
-    return samples, -(-SPP // samples)
+    samples = max(1, min(spp, PASS // (height * width)))
+    return samples, -(-spp // samples)
