@@ -24,6 +24,9 @@ Json = dict[str, Any]
 JsonValue = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None
 """Whatever JSON can hold."""
 
+JsonObject = dict[str, JsonValue]
+"""A JSON object."""
+
 DEPTH = 100
 """Deepest nesting of JSON, in lists and objects."""
 

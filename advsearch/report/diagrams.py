@@ -109,8 +109,15 @@ def _errors(axes: Axes, points: Points, measure: str, report: PrecisionResult) -
     axes.set_xlabel("seconds")
     axes.set_ylabel("relative error, %")
     axes.grid(True, which="major")
-    place: dict[str, Any] = {"loc": "upper left", "bbox_to_anchor": (1.0, 1.0), "borderaxespad": 0.2}
-    axes.legend(**place, handlelength=1.6, title="slope against samples", title_fontsize=8, alignment="left")
+    axes.legend(
+        loc="upper left",
+        bbox_to_anchor=(1.0, 1.0),
+        borderaxespad=0.2,
+        handlelength=1.6,
+        title="slope against samples",
+        title_fontsize=8,
+        alignment="left",
+    )
 
 
 def _line(axes: Axes, line: Points, measure: str, number: int, label: str) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-from typing import Any
+
+from numpy.typing import ArrayLike
 
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
@@ -21,7 +22,7 @@ MOST_ROWS = 24
 """Values of an axis that are listed; of more, none."""
 
 
-def attack_html(summary: AttackSummary, pictures: Mapping[str, Any]) -> str:
+def attack_html(summary: AttackSummary, pictures: Mapping[str, ArrayLike]) -> str:
     """Return an attack's verdict, its pictures and its rates.
 
     Args:

@@ -181,10 +181,17 @@ def _gif(pictures: Sequence[Bytes]) -> bytes:
     stride = 1 + pixels.shape[0] * pixels.shape[1] // _PALETTE_PIXELS
     palette = Image.fromarray(np.ascontiguousarray(pixels[::stride])).quantize(256)
     frames = [Image.fromarray(one).quantize(palette=palette, dither=Image.Dither.NONE) for one in pictures]
-    last: dict[str, Any] = {"save_all": True, "append_images": frames[1:]} if len(frames) > 1 else {}
+    several = len(frames) > 1
     durations = [FRAME_MS] * (len(frames) - 1) + [LAST_FRAME_MS]
     buffer = io.BytesIO()
-    frames[0].save(buffer, "GIF", loop=0, duration=durations if last else LAST_FRAME_MS, **last)
+    frames[0].save(
+        buffer,
+        "GIF",
+        loop=0,
+        duration=durations if several else LAST_FRAME_MS,
+        save_all=several,
+        append_images=frames[1:],
+    )
     return buffer.getvalue()
 
 

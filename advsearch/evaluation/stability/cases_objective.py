@@ -14,6 +14,7 @@ from advsearch.attacks import POLICIES, Ending, make_policy, search, verify
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.evaluation.stability.case import Check, Group, Outcome, holds
 from advsearch.evaluation.stability.search import Toy, numbers, quadratic
+from advsearch.files import JsonObject
 from advsearch.models.model import Model
 from advsearch.models.preprocessing import Preprocessing
 from advsearch.seeds import stream
@@ -24,7 +25,7 @@ IMAGE = torch.zeros(1, 2, 2, 3)
 STEPS = 40
 SPACING = 2.0**-10
 """Distance of neighbouring 32-bit numbers at 10,000: logits themselves are no more exact than that."""
-WITH_OPTIONS: dict[str, dict[str, Any]] = {
+WITH_OPTIONS: dict[str, JsonObject] = {
     "restarts": {"policy": "pgd", "times": 2},
     "portfolio": {"policies": ["pgd", "cmaes"]},
 }

@@ -231,8 +231,7 @@ def rendered(path: str, count: int) -> None:
         places = torch.linspace(0.1, 0.9, MOVES)
         found["moved"] = torch.stack([denoised(place[None], 0, 8) for place in places])
     found["adjoint"], found["again"] = (raw.gradient(loss, raw.start, 0, 8)[1] for _ in range(2))
-    arrays: dict[str, Any] = {name: one.numpy() for name, one in found.items()}
-    np.savez(path, **arrays)
+    np.savez(path, allow_pickle=False, **{name: one.numpy() for name, one in found.items()})
 
 
 @GROUP.case(

@@ -317,5 +317,9 @@ def domain_of(renderer: Renderer, start: Tensor | None = None) -> Domain:
     """Return where a search of a renderer's space may look, from its start or another one."""
     space = renderer.space
     assert isinstance(space, Space)
-    more: dict[str, Any] = {"gradient_cost": renderer.plan.renders, "partial_gradients": True}
-    return domains.domain_of(space.controls, renderer.start if start is None else start, **more)
+    return domains.domain_of(
+        space.controls,
+        renderer.start if start is None else start,
+        gradient_cost=renderer.plan.renders,
+        partial_gradients=True,
+    )

@@ -11,7 +11,7 @@ import struct
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, FailFast, Field, JsonValue, ValidationError
 
 from advsearch import files
 from advsearch.errors import FileFormatError
@@ -70,7 +70,7 @@ class Accessor(_Entry):
     type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
     bufferView: Index | None = None
     byteOffset: Size = 0
-    sparse: dict[str, Any] | None = Field(default=None, exclude=True)
+    sparse: dict[str, JsonValue] | None = Field(default=None, exclude=True)
 
     def size(self) -> int:
         """Bytes of its values, packed."""

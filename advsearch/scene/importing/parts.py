@@ -117,7 +117,7 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
 def _parse(path: Path, data: bytes, references: References) -> list[tuple[Any, Array]]:
     """Run trimesh's parser; return what it found with the transforms (4, 4), always in the same order."""
     kind = path.suffix.lower().lstrip(".")
-    options: dict[str, Any] = {"process": False}
+    options: dict[str, bool] = {"process": False}
     if kind == "ply":  # with fix_texture, vertices are shuffled and their normals are not
         options["fix_texture"] = _has_face_uvs(path, data)
     try:

@@ -10,15 +10,15 @@ from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.inputs import SceneInput, number, transform
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
 
 
-def scene_dict(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> dict[str, Any]:
+def scene_dict(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> Plugin:
     """Everything but the object and the parts."""
     mi = mitsuba()
     place = mi.ScalarTransform4f
     number = description.number
-    scene: dict[str, Any] = {
+    scene: Plugin = {
         "type": "scene",
         "camera": _camera(description, resolution, filter, sampler),
     }
@@ -42,9 +42,9 @@ def scene_dict(description: SceneDescription, resolution: tuple[int, int], filte
     return scene
 
 
-def _camera(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> dict[str, Any]:
+def _camera(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> Plugin:
     height, width = resolution
-    camera: dict[str, Any] = {
+    camera: Plugin = {
         "type": "thinlens" if description.thin_lens else "perspective",
         "fov": description.number("camera.fov"),
         "fov_axis": "larger",

@@ -5,7 +5,6 @@ Mitsuba 3.10 renames these parameters: they stand here and nowhere else.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,13 +12,13 @@ import numpy.typing as npt
 
 from advsearch.scene.assets import Floats, Material, Mesh
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
 
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
 """Names of a mesh's parameters: flat arrays of 3, 3 and 2 numbers a vertex, and 3 indices a face."""
 
 
-def principled(base_color: Floats, material: Material, extra: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def principled(base_color: Floats, material: Material, extra: Plugin | None = None) -> Plugin:
     """A two-sided principled BSDF with the base colour as a bilinear texture of linear reflectance.
 
     Args:
@@ -29,7 +28,7 @@ def principled(base_color: Floats, material: Material, extra: Mapping[str, Any] 
     """
     mi = mitsuba()
     linear = srgb_to_linear(base_color)
-    surface: dict[str, Any] = {
+    surface: Plugin = {
         "type": "principled",
         "base_color": {
             "type": "bitmap",
@@ -47,7 +46,7 @@ def principled(base_color: Floats, material: Material, extra: Mapping[str, Any] 
     return {"type": "twosided", "bsdf": surface}
 
 
-def mitsuba_mesh(name: str, mesh: Mesh, to_world: npt.NDArray[np.float64], bsdf: dict[str, Any]) -> Any:
+def mitsuba_mesh(name: str, mesh: Mesh, to_world: npt.NDArray[np.float64], bsdf: Plugin) -> Any:
     """Return a Mitsuba mesh of the given geometry under a pose, with shading normals and texture coordinates.
 
     Mitsuba's bitmaps have row 0 at v = 0 while ours have it at v = 1, hence the flip.

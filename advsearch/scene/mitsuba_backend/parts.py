@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, MutableMapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import singledispatch
-from typing import Any
 
 from advsearch.scene.mitsuba_backend.inputs import SceneInput, color, flat, number, point, transform
 from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, mitsuba_mesh, principled
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
 from advsearch.scene.parts import BallLamp, HazePart, MeshPart, PointLamp, ScenePart
 
 ABSENT = {"type": "uniform", "value": 0.0}
-IDLE_LOBES: Mapping[str, Any] = {name: ABSENT for name in ("clearcoat", "sheen")}
+IDLE_LOBES: Plugin = {name: ABSENT for name in ("clearcoat", "sheen")}
 """Entries of the principled surface that give it lobes of strength 0."""
 
 
@@ -28,9 +27,9 @@ class Translation:
         integrator: entries that replace those of the path integrator's dictionary (another type, for a medium).
     """
 
-    plugins: dict[str, Any]
+    plugins: Plugin
     inputs: tuple[SceneInput, ...] = ()
-    integrator: dict[str, Any] = field(default_factory=dict)
+    integrator: Plugin = field(default_factory=dict)
 
 
 @singledispatch
@@ -40,7 +39,7 @@ def translation(part: ScenePart) -> Translation:
 
 
 @translation.register
-def mesh_translation(part: MeshPart, lobes: Mapping[str, Any] | None = None) -> Translation:
+def mesh_translation(part: MeshPart, lobes: Plugin | None = None) -> Translation:
     """A mesh.
 
     Args:
@@ -102,11 +101,11 @@ def _haze(part: HazePart) -> Translation:
     return Translation({name: medium}, inputs, {"type": "advsearch_haze", "medium": medium, "radius": part.radius})
 
 
-def _rgb(value: Sequence[float]) -> dict[str, Any]:
+def _rgb(value: Sequence[float]) -> Plugin:
     return {"type": "rgb", "value": list(value)}
 
 
-def leave_dark_lamps_out(plugins: MutableMapping[str, Any], parts: Sequence[ScenePart]) -> None:
+def leave_dark_lamps_out(plugins: Plugin, parts: Sequence[ScenePart]) -> None:
     """Take no samples towards lamps that emit nothing.
 
     A path that arrives at one by chance still counts, with all of the weight, so that nothing is biased should it be

@@ -26,7 +26,7 @@ from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, leave_dark_lamps_o
 from advsearch.scene.mitsuba_backend.population import population
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER, next_count
 from advsearch.scene.mitsuba_backend.transport import Paths, collect
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
 
 MAX_DEPTH = 6
 """Longest light path in segments: five bounces off surfaces."""
@@ -87,7 +87,7 @@ class MitsubaScene:
         plugins = scene_dict(description, resolution, filter, sampler)
         translated = [mesh_translation(description.meshes[OBJECT], None if "lobes" in leave_out else IDLE_LOBES)]
         translated += [translation(part) for part in description.parts]
-        self._path: dict[str, Any] = {"type": integrator}
+        self._path: Plugin = {"type": integrator}
         for one in translated:
             plugins |= one.plugins
             self._path |= one.integrator
@@ -332,7 +332,7 @@ class MitsubaScene:
         if key not in self._integrators:
             mi = mitsuba()
             path = {"type": "prb", "max_depth": self._depth, "rr_depth": NO_ROULETTE, **self._path}
-            recipes: dict[str, dict[str, Any]] = {
+            recipes: dict[str, Plugin] = {
                 "path": path,
                 "hidden": {**path, "hide_emitters": True},
                 "guides": {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"},

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import sys
 from types import ModuleType
+from typing import Any
 
 from advsearch import threads
 from advsearch.scene.mitsuba_backend.llvm import ensure_llvm
 
 VARIANT = "llvm_ad_rgb"
+
+Plugin = dict[str, Any]
+"""A plugin, or a whole scene, as Mitsuba's loader takes it: its `type`, and by Mitsuba's names for them numbers, texts,
+transforms, bitmaps, objects that are loaded already, and further plugins."""
 
 
 def mitsuba() -> ModuleType:
