@@ -15,13 +15,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import ClassVar, TypedDict
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from advsearch.controls.clean import Moved
 from advsearch.controls.values import is_number, is_whole
+from advsearch.described import Value as Value
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.gradients.group import WHOLE_RANGE as WHOLE_RANGE
@@ -76,13 +77,6 @@ class Choice:
             allowed, fits = f"a number over 0 and up to {self.most:g}", is_number(given) and 0.0 < given <= self.most
         if not fits and not (given is None and self.default is None):
             raise InputError(f"{control}.{self.name}: expected {allowed}, got {given!r}")
-
-
-class Value(TypedDict):
-    """One value of a configuration as it is stored."""
-
-    value: float | str
-    unit: str
 
 
 class BoundControl(ABC):

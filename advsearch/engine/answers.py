@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from torch import Tensor
 
-from advsearch.controls.base import Value
+from advsearch.described import Value
 from advsearch.engine.loading import PictureSettings, Scene
 from advsearch.engine.rendering import render
 from advsearch.errors import InputError

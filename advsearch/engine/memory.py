@@ -7,7 +7,6 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,7 @@ from advsearch.engine.problem import OnImage
 from advsearch.engine.rows import judgement_of
 from advsearch.errors import InputError
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.replay import Entry
-from advsearch.runs.results.base import plain
+from advsearch.runs.replay import Entry, LoggedEvaluation, LoggedJudgement
 from advsearch.runs.store import Row
 from advsearch.scene.formation import to_8_bit
 from advsearch.tasks import Answer, Judgement
@@ -147,8 +145,8 @@ class Memory:
         if seconds is None:
             return None
         entries = list(self._entries(kind))
-        explored = [entry for entry in entries if entry.facts["index"] < steps]
-        left = seconds - math.fsum(entry.facts["seconds"] for entry in explored)
+        explored = [entry for entry in entries if entry.facts.index < steps]
+        left = seconds - math.fsum(entry.facts.seconds for entry in explored)
         ended, begun = len(entries) > len(explored), time.perf_counter()
 
         def late(count: int) -> bool:
@@ -181,7 +179,7 @@ class Memory:
             self._run.store.set_note(key, json.dumps(value))
 
     def _check(self, entry: Entry, u: Tensor, index: int) -> None:
-        if entry.facts["u"] != _digest(u) or entry.facts["index"] != index:
+        if entry.facts.u != _digest(u) or entry.facts.index != index:
             path = self._run.path if self._run is not None else ""
             raise InputError(
                 f"{path}: cannot go on: evaluation {entry.number} of the {entry.kind} is another one now than it was, "
@@ -198,16 +196,16 @@ def is_search(kind: str) -> bool:
 def _entry(
     kind: str, number: int, index: int, u: Tensor, found: Evaluation, picture: Tensor | None, seconds: float
 ) -> Entry:
-    facts = {
-        "index": index,
-        "u": _digest(u),
-        "objective": found.objective.hex() if found.finite else str(found.objective),
-        "success": found.success,
-        "non_finite": found.non_finite,
-        "cost": found.cost,
-        "seconds": seconds,
-        "judgement": None if found.judgement is None else _told(found.judgement),
-    }
+    facts = LoggedEvaluation(
+        index=index,
+        u=_digest(u),
+        objective=found.objective.hex() if found.finite else str(found.objective),
+        success=found.success,
+        non_finite=found.non_finite,
+        cost=found.cost,
+        seconds=seconds,
+        judgement=None if found.judgement is None else LoggedJudgement.of(found.judgement),
+    )
     arrays = {}
     if found.gradient is not None:
         arrays["gradient"] = found.gradient.detach().numpy()
@@ -216,21 +214,18 @@ def _entry(
     return Entry(kind, number, facts, arrays)
 
 
-def _told(judgement: Judgement) -> dict[str, object]:
-    return {**asdict(replace(judgement, payload=None)), "payload": plain(judgement.payload)}
-
-
 def _evaluation(entry: Entry) -> Evaluation:
-    text = entry.facts["objective"]
-    gradient = entry.arrays.get("gradient")
-    told = entry.facts.get("judgement")
+    facts, gradient = entry.facts, entry.arrays.get("gradient")
+    text, told = facts.objective, facts.judgement
     return Evaluation(
         objective=float.fromhex(text) if "x" in text else float(text),
         gradient=None if gradient is None else torch.from_numpy(gradient),
-        success=entry.facts["success"],
-        non_finite=entry.facts["non_finite"],
-        cost=entry.facts["cost"],
-        judgement=None if told is None else Judgement(**{**told, "answer": Answer(**told["answer"])}),
+        success=facts.success,
+        non_finite=facts.non_finite,
+        cost=facts.cost,
+        judgement=None
+        if told is None
+        else Judgement(told.score, told.margin, told.right, Answer(**vars(told.answer)), told.payload),
     )
 
 

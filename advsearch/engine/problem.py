@@ -14,7 +14,7 @@ from advsearch.attacks import Domain, Evaluate, Evaluation, Objective
 from advsearch.attacks.evaluation import Wanted
 from advsearch.attacks.verification import EASIER, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.controls import Space
-from advsearch.controls.base import Value
+from advsearch.described import Value
 from advsearch.engine.answers import Described, Looked
 from advsearch.engine.domains import domain_of
 from advsearch.models import Model

@@ -6,9 +6,9 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 from advsearch.attacks import Trials
+from advsearch.described import Value
 from advsearch.runs.results.attack import VerifiedRate
 from advsearch.runs.store import Row
 from advsearch.tasks import Answer, Judgement
@@ -20,7 +20,7 @@ def trial_row(
     seed: int,
     spp: int,
     trial: Judgement,
-    values: Mapping[str, Any] | None = None,
+    values: Mapping[str, Value] | None = None,
     *,
     sought: bool = True,
 ) -> Row:

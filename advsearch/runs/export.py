@@ -18,7 +18,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import IO, Any
 
+from advsearch.described import Value
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.files import JsonObject, JsonValue
 from advsearch.runs.files import placed_by, replacing
 from advsearch.runs.store import Row, Store
 
@@ -74,7 +76,7 @@ def columns(rows: Iterable[Row]) -> list[str]:
     return [*OWN, *seen, *AFTER]
 
 
-def record(row: Row) -> dict[str, Any]:
+def record(row: Row) -> JsonObject:
     """Return a row as column to value."""
     own = {one.name: getattr(row, one.name) for one in fields(row) if one.name != "values"}
     return own | _values(row.values)
@@ -94,13 +96,13 @@ def to_pandas(rows: Iterable[Row]) -> Any:
     return pandas.DataFrame([record(row) for row in listed], columns=columns(listed))
 
 
-def _records(rows: Iterable[Row]) -> Iterator[dict[str, Any]]:
+def _records(rows: Iterable[Row]) -> Iterator[JsonObject]:
     return (record(row) for row in rows)
 
 
-def _values(values: Mapping[str, Any]) -> dict[str, Any]:
+def _values(values: Mapping[str, Value | JsonValue]) -> JsonObject:
     """Column to number or text."""
-    found: dict[str, Any] = {}
+    found: JsonObject = {}
     for name, told in values.items():
         value, unit = (told.get("value"), told.get("unit", "")) if isinstance(told, Mapping) else (told, "")
         suffix = f" [{unit}]" if unit else ""
@@ -111,7 +113,7 @@ def _values(values: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _csv(records: Iterable[Mapping[str, Any]], names: list[str], stream: IO[bytes]) -> None:
+def _csv(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> None:
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
     writer = csv.DictWriter(text, names, restval="", lineterminator="\n")
     writer.writeheader()
@@ -119,17 +121,17 @@ def _csv(records: Iterable[Mapping[str, Any]], names: list[str], stream: IO[byte
     text.detach()
 
 
-def _flat(record: Mapping[str, Any]) -> Mapping[str, Any]:
+def _flat(record: JsonObject) -> JsonObject:
     """The record with its payload as a text."""
     payload = record[PAYLOAD]
     return record if payload is None else {**record, PAYLOAD: json.dumps(payload, allow_nan=False, ensure_ascii=False)}
 
 
-def _cell(value: Any) -> Any:
+def _cell(value: JsonValue) -> JsonValue:
     return "" if value is None else int(value) if isinstance(value, bool) else value
 
 
-def _json(records: Iterable[Mapping[str, Any]], names: list[str], stream: IO[bytes]) -> None:
+def _json(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> None:
     stream.write(b"[")
     for number, one in enumerate(records):
         line = json.dumps({name: one.get(name) for name in names}, allow_nan=False, ensure_ascii=False)
@@ -137,7 +139,7 @@ def _json(records: Iterable[Mapping[str, Any]], names: list[str], stream: IO[byt
     stream.write(b"\n]\n")
 
 
-def _parquet(records: Iterable[Mapping[str, Any]], names: list[str], stream: IO[bytes]) -> None:
+def _parquet(records: Iterable[JsonObject], names: list[str], stream: IO[bytes]) -> None:
     try:
         import pyarrow
         import pyarrow.parquet
@@ -153,7 +155,7 @@ def _parquet(records: Iterable[Mapping[str, Any]], names: list[str], stream: IO[
             first = list(itertools.islice(rows, GROUP))
 
 
-def _arrow_type(name: str, rows: Sequence[Mapping[str, Any]], pyarrow: Any) -> Any:
+def _arrow_type(name: str, rows: Sequence[JsonObject], pyarrow: Any) -> Any:
     """Type of a column: by its name in the store, by its first values otherwise."""
     declared = {one.name: str(one.type) for one in fields(Row)}.get(name)
     if name == PAYLOAD:

@@ -25,6 +25,8 @@ from numpy.typing import NDArray
 from advsearch.errors import FileFormatError
 from advsearch.files import parse_json
 from advsearch.runs.files import storage_errors
+from advsearch.runs.results.base import Fields, Payload
+from advsearch.runs.results.render import ClassAnswer
 
 NAME = "replay.bin"
 
@@ -34,6 +36,40 @@ _MAGIC = b"ADVr"
 Array = NDArray[Any]
 
 
+class LoggedJudgement(Fields):
+    """What a task said; floats come back bit for bit."""
+
+    score: float
+    margin: float
+    right: bool
+    answer: ClassAnswer
+    payload: Payload = None
+
+
+class LoggedEvaluation(Fields):
+    """One evaluation without its arrays.
+
+    Attributes:
+        index: of its step.
+        u: digest of the configuration.
+        objective: in hexadecimal, or "nan" or "inf".
+        success: whether the answer is what is sought.
+        non_finite: numbers that were not.
+        cost: in evaluations.
+        seconds: that it took.
+        judgement: None where there was none.
+    """
+
+    index: int
+    u: str
+    objective: str
+    success: bool
+    non_finite: int
+    cost: int
+    seconds: float
+    judgement: LoggedJudgement | None = None
+
+
 @dataclass(frozen=True, eq=False)
 class Entry:
     """What one evaluation told.
@@ -41,13 +77,13 @@ class Entry:
     Attributes:
         kind: of search: ``"search"``, ``"baseline"``.
         number: of the evaluation within its kind, from 0.
-        facts: JSON values; floats come back bit for bit.
+        facts: what was told beside the arrays.
         arrays: by name.
     """
 
     kind: str
     number: int
-    facts: Mapping[str, Any]
+    facts: LoggedEvaluation
     arrays: Mapping[str, Array] = field(default_factory=dict)
 
 
@@ -102,7 +138,8 @@ class ReplayLog:
             StorageError: the disk is full or cannot be written.
         """
         shapes = {name: (str(array.dtype), list(array.shape)) for name, array in entry.arrays.items()}
-        head = json.dumps({"kind": entry.kind, "number": entry.number, "facts": entry.facts, "arrays": shapes}).encode()
+        facts = entry.facts.model_dump()
+        head = json.dumps({"kind": entry.kind, "number": entry.number, "facts": facts, "arrays": shapes}).encode()
         body = b"".join(np.ascontiguousarray(array).tobytes() for array in entry.arrays.values())
         start = _START.pack(_MAGIC, len(head), len(body), zlib.crc32(body, zlib.crc32(head)))
         with storage_errors(self.path):
@@ -154,7 +191,7 @@ def _entry(data: bytes, head_size: int) -> Entry:
         count = int(np.prod(shape, dtype=np.int64))
         arrays[name] = np.frombuffer(data, dtype, count, begin).reshape(shape).copy()
         begin += arrays[name].nbytes
-    kind, number, facts = head["kind"], head["number"], head["facts"]
-    if not (isinstance(kind, str) and isinstance(number, int) and isinstance(facts, dict)):
+    kind, number = head["kind"], head["number"]
+    if not (isinstance(kind, str) and isinstance(number, int)):
         raise TypeError("an entry of another type")
-    return Entry(kind, number, facts, arrays)
+    return Entry(kind, number, LoggedEvaluation.of(head["facts"]), arrays)

@@ -21,6 +21,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, final, get_args, get_type_hints
 
+from advsearch.described import Value
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonValue, open_regular, parse_json
 from advsearch.runs.files import storage_errors
@@ -127,7 +128,7 @@ class Row:
     label_index: int | None = None
     probability: float | None = None
     payload: JsonValue = None
-    values: Mapping[str, Any] = field(default_factory=dict)
+    values: Mapping[str, Value] = field(default_factory=dict)
     seconds: float | None = None
     renders: int | None = None
     time: float | None = None
@@ -395,7 +396,13 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
     given = dict(zip((one.name for one in fields(Row)), values, strict=True))
     wrong = [name for name, value in given.items() if not isinstance(value, _TYPES[name])]
     if not wrong:
-        wrong = [f"{name}_json" for name in _AS_JSON if not _read_json(given, name)]
+        given["values"] = _values(given["values"])
+        wrong = ["values_json"] if given["values"] is None else []
+    if not wrong and given["payload"] is not None:
+        try:
+            given["payload"] = parse_json(given["payload"])
+        except ValueError:
+            wrong = ["payload_json"]
     if wrong:
         raise FileFormatError(f"{path}: row {given['id']!r}: expected another type of {wrong[0]}; {_DAMAGED}")
     for name in ("success", "correct"):
@@ -403,11 +410,10 @@ def _decode(values: tuple[Any, ...], path: Path) -> Row:
     return Row(**given)
 
 
-def _read_json(given: dict[str, Any], name: str) -> bool:
-    """Put a value in the place of its JSON text, and return whether it is what `Row` says."""
-    read = json.loads if name == "values" else parse_json  # the values, which every row has, are never nested deeply
+def _values(text: str) -> dict[str, Value] | None:
+    """Return the values of a row, None where they are not what `Row` says."""
     try:
-        given[name] = None if given[name] is None else read(given[name])
+        values = json.loads(text)
     except (ValueError, RecursionError):
-        return False
-    return name == "payload" or isinstance(given[name], dict)
+        return None
+    return values if isinstance(values, dict) else None

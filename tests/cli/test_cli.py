@@ -34,6 +34,7 @@ from advsearch.cli.output import columns
 from advsearch.cli.progress import BarProgress, LineProgress, watching
 from advsearch.cli.table import answer
 from advsearch.config import AttackConfig, GapConfig, RegionConfig, SweepConfig
+from advsearch.described import Value
 from advsearch.errors import InputError, StorageError
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory
@@ -577,7 +578,7 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     make_run(tmp_path / "runs" / "done", pictures=False)
     with RunDirectory.create_for(AttackConfig(object="mug", controls=["pose"], run="killed")) as run:
-        yaw = {"pose.yaw": {"value": 12.5, "unit": "degrees"}}
+        yaw: dict[str, Value] = {"pose.yaw": {"value": 12.5, "unit": "degrees"}}
         run.record(Row("search", 0, objective=0.5, success=True, values=yaw), Row("control", 0))
     return tmp_path
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import random
 import signal
@@ -28,7 +29,8 @@ from advsearch.errors import FileFormatError, InputError, RunExistsError
 from advsearch.progress import NullProgress
 from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.replay import Entry, ReplayLog
+from advsearch.runs.replay import Entry, LoggedEvaluation, LoggedJudgement, ReplayLog
+from advsearch.runs.results.render import ClassAnswer
 from advsearch.runs.store import Row
 from advsearch.settings import Config
 
@@ -176,12 +178,30 @@ def test_a_run_that_is_older_than_the_note_goes_on_and_a_damaged_note_is_named(t
         RunDirectory.resume(tmp_path / "run", configuration())
 
 
+LOGGED = LoggedEvaluation(
+    index=3,
+    u="12",
+    objective=(0.1 + 0.2).hex(),
+    success=False,
+    non_finite=0,
+    cost=2,
+    seconds=0.5,
+    judgement=LoggedJudgement(
+        score=0.1 + 0.2,
+        margin=-math.inf,
+        right=True,
+        answer=ClassAnswer(label="mug", index=None, probability=1.0 / 3.0),
+        payload={"boxes": [[0.1, 2]]},
+    ),
+)
+
+
 def test_a_log_keeps_whole_entries_only(tmp_path: Path) -> None:
     path = tmp_path / "replay.bin"
     log = ReplayLog(path)
     gradient = np.arange(5, dtype=np.float32) / 3
-    log.append(Entry("search", 0, {"objective": (0.1 + 0.2).hex()}, {"gradient": gradient}))
-    log.append(Entry("search", 1, {}, {}))
+    log.append(Entry("search", 0, LOGGED, {"gradient": gradient}))
+    log.append(Entry("search", 1, LOGGED))
     log.close()
     size = path.stat().st_size
     for cut in range(1, 40):
@@ -191,8 +211,8 @@ def test_a_log_keeps_whole_entries_only(tmp_path: Path) -> None:
         assert ("search", 0) in log and ("search", 1) not in log
         entry = log.read("search", 0)
         assert np.array_equal(entry.arrays["gradient"], gradient) and entry.arrays["gradient"].dtype == np.float32
-        assert float.fromhex(entry.facts["objective"]) == 0.1 + 0.2
-        log.append(Entry("search", 1, {}, {}))
+        assert entry.facts == LOGGED and float.fromhex(entry.facts.objective) == 0.1 + 0.2
+        log.append(Entry("search", 1, LOGGED))
         assert ("search", 1) in log
         log.close()
     log = ReplayLog(path)

@@ -502,7 +502,7 @@ def test_counts_are_those_of_the_rows(tmp_path: Path) -> None:
         if row.axis == "camera.azimuth":
             assert isinstance(row.value, tuple)
             low, high = row.value
-            inside = [one for one in rows if low <= one.values["camera.azimuth"]["value"] < high]
+            inside = [one for one in rows if low <= float(one.values["camera.azimuth"]["value"]) < high]
             assert row.unit == "degrees" and row.configurations == len(inside) > 15
             assert row.correct == sum(one in right for one in inside)
     assert json.loads((tmp_path / "run" / "summary.json").read_text("utf-8")) == summary.to_dict()

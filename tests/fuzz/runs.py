@@ -9,6 +9,7 @@ from contextlib import closing
 from functools import cache
 from pathlib import Path
 
+from advsearch.described import Value
 from advsearch.runs.store import Row, Store
 from advsearch.settings import HEADER
 from fuzz.case import Case, Maker, Random
@@ -33,7 +34,7 @@ def results() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "results.sqlite"
         with Store(path) as store:
-            values = {"pose.yaw": {"value": 3.0, "unit": "degrees"}}
+            values: dict[str, Value] = {"pose.yaw": {"value": 3.0, "unit": "degrees"}}
             store.append(Row("search", step, seed=step, objective=0.5, values=values) for step in range(40))
         with closing(sqlite3.connect(path)) as db:
             db.execute("PRAGMA journal_mode = DELETE")  # or reading it makes a log beside it

@@ -21,10 +21,12 @@ from advsearch.runs.export import FORMATS, columns, export
 from advsearch.runs.listing import finished, listed
 from advsearch.runs.store import NAME, Row, Store
 
+TWO: Any = {"light.place": {"value": [1.0, 2.0], "unit": ""}}
+"""A value of two numbers; our own controls have none such."""
 ROWS = (
     Row("search", 0, seed=2**63 - 1, spp=8, objective=0.1 + 0.2, success=True, label="tea, pot", label_index=3,
         probability=0.5, values={"pose.yaw": {"value": 30.0, "unit": "degrees"}}, renders=3),
-    Row("search", 1, objective=math.nan, values={"light.place": {"value": [1.0, 2.0], "unit": ""}}),
+    Row("search", 1, objective=math.nan, values=TWO),
     Row("control", 0, success=False, values={"material.pattern": {"value": "felt", "unit": ""}}),
 )  # fmt: skip
 

@@ -17,6 +17,7 @@ import pytest
 from samples import GAP, REGION, SWEEP, attack, rated
 
 from advsearch.cli.main import main
+from advsearch.described import Value
 from advsearch.errors import AdvsearchError, FileFormatError
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.replay import ReplayLog
@@ -35,7 +36,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (folder / "run.yaml").write_text(f"{HEADER}schema: 1\ncommand: attack\nobject: mug\ncontrols: {{pose: {{}}}}\n")
     (folder / "summary.json").write_text(json.dumps(SUMMARY))
     with Store(folder / "results.sqlite") as store:
-        values = {"pose.yaw": {"value": 3.0, "unit": "degrees"}}
+        values: dict[str, Value] = {"pose.yaw": {"value": 3.0, "unit": "degrees"}}
         store.append([Row("search", step, objective=0.5, values=values) for step in range(2)])
         store.set_note("answer", "[0.5]")
     return folder

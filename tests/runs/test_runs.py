@@ -100,7 +100,8 @@ def test_a_row_comes_back_as_it_was(run: RunDirectory) -> None:
 
 def test_rows_are_added_all_or_none(run: RunDirectory) -> None:
     run.record(Row("search", 0))
-    broken = Row("search", 2, values={"p": object()})
+    nothing: Any = object()
+    broken = Row("search", 2, values={"p": nothing})
     with pytest.raises(TypeError, match="expected something that JSON can hold, got object"):
         run.record(Row("search", 1), broken)
     run.record(Row("search", 5))
@@ -655,8 +656,8 @@ def test_text_is_on_the_disk_when_it_is_written_and_pictures_do_not_wait(
 @pytest.fixture
 def filled(run: RunDirectory) -> Store:
     """Rows of three kinds; the values of the second have a column more, and a list."""
-    yaw = {"pose.yaw": {"value": 0.1, "unit": "degrees"}}
-    target = {
+    yaw: dict[str, Any] = {"pose.yaw": {"value": 0.1, "unit": "degrees"}}
+    target: dict[str, Any] = {
         "camera.target": {"value": [0.5, -1.0], "unit": "sizes"},
         "backdrop.which": {"value": 'a,"b"\n', "unit": ""},
     }

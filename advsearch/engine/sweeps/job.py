@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Literal
 
 from advsearch.controls import CONTROLS, Control, Space, make_space
-from advsearch.controls.base import Value
+from advsearch.described import Value
 from advsearch.engine.answers import Looked, check_truth, facts_of
 from advsearch.engine.domains import domain_of
 from advsearch.engine.loading import PictureSettings, Scene, framed

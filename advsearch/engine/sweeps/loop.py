@@ -16,7 +16,7 @@ from typing import Any
 
 from advsearch.attacks.draws import Seeds
 from advsearch.attacks.product import batches
-from advsearch.controls.base import Value
+from advsearch.described import Value
 from advsearch.engine.record import Stages
 from advsearch.engine.rows import judgement_of, trial_row
 from advsearch.engine.sweeps.job import Job, check_all
@@ -199,8 +199,10 @@ class Sweep:
     ) -> store.Row:
         place = self.job.places[number // self.per_scene]
         lit_by = self.points.lit_by(values)
-        lit: dict[str, Value] = {} if lit_by is None else {"environment": {"value": lit_by, "unit": ""}}
-        named = {**place.values, **lit, "model": {"value": self.job.models[model].name, "unit": ""}, **values}
+        named = place.values
+        if lit_by is not None:
+            named["environment"] = {"value": lit_by, "unit": ""}
+        named |= {"model": {"value": self.job.models[model].name, "unit": ""}, **values}
         row = trial_row(KIND, number * self.models + model, seed, self.samples, trial, named, sought=False)
         return replace(row, seconds=seconds, renders=int(self.job.sizes[model] not in self.job.sizes[:model]))
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from advsearch.controls.base import Value
+from advsearch.described import Value
 from advsearch.engine.loading import framed, make_renderer
 from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.points import Picks, Points

@@ -1,0 +1,12 @@
+"""A configuration in words: named values with units, as controls say them and runs keep them."""
+
+from __future__ import annotations
+
+from typing import TypedDict
+
+
+class Value(TypedDict):
+    """One value of a configuration."""
+
+    value: float | str
+    unit: str
