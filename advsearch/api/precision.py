@@ -165,11 +165,11 @@ class _Measurement:
     def _confirm(self, bench: GradientBench, part: GradientPart, budget: TimeBudget) -> None:
         """Measure the setting that is recommended so far again, with seeds of its own."""
         one = self.section.recommended("gradient", part.name, self.config.error)
-        if one is None:
+        if one is None or one.spp is None:
             return
-        like = next(setting for setting in bench.settings if setting.line == one.line)
+        like = next(setting for setting in bench.settings if setting.series == one.estimator)
         setting = replace(like, spp=one.spp, cost=like.cost / like.spp * one.spp)
-        tick = self._timed(f"gradient of {part.name}: {one.line[2]} with {one.spp} samples again", budget)
+        tick = self._timed(f"gradient of {part.name}: {one.estimator} with {one.spp} samples again", budget)
         found = in_rounds(
             [setting],
             bench.measure,
@@ -181,7 +181,7 @@ class _Measurement:
         samples = [Sample(numbers, seconds) for numbers, seconds in found.results.get(setting, [])]
         if len(samples) >= CONFIRM_LEAST:
             floor = bench.floor(setting, "error")
-            self.section.again[one.line, "error"] = point_of(setting, samples, "error", floor)
+            self.section.again[setting.line, "error"] = point_of(setting, samples, "error", floor)
 
     def objective(self, budget: TimeBudget, policies: Mapping[str, Policy[Any]]) -> None:
         """The best verified objective of each policy."""

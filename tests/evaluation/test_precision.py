@@ -20,7 +20,6 @@ from advsearch.evaluation.precision.fits import (
     FURTHEST,
     INDEPENDENT,
     STRATIFIED,
-    Recommendation,
     confirmed,
     fit,
     fixed_seconds,
@@ -48,7 +47,7 @@ from advsearch.evaluation.precision.points import (
 from advsearch.evaluation.precision.report import Section, _rounding
 from advsearch.evaluation.precision.rounds import LEAST, TimeBudget, gather, in_rounds, part_samples
 from advsearch.report.diagrams import precision_figures
-from advsearch.runs.results.precision import PrecisionResult
+from advsearch.runs.results.precision import PrecisionResult, Recommended
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.mitsuba_backend.samplers import next_count
 
@@ -182,8 +181,8 @@ def test_independent_noise_has_slope_minus_a_half() -> None:
     points = measured(exact())
     for against in ("samples", "seconds"):
         line = fit(points, against, INDEPENDENT)
-        assert line is not None and line.value == pytest.approx(-0.5, abs=TOLERANCE)
-        assert line.interval[0] < -0.5 < line.interval[1] or abs(line.value + 0.5) < 0.02
+        assert line is not None and line.slope == pytest.approx(-0.5, abs=TOLERANCE)
+        assert line.interval[0] < -0.5 < line.interval[1] or abs(line.slope + 0.5) < 0.02
         assert line.agrees is True and line.points == 5
         assert warning_of(line, points) is None
 
@@ -191,13 +190,13 @@ def test_independent_noise_has_slope_minus_a_half() -> None:
 def test_the_slope_survives_a_reference_that_is_hardly_better() -> None:
     line = fit(measured(rough(256)), theory=INDEPENDENT)
     assert line is not None and line.points == 4  # 1,024 samples are below the reference
-    assert line.value == pytest.approx(-0.5, abs=TOLERANCE)
+    assert line.slope == pytest.approx(-0.5, abs=TOLERANCE)
 
 
 def test_a_bias_levels_off_and_is_warned_of() -> None:
     points = measured(exact(), bias=0.1)
     line = fit(points, theory=INDEPENDENT)
-    assert line is not None and line.value > -0.35 and line.agrees is False
+    assert line is not None and line.slope > -0.35 and line.agrees is False
     assert levels_off(points) and not levels_off(measured(exact()))
     assert "levels off" in str(warning_of(line, points))
 
@@ -206,7 +205,7 @@ def test_a_steeper_slope_agrees_only_where_theory_allows_it() -> None:
     points = measured(exact(), power=-0.75)
     strict, free = fit(points, theory=INDEPENDENT), fit(points, theory=STRATIFIED)
     assert strict is not None and free is not None
-    assert strict.value == pytest.approx(-0.75, abs=TOLERANCE)
+    assert strict.slope == pytest.approx(-0.75, abs=TOLERANCE)
     assert strict.agrees is False and free.agrees is True
 
 
@@ -214,10 +213,10 @@ def test_a_fixed_cost_keeps_points_out_of_the_slope_against_seconds() -> None:
     points = measured(exact(), fixed=0.01)
     assert fixed_seconds(points) == pytest.approx(0.01, rel=1e-6)
     line = fit(points, "seconds", INDEPENDENT)
-    assert line is not None and line.points == 3 and line.fixed == pytest.approx(0.01)
-    assert line.agrees is True and line.value == pytest.approx(-0.5, abs=0.1)
+    assert line is not None and line.points == 3 and line.fixed_seconds == pytest.approx(0.01)
+    assert line.agrees is True and line.slope == pytest.approx(-0.5, abs=0.1)
     slow = fit(measured(exact(), fixed=1.0), "seconds", INDEPENDENT)
-    assert slow is not None and slow.points == 5 and slow.value < -1.0 and slow.agrees is None
+    assert slow is not None and slow.points == 5 and slow.slope < -1.0 and slow.agrees is None
 
 
 def test_a_line_needs_three_known_points() -> None:
@@ -233,12 +232,18 @@ def error_at(samples: float) -> float:
     return found
 
 
+def reached(found: Recommended | None) -> tuple[Recommended, int, float]:
+    """A recommendation with its sample count and its error, which are there."""
+    assert found is not None and found.spp is not None and found.error is not None
+    return found, found.spp, found.error
+
+
 @pytest.mark.parametrize("goal", [0.3, 0.1, 0.05])
 def test_a_recommended_count_reaches_its_goal(goal: float) -> None:
-    found = reaching(measured(exact()), goal)
-    assert found is not None and found.basis in ("interpolated", "fitted")
-    assert error_at(found.spp) == pytest.approx(goal, rel=0.1)
-    assert found.seconds == pytest.approx(1e-3 * found.spp, rel=0.01)
+    found, spp, _ = reached(reaching(measured(exact()), goal))
+    assert found.basis in ("interpolated", "fitted")
+    assert error_at(spp) == pytest.approx(goal, rel=0.1)
+    assert found.seconds == pytest.approx(1e-3 * spp, rel=0.01)
 
 
 def test_a_line_that_explains_all_points_overrules_a_lucky_one() -> None:
@@ -261,10 +266,9 @@ def up(_: str, samples: float) -> int:
 def test_new_measurements_of_a_recommended_setting_are_what_is_promised(
     error: float, times: int, promised: float
 ) -> None:
-    one = reaching(measured(exact()), 0.1)
-    assert one is not None
-    found = confirmed(one, Point(setting(one.spp), "error", error, (0.0, 1.0), True, 0.0, 0.5, 12), up)
-    assert (found.basis, found.repeats, found.spp) == ("confirmed", 12, times * one.spp)
+    one, spp, _ = reached(reaching(measured(exact()), 0.1))
+    found = confirmed(one, Point(setting(spp), "error", error, (0.0, 1.0), True, 0.0, 0.5, 12), up)
+    assert (found.basis, found.repeats, found.spp) == ("confirmed", 12, times * spp)
     assert found.error == pytest.approx(promised) and found.seconds == pytest.approx(0.5 * times)
 
 
@@ -279,20 +283,19 @@ def test_what_is_chosen_among_noisy_points_looks_better_than_it_is_until_it_is_m
     before, after = [], []
     for _ in range(200):
         lines = {name: [point(name, spp, 4) for spp in (4, 16, 64, 256)] for name in "abc"}
-        one = recommend({setting(4, name).line: points for name, points in lines.items()}, 0.1)
-        assert one is not None
-        again = confirmed(one, point(one.line[2], one.spp, 24), up)
-        before.append(math.log(one.spp**-0.5 / one.error))
-        after.append(math.log(again.spp**-0.5 / again.error))
+        one, spp, error = reached(recommend({setting(4, name).line: points for name, points in lines.items()}, 0.1))
+        before.append(math.log(spp**-0.5 / error))
+        _, spp, error = reached(confirmed(one, point(str(one.estimator), spp, 24), up))
+        after.append(math.log(spp**-0.5 / error))
     assert np.mean(before) > 0.2
     assert abs(np.mean(after)) < 0.05 and np.quantile(np.abs(after), 0.95) < math.log(1.5)
 
 
 def test_beyond_the_last_point_it_says_so_and_not_too_far() -> None:
     points = measured(exact())
-    found = reaching(points, 0.5 * points[-1].error)
-    assert found is not None and found.basis == "extrapolated"
-    assert error_at(found.spp) == pytest.approx(found.goal, rel=0.15)
+    found, spp, _ = reached(reaching(points, 0.5 * points[-1].error))
+    assert found.basis == "extrapolated"
+    assert error_at(spp) == pytest.approx(found.goal, rel=0.15)
     assert reaching(points, points[-1].error / FURTHEST) is None
 
 
@@ -302,19 +305,19 @@ def test_what_levels_off_is_never_recommended_below_its_level() -> None:
     plain = measured(exact(), fixed=1.0)
     both = {one[0].setting.line: one for one in (biased, plain)}
     cheap, good = recommend(both, 0.2), recommend(both, 0.05)
-    assert cheap is not None and cheap.line[2] == "biased"
-    assert good is not None and good.line[2] == "independent"
+    assert cheap is not None and cheap.estimator == "biased"
+    assert good is not None and good.estimator == "independent"
 
 
 def test_a_count_is_rounded_to_what_the_sampler_takes() -> None:
-    found = reaching(measured(exact()), 0.1, lambda series, samples: next_count("ldsampler", samples))
-    assert found is not None and math.log(found.spp, 4) == pytest.approx(round(math.log(found.spp, 4)))
-    assert found.error <= 0.1
+    _, spp, error = reached(reaching(measured(exact()), 0.1, lambda series, samples: next_count("ldsampler", samples)))
+    assert math.log(spp, 4) == pytest.approx(round(math.log(spp, 4)))
+    assert error <= 0.1
 
 
 def test_the_cheapest_that_is_good_enough_is_taken_as_it_is() -> None:
     found = reaching(measured(exact()), 10.0)
-    assert isinstance(found, Recommendation) and (found.spp, found.basis) == (4, "measured")
+    assert found is not None and (found.spp, found.basis) == (4, "measured")
 
 
 # ---- rounds and budgets ---------------------------------------------------------------------------------------------

@@ -1,10 +1,13 @@
-"""Slopes of work-precision lines beside theory, and the setting that reaches a goal soonest."""
+"""Slopes of work-precision lines beside theory, and the setting that reaches a goal soonest.
+
+Both are said as `runs.results.precision` keeps them.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
@@ -12,6 +15,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from advsearch.evaluation.precision.points import LEVEL, Point
+from advsearch.runs.results.precision import PrecisionSlope, Recommended
 
 AGREES = 0.1
 """How far a slope may be from theory, whatever its interval."""
@@ -48,36 +52,7 @@ STRATIFIED = Theory(MONTE_CARLO, at_most=True)
 UNKNOWN = Theory()
 
 
-@dataclass(frozen=True)
-class Slope:
-    """A line through points, both axes logarithmic.
-
-    Attributes:
-        line: quantity, control and series.
-        measure: which error.
-        against: "samples" or "seconds".
-        value: its slope.
-        interval: 95 %, Student's t.
-        offset: logarithm of the error at one sample or second.
-        points: how many points it goes through.
-        theory: what it should be.
-        fixed: seconds of a call that don't grow with the samples; NaN against samples.
-        agrees: whether it is as theory says; None where theory says nothing, or the interval is too wide to tell.
-    """
-
-    line: tuple[str, str, str]
-    measure: str
-    against: Against
-    value: float
-    interval: tuple[float, float]
-    offset: float
-    points: int
-    theory: Theory
-    fixed: float
-    agrees: bool | None
-
-
-def fit(points: Sequence[Point], against: Against = "samples", theory: Theory = UNKNOWN) -> Slope | None:
+def fit(points: Sequence[Point], against: Against = "samples", theory: Theory = UNKNOWN) -> PrecisionSlope | None:
     """Return the least-squares line of log error against log samples or seconds.
 
     Only points whose error is known count: one below the reference's own error says nothing. None where fewer than
@@ -104,9 +79,22 @@ def fit(points: Sequence[Point], against: Against = "samples", theory: Theory = 
     x = np.log([_across(point, against) for point in known])
     y = np.log([point.error for point in known])
     slope, offset, half = straight_line(x, y)
-    line, interval = known[0].setting.line, (slope - half, slope + half)
-    agrees = _agrees(slope, half, theory) if holds else None
-    return Slope(line, known[0].measure, against, slope, interval, offset, len(known), theory, fixed, agrees)
+    setting = known[0].setting
+    return PrecisionSlope(
+        quantity=setting.quantity,
+        control=setting.control or None,
+        estimator=setting.series,
+        measure=known[0].measure,
+        against=against,
+        slope=slope,
+        interval=(slope - half, slope + half),
+        offset=offset,
+        points=len(known),
+        fixed_seconds=fixed,
+        theory=theory.slope,
+        or_steeper=theory.at_most,
+        agrees=_agrees(slope, half, theory) if holds else None,
+    )
 
 
 def straight_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
@@ -137,19 +125,18 @@ def fixed_seconds(points: Sequence[Point]) -> float:
     return max(0.0, float(fixed))
 
 
-def warning_of(slope: Slope, points: Sequence[Point]) -> str | None:
+def warning_of(slope: PrecisionSlope, points: Sequence[Point]) -> str | None:
     """Return a sentence where a slope disagrees with theory, with the likeliest reason; None where it agrees."""
-    if slope.agrees is not False or slope.theory.slope is None:
+    if slope.agrees is not False or slope.theory is None:
         return None
-    quantity, control, series = slope.line
-    what = f"{control or quantity} by {series}" + ("" if slope.measure == "error" else ", margin")
-    said = f"{what}: the error falls with slope {slope.value:.2f} against {slope.against}"
-    said += f" (95 %: {slope.interval[0]:.2f} to {slope.interval[1]:.2f}), theory says {slope.theory.slope:g}"
-    return f"{said}{' or steeper' if slope.theory.at_most else ''}: {_reason(slope, points)}"
+    what = f"{slope.control or slope.quantity} by {slope.estimator}" + ("" if slope.measure == "error" else ", margin")
+    said = f"{what}: the error falls with slope {slope.slope:.2f} against {slope.against}"
+    said += f" (95 %: {slope.interval[0]:.2f} to {slope.interval[1]:.2f}), theory says {slope.theory:g}"
+    return f"{said}{' or steeper' if slope.or_steeper else ''}: {_reason(slope, points)}"
 
 
-def _reason(slope: Slope, points: Sequence[Point]) -> str:
-    if slope.value > (slope.theory.slope or 0.0):
+def _reason(slope: PrecisionSlope, points: Sequence[Point]) -> str:
+    if slope.slope > (slope.theory or 0.0):
         if levels_off(points):
             return "it levels off: a bias is left that no samples remove"
         return "heavy-tailed noise, clipping at few samples or a bias"
@@ -170,35 +157,9 @@ def levels_off(points: Sequence[Point]) -> bool:
 # ---- the recommendation ---------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Recommendation:
-    """The cheapest setting that reaches a goal.
-
-    Attributes:
-        line: quantity, control and series.
-        measure: which error.
-        goal: relative error that is wanted.
-        spp: samples a pixel.
-        seconds: how long it takes.
-        error: what it should have.
-        basis: "measured", "fitted", "interpolated" or "extrapolated"; "confirmed" where it was measured after it was
-            chosen.
-        repeats: measurements that confirm it.
-    """
-
-    line: tuple[str, str, str]
-    measure: str
-    goal: float
-    spp: int
-    seconds: float
-    error: float
-    basis: str
-    repeats: int = 0
-
-
 def recommend(
     lines: Mapping[tuple[str, str, str], Sequence[Point]], goal: float, round_up: RoundUp | None = None
-) -> Recommendation | None:
+) -> Recommended | None:
     """Return the setting with the least time that reaches a relative error; None where none is known to.
 
     Args:
@@ -207,10 +168,10 @@ def recommend(
         round_up: what sample counts a series takes; None for all whole numbers.
     """
     found = [one for points in lines.values() if (one := reaching(points, goal, round_up)) is not None]
-    return min(found, key=lambda one: one.seconds, default=None)
+    return min(found, key=lambda one: one.seconds or 0.0, default=None)
 
 
-def reaching(points: Sequence[Point], goal: float, round_up: RoundUp | None = None) -> Recommendation | None:
+def reaching(points: Sequence[Point], goal: float, round_up: RoundUp | None = None) -> Recommended | None:
     """Return the least sample count at which one line reaches a goal, and what it takes there.
 
     Where the fitted line goes through the interval of every known point, of at least four, it stands for them: it
@@ -221,18 +182,27 @@ def reaching(points: Sequence[Point], goal: float, round_up: RoundUp | None = No
     if not points or not goal > 0.0:
         return None
     ordered = sorted(points, key=lambda point: point.setting.spp)
-    line, measure = ordered[0].setting.line, ordered[0].measure
+    setting = ordered[0].setting
     fitted = _explaining(ordered)
     count, basis = _samples_for(ordered, goal) if fitted is None else _on_line(fitted, ordered, goal)
     if count is None:
         return None
-    series = line[2]
-    spp = (round_up or (lambda _, samples: math.ceil(samples - 1e-9)))(series, count)
-    error = _at(ordered, spp, "error") if fitted is None else _line_at(fitted, spp)
-    return Recommendation(line, measure, goal, spp, _at(ordered, spp, "seconds"), error, basis)
+    spp = (round_up or (lambda _, samples: math.ceil(samples - 1e-9)))(setting.series, count)
+    return Recommended(
+        quantity=setting.quantity,
+        control=setting.control or None,
+        measure=ordered[0].measure,
+        among=None,
+        goal=goal,
+        estimator=setting.series,
+        spp=spp,
+        seconds=_at(ordered, spp, "seconds"),
+        error=_at(ordered, spp, "error") if fitted is None else _line_at(fitted, spp),
+        basis=basis,
+    )
 
 
-def confirmed(one: Recommendation, point: Point, round_up: RoundUp) -> Recommendation:
+def confirmed(one: Recommended, point: Point, round_up: RoundUp) -> Recommended:
     """Return a recommendation that rests on measurements made after it was chosen, with seeds of their own.
 
     What looks cheapest among noisy points is mostly a lucky one, and its error looks smaller than it is. New
@@ -244,40 +214,42 @@ def confirmed(one: Recommendation, point: Point, round_up: RoundUp) -> Recommend
         point: of its setting, from new measurements.
         round_up: what sample counts a series takes.
     """
+    assert one.goal is not None and one.spp is not None and one.estimator is not None
     more = min(FURTHEST, max(1.0, (point.error / one.goal) ** 2))
-    spp = round_up(one.line[2], one.spp * more)
+    spp = round_up(one.estimator, one.spp * more)
     times = spp / one.spp
-    return replace(
-        one,
-        spp=spp,
-        seconds=point.seconds * times,
-        error=point.error / math.sqrt(times),
-        basis="confirmed",
-        repeats=point.repeats,
+    return one.model_copy(
+        update={
+            "spp": spp,
+            "seconds": point.seconds * times,
+            "error": point.error / math.sqrt(times),
+            "basis": "confirmed",
+            "repeats": point.repeats,
+        }
     )
 
 
-def _explaining(ordered: Sequence[Point]) -> Slope | None:
+def _explaining(ordered: Sequence[Point]) -> PrecisionSlope | None:
     """The fitted line, if it falls and goes through the intervals of all known points, of at least four."""
     line = fit(ordered)
-    if line is None or line.points < LEAST_POINTS + 1 or line.value > -0.1:
+    if line is None or line.points < LEAST_POINTS + 1 or line.slope > -0.1:
         return None
     known = [point for point in ordered if point.known]
     through = all(point.interval[0] <= _line_at(line, point.setting.spp) <= point.interval[1] for point in known)
     return line if through else None
 
 
-def _on_line(line: Slope, ordered: Sequence[Point], goal: float) -> tuple[float | None, str]:
+def _on_line(line: PrecisionSlope, ordered: Sequence[Point], goal: float) -> tuple[float | None, str]:
     """The samples at which a fitted line reaches a goal."""
     least, largest = ordered[0].setting.spp, ordered[-1].setting.spp
-    count = math.exp((math.log(goal) - line.offset) / line.value)
+    count = math.exp((math.log(goal) - line.offset) / line.slope)
     if count > FURTHEST * largest:
         return None, ""
     return max(count, float(least)), "measured" if count <= least else "fitted" if count <= largest else "extrapolated"
 
 
-def _line_at(line: Slope, spp: int) -> float:
-    return math.exp(line.offset + line.value * math.log(spp))
+def _line_at(line: PrecisionSlope, spp: int) -> float:
+    return math.exp(line.offset + line.slope * math.log(spp))
 
 
 def _samples_for(ordered: Sequence[Point], goal: float) -> tuple[float | None, str]:
@@ -299,9 +271,9 @@ def _samples_for(ordered: Sequence[Point], goal: float) -> tuple[float | None, s
 
 def _extrapolated(ordered: Sequence[Point], goal: float) -> float | None:
     line, last = fit(ordered), ordered[-1]
-    if line is None or not last.known or line.value > -0.1 or levels_off(ordered):
+    if line is None or not last.known or line.slope > -0.1 or levels_off(ordered):
         return None
-    factor = (goal / last.error) ** (1.0 / max(line.value, -1.0))
+    factor = (goal / last.error) ** (1.0 / max(line.slope, -1.0))
     return last.setting.spp * factor if factor <= FURTHEST else None
 
 
@@ -314,7 +286,7 @@ def _at(ordered: Sequence[Point], spp: int, what: Literal["seconds", "error"]) -
     if spp <= counts[-1]:
         return math.exp(float(np.interp(math.log(spp), np.log(counts), values)))
     line = fit(ordered)
-    slope = 1.0 if what == "seconds" else (MONTE_CARLO if line is None else max(line.value, -1.0))
+    slope = 1.0 if what == "seconds" else (MONTE_CARLO if line is None else max(line.slope, -1.0))
     return math.exp(values[-1] + slope * math.log(spp / counts[-1]))
 
 

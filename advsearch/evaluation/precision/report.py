@@ -8,9 +8,7 @@ from dataclasses import dataclass, field
 
 from advsearch.evaluation.precision.fits import (
     Against,
-    Recommendation,
     RoundUp,
-    Slope,
     Theory,
     confirmed,
     fit,
@@ -34,7 +32,6 @@ from advsearch.scene.mitsuba_backend.samplers import next_count
 Line = tuple[str, str, str]
 AGAINST: tuple[Against, ...] = ("samples", "seconds")
 FAMILIES = {"raw": "without denoiser", "oidn": "with denoiser", "depth": "by path depth"}
-MEASURES = {"error": "", "margin_error": "margin"}
 
 
 @dataclass
@@ -72,10 +69,10 @@ class Section:
         self.points[line, points[0].measure] = sorted(points, key=lambda point: point.setting.spp)
         self.theories[line] = theory
 
-    def recommended(self, quantity: str, control: str, goal: float) -> Recommendation | None:
+    def recommended(self, quantity: str, control: str, goal: float) -> Recommended | None:
         """Return the setting that reaches a goal soonest, by what was measured so far."""
-        found = (one for one, *what in _recommended(self, goal) if what[:2] == [quantity, control])
-        return next(found, None)
+        found = (one for one in _recommended(self, goal) if (one.quantity, one.control) == (quantity, control or None))
+        return next((one for one in found if one.estimator is not None), None)
 
     def refer(
         self,
@@ -105,15 +102,16 @@ def report_of(head: Json, section: Section, goal: float, seconds: Mapping[str, f
     """Return the report: what was asked for (`head`), what was measured and what follows from it; no figures yet."""
     slopes = _slopes(section)
     for slope in slopes:
-        said = warning_of(slope, section.points[slope.line, slope.measure])
+        line = (slope.quantity, slope.control or "", slope.estimator)
+        said = warning_of(slope, section.points[line, slope.measure])
         section.warnings += [said] if said else []
     return PrecisionResult(
         **head,
         goal=goal,
         points=_points(section),
-        slopes=[_slope(one) for one in slopes],
+        slopes=slopes,
         references=section.references,
-        recommendations=[_recommendation(*one) for one in _recommended(section, goal)] + _policy(section, goal),
+        recommendations=_recommended(section, goal) + _policy(section, goal),
         warnings=section.warnings + (["interrupted: only a part was measured"] if section.interrupted else []),
         left_out=[NotMeasured(**_place(one), reason="did not fit into the time") for one in section.left_out],
         seconds=dict(seconds),
@@ -125,7 +123,7 @@ def report_of(head: Json, section: Section, goal: float, seconds: Mapping[str, f
 # ---- inside ---------------------------------------------------------------------------------------------------------
 
 
-def _slopes(section: Section) -> list[Slope]:
+def _slopes(section: Section) -> list[PrecisionSlope]:
     found = []
     for (line, _), points in section.points.items():
         for against in AGAINST:
@@ -174,27 +172,8 @@ def _place(setting: MeasuredSetting) -> Json:
     return {**place, "control": setting.control or None}
 
 
-def _slope(one: Slope) -> PrecisionSlope:
-    quantity, control, series = one.line
-    return PrecisionSlope(
-        quantity=quantity,
-        control=control or None,
-        estimator=series,
-        measure=one.measure,
-        against=one.against,
-        slope=one.value,
-        interval=one.interval,
-        offset=one.offset,
-        points=one.points,
-        fixed_seconds=one.fixed,
-        theory=one.theory.slope,
-        or_steeper=one.theory.at_most,
-        agrees=one.agrees,
-    )
-
-
-def _recommended(section: Section, goal: float) -> list[tuple[Recommendation | None, str, str, str, str]]:
-    """For each thing that can be asked for: the setting that reaches the goal soonest, or None."""
+def _recommended(section: Section, goal: float) -> list[Recommended]:
+    """For each thing that can be asked for: the setting that reaches the goal soonest, if any does."""
     asked: dict[tuple[str, str, str, str], dict[Line, Sequence[Point]]] = {}
     for (line, measure), points in section.points.items():
         family = section.families.get(line, "")
@@ -202,13 +181,15 @@ def _recommended(section: Section, goal: float) -> list[tuple[Recommendation | N
             continue
         asked.setdefault((line[0], line[1], measure, family), {})[line] = points
     found = []
-    for what, lines in asked.items():
-        round_up = _rounding(section, what[0])
+    for (quantity, control, measure, family), lines in asked.items():
+        round_up = _rounding(section, quantity)
         one = recommend(lines, goal, round_up)
-        again = None if one is None else section.again.get((one.line, one.measure))
-        if one is not None and again is not None:
+        if one is None:
+            one = Recommended(quantity=quantity, control=control or None, measure=measure, among=None, estimator=None)
+        again = section.again.get(((quantity, control, one.estimator or ""), measure))
+        if again is not None:
             one = confirmed(one, again, round_up)
-        found.append((one, *what))
+        found.append(one.model_copy(update={"among": FAMILIES.get(family)}))
     return found
 
 
@@ -216,22 +197,6 @@ def _rounding(section: Section, quantity: str) -> RoundUp:
     """A line of the picture is named after its sampler; one of a gradient has that of the run."""
     return lambda series, samples: next_count(
         section.sampler if quantity == "gradient" else series.removesuffix(OIDN), samples
-    )
-
-
-def _recommendation(one: Recommendation | None, quantity: str, control: str, measure: str, family: str) -> Recommended:
-    return Recommended(
-        quantity=quantity,
-        control=control or None,
-        measure=measure,
-        among=FAMILIES.get(family),
-        estimator=None if one is None else one.line[2],
-        goal=None if one is None else one.goal,
-        spp=None if one is None else one.spp,
-        seconds=None if one is None else one.seconds,
-        error=None if one is None else one.error,
-        basis=None if one is None else one.basis,
-        repeats=None if one is None else one.repeats or None,
     )
 
 
