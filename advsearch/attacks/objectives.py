@@ -72,7 +72,6 @@ class ObjectiveKind:
         unit: of its values.
         plain: the function of the right answers; None for one that has to be made for a run.
         targeted: the same, of a target in their place; None if it has no such form.
-        rivals: how many classes there must be beside the label set.
         task: name of the task whose outputs it takes; None for any.
         needs_features: whether it is made from the model's features and a clean picture.
     """
@@ -82,7 +81,6 @@ class ObjectiveKind:
     unit: str
     plain: Objective | None = None
     targeted: Objective | None = None
-    rivals: int = 1
     task: str | None = Classification.name
     needs_features: bool = False
 
@@ -124,7 +122,6 @@ _OWN = {
             "none (a ratio)",
             dlr,
             targeted_dlr,
-            rivals=2,
         ),
         ObjectiveKind(
             "feature_distance",

@@ -32,7 +32,6 @@ class Region:
         samples: how many there were.
         attempts: how many boxes might have been sampled until there was no exception.
         renders: pictures in all.
-        exceptions: (k, d) final samples with another answer.
     """
 
     centre: Tensor
@@ -42,7 +41,6 @@ class Region:
     samples: int
     attempts: int
     renders: int
-    exceptions: Tensor
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -115,7 +113,7 @@ def grow(
             break
         for point in wrong:
             _cut(low, high, centre, point)
-    return Region(centre, low, high, samples - len(wrong), samples, attempts, judge.count, wrong)
+    return Region(centre, low, high, samples - len(wrong), samples, attempts, judge.count)
 
 
 class _Judge:

@@ -29,7 +29,7 @@ from advsearch.scene.description import SceneDescription
 from advsearch.scene.exposure import WHITE, metered_gain
 from advsearch.scene.geometry import affine
 from advsearch.scene.parts import BallLamp, PointLamp
-from advsearch.scene.settings import CHANNELS, LIT, colors
+from advsearch.scene.settings import CHANNELS, LIT, colors, moving
 
 LIT_WHITE = 0.9
 """Linear display value of a white surface that faces a lamp of power 1 at distance 1."""
@@ -44,18 +44,7 @@ def metered_irradiance(scene: SceneDescription) -> float:
 
 
 def _place(name: str, low: float, high: float, default: float, description: str) -> Parameter:
-    return Parameter(
-        name,
-        (),
-        "object sizes",
-        -1000.0,
-        1000.0,
-        default,
-        description,
-        moves_silhouettes=True,
-        search=(low, high),
-        estimators=("differences",),
-    )
+    return moving(("differences",), name, "object sizes", -1000.0, 1000.0, default, description, (low, high))
 
 
 class LightControl(NumberControl):
@@ -80,18 +69,16 @@ class LightControl(NumberControl):
             search=(0.0, 12.0),
             estimators=LIT,
         ),
-        Parameter(
+        moving(
+            ("differences",),
             "size",
-            (),
             "object sizes",
             0.001,
             10.0,
             0.2,
             "Diameter of an area light; a point has none.",
-            moves_silhouettes=True,
-            search=(0.05, 0.6),
+            (0.05, 0.6),
             log=True,
-            estimators=("differences",),
         ),
     )
     choices: ClassVar[tuple[Choice, ...]] = (

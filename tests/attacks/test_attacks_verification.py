@@ -224,7 +224,7 @@ def test_the_fewest_samples_of_a_region_follow_from_the_confidence_of_its_interv
     low, high = torch.zeros(1), torch.ones(1)
     attempts = inspect.signature(grow).parameters["attempts"].default
     for samples in (FEWEST_SAMPLES - 1, FEWEST_SAMPLES):
-        region = Region(low, low, high, samples, samples, attempts, samples, torch.zeros(0, 1))
+        region = Region(low, low, high, samples, samples, attempts, samples)
         assert (region.interval[0] >= LEAST_RATE) == (samples == FEWEST_SAMPLES)
 
 

@@ -29,6 +29,7 @@ from advsearch.scene.assets import Floats, Material, Mesh
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import object_to_world
 from advsearch.scene.parts import MeshPart
+from advsearch.scene.settings import ORBIT, moving
 
 INGREDIENTS = ("water", "milk", "coffee")
 """In the order in which they are cut off the stick; what the first two leave is coffee."""
@@ -64,17 +65,8 @@ class ContentsControl(NumberControl):
     amount: ClassVar[str | None] = "level"
     summary: ClassVar[str] = "What a vessel is filled with, and how high: water, coffee and milk."
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        Parameter(
-            "level",
-            (),
-            "1",
-            0.0,
-            1.0,
-            0.0,
-            "Height of the liquid: 0 is empty, 1 is full to the brim.",
-            moves_silhouettes=True,
-            search=(0.0, 0.95),
-            estimators=("secant", "differences", "forward", "simultaneous"),
+        moving(
+            ORBIT, "level", "1", 0.0, 1.0, 0.0, "Height of the liquid: 0 is empty, 1 is full to the brim.", (0.0, 0.95)
         ),
         _ingredient("water", 0.0, "Share of water."),
         _ingredient("milk", 0.0, "Share of milk."),

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -31,13 +32,14 @@ from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import affine, camera_to_world, object_to_world
 from advsearch.scene.parts import MeshPart
+from advsearch.scene.settings import ORBIT, moving
 from advsearch.scene.silhouettes import Frame, Passage, Silhouette, angle_outside, middle_axes, silhouette
 
 Doubles = npt.NDArray[np.float64]
+_moving = partial(moving, ORBIT)
 
 BUNDLED = ("book", "bottle", "vase", "chair", "banana", "hammer")
 OPTIONS = (*MADE, *BUNDLED)
-MOVING = ("secant", "differences", "forward", "simultaneous")
 EASE = 0.02
 """Below this coverage the occluder slides in from outside the frame, so that the picture changes without a jump."""
 CLEARANCE = 0.05
@@ -87,67 +89,52 @@ class OcclusionControl(NumberControl):
             moves_silhouettes=True,
             options=OPTIONS,
         ),
-        Parameter(
+        _moving(
             "coverage",
-            (),
             "1",
             0.0,
             0.9,
             0.0,
             "Share of the object's picture area that it hides; at 0 it is out of the frame.",
-            moves_silhouettes=True,
             search=(0.0, 0.5),
-            estimators=MOVING,
         ),
-        Parameter(
+        _moving(
             "direction",
-            (),
             "degrees",
             -3600.0,
             3600.0,
             0.0,
             "Side of the picture it comes in from: 0 is the right, 90 the top, counter-clockwise.",
             periodic=True,
-            moves_silhouettes=True,
             search=(0.0, 360.0),
-            estimators=MOVING,
         ),
-        Parameter(
+        _moving(
             "size",
-            (),
             "object sizes",
             0.05,
             5.0,
             0.6,
             "Its largest extent.",
-            moves_silhouettes=True,
             search=(0.3, 1.0),
             log=True,
-            estimators=MOVING,
         ),
-        Parameter(
+        _moving(
             "distance",
-            (),
             "1",
             0.1,
             0.9,
             0.5,
             "Where between the camera and the object's middle: 0 is the camera, 1 the middle.",
-            moves_silhouettes=True,
             search=(0.3, 0.7),
-            estimators=MOVING,
         ),
-        Parameter(
+        _moving(
             "turn",
-            (),
             "degrees",
             -3600.0,
             3600.0,
             0.0,
             "Rotation of the occluder about its own upright axis.",
             periodic=True,
-            moves_silhouettes=True,
-            estimators=MOVING,
         ),
     )
     choices: ClassVar[tuple[Choice, ...]] = (

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -30,7 +29,6 @@ WITH_OPTIONS: dict[str, JsonObject] = {
     "portfolio": {"policies": ["pgd", "cmaes"]},
 }
 FORMS = {name: kind.plain for name, kind in OBJECTIVE_KINDS.items() if kind.plain is not None}
-Logits = Callable[[], Tensor]
 
 GROUP = Group("objective")
 _NAN = "an objective that is not finite counts as -inf, its gradient as zero; three in a row end the search"
