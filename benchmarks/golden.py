@@ -42,6 +42,7 @@ SWEPT = {
     "background": "background.hue=40,200",
     "haze": "haze.density=0.1,0.4",
     "lens": "lens.dots=2",
+    "sensor": "sensor.mosaic=0,1",
     "corruption": "corruption.severity=2,4",
 }
 """One small grid of each control, or, for a control without numbers, its settings."""

@@ -45,8 +45,9 @@ HEAVY = frozenset(RENDERER | {"torch"})
 RULES = {
     **{name: Rule(set(), {"numpy"}, HEAVY) for name in COMMON},
     "yaml_text": Rule(set(), {"yaml"}),
-    "settings": Rule(set(), {"pydantic", "yaml", "typing_extensions"}),  # the last for the type checker only
-    "config": Rule({"settings"}, {"pydantic", "yaml"}),
+    # typing_extensions for the type checker only
+    "settings": Rule(set(), {"pydantic", "yaml", "typing_extensions"}),
+    "config": Rule({"settings"}, {"pydantic", "yaml", "typing_extensions"}),
     "scene": Rule(set()),
     "bundled": Rule({"scene"}),
     "controls": Rule({"scene"}),

@@ -52,6 +52,7 @@ FORMS: dict[str, dict[str, Any]] = {
     "background": {"ground": "keep", "hue": [0, 300], "saturation": [0.5, 1.0]},
     "haze": {"density": [0.1, 0.5], "blue": [0.3, 1.0]},
     "lens": {"dots": 2, "opacity": [0.2, 0.9], "x": [0.1, 0.9]},
+    "sensor": {"shot": [0.0, 0.2], "mosaic": [0, 1], "compression": [0, 80]},
     "corruption": {"which": ["fog", "jpeg", "gaussian_noise"], "severity": [0, 5]},
 }
 EXCLUSIVE = {frozenset(("sky", "environment"))}

@@ -32,6 +32,7 @@ OWN = {
     "background": "BackgroundControl",
     "haze": "HazeControl",
     "lens": "LensControl",
+    "sensor": "SensorControl",
     "corruption": "CorruptionControl",
 }
 """The package's own controls: the word on the command line is the module's name, and this is its class."""

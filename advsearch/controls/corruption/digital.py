@@ -66,14 +66,23 @@ def pixelate(image: Tensor, whole: int) -> Tensor:
 
 
 def jpeg(image: Tensor, whole: int) -> Tensor:
+    """Save as a JPEG file of the severity's quality and read it again; see `coded`."""
+    return coded(image, JPEG[whole - 1])
+
+
+def coded(image: Tensor, quality: int) -> Tensor:
     """Save as a JPEG file and read it again, chroma subsampled; the derivative is that of the unchanged picture.
 
     For changes that are smooth over three pixels or more this is within about a third of what the file does with
-    them (measured); of finer ones the file keeps less than it says.
+    them (measured at qualities of 7 to 25); of finer ones the file keeps less than it says.
+
+    Args:
+        image: (H, W, 3) display-referred sRGB in [0, 1].
+        quality: 1 to 100, as of libjpeg.
     """
     levels = (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
     file = io.BytesIO()
-    Image.fromarray(levels).save(file, "JPEG", quality=JPEG[whole - 1])
+    Image.fromarray(levels).save(file, "JPEG", quality=quality)
     with Image.open(file) as read:
-        coded = torch.from_numpy(np.asarray(read, dtype=np.float32) / 255.0)
-    return image + (coded - image).detach()
+        read_back = torch.from_numpy(np.asarray(read, dtype=np.float32) / 255.0)
+    return image + (read_back - image).detach()

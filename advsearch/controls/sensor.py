@@ -1,0 +1,133 @@
+"""The `sensor` control: what a camera's sensor and its processing do to a picture.
+
+    light      the red and blue picture are a little larger or smaller than the green one (lateral aberration)
+    noise      light + sqrt(shot^2 light + read^2) n,    n standard normal, one draw for each pixel and channel
+    mosaic     of each pixel one channel is kept, in the pattern RGGB, the others are interpolated between neighbours
+    balance    red and blue times 2^red, 2^blue
+    file       the tone curve, then JPEG
+
+The noise is the usual model of a raw image, Gaussian with a variance that is affine in the light (Foi, Trimeche,
+Katkovnik and Egiazarian 2008, Practical Poissonian-Gaussian noise modeling and fitting for single-image raw-data,
+section II). The pattern is Bayer's (1976, US patent 3971065); interpolation is bilinear. Chromatic aberration as a
+difference of magnification: Kang 2007, Automatic removal of chromatic aberration from a single image, section 2.
+
+It happens to the finished picture, and nothing is rendered anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.controls.base import Choice, Parameter
+from advsearch.controls.corruption.digital import coded
+from advsearch.controls.corruption.tools import picture, planes, warped
+from advsearch.controls.numbers import NumberControl, Values
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
+from advsearch.scene.description import SceneDescription
+
+_DARK = 1e-6
+"""Keeps the slope of a square root finite in black."""
+
+
+def _number(name: str, unit: str, low: float, high: float, description: str, **more: object) -> Parameter:
+    return Parameter(
+        name,
+        (),
+        unit,
+        low,
+        high,
+        0.0,
+        description,
+        **{"search": (low, high), "estimators": ("image",), **more},  # type: ignore[arg-type]
+    )
+
+
+class SensorControl(NumberControl):
+    """Noise, mosaic, white balance, chromatic aberration and compression of a camera."""
+
+    kind: ClassVar[str] = "sensor"
+    summary: ClassVar[str] = "What a camera adds: noise, mosaic, white balance, chromatic aberration, JPEG."
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        _number("aberration", "1", -0.02, 0.02, "How much larger the red picture is than the green one; blue smaller."),
+        _number("shot", "1", 0.0, 0.5, "Standard deviation of the noise in white that grows with the root of light."),
+        _number("read", "1", 0.0, 0.2, "Standard deviation of the noise that is there in the dark."),
+        _number("mosaic", "1", 0.0, 1.0, "Share of the picture that goes through a Bayer mosaic; 1 is a real camera."),
+        _number("red", "stops", -1.0, 1.0, "White balance: red is this much brighter."),
+        _number("blue", "stops", -1.0, 1.0, "White balance: blue is this much brighter."),
+        _number(
+            "compression", "1", 0.0, 95.0, "0 is no file; above, a JPEG file of quality 100 less this.", estimators=()
+        ),
+    )
+    choices: ClassVar[tuple[Choice, ...]] = (
+        Choice("seed", 0, "Which draw of the noise: a whole number from 0.", whole=(0, 2**32 - 1)),
+    )
+
+    def on_picture(self, scene: SceneDescription, values: Values, image: Tensor) -> Tensor:
+        return through_sensor(image, values, int(self.chosen["seed"]))  # type: ignore[call-overload]
+
+
+def through_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -> Tensor:
+    """Return a picture as a camera would have taken it.
+
+    Args:
+        image: (H, W, 3) display-referred sRGB in [0, 1].
+        values: of shape (), as in `SensorControl.parameters`.
+        seed: chooses the noise.
+
+    Returns:
+        (H, W, 3) sRGB in [0, 1]; differentiable in the picture and in every value but `compression`, past which the
+        derivative is that of the picture before it.
+    """
+    light = aberrated(srgb_to_linear(image), values["aberration"])
+    height, width = image.shape[:2]
+    variance = values["shot"] ** 2 * light + values["read"] ** 2
+    spread = torch.sqrt(variance + _DARK**2) - _DARK
+    light = light + spread * _normal(height, width, seed).to(light)
+    light = light + values["mosaic"] * (demosaiced(light) - light)
+    gains = torch.stack([2.0 ** values["red"], torch.ones_like(values["red"]), 2.0 ** values["blue"]])
+    seen = linear_to_srgb((light * gains).clamp(0.0, 1.0))
+    compression = round(float(values["compression"].detach()))
+    return coded(seen, 100 - compression).clamp(0.0, 1.0) if compression else seen
+
+
+def aberrated(image: Tensor, amount: Tensor) -> Tensor:
+    """Return (H, W, 3) whose red is larger by a factor 1 + amount about the middle, and whose blue is smaller."""
+    height, width = image.shape[:2]
+    down, across = torch.meshgrid(
+        torch.arange(height) + 0.5 - height / 2, torch.arange(width) + 0.5 - width / 2, indexing="ij"
+    )
+    outwards = torch.stack([across, down], dim=-1).to(image)
+    red, blue = (
+        warped(image[..., k : k + 1], outwards * (1.0 / (1.0 + sign * amount) - 1.0)) for k, sign in ((0, 1), (2, -1))
+    )
+    return torch.cat([red, image[..., 1:2], blue], dim=-1)
+
+
+def demosaiced(light: Tensor) -> Tensor:
+    """Return (H, W, 3) of which each pixel keeps one channel (RGGB) and gets the others from neighbours, bilinearly."""
+    height, width = light.shape[:2]
+    kept = _pattern(height, width).to(light)
+    kernel = light.new_tensor([[1.0, 2.0, 1.0], [2.0, 4.0, 2.0], [1.0, 2.0, 1.0]]).expand(3, 1, 3, 3)
+    total = F.conv2d(planes(light * kept), kernel, padding=1, groups=3)
+    weight = F.conv2d(planes(kept), kernel, padding=1, groups=3)
+    return torch.where(kept > 0.0, light, picture(total / weight.clamp_min(1e-6)))
+
+
+@lru_cache(maxsize=8)
+def _pattern(height: int, width: int) -> Tensor:
+    """(H, W, 3): 1 where Bayer's pattern keeps the channel."""
+    rows, columns = torch.arange(height)[:, None] % 2, torch.arange(width)[None, :] % 2
+    red, blue = (1 - rows) * (1 - columns), rows * columns
+    return torch.stack([red, 1 - red - blue, blue], dim=-1).float()
+
+
+@lru_cache(maxsize=8)
+def _normal(height: int, width: int, seed: int) -> Tensor:
+    return torch.randn(height, width, 3, generator=torch.Generator().manual_seed(seeds.stream(seed, "sensor")))
