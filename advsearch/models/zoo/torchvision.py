@@ -39,10 +39,10 @@ def load(spec: str) -> Source:
     described = _described(default, module if name in classifies else None)
     if name in finds:
         described.update(mean=None, std=None)
-    return source_of(_Segmenter(module) if name in segments else module, name, **described)
+    return source_of(_FromDictionary(module) if name in segments else module, name, **described)
 
 
-class _Segmenter(nn.Module):
+class _FromDictionary(nn.Module):
     """Logits (N, classes, H, W) of each pixel, out of a dictionary."""
 
     def __init__(self, network: nn.Module) -> None:
