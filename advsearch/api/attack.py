@@ -274,7 +274,8 @@ def _policy_options(config: AttackConfig) -> dict[str, Any]:
 def _problem(job: _Job) -> Problem:
     config, (model, _) = job.config, job.loaded
     description = job.scene.description
-    task = job.task.on(model, target=config.target, minimise=config.minimise)
+    asked = job.task.seeking(job.objective) if isinstance(job.objective, str) else job.task
+    task = asked.on(model, target=config.target, minimise=config.minimise)
     facts = partial(facts_of, job.scene, config.object, config.label)
     pictures = PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed)
     check_truth(task, model, job.scene, facts(dict), pictures)

@@ -32,7 +32,8 @@ from advsearch.attacks.logit_objectives import (
 )
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.registry import Registry
-from advsearch.tasks import Classification, Task
+from advsearch.tasks import Classification, Segmentation, Task
+from advsearch.tasks.detection import GOALS, Detection
 
 __all__ = [
     "OBJECTIVES",
@@ -74,6 +75,7 @@ class ObjectiveKind:
         targeted: the same, of a target in their place; None if it has no such form.
         task: name of the task whose outputs it takes; None for any.
         needs_features: whether it is made from the model's features and a clean picture.
+        of_task: what makes it from the task, which knows of target and direction itself; None where nothing does.
     """
 
     name: str
@@ -83,6 +85,7 @@ class ObjectiveKind:
     targeted: Objective | None = None
     task: str | None = Classification.name
     needs_features: bool = False
+    of_task: Callable[[Any], Objective] | None = None
 
     def form(self, *, targeted: bool) -> Objective:
         """Return the plain or the targeted function."""
@@ -90,6 +93,24 @@ class ObjectiveKind:
         if found is None:
             raise InputError(f"objective {self.name!r}: has no {'targeted' if targeted else 'plain'} form; use another")
         return found
+
+
+def _score_of(task: Task) -> Objective:
+    """The score of a task."""
+
+    def score(output: Any, images: Tensor, truth: Any) -> Tensor:
+        return task.score(output, truth)
+
+    return score
+
+
+def _pixel_margin_of(task: Segmentation) -> Objective:
+    """The mean over the object's pixels."""
+
+    def pixel_margin(output: Tensor, images: Tensor, truth: Any) -> Tensor:
+        return task.pixel_margin(output, truth)
+
+    return pixel_margin
 
 
 _OWN = {
@@ -134,6 +155,18 @@ _OWN = {
             "the task's own score, over 0 where an answer is what is sought; in classification the margin",
             "that of the task",
             task=None,
+            of_task=_score_of,
+        ),
+        *(
+            ObjectiveKind(name, f"sought: {summary}", "log-odds", task=Detection.name, of_task=_score_of)
+            for name, summary in GOALS.items()
+        ),
+        ObjectiveKind(
+            "pixel_margin",
+            "the largest wrong logit minus the largest right one, mean over the object's pixels",
+            "logits (log-odds)",
+            task=Segmentation.name,
+            of_task=_pixel_margin_of,
         ),
     )
 }
@@ -185,8 +218,8 @@ def get_objective(
     kind = _kind_of(objective)
     if kind is None:
         found = checked(objective)  # type: ignore[arg-type]
-    elif kind.task is None:
-        return _score_of(task)
+    elif kind.of_task is not None:
+        return kind.of_task(task)
     elif kind.needs_features:
         if features is None or clean is None:
             raise InputError(
@@ -242,15 +275,6 @@ def check_objective(
             setting, reason = "target", "it leads away from the clean picture, to no class in particular"
         expected = f"expected `objective` {' or '.join(OBJECTIVES)}"
         raise InputError(f"{setting}: {expected}, got {kind.name}; {reason}")
-
-
-def _score_of(task: Task) -> Objective:
-    """The score of a task, which knows of target and direction itself."""
-
-    def score(output: Any, images: Tensor, truth: Any) -> Tensor:
-        return task.score(output, truth)
-
-    return score
 
 
 def _kind_of(objective: object) -> ObjectiveKind | None:

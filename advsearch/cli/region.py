@@ -77,6 +77,7 @@ def carry_out(config: RegionConfig, *, as_json: bool, quiet: bool, resumed: Path
 def answer(result: RegionResult) -> str:
     """Return the box and what is known of it."""
     from advsearch.report import wording
+    from advsearch.report.phrases import percent
 
     cost = [
         ["renders", str(result.renders["verification"])],
@@ -91,5 +92,5 @@ def answer(result: RegionResult) -> str:
     )
     rows = [["parameter", "from", "to", "centre", "unit"]]
     rows += [[one.name, f"{one.low:.4g}", f"{one.high:.4g}", f"{one.centre:.4g}", one.unit] for one in result.box]
-    facts = [["share of the space", wording.percent(result.volume)], *cost]
+    facts = [["share of the space", percent(result.volume)], *cost]
     return "\n\n".join([said, output.columns(rows), output.columns(facts)])

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from advsearch.cli.output import columns
 from advsearch.report import wording
+from advsearch.report.phrases import margin_text, percent
 from advsearch.runs.results.attack import VerifiedRate
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.results.gap import CurveResult, EpsilonBudget, GapResult, ObjectRow
 
 
 def _meaning(result: CurveResult | GapResult) -> str:
-    return f"\n  margin: {wording.margin_text(result.task)}, in the trials of the worst case"
+    return f"\n  margin: {margin_text(result.task)}, in the trials of the worst case"
 
 
 def answer(result: CurveResult | GapResult) -> str:
@@ -39,7 +40,7 @@ def _curve(result: CurveResult) -> str:
         [
             _plain(one.epsilon) or "own",
             f"{one.robust}/{one.objects}",
-            wording.percent(one.accuracy),
+            percent(one.accuracy),
             wording.interval_text(one.interval),
             str(one.already_wrong),
         ]
@@ -53,7 +54,7 @@ def _gap(result: GapResult) -> str:
     rows = [["object", "control", "right on average", "95 % interval", "worst: wrong", "margin", "ending"]]
     for row in result.table:
         average = row.average
-        right = f"{average.correct}/{average.configurations} ({wording.percent(average.accuracy)})"
+        right = f"{average.correct}/{average.configurations} ({percent(average.accuracy)})"
         worst = _rate(row.worst), _margin(row.margin)
         rows.append([row.object, row.control, right, wording.interval_text(average.interval), *worst, row.ending])
     return columns(rows) + _meaning(result)

@@ -7,6 +7,7 @@ from typing import Any
 
 from advsearch.cli.output import columns
 from advsearch.report import wording
+from advsearch.report.phrases import answer_text, margin_text, percent
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.results.sweep import AxisRow, SweepSummary, WorstConfiguration
 
@@ -31,7 +32,7 @@ def _verdict(summary: SweepSummary) -> str:
     seen, correct = summary.configurations, summary.correct
     if not seen:
         return "Interrupted before the first configuration."
-    rate = f"{wording.percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}"
+    rate = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}"
     if summary.ending == INTERRUPTED and seen < summary.planned:
         return f"Interrupted after {seen} of {summary.planned} configurations: right in {correct} ({rate})."
     return f"The model is right in {correct} of {wording.count(seen, 'configuration')} ({rate})."
@@ -55,7 +56,7 @@ def _table(name: str, rows: Sequence[AxisRow]) -> str:
         [
             _value(row.value),
             _bar(row.accuracy or 0.0),
-            wording.percent(row.accuracy),
+            percent(row.accuracy),
             f"{row.correct} of {row.configurations}",
             wording.interval_text(row.interval),
         ]
@@ -96,6 +97,6 @@ def _configuration(worst: WorstConfiguration) -> str:
 
 def _said(worst: WorstConfiguration, task: str) -> str:
     claim, checked = worst.claimed, worst.verified
-    text = f"answer {claim.label}" + (f" ({wording.percent(claim.probability)})" if claim.probability else "")
+    text = f"answer {answer_text(task, claim)}"
     rate = f"wrong in {wording.rate_text(checked)}" if checked else "not verified"
-    return f"{text}; margin ({wording.margin_text(task)}) {claim.margin:.3g}; {rate}"
+    return f"{text}; margin ({margin_text(task)}) {claim.margin:.3g}; {rate}"

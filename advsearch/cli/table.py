@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from advsearch.cli.output import columns
 from advsearch.report import wording
-from advsearch.runs.results.attack import AttackSummary, UsualAnswer, VerifiedRate
+from advsearch.report.phrases import cells
+from advsearch.runs.results.attack import AttackSummary, VerifiedRate
 from advsearch.runs.results.base import Interval
 
 
@@ -18,9 +19,9 @@ def answer(summary: AttackSummary) -> str:
 def _rates(summary: AttackSummary) -> list[list[str]]:
     clean, control, success = summary.clean, summary.clean.control, wording.success(summary)
     rated = _rate("right", control.correct, control.trials, control.interval) if control else ["not verified"]
-    rows = [["clean", *_answer(clean), *rated]]
+    rows = [["clean", *cells(summary.task, clean), *rated]]
     if summary.adversarial:
-        rows.append(["adversarial", *_answer(summary.adversarial), *_verified(success, summary.verified)])
+        rows.append(["adversarial", *cells(summary.task, summary.adversarial), *_verified(success, summary.verified)])
     if summary.baseline:
         pictures = f"{summary.baseline.renders} pictures"
         rows.append(["random search", pictures, "", *_verified(success, summary.baseline.verified)])
@@ -31,10 +32,6 @@ def _rates(summary: AttackSummary) -> list[list[str]]:
             ["average case", drawn, "", *_rate("right", average.correct, average.configurations, average.interval)]
         )
     return rows
-
-
-def _answer(answer: UsualAnswer) -> list[str]:
-    return [answer.label, "" if answer.probability is None else wording.percent(answer.probability)]
 
 
 def _verified(what: str, rated: VerifiedRate | None) -> list[str]:

@@ -54,15 +54,13 @@ def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, pictures: 
         pictures: how it is rendered.
 
     Raises:
-        InputError: what `Task.truth` raises; where no label was given, with the model's first answers to a clean
+        InputError: what `Task.check` raises; where no label was given, with the model's first answers to a clean
             picture.
     """
-    if task.varies:
-        return
     try:
-        task.truth(facts)
+        task.check(facts)
     except InputError as error:
-        if facts.label is not None or not task.reads_logits:
+        if facts.label is not None:
             raise
         raise InputError(f"{error}; {_advice(task, model, scene, pictures)}") from None
 

@@ -17,6 +17,7 @@ from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.smallest import Bracket
 from advsearch.engine.memory import ANSWER, MOST_NUMBERS
+from advsearch.engine.pictures import write_artifacts, write_pictures
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.rows import verified_rate
@@ -24,8 +25,7 @@ from advsearch.engine.transport import Transport
 from advsearch.errors import InputError
 from advsearch.report.notebook import attack_html
 from advsearch.report.page import write_report
-from advsearch.runs import images, store
-from advsearch.runs.directory import RunDirectory
+from advsearch.runs import store
 from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import (
@@ -157,8 +157,8 @@ def summarise(
     run = recorder.run
     warnings = [*said, *_remarks(findings, problem)]
     if run is not None:
-        _write_pictures(run, problem, findings, linear, clean, adversarial)
-        _write_artifacts(run, artifacts)
+        write_pictures(run, problem, findings, linear, {"clean": clean, "adversarial": adversarial}, u)
+        write_artifacts(run, artifacts)
         for name, data in space.files(u).items():
             write_bytes(run.path / "artifacts" / name, data)
         if u.numel() <= MOST_NUMBERS:
@@ -387,34 +387,3 @@ def _remarks(findings: Findings, problem: Problem) -> list[str]:
     if problem.renderer.non_finite:
         said.append(f"{problem.renderer.non_finite} values of pictures or gradients were not finite and were set to 0.")
     return said
-
-
-# ---- the files ------------------------------------------------------------------------------------------------------
-
-
-def _write_pictures(
-    run: RunDirectory,
-    problem: Problem,
-    findings: Findings,
-    linear: dict[str, Tensor],
-    clean: Tensor,
-    adversarial: Tensor,
-) -> None:
-    gain = problem.renderer.formation.gain
-    for name, picture in (("clean", clean), ("adversarial", adversarial)):
-        run.save_image(name, picture)
-        run.save_exr(name, linear[name] * gain)
-    run.save_image("difference", images.difference(clean, adversarial))
-    if findings.verification is not None:
-        for number in range(min(4, len(findings.verification.adversarial_trials))):
-            seed = seeds.stream(problem.seed, "verification", number)
-            run.save_image(f"verification-{number:02d}", problem.picture(findings.verification.u, seed, findings.spp))
-    if findings.frames:
-        run.save_animation("search", [*findings.frames, adversarial.numpy()])
-
-
-def _write_artifacts(run: RunDirectory, artifacts: dict[str, Tensor]) -> None:
-    """Keep what the controls hand over: an 8-bit PNG, and an EXR of the same display-referred values in float32."""
-    for name, picture in artifacts.items():
-        run.save_image(name, picture, folder="artifacts")
-        run.save_exr(name, picture, folder="artifacts")

@@ -23,8 +23,8 @@ from advsearch.scene.formation import to_8_bit
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import GradientPlan
 from advsearch.scene.renderer import Renderer
-from advsearch.tasks import Facts, Judgement, Task
-from advsearch.tasks.base import Output, Truth
+from advsearch.tasks import Facts, Judgement, Mark, Task
+from advsearch.tasks.base import Output, Truth, mean, typical
 
 
 class OnImage(NamedTuple):
@@ -151,6 +151,11 @@ class Problem:
         with torch.no_grad():
             return self.task.judge(self.model(picture), self.truth(whole))[0]
 
+    def marks(self, picture: Tensor, whole: Tensor) -> list[Mark]:
+        """Return what shows the model's answer to a picture (H, W, 3) of the whole space at `whole`."""
+        with torch.no_grad():
+            return self.task.marks(self.model(picture), self.truth(whole))[0]
+
     def truth(self, whole: Tensor | None = None) -> Truth:
         """Return what is true of the scene at a configuration of the whole space; None for the start."""
         if whole is None or not self.task.varies:
@@ -258,9 +263,12 @@ class Problem:
         """The mean over conditions. Its cost is counted in evaluations, each of which takes a picture a draw."""
         each, count = [one for one, _ in found], len(found)
         gradients = [one.gradient[: u.numel()] for one in each if one.gradient is not None]
-        with torch.no_grad():
-            output = self.task.average([output for _, output in found])
-            judgement = self.task.judge(output, self.truth(self.whole(u)))[0]
+        if self.task.varies:  # each condition has a truth of its own
+            judgement = self._usual([one.judgement for one in each if one.judgement is not None])
+        else:
+            with torch.no_grad():
+                output = self.task.average([output for _, output in found])
+                judgement = self.task.judge(output, self.truth())[0]
         return Evaluation(
             objective=sum(one.objective for one in each) / count,
             gradient=torch.stack(gradients).mean(dim=0) if gradients else None,
@@ -269,6 +277,12 @@ class Problem:
             cost=max(one.cost for one in each),
             judgement=judgement,
         )
+
+    @staticmethod
+    def _usual(each: Sequence[Judgement]) -> Judgement:
+        """The most frequent answer, with the means over all."""
+        score, margin = (mean(values) for values in ([one.score for one in each], [one.margin for one in each]))
+        return replace(typical(each), score=score, margin=margin, right=margin <= 0.0)
 
     def loss(self, image: Tensor) -> Tensor:
         """The objective of a picture (H, W, 3) sRGB near the start, as a number with a graph."""

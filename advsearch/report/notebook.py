@@ -9,9 +9,10 @@ from numpy.typing import ArrayLike
 
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
+from advsearch.report.phrases import cells, percent
 from advsearch.report.studies import sweep_figure
 from advsearch.runs.images import png_bytes
-from advsearch.runs.results.attack import AttackSummary, UsualAnswer, VerifiedRate
+from advsearch.runs.results.attack import AttackSummary, VerifiedRate
 from advsearch.runs.results.base import Interval
 from advsearch.runs.results.sweep import AxisRow, SweepSummary
 
@@ -36,9 +37,9 @@ def attack_html(summary: AttackSummary, pictures: Mapping[str, ArrayLike]) -> st
     rows = [["", "answer", "probability", "rate", "95 % interval"]]
     success, control = wording.success(summary), summary.clean.control
     rate = _rate("right", control.correct, control.trials, control.interval) if control else ["", ""]
-    rows.append(["clean", *_answer(summary.clean), *rate])
+    rows.append(["clean", *cells(summary.task, summary.clean), *rate])
     if summary.adversarial:
-        rows.append(["adversarial", *_answer(summary.adversarial), *_verified(success, summary.verified)])
+        rows.append(["adversarial", *cells(summary.task, summary.adversarial), *_verified(success, summary.verified)])
     if summary.baseline:
         rows.append(["random search", "", "", *_verified(success, summary.baseline.verified)])
     return element("div", element("p", wording.verdict(summary)), *shown, _table(rows))
@@ -49,7 +50,7 @@ def sweep_html(summary: SweepSummary) -> str:
     if not summary.configurations:
         return element("p", "No configuration was looked at.")
     total = f"Right in {summary.correct} of {summary.configurations} configurations"
-    rate = f"{wording.percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}"
+    rate = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}"
     figure = sweep_figure(summary)
     rows = [["axis", "value", "configurations", "right", "accuracy", "95 % interval"]]
     for name in dict.fromkeys(row.axis for row in summary.axes):
@@ -64,11 +65,7 @@ def _axis_row(row: AxisRow) -> list[str]:
     value = " to ".join(f"{end:g}" if isinstance(end, float) else str(end) for end in ends)
     unit = f" {row.unit}" if row.unit not in ("", "name") else ""
     counts = [str(row.configurations), str(row.correct)]
-    return [row.axis, value + unit, *counts, wording.percent(row.accuracy), wording.interval_text(row.interval)]
-
-
-def _answer(answer: UsualAnswer) -> list[str]:
-    return [answer.label, "" if answer.probability is None else wording.percent(answer.probability)]
+    return [row.axis, value + unit, *counts, percent(row.accuracy), wording.interval_text(row.interval)]
 
 
 def _verified(what: str, rated: VerifiedRate | None) -> list[str]:

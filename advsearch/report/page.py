@@ -13,6 +13,7 @@ from advsearch import __version__
 from advsearch.report import wording
 from advsearch.report.charts import NARROW, WIDE, Curve, interval_bar, objective_chart
 from advsearch.report.markup import Html, element, join
+from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text
 from advsearch.report.style import CSS
 from advsearch.runs import directory, images, store
 from advsearch.runs.files import write_text
@@ -113,17 +114,24 @@ def _header(summary: AttackSummary) -> Html:
 
 
 def _pictures(data: RunData) -> Html:
-    clean, adversarial = data.summary.clean, data.summary.adversarial
+    summary = data.summary
+    clean, adversarial = summary.clean, summary.adversarial
     gain = f"{images.DIFFERENCE_GAIN:g} times magnified, grey where nothing changed"
     shown = [
-        _figure(data, "images/clean.png", "Clean", _answer(clean)),
-        _figure(data, "images/adversarial.png", "Adversarial", _answer(adversarial)),
+        _figure(data, "images/clean.png", "Clean", _answer(summary, clean)),
+        _figure(data, "images/adversarial.png", "Adversarial", _answer(summary, adversarial)),
         _figure(data, "images/difference.png", "Difference", gain),
     ]
-    trials = [name for name in data.pictures if name.startswith("images/verification")][:MOST_TRIALS]
+    answered = [
+        _figure(data, "images/clean-answer.png", "Clean", _answer(summary, clean)),
+        _figure(data, "images/adversarial-answer.png", "Adversarial", _answer(summary, adversarial)),
+    ]
+    trials = [name for name in data.pictures if name.startswith("images/verification")]
+    trials = ([name for name in trials if name.endswith("-answer.png")] or trials)[:MOST_TRIALS]
     animation = _figure(data, "images/search.gif", "", "from the first step to the last")
     return join(
         _section("What the model sees", shown),
+        _section("What it answers", answered, "pair", "Blue is true of the scene, orange is the model's answer."),
         _details("Pictures of the verification", [_figure(data, name, "", _trial(name)) for name in trials], "small"),
         _details("The search as an animation", [animation], "single"),
     )
@@ -182,7 +190,7 @@ def _curve(data: RunData) -> Html:
         return Html("")
     objective = data.summary.objective
     above = "right" if data.summary.minimises else wording.success(data.summary)
-    zero = f"above: {above}" if objective == "margin" else ""
+    zero = f"above: {above}" if objective in SUCCESS_ABOVE_ZERO else ""
     charts = [objective_chart(curves, objective, zero, paper) for paper in (WIDE, NARROW)]
     note = "Lines: the best so far. Dots: each evaluation. These are the search's claims; the table above is verified."
     return join(
@@ -224,11 +232,12 @@ def _repeat(data: RunData) -> Html:
     return join(element("h2", "Do it again"), *(element("pre", text, class_="wrap") for text in commands), recipe)
 
 
-def _section(heading: str, figures: Iterable[Html | None], css: str = "") -> Html:
+def _section(heading: str, figures: Iterable[Html | None], css: str = "", note: str = "") -> Html:
     shown = [figure for figure in figures if figure is not None]
     if not shown:
         return Html("")
-    return join(element("h2", heading), element("div", *shown, class_=f"pictures {css}".strip()))
+    remark = element("p", note, class_="soft") if note else None
+    return join(element("h2", heading), element("div", *shown, class_=f"pictures {css}".strip()), remark)
 
 
 def _details(heading: str, figures: Iterable[Html | None], css: str = "") -> Html:
@@ -247,14 +256,12 @@ def _figure(data: RunData, name: str, heading: str, caption: str) -> Html | None
     return element("figure", picture, element("figcaption", label, ": " if heading else None, caption))
 
 
-def _answer(answer: UsualAnswer | None) -> str:
-    if answer is None:
-        return "no answer recorded"
-    return answer.label if answer.probability is None else f"{answer.label}, {wording.percent(answer.probability)}"
+def _answer(summary: AttackSummary, answer: UsualAnswer | None) -> str:
+    return "no answer recorded" if answer is None else answer_text(summary.task, answer)
 
 
 def _trial(name: str) -> str:
-    return "trial " + Path(name).stem.removeprefix("verification").strip("-_")
+    return "trial " + Path(name).stem.removeprefix("verification").removesuffix("-answer").strip("-_")
 
 
 def _table_of_facts(facts: Mapping[str, str]) -> Html:

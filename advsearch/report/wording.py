@@ -6,17 +6,22 @@ from collections.abc import Mapping
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any
 
+from advsearch.report.phrases import (
+    CLASSIFICATION,
+    calling,
+    calls,
+    margin_text,
+    percent_number,
+    wanted,
+    with_article,
+)
+
 if TYPE_CHECKING:
     from advsearch.runs.results.attack import AttackSummary, VerifiedRate
     from advsearch.runs.results.base import Formation, Interval
 
 NO_INTERVAL = "no interval"
 
-MARGIN = "how far the wrong answer leads the right one, in logits"
-CLASSIFICATION = "classification"
-"""The task whose answers are names of classes."""
-
-OTHER_MARGIN = "over 0 where the answer is wrong"
 NORMS = {"linf": "the largest change of any value", "l2": "the root of the sum of all squared changes"}
 """What these words mean, said where they are first used."""
 
@@ -33,7 +38,7 @@ def verdict(summary: AttackSummary) -> str:
     ending, verified = summary.ending, summary.verified
     thing = f"this {noun(summary)}"
     if ending == "already wrong":
-        wrong = _calls(summary, thing, summary.clean.label)
+        wrong = calls(summary.task, thing, summary.clean.label)
         return f"The model already {wrong}: nothing was changed and nothing counts as found."
     if verified is None:
         return f"{ending[:1].upper()}{ending[1:]} after {count(summary.steps, 'step')}; nothing is verified."
@@ -78,11 +83,6 @@ def title(summary: AttackSummary) -> str:
     return ", ".join([noun(summary), *summary.controls])
 
 
-def margin_text(task: str) -> str:
-    """Return what the margin of a task is, as a clause."""
-    return MARGIN if task == CLASSIFICATION else OTHER_MARGIN
-
-
 def success(summary: AttackSummary) -> str:
     """Return one word for a trial that counts: ``wrong``, ``target`` or ``easier``."""
     return "target" if summary.target else "easier" if summary.minimises else "wrong"
@@ -118,21 +118,9 @@ def short_name(value: Any) -> str:
     return PurePath(str(value)).name or str(value)
 
 
-def with_article(name: str) -> str:
-    """Return ``a mug``, ``an iron``."""
-    return f"{'an' if name[:1].lower() in 'aeiou' else 'a'} {name}"
-
-
-def percent(share: Any) -> str:
-    """Return ``83 %`` for 0.83. 100 and 0 are said only of exactly 1 and 0."""
-    if share is None:
-        return "unknown"
-    return f"{_percent_number(float(share))} %"
-
-
 def interval_text(interval: Interval | None) -> str:
     """Return ``83-100 %`` for the interval of a rate."""
-    return f"{_percent_number(interval[0])}-{_percent_number(interval[1])} %" if interval else NO_INTERVAL
+    return f"{percent_number(interval[0])}-{percent_number(interval[1])} %" if interval else NO_INTERVAL
 
 
 def rate_text(rated: VerifiedRate) -> str:
@@ -215,12 +203,11 @@ def _how_it_errs(summary: AttackSummary, verified: VerifiedRate, thing: str) -> 
         return f"The model recognises {thing}, more surely than in the clean scene,"
     answers = verified.labels
     if len(answers) == 1:
-        return f"The model {_calls(summary, thing, next(iter(answers)))}"
+        return f"The model {calls(summary.task, thing, next(iter(answers)))}"
     if answers:
         most = max(answers, key=lambda label: answers[label])
         what = "takes {} for one of the targets" if summary.target else "is wrong about {}"
-        often = f"calling it {with_article(most)}" if summary.task == CLASSIFICATION else f'answering "{most}"'
-        return f"The model {what.format(thing)}, most often {often},"
+        return f"The model {what.format(thing)}, most often {calling(summary.task, most)},"
     if summary.task != CLASSIFICATION:
         return f"The model is wrong about {thing}"
     called = with_article(summary.adversarial.label) if summary.adversarial else "something else"
@@ -231,8 +218,10 @@ def _claim(summary: AttackSummary, thing: str) -> str:
     """Return what a trial counts as, as a clause: "the model is wrong about this mug"."""
     if summary.minimises:
         return f"the model recognises {thing}, more surely than in the clean scene,"
-    if summary.target:
+    if summary.target and summary.task == CLASSIFICATION:
         return f"the model calls {thing} {_a_target(summary)}"
+    if summary.target:
+        return f"the model answers {' or '.join(summary.target)}"
     return "it is wrong" if summary.ending in _REASONS else f"the model is wrong about {thing}"
 
 
@@ -240,7 +229,7 @@ def _wanted(summary: AttackSummary, thing: str) -> str:
     """Return what was looked for, as a clause: "makes the model miss this mug"."""
     if summary.minimises:
         return f"makes {thing} easier to recognise"
-    return f"makes the model call {thing} {_a_target(summary)}" if summary.target else f"makes the model miss {thing}"
+    return f"makes the model call {thing} {_a_target(summary)}" if summary.target else wanted(summary.objective, thing)
 
 
 def _a_target(summary: AttackSummary) -> str:
@@ -262,16 +251,3 @@ def _against_random(summary: AttackSummary) -> list[str]:
     if random.rate == ours.rate > 0:
         return [f"Random search with as many renders does as well: {tally}. The policy adds nothing here."]
     return []
-
-
-def _calls(summary: AttackSummary, thing: str, label: str) -> str:
-    """Return ``calls this mug a vase``, or ``answers "0.81" for this mug`` where answers are no names."""
-    return (
-        f"calls {thing} {with_article(label)}" if summary.task == CLASSIFICATION else f'answers "{label}" for {thing}'
-    )
-
-
-def _percent_number(share: float) -> str:
-    value = 100.0 * share
-    near_end = (99.0 < value < 100.0 and round(value) == 100) or (0.0 < value < 1.0 and round(value) == 0)
-    return f"{min(max(value, 0.1), 99.9):.1f}" if near_end else f"{value:.0f}"

@@ -8,12 +8,14 @@ from typing import Any
 from advsearch.errors import UnknownNameError
 from advsearch.options import check_options
 from advsearch.registry import Registry
-from advsearch.tasks.base import Answer, Facts, Judgement, Task
+from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Task
 from advsearch.tasks.classification import Classification
+from advsearch.tasks.detection import Detection
+from advsearch.tasks.segmentation import Segmentation
 
 TASKS: Registry[type[Task]] = Registry(
     "advsearch.tasks",
-    {Classification.name: Classification},
+    {kind.name: kind for kind in (Classification, Detection, Segmentation)},
     "a subclass of Task whose name is that of the entry point",
     lambda name, entry: isinstance(entry, type) and issubclass(entry, Task) and entry.name == name,
 )
@@ -42,4 +44,16 @@ def make_task(task: AnyTask) -> Task:
     return TASKS[name](**options)
 
 
-__all__ = ["TASKS", "Answer", "AnyTask", "Classification", "Facts", "Judgement", "Task", "make_task"]
+__all__ = [
+    "TASKS",
+    "Answer",
+    "AnyTask",
+    "Classification",
+    "Detection",
+    "Facts",
+    "Judgement",
+    "Mark",
+    "Segmentation",
+    "Task",
+    "make_task",
+]

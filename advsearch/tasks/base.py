@@ -70,6 +70,23 @@ class Judgement:
 
 
 @dataclass(frozen=True)
+class Mark:
+    """What a picture shows of an answer, or of what is true: a box, or the pixels of a mask.
+
+    Attributes:
+        text: that stands beside it.
+        true: whether it is what is true of the scene; otherwise it is what the model says.
+        box: x0, y0, x1, y1 in pixels of the picture, from the top left.
+        mask: (h, w) bool over the whole picture, of any size.
+    """
+
+    text: str
+    true: bool
+    box: tuple[float, float, float, float] | None = None
+    mask: Tensor | None = None
+
+
+@dataclass(frozen=True)
 class Facts:
     """What a scene gives a task to judge by, in one configuration.
 
@@ -214,6 +231,19 @@ class Task(ABC):
             raise InputError(f"target: task {self.name} has none; leave it out")
         return replace(self, minimise=minimise)
 
+    def seeking(self: Own, objective: str) -> Own:
+        """Return the task where an objective of its own is maximised, which may say what counts as success."""
+        return self
+
+    def check(self, facts: Facts) -> None:
+        """Refuse a scene of which nothing could be judged, before anything is rendered.
+
+        Raises:
+            InputError: as for `truth`.
+        """
+        if not self.varies:
+            self.truth(facts)
+
     def score(self, output: Output, truth: Truth) -> Tensor:
         """Return (N,): over 0 exactly where an output is a success; differentiable."""
         if self.target is not None:
@@ -224,6 +254,10 @@ class Task(ABC):
     def payloads(self, output: Output) -> Sequence[Any]:
         """Return what is kept of each of N outputs beside the words, as JSON values."""
         return [None] * len(output)
+
+    def marks(self, output: Output, truth: Truth) -> list[list[Mark]]:
+        """Return what is drawn into each of N pictures to show the answer; empty where words say it all."""
+        return [[] for _ in range(len(output))]
 
     def average(self, outputs: Sequence[Output]) -> Output:
         """Return one output for several pictures of a configuration; each is of one picture, as is the result."""

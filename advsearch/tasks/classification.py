@@ -4,81 +4,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
-from advsearch.models import Model, find_label_set
-from advsearch.options import FROM_RUN
-from advsearch.tasks.base import Answer, Facts, Task
-
-Labels = tuple[int, ...]
+from advsearch.tasks.base import Answer, Facts
+from advsearch.tasks.classes import ClassTask, Labels
 
 
 @dataclass(frozen=True, kw_only=True)
-class Classification(Task):
+class Classification(ClassTask):
     """The model's largest logit names the class of the object.
 
     The truth is the indices of the right classes, of which there may be several ("coffee mug" and "cup").
-
-    Args:
-        labels: one name per class; numbers stand in for names that are not there.
-        named: False if `labels` are placeholders.
-        target: indices of classes; where there are some, only these are a success.
-
-    Raises:
-        InputError: there is a target to minimise.
     """
 
     name = "classification"
     objective = "margin"
     reads_logits = True
 
-    labels: tuple[str, ...] = field(default=(), metadata=FROM_RUN)
-    named: bool = field(default=True, metadata=FROM_RUN)
-    target: Labels | None = field(default=None, metadata=FROM_RUN)
-
-    def __post_init__(self) -> None:
-        if self.target is not None and self.minimise:
-            raise InputError("minimise: makes the right answer easier to give; leave `target` out")
-
-    def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Classification:
-        """See `Task.on`: the target is one of the model's classes, or several.
-
-        Raises:
-            InputError: there is no such class, or the model does not answer with logits.
-        """
-        if model.read is not None:
-            raise InputError(
-                f"model {model.name}: expected logits, and it was loaded for another task; leave `read` out"
-            )
-        try:
-            wanted = None if target is None else model.label_set(target).indices
-        except InputError as error:
-            raise InputError(f"target: {error}") from None
-        return replace(self, labels=model.labels, named=model.named, target=wanted, minimise=minimise)
-
     def truth(self, facts: Facts) -> Labels:
-        """Return the indices of the right classes: what was said, or else the object's own label.
-
-        Raises:
-            InputError: the model has no such class, the object has no label, or a target is right.
-        """
-        text = facts.own_label if facts.label is None else facts.label
-        if text is None:
-            raise InputError(f"label: expected the right answers for {facts.object}, got none")
-        try:
-            right = find_label_set(text, self.labels, named=self.named).indices
-        except InputError as error:
-            if facts.label is not None:
-                raise InputError(f"label: {error}") from None
-            raise InputError(f"label: the label of {facts.object} itself does not fit the model ({error})") from None
-        both = sorted(set(right) & set(self.target or ()))
-        if both:
-            raise InputError(f"target: expected classes that are not right answers, got {both}, which `label` has too")
-        return right
+        """See `ClassTask.right_classes`."""
+        return self.right_classes(facts)
 
     def margin(self, output: Tensor, truth: Labels) -> Tensor:
         """See `wrong_lead`."""
@@ -93,14 +42,11 @@ class Classification(Task):
         else:
             values, indices = probabilities.topk(min(count, output.shape[1]), dim=1)
         rows = zip(indices.tolist(), values.tolist(), strict=True)
-        return [tuple(Answer(self._name(i), i, p) for i, p in zip(*row, strict=True)) for row in rows]
+        return [tuple(Answer(self.name_of(i), i, p) for i, p in zip(*row, strict=True)) for row in rows]
 
     def truth_names(self, truth: Sequence[int]) -> tuple[str, ...]:
         """Return the names of classes."""
-        return tuple(map(self._name, truth))
-
-    def _name(self, index: int) -> str:
-        return self.labels[index] if self.labels else f"class {index}"
+        return self.names(truth)
 
 
 # ---- logits ---------------------------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from advsearch.report import wording
 from advsearch.report.charts import NARROW, Curve, interval_bar, nice_ticks, objective_chart
 from advsearch.report.markup import Html, element, join
 from advsearch.report.page import LARGE_PICTURE, SMALLER_SIDE, write_report
+from advsearch.report.phrases import percent
 from advsearch.report.studies import gap_figure
 from advsearch.report.style import CSS
 from advsearch.runs.images import read_png
@@ -444,7 +445,7 @@ def test_a_better_random_search_and_a_failing_control_group_are_said() -> None:
     ],
 )
 def test_only_certainty_is_called_100_percent(share: float | None, text: str) -> None:
-    assert wording.percent(share) == text
+    assert percent(share) == text
 
 
 @pytest.mark.parametrize(

@@ -155,7 +155,7 @@ def test_an_objective_of_another_task_is_refused() -> None:
         InputError, match=r"expected one of task yaw \(score\), got margin, which takes outputs of class"
     ):
         check_objective("margin", "yaw")
-    assert {kind.task for kind in OBJECTIVE_KINDS.values()} == {"classification", None}
+    assert {kind.task for kind in OBJECTIVE_KINDS.values()} == {*TASKS, None}
 
 
 def test_a_model_of_a_task_answers_with_what_the_task_reads() -> None:
@@ -212,7 +212,10 @@ def test_every_command_maximises_what_is_the_tasks_own(command: str, monkeypatch
 
 
 def test_tasks_have_names() -> None:
-    assert list(TASKS) == ["classification"] and make_task("classification") == Classification()
+    assert (
+        list(TASKS) == ["classification", "detection", "segmentation"]
+        and make_task("classification") == Classification()
+    )
     mine = Yaw(tolerance=5.0)
     assert make_task(mine) is mine
     with pytest.raises(UnknownNameError, match="classification"):

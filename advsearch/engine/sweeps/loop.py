@@ -17,6 +17,7 @@ from typing import Any
 from advsearch.attacks.draws import Seeds
 from advsearch.attacks.product import batches
 from advsearch.described import Value
+from advsearch.engine.pictures import save_marked
 from advsearch.engine.record import Stages
 from advsearch.engine.rows import judgement_of, trial_row
 from advsearch.engine.sweeps.job import Job, check_all
@@ -275,7 +276,9 @@ class Sweep:
         checked = check_worst(view, self.job, model, u, self.run, self.stages)
         if self.run is not None:
             spp = max(PICTURE_SPP, checked.spp if checked else 0)
-            self.run.save_image("worst", view.picture(model, u, worst.seed, spp))
+            picture = view.picture(model, u, worst.seed, spp)
+            self.run.save_image("worst", picture)
+            save_marked(self.run, "worst", picture, view.marks(model, u, picture))
         return checked
 
     def _find(self, index: int) -> tuple[Points, Picks, int]:

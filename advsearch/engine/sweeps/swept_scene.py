@@ -15,7 +15,7 @@ from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.points import Picks, Points
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
-from advsearch.tasks import Judgement
+from advsearch.tasks import Judgement, Mark
 from advsearch.tasks.base import Truth
 
 Values = dict[str, Value]
@@ -95,6 +95,13 @@ class SweptScene:
     def picture(self, number: int, u: Tensor, seed: int, spp: int) -> Tensor:
         """The picture (H, W, 3) that one model sees of one configuration."""
         return self._pictures(self.renderers[self._job.sizes[number]], u[None], [seed], spp)[0]
+
+    def marks(self, number: int, u: Tensor, picture: Tensor) -> list[Mark]:
+        """What shows the answer of one model to the picture (H, W, 3) of one configuration."""
+        values = self._spaces[self._job.sizes[number]].describe(u)
+        with torch.no_grad():
+            output = self._job.models[number](picture)
+            return self._job.tasks[number].marks(output, self.truth(number, u, values))[0]
 
     @staticmethod
     def _pictures(renderer: Renderer, u: Tensor, noise: Sequence[int], spp: int) -> Tensor:

@@ -1,0 +1,109 @@
+"""What a task's answers are called in sentences and tables, by the name of the task."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+CLASSIFICATION, DETECTION, SEGMENTATION = "classification", "detection", "segmentation"
+"""Tasks whose answers have words of their own; others are quoted."""
+
+_MARGINS = {
+    CLASSIFICATION: "how far the wrong answer leads the right one, in logits",
+    DETECTION: "how far the best right box is under the score that counts, in log-odds; over 0 where none is found",
+    SEGMENTATION: "the lead of wrong classes at the pixel that decides, in logits; over 0 where too few are right",
+}
+_WANTED = {
+    "mislabel": "makes the model take {} for something else",
+    "displace": "makes the model see {} elsewhere",
+    "create": "makes the model see beside {} what is not there",
+}
+SUCCESS_ABOVE_ZERO = ("margin", "score", "vanish", *_WANTED)
+"""Objectives that are over 0 exactly where an answer is what is sought."""
+
+_NONE, _ELSEWHERE = "no ", " elsewhere"
+
+
+class Said(Protocol):
+    """An answer of a model: `advsearch.tasks.Answer`, or what a result holds of one."""
+
+    @property
+    def label(self) -> str:
+        """In words."""
+
+    @property
+    def probability(self) -> float | None:
+        """In [0, 1], of what the task says; None where there is none."""
+
+
+def percent(share: float | None) -> str:
+    """Return ``83 %`` for 0.83. 100 and 0 are said only of exactly 1 and 0."""
+    return "unknown" if share is None else f"{percent_number(float(share))} %"
+
+
+def percent_number(share: float) -> str:
+    """Return ``83`` for 0.83; see `percent`."""
+    value = 100.0 * share
+    near_end = (99.0 < value < 100.0 and round(value) == 100) or (0.0 < value < 1.0 and round(value) == 0)
+    return f"{min(max(value, 0.1), 99.9):.1f}" if near_end else f"{value:.0f}"
+
+
+def with_article(name: str) -> str:
+    """Return ``a mug``, ``an iron``."""
+    return f"{'an' if name[:1].lower() in 'aeiou' else 'a'} {name}"
+
+
+def margin_text(task: str) -> str:
+    """Return what the margin of a task is, as a clause."""
+    return _MARGINS.get(task, "over 0 where the answer is wrong")
+
+
+def wanted(objective: str, thing: str) -> str:
+    """Return what a search with an objective looks for, as a clause: "makes the model miss this mug"."""
+    return _WANTED.get(objective, "makes the model miss {}").format(thing)
+
+
+def cells(task: str, answer: Said) -> list[str]:
+    """Return an answer and its number, for a table: ``["vase", "91 %"]``, ``["no cup found", "best 0.12"]``."""
+    label, share = answer.label, answer.probability
+    if share is None:
+        return [label, ""]
+    if task == DETECTION:
+        none = label.startswith(_NONE)
+        return [f"{label} found", f"best {share:.2f}"] if none else [label, f"score {share:.2f}"]
+    return [label, f"accuracy {percent(share)}" if task == SEGMENTATION else percent(share)]
+
+
+def answer_text(task: str, answer: Said) -> str:
+    """Return an answer on one line: ``vase, 91 %``, ``no cup found (best 0.12)``."""
+    label, number = cells(task, answer)
+    if task == SEGMENTATION and number:
+        return f"accuracy over the object's pixels {percent(answer.probability)}, most answers {label}"
+    if task == DETECTION and number:
+        return f"{label} ({number})"
+    return f"{label}, {number}" if number else label
+
+
+def calls(task: str, thing: str, label: str) -> str:
+    """Return what a model does to a thing, as a clause: ``calls this mug a vase``, ``finds no cup``."""
+    if task == CLASSIFICATION:
+        return f"calls {thing} {with_article(label)}"
+    if task == DETECTION:
+        return _detects("finds", "sees", "takes", thing, label)
+    return f"takes most of {thing} for {label}" if task == SEGMENTATION else f'answers "{label}" for {thing}'
+
+
+def calling(task: str, label: str) -> str:
+    """Return the same of a thing that was named already: ``calling it a vase``, ``finding no cup``."""
+    if task == CLASSIFICATION:
+        return f"calling it {with_article(label)}"
+    if task == DETECTION:
+        return _detects("finding", "seeing", "taking", "it", label)
+    return f"taking most of it for {label}" if task == SEGMENTATION else f'answering "{label}"'
+
+
+def _detects(finds: str, sees: str, takes: str, thing: str, label: str) -> str:
+    if label.startswith(_NONE):
+        return f"{finds} {label}"
+    if label.endswith(_ELSEWHERE):
+        return f"{sees} {with_article(label.removesuffix(_ELSEWHERE))} where there is none"
+    return f"{takes} {thing} for {with_article(label)}"

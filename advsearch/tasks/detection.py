@@ -1,0 +1,338 @@
+"""Object detection: whether a model finds the object, by a box where it is and the right name.
+
+Every box that a model returns is looked at, also where it has not suppressed those that overlap: a right one that a
+better one would have displaced counts. Scores p are compared as log-odds, log(p / (1 - p)).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch.errors import InputError
+from advsearch.models import Model
+from advsearch.options import FROM_RUN
+from advsearch.tasks.base import Answer, Facts, Judgement, Mark
+from advsearch.tasks.boxes import FORMS, Detections, detections_in, overlap, share_inside, strongest
+from advsearch.tasks.classes import ClassTask, Labels
+
+GOALS = {
+    "vanish": "no right box is found where the object is",
+    "mislabel": "a box where the object is has a wrong name, and none the right one",
+    "displace": "boxes with the right name are found, and none of them where the object is",
+    "create": "a box is found where nothing is",
+}
+"""What an attack may be after, by the name of the objective."""
+
+SMALLEST = 1e-6
+"""Scores and overlaps below this, or as near to 1, count as this: log-odds of 13.8."""
+MOST, LEAST, SAME, LOOKED_AT = 8, 0.1, 0.5, 500
+"""Most boxes that are kept of a picture; the least score of one; overlap from which two of a class are one thing; and
+among how many of the best scores they are looked for."""
+
+Box = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Place:
+    """What is to be found in a picture: the truth of detection.
+
+    Attributes:
+        labels: indices of the right classes.
+        box: smallest box round what is seen of the object, x0, y0, x1, y1 in pixels; None where nothing is.
+        size: (height, width) of the picture in pixels.
+    """
+
+    labels: Labels
+    box: tuple[int, int, int, int] | None
+    size: tuple[int, int]
+
+    @property
+    def shares(self) -> Tensor | None:
+        """The box as shares of width and height, (4,)."""
+        if self.box is None:
+            return None
+        height, width = self.size
+        return torch.tensor(self.box) / torch.tensor([width, height, width, height])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Detection(ClassTask):
+    """A model finds the object: one of its boxes has a right name, a score of `confidence` and overlaps the true box.
+
+    Where the object is not seen at all there is nothing to find, and every answer is right.
+
+    Args:
+        iou: least intersection over union with the true box.
+        confidence: least score of a box that counts.
+        boxes: how the model gives a box, one of `FORMS`.
+        unit: of these numbers: "fractions" of the picture's sides, or "pixels" of the model's input; "" for what the
+            boxes in a picture of noise look like.
+        seek: what an attack is after, one of `GOALS`.
+        input_size: (height, width) of the model's input in pixels.
+
+    Raises:
+        InputError: a value that is none of these.
+    """
+
+    name = "detection"
+    varies = True
+
+    iou: float = 0.5
+    confidence: float = 0.5
+    boxes: str = "xyxy"
+    unit: str = ""
+    seek: str = "vanish"
+    input_size: tuple[int, int] = field(default=(1, 1), metadata=FROM_RUN)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("iou", "confidence"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < 1.0:
+                raise InputError(f"task detection: {name}: expected a number between 0 and 1, got {value!r}")
+        for name, known in (("boxes", FORMS), ("unit", ("", "fractions", "pixels")), ("seek", tuple(GOALS))):
+            if getattr(self, name) not in known:
+                expected = ", ".join(filter(None, known))
+                raise InputError(f"task detection: {name}: expected one of {expected}, got {getattr(self, name)!r}")
+        if self.target is not None and self.seek not in ("mislabel", "create"):
+            raise InputError(f"target: {self.seek} has none; add `objective` mislabel or create")
+        if self.minimise and self.seek != "vanish":
+            raise InputError(f"minimise: expected `objective` vanish, whose opposite is to be found, got {self.seek}")
+
+    def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Detection:
+        """See `Task.on`."""
+        found = super().on(model, target=target, minimise=minimise)
+        return replace(found, input_size=model.input_size, unit=self.unit or _unit_of(model))
+
+    def seeking(self, objective: str) -> Detection:
+        """See `Task.seeking`: the objectives of detection say what counts as success."""
+        return replace(self, seek=objective) if objective in GOALS else self
+
+    def read(self, answer: Any, count: int) -> list[Detections]:
+        """See `Task.read`: what `advsearch.tasks.boxes.detections_in` takes."""
+        return detections_in(answer, count, self.boxes)
+
+    def classes_in(self, output: Sequence[Detections]) -> int | None:
+        """Return how many classes each box has a score of."""
+        return None if "labels" in output[0] else output[0]["scores"].shape[1]
+
+    def check(self, facts: Facts) -> None:
+        """See `Task.check`: the model must have such a class."""
+        self.right_classes(facts)
+
+    def truth(self, facts: Facts) -> Place:
+        """Return what is to be found, and where it is seen."""
+        height, width = facts.mask.shape
+        return Place(self.right_classes(facts), facts.box, (height, width))
+
+    def truth_names(self, truth: Place) -> tuple[str, ...]:
+        """Return the right names."""
+        return self.names(truth.labels)
+
+    # ---- scores -----------------------------------------------------------------------------------------------------
+
+    def margin(self, output: Sequence[Detections], truth: Place) -> Tensor:
+        """Return how far the best right box stays below `confidence`, in log-odds, (N,).
+
+        Of `create`: how far the best box where nothing is stands above it.
+        """
+        wrong = self._created if self.seek == "create" else self._missed
+        return torch.stack([wrong(one, truth) for one in output])
+
+    def score(self, output: Sequence[Detections], truth: Place) -> Tensor:
+        """Return how near each of N outputs is to what is sought, (N,), in log-odds: over 0 where it is a success."""
+        if self.minimise:
+            return -self.margin(output, truth)
+        reach = {
+            "vanish": self._missed,
+            "mislabel": self._mislabelled,
+            "displace": self._displaced,
+            "create": self._created,
+        }[self.seek]
+        return torch.stack([reach(one, truth) for one in output])
+
+    def _missed(self, one: Detections, truth: Place) -> Tensor:
+        at = self._overlap(one, truth)
+        if at is None:
+            return one["scores"].sum() * 0.0 - 1.0
+        return self._bar - log_odds(_best(self._of(one, truth.labels), at >= self.iou))
+
+    def _mislabelled(self, one: Detections, truth: Place) -> Tensor:
+        missed, at = self._missed(one, truth), self._overlap(one, truth)
+        if at is None:
+            return missed
+        called = log_odds(_best(self._rivals(one, truth.labels), at >= self.iou)) - self._bar
+        return torch.minimum(missed, called)
+
+    def _displaced(self, one: Detections, truth: Place) -> Tensor:
+        """The lesser of two: how far the best overlap of a box that counts is under `iou`, and that some box counts.
+
+        The first is in units in which a small step from `iou` is as long as one in log-odds.
+        """
+        at, scores = self._overlap(one, truth), self._of(one, truth.labels)
+        if at is None:
+            return one["scores"].sum() * 0.0 - 1.0
+        sure = log_odds(_best(scores)) - self._bar
+        away = (self.iou - _best(at, scores >= self.confidence)) / (self.iou * (1.0 - self.iou))
+        return torch.minimum(away, sure)
+
+    def _created(self, one: Detections, truth: Place) -> Tensor:
+        return log_odds(_best(self._sought(one), self._elsewhere(one, truth))) - self._bar
+
+    @property
+    def _bar(self) -> float:
+        return math.log(self.confidence / (1.0 - self.confidence))
+
+    # ---- boxes and scores of one picture ----------------------------------------------------------------------------
+
+    def _fractions(self, one: Detections) -> Tensor:
+        """Boxes as shares of width and height, (D, 4)."""
+        height, width = self.input_size if self.unit == "pixels" else (1, 1)
+        return one["boxes"] / one["boxes"].new_tensor([width, height] * 2)
+
+    def _overlap(self, one: Detections, truth: Place) -> Tensor | None:
+        """Intersection over union with the true box, (D,); None where the object is not seen."""
+        shares = truth.shares
+        return None if shares is None else overlap(self._fractions(one), shares.to(one["boxes"]))
+
+    def _elsewhere(self, one: Detections, truth: Place) -> Tensor:
+        """Boxes of which most is not on the object, and that do not frame it, (D,) bool."""
+        shares = truth.shares
+        if shares is None:
+            return torch.ones(len(one["boxes"]), dtype=torch.bool, device=one["boxes"].device)
+        boxes, place = self._fractions(one), shares.to(one["boxes"])
+        return (share_inside(boxes, place) < 0.5) & (overlap(boxes, place) < self.iou)
+
+    @staticmethod
+    def _of(one: Detections, labels: Labels) -> Tensor:
+        """The score of a class among these for each box, (D,)."""
+        scores = one["scores"]
+        if "labels" not in one:
+            return scores[:, list(labels)].amax(dim=1) if len(scores) else scores.sum(dim=1)
+        return scores * torch.isin(one["labels"], torch.tensor(labels, device=scores.device))
+
+    def _rivals(self, one: Detections, labels: Labels) -> Tensor:
+        """The score of another class, or of those that are sought, for each box, (D,)."""
+        if self.target is not None:
+            return self._of(one, self.target)
+        if "labels" in one:
+            return one["scores"] - self._of(one, labels)
+        return self._of(one, tuple(sorted(set(range(one["scores"].shape[1])) - set(labels))))
+
+    def _sought(self, one: Detections) -> Tensor:
+        """The score of any class, or of those that are sought, for each box, (D,)."""
+        return self._rivals(one, ())
+
+    # ---- in words ---------------------------------------------------------------------------------------------------
+
+    def answers(self, output: Sequence[Detections], count: int = 1) -> list[tuple[Answer, ...]]:
+        """Return the names of the best boxes of each picture with their scores; of boxes that overlap, the best one."""
+        found = []
+        for one in output:
+            listed = [Answer(self.name_of(label), label, score) for _, label, score in self._listed(one, count, 0.0)]
+            found.append(tuple(listed) or (Answer("nothing"),))
+        return found
+
+    def judge(self, output: Sequence[Detections], truth: Place) -> list[Judgement]:
+        """See `Task.judge`; the answer is what the model says of the object, the payload its boxes in pixels."""
+        with torch.no_grad():
+            scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
+            return [
+                Judgement(score, margin, margin <= 0.0, self._answer(one, truth), self._payload(one, truth))
+                for score, margin, one in zip(scores, margins, output, strict=True)
+            ]
+
+    def _answer(self, one: Detections, truth: Place) -> Answer:
+        """What a model says of the object, with the score of the box that says so."""
+        names, at = self.names(truth.labels), self._overlap(one, truth)
+        if self.seek == "create" and float(self._created(one, truth)) > 0.0:
+            return self._named(one, self._sought(one), self._elsewhere(one, truth), f"{{}} {ELSEWHERE}")
+        if at is None:
+            return Answer("out of view")
+        near, right = at >= self.iou, self._of(one, truth.labels)
+        best = float(_best(right, near))
+        if best >= self.confidence:
+            return self._named(one, right, near)
+        if float(_best(self._rivals(one, truth.labels), near)) >= self.confidence:
+            return self._named(one, self._rivals(one, truth.labels), near)
+        if float(_best(right)) >= self.confidence:
+            return self._named(one, right, ~near, f"{{}} {ELSEWHERE}")
+        return Answer(f"{NO}{names[0]}", None, best if math.isfinite(best) else None)
+
+    def _named(self, one: Detections, scores: Tensor, among: Tensor, form: str = "{}") -> Answer:
+        """The class of the best box among some."""
+        place = int(torch.where(among, scores, -1.0).argmax())
+        score = float(scores[place])
+        label = int(one["labels"][place] if "labels" in one else (one["scores"][place] == score).nonzero()[0])
+        return Answer(form.format(self.name_of(label)), label if form == "{}" else None, score)
+
+    def _listed(self, one: Detections, count: int, least: float) -> list[tuple[Box, int, float]]:
+        """The best boxes, of a class and a place one: shares of width and height, class, score."""
+        boxes, scores = self._fractions(one).detach(), one["scores"].detach()
+        best, places = scores.flatten().topk(min(LOOKED_AT, scores.numel()))
+        each = 1 if "labels" in one else scores.shape[1]
+        rows = places // each
+        classes = one["labels"][rows] if "labels" in one else places % each
+        found: list[tuple[Box, int, float]] = []
+        for label in classes[best >= least].unique().tolist():
+            mine = ((classes == label) & (best >= least)).nonzero().flatten()
+            for place in mine[strongest(boxes[rows[mine]], best[mine], count, SAME)].tolist():
+                x0, y0, x1, y1 = boxes[rows[place]].tolist()
+                found.append(((x0, y0, x1, y1), label, float(best[place])))
+        return sorted(found, key=lambda row: -row[2])[:count]
+
+    def _payload(self, one: Detections, truth: Place) -> Any:
+        """The true box, and what the model found, in pixels of the picture."""
+        height, width = truth.size
+        found = [
+            {
+                "box": [round(share * side, 1) for share, side in zip(box, [width, height] * 2, strict=True)],
+                "label": self.name_of(label),
+                "score": round(score, 3),
+            }
+            for box, label, score in self._listed(one, MOST, min(LEAST, self.confidence))
+        ]
+        return {"box": None if truth.box is None else list(truth.box), "found": found}
+
+    def marks(self, output: Sequence[Detections], truth: Place) -> list[list[Mark]]:
+        """See `Task.marks`: the true box, and every box with a score of `confidence`."""
+        height, width = truth.size
+        true = [] if truth.box is None else [Mark(" or ".join(self.names(truth.labels)), True, box=truth.box)]
+        found = []
+        for one in output:
+            listed = self._listed(one, MOST, self.confidence)
+            found.append(true + [
+                Mark(f"{self.name_of(label)} {score:.2f}", False, box=(a * width, b * height, c * width, d * height))
+                for (a, b, c, d), label, score in listed
+            ])  # fmt: skip
+        return found
+
+
+ELSEWHERE, NO = "elsewhere", "no "
+"""How an answer says that a box is not where the object is, or that there is none."""
+
+
+def _unit_of(model: Model) -> str:
+    """The unit of a model's boxes, by those in a picture of noise: pixels where there are none."""
+    with torch.no_grad():
+        noise = torch.rand((1, *model.input_size, 3), generator=torch.Generator().manual_seed(0))
+        boxes = model(noise)[0]["boxes"]
+    return "fractions" if len(boxes) and float(boxes.abs().mean()) < 2.0 else "pixels"
+
+
+def log_odds(shares: Tensor) -> Tensor:
+    """Return log(p / (1 - p)), with what lies outside [0, 1] taken for its end."""
+    inside = shares.clamp(SMALLEST, 1.0 - SMALLEST)
+    return inside.log() - torch.log1p(-inside)
+
+
+def _best(values: Tensor, among: Tensor | None = None) -> Tensor:
+    """The largest of values (D,), or of those where `among` is true; 0 where there are none."""
+    chosen = values if among is None else torch.where(among, values, 0.0)
+    return torch.cat([chosen, chosen.new_zeros(1)]).amax()

@@ -1,0 +1,201 @@
+"""Semantic segmentation: whether a model gives the object's pixels a right class."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advsearch.errors import InputError
+from advsearch.tasks.base import Answer, Facts, Judgement, Mark
+from advsearch.tasks.classes import ClassTask, Labels
+from advsearch.tasks.classification import members, target_lead, wrong_lead
+
+EXPECTED = "expected logits (N, classes, height, width), or a mapping with these as `out` or `logits`"
+
+Lead = Callable[[Tensor, Labels], Tensor]
+
+
+@dataclass(frozen=True)
+class Region:
+    """What is to be segmented in a picture: the truth of segmentation.
+
+    Attributes:
+        labels: indices of the right classes.
+        mask: (H, W) bool, the pixels of the picture in which the object is seen.
+    """
+
+    labels: Labels
+    mask: Tensor
+
+    def at(self, size: tuple[int, int]) -> Tensor:
+        """Return the mask at the size of an output, (h, w) bool: a pixel of which at least half is the object's.
+
+        Where none is, those that have a part of it.
+        """
+        if self.mask.shape == size:
+            return self.mask
+        shares = F.interpolate(self.mask[None, None].float(), size=size, mode="area")[0, 0]
+        half = shares >= 0.5
+        return half if bool(half.any()) else shares > 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Segmentation(ClassTask):
+    """A model gives at least `accuracy` of the object's pixels a right class. Pixels beside the object don't count.
+
+    Where the object is not seen at all there is nothing to segment, and every answer is right.
+
+    Args:
+        accuracy: least share of the object's pixels.
+
+    Raises:
+        InputError: no share between 0 and 1.
+    """
+
+    name = "segmentation"
+    objective = "pixel_margin"
+    varies = True
+
+    accuracy: float = 0.5
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        value: object = self.accuracy
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value <= 1.0:
+            raise InputError(f"task segmentation: accuracy: expected a number over 0, up to 1, got {value!r}")
+
+    def read(self, answer: Any, count: int) -> Tensor:
+        """Return the logits (N, classes, h, w) in what a network answered.
+
+        Raises:
+            ValueError: there are none.
+        """
+        if isinstance(answer, Mapping):
+            answer = answer.get("out", answer.get("logits"))
+        elif hasattr(answer, "logits"):
+            answer = answer.logits
+        elif isinstance(answer, (list, tuple)) and answer:
+            answer = answer[0]
+        if not isinstance(answer, Tensor) or answer.ndim != 4 or len(answer) != count or answer.shape[1] < 2:
+            raise ValueError(EXPECTED)
+        return answer.float()
+
+    def classes_in(self, output: Tensor) -> int:
+        """Return the number of classes."""
+        return output.shape[1]
+
+    def check(self, facts: Facts) -> None:
+        """See `Task.check`: the model must have such a class."""
+        self.right_classes(facts)
+
+    def truth(self, facts: Facts) -> Region:
+        """Return what is to be segmented."""
+        return Region(self.right_classes(facts), facts.mask)
+
+    def truth_names(self, truth: Region) -> tuple[str, ...]:
+        """Return the right names."""
+        return self.names(truth.labels)
+
+    # ---- scores -----------------------------------------------------------------------------------------------------
+
+    def margin(self, output: Tensor, truth: Region) -> Tensor:
+        """Return, in logits (N,), the wrong classes' lead at the pixel that decides: over 0 where too few are right.
+
+        Of the object's pixels in the order of that lead it is the one at which `accuracy` of them is reached.
+        """
+        return self._deciding(output, truth, wrong_lead, truth.labels)
+
+    def score(self, output: Tensor, truth: Region) -> Tensor:
+        """See `Task.score`; with a target, enough of the object's pixels have to be given that."""
+        if self.target is None:
+            margin = self.margin(output, truth)
+            return -margin if self.minimise else margin
+        return -self._deciding(output, truth, lambda logits, labels: -target_lead(logits, labels), self.target)
+
+    def pixel_margin(self, output: Tensor, truth: Region) -> Tensor:
+        """Return the mean over the object's pixels of what is sought: the lead of wrong classes, or of the target's.
+
+        In logits, (N,). Every pixel has a derivative, and not the deciding one alone as in `margin`.
+        """
+        pixels = self._pixels(output, truth)
+        if pixels is None:
+            return self._unseen(output)
+        lead = wrong_lead(pixels, truth.labels) if self.target is None else target_lead(pixels, self.target)
+        mean = lead.reshape(len(output), -1).mean(dim=1)
+        return -mean if self.minimise else mean
+
+    def _deciding(self, output: Tensor, truth: Region, lead: Lead, labels: Labels) -> Tensor:
+        """The lead at the pixel at which `accuracy` of them is reached, (N,)."""
+        pixels = self._pixels(output, truth)
+        if pixels is None:
+            return self._unseen(output)
+        values = lead(pixels, labels).reshape(len(output), -1)
+        return values.kthvalue(math.ceil(self.accuracy * values.shape[1]), dim=1).values
+
+    @staticmethod
+    def _pixels(output: Tensor, truth: Region) -> Tensor | None:
+        """The logits of the object's pixels, picture by picture, (N * P, classes); None where it is not seen."""
+        mask = truth.at((output.shape[2], output.shape[3])).to(output.device)
+        chosen = output.permute(0, 2, 3, 1)[:, mask]
+        return chosen.reshape(-1, output.shape[1]) if chosen.shape[1] else None
+
+    @staticmethod
+    def _unseen(output: Tensor) -> Tensor:
+        return output.sum(dim=(1, 2, 3)) * 0.0 - 1.0
+
+    # ---- in words ---------------------------------------------------------------------------------------------------
+
+    def answers(self, output: Tensor, count: int = 1) -> list[tuple[Answer, ...]]:
+        """Return the classes of most pixels of each picture, with the shares that they have."""
+        found = []
+        for classes in output.detach().argmax(dim=1):
+            shares, indices = classes.flatten().bincount(minlength=output.shape[1]).topk(min(count, output.shape[1]))
+            rows = zip(indices.tolist(), shares.tolist(), strict=True)
+            found.append(tuple(Answer(self.name_of(i), i, n / classes.numel()) for i, n in rows if n))
+        return found
+
+    def judge(self, output: Tensor, truth: Region) -> list[Judgement]:
+        """See `Task.judge`.
+
+        The answer is the class of most of the object's pixels; a wrong one where too few are right. Its probability is
+        the share of the object's pixels that are right.
+        """
+        with torch.no_grad():
+            scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
+            return [
+                Judgement(score, margin, margin <= 0.0, *self._said(one, truth, right=margin <= 0.0))
+                for score, margin, one in zip(scores, margins, output, strict=True)
+            ]
+
+    def _said(self, logits: Tensor, truth: Region, *, right: bool) -> tuple[Answer, Any]:
+        """The answer of one picture, and what else is kept: shares of the object's pixels by class, and the overlap."""
+        pixels = self._pixels(logits[None], truth)
+        if pixels is None:
+            return Answer("out of view"), None
+        correct = members(pixels, truth.labels)
+        hits = self._correct(logits, truth)
+        mask = truth.at((logits.shape[1], logits.shape[2])).to(hits.device)
+        counts = pixels.argmax(dim=1).bincount(minlength=pixels.shape[1])
+        first = int(counts.masked_fill(correct != right, -1).argmax())
+        accuracy = float(hits[mask].float().mean())
+        shares = {self.name_of(i): round(n / len(pixels), 4) for i, n in enumerate(counts.tolist()) if n}
+        payload = {"accuracy": round(accuracy, 4), "iou": round(float((hits & mask).sum() / (hits | mask).sum()), 4)}
+        return Answer(self.name_of(first), first, accuracy), {**payload, "pixels": shares}
+
+    @staticmethod
+    def _correct(logits: Tensor, truth: Region) -> Tensor:
+        """Where the answer (C, h, w) is a right class, (h, w) bool; a tie is right, NaN is not."""
+        classes = logits.shape[0]
+        return (wrong_lead(logits.permute(1, 2, 0).reshape(-1, classes), truth.labels) <= 0.0).reshape(logits.shape[1:])
+
+    def marks(self, output: Tensor, truth: Region) -> list[list[Mark]]:
+        """See `Task.marks`: the object, and the pixels that are given a right class."""
+        name = " or ".join(self.names(truth.labels))
+        true = Mark(name, True, mask=truth.mask)
+        return [[true, Mark(name, False, mask=self._correct(one, truth))] for one in output.detach()]

@@ -1,0 +1,364 @@
+"""Object detection: what a detector may return, and when the object counts as found, mislabelled, displaced."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from advsearch.attacks.objectives import check_objective, get_objective
+from advsearch.errors import InputError, ModelError
+from advsearch.models import load_model
+from advsearch.tasks import Answer, Detection, Facts, Judgement
+from advsearch.tasks.boxes import corners, detections_in, overlap, share_inside, strongest
+from advsearch.tasks.detection import GOALS, Place, log_odds
+
+NAMES = ("cup", "bowl", "dog")
+HERE, NEAR, AWAY = [0.2, 0.2, 0.6, 0.6], [0.3, 0.2, 0.7, 0.6], [0.7, 0.7, 0.9, 0.9]
+TASK = Detection(labels=NAMES, unit="fractions")
+TRUTH = Place((0,), (4, 4, 12, 12), (20, 20))
+"""The object is where `HERE` says; `NEAR` overlaps it by 0.6."""
+
+
+def dense(*rows: tuple[list[float], list[float]]) -> list[dict[str, Tensor]]:
+    """What a detector says of one picture: boxes with scores of all classes."""
+    return [{"boxes": torch.tensor([box for box, _ in rows]), "scores": torch.tensor([scores for _, scores in rows])}]
+
+
+def sparse(*rows: tuple[list[float], int, float]) -> list[dict[str, Tensor]]:
+    """The same of boxes with one class each; of a picture without any, too."""
+    boxes = torch.tensor([box for box, _, _ in rows]).reshape(-1, 4)
+    labels, scores = torch.tensor([k for _, k, _ in rows]).long(), torch.tensor([s for *_, s in rows]).float()
+    return [{"boxes": boxes, "labels": labels, "scores": scores}]
+
+
+def judged(task: Detection, output: list[dict[str, Tensor]], truth: Place = TRUTH) -> Judgement:
+    (found,) = task.judge(output, truth)
+    assert found.score == pytest.approx(float(task.score(output, truth)))
+    assert found.margin == pytest.approx(float(task.margin(output, truth)))
+    return found
+
+
+# ---- boxes ----------------------------------------------------------------------------------------------------------
+
+
+def test_boxes_overlap_by_the_share_of_their_union() -> None:
+    box = torch.tensor(HERE)
+    boxes = torch.tensor([HERE, NEAR, AWAY, [0.2, 0.2, 0.4, 0.6], [0.6, 0.6, 0.2, 0.2]])
+    assert overlap(boxes, box).tolist() == pytest.approx([1.0, 0.6, 0.0, 0.5, 0.0], abs=1e-5)
+    assert share_inside(boxes, box).tolist() == pytest.approx([1.0, 0.75, 0.0, 1.0, 0.0], abs=1e-5)
+
+
+def test_all_forms_of_a_box_are_the_same_corners() -> None:
+    forms = {"xyxy": [1, 2, 5, 8], "xywh": [1, 2, 4, 6], "cxcywh": [3, 5, 4, 6], "yxyx": [2, 1, 8, 5]}
+    for form, numbers in forms.items():
+        assert corners(torch.tensor(numbers).float(), form).tolist() == [1, 2, 5, 8]
+
+
+def test_of_boxes_that_overlap_the_best_one_is_left() -> None:
+    boxes, scores = torch.tensor([HERE, NEAR, AWAY]), torch.tensor([0.5, 0.9, 0.6])
+    assert strongest(boxes, scores, 5, 0.5) == [1, 2] and strongest(boxes, scores, 1, 0.5) == [1]
+    assert strongest(boxes, scores, 5, 0.7) == [1, 2, 0]
+
+
+# ---- what a detector returns ----------------------------------------------------------------------------------------
+
+BOXES, SCORES = torch.tensor([[HERE, AWAY]] * 2), torch.rand(2, 2, 3, generator=torch.Generator().manual_seed(1))
+LABELS, ONE = torch.tensor([[0, 2], [1, 1]]), torch.tensor([[0.9, 0.2], [0.4, 0.3]])
+
+
+class Output:
+    """An answer with names, as libraries return it."""
+
+    def __init__(self, **parts: Tensor) -> None:
+        self.__dict__.update(parts)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        (BOXES, SCORES),
+        [BOXES, SCORES],
+        {"boxes": BOXES, "scores": SCORES},
+        Output(boxes=BOXES, scores=SCORES),
+        [{"boxes": BOXES[k], "scores": SCORES[k]} for k in range(2)],
+    ],
+)
+def test_scores_of_all_classes_are_read_in_every_form(answer: Any) -> None:
+    found = detections_in(answer, 2, "xyxy")
+    assert [sorted(one) for one in found] == [["boxes", "scores"]] * 2
+    for k, one in enumerate(found):
+        assert one["boxes"].equal(BOXES[k]) and one["scores"].equal(SCORES[k])
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        (BOXES, LABELS, ONE),
+        (BOXES, ONE, LABELS),
+        (BOXES, LABELS.float(), ONE),
+        {"boxes": BOXES, "labels": LABELS, "scores": ONE},
+        [{"boxes": BOXES[k], "labels": LABELS[k], "scores": ONE[k]} for k in range(2)],
+        [(BOXES[k], LABELS[k], ONE[k]) for k in range(2)],
+    ],
+)
+def test_one_label_a_box_is_read_in_every_form(answer: Any) -> None:
+    for k, one in enumerate(detections_in(answer, 2, "xyxy")):
+        assert one["boxes"].equal(BOXES[k]) and one["labels"].equal(LABELS[k]) and one["scores"].equal(ONE[k])
+
+
+def test_one_picture_may_come_without_its_dimension_and_none_may_be_found() -> None:
+    (one,) = detections_in((BOXES[0], LABELS[0], ONE[0]), 1, "xyxy")
+    assert one["labels"].equal(LABELS[0])
+    first, second = detections_in([*sparse((HERE, 1, 0.5)), *sparse()], 2, "xyxy")
+    assert len(first["scores"]) == 1 and second["boxes"].shape == (0, 4)
+
+
+@pytest.mark.parametrize(
+    ("answer", "text"),
+    [
+        (BOXES, "expected boxes"),
+        ((BOXES, SCORES[:1]), "expected boxes"),
+        ((BOXES, SCORES[:, :1]), "expected boxes"),
+        ((BOXES[..., :3], SCORES), "expected boxes"),
+        ((BOXES, "scores"), "expected boxes"),
+        ((BOXES, LABELS, ONE, ONE), "expected boxes"),
+        ({"boxes": BOXES}, "expected boxes"),
+        ((BOXES, 3.0 * SCORES - 1.0), r"probabilities in \[0, 1\]; apply a sigmoid"),
+    ],
+)
+def test_what_is_no_detection_is_refused(answer: Any, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        detections_in(answer, 2, "xyxy")
+
+
+# ---- the judgement --------------------------------------------------------------------------------------------------
+
+FOUND = dense((HERE, [0.8, 0.1, 0.0]), (AWAY, [0.1, 0.2, 0.1]))
+
+
+@pytest.mark.parametrize(
+    ("output", "answer", "right"),
+    [
+        (FOUND, Answer("cup", 0, 0.8), True),
+        (dense((NEAR, [0.7, 0.6, 0.0])), Answer("cup", 0, 0.7), True),
+        (dense((HERE, [0.5, 0.6, 0.0])), Answer("cup", 0, 0.5), True),
+        (dense((HERE, [0.3, 0.6, 0.0])), Answer("bowl", 1, 0.6), False),
+        (dense((HERE, [0.3, 0.4, 0.0]), (AWAY, [0.7, 0.0, 0.0])), Answer("cup elsewhere", None, 0.7), False),
+        (dense((HERE, [0.3, 0.4, 0.0]), (AWAY, [0.4, 0.9, 0.0])), Answer("no cup", None, 0.3), False),
+        (sparse((HERE, 0, 0.8), (AWAY, 1, 0.9)), Answer("cup", 0, 0.8), True),
+        (sparse((HERE, 1, 0.8), (AWAY, 0, 0.4)), Answer("bowl", 1, 0.8), False),
+        (sparse(), Answer("no cup", None, 0.0), False),
+    ],
+)
+def test_the_object_is_found_by_a_right_box_with_a_right_name(
+    output: list[dict[str, Tensor]], answer: Answer, right: bool
+) -> None:
+    found = judged(TASK, output)
+    assert (found.answer.label, found.answer.index, found.right) == (answer.label, answer.index, right)
+    assert found.answer.probability == pytest.approx(answer.probability)
+    assert found.success is not right
+
+
+def test_the_margin_is_in_log_odds_of_the_score_that_counts() -> None:
+    assert judged(TASK, FOUND).margin == pytest.approx(-math.log(4.0), abs=1e-5)
+    strict = replace(TASK, confidence=0.9)
+    assert judged(strict, FOUND).margin == pytest.approx(math.log(9.0) - math.log(4.0), abs=1e-5)
+    assert not judged(replace(TASK, iou=0.7), dense((NEAR, [0.9, 0.0, 0.0]))).right
+    assert judged(replace(TASK, iou=0.55), dense((NEAR, [0.9, 0.0, 0.0]))).right
+
+
+def test_several_names_may_be_right() -> None:
+    either = Place((0, 1), TRUTH.box, TRUTH.size)
+    found = judged(TASK, dense((HERE, [0.2, 0.7, 0.6])), either)
+    assert found.right and found.answer.label == "bowl" and TASK.truth_names(either) == ("cup", "bowl")
+
+
+@pytest.mark.parametrize(
+    ("seek", "output", "success"),
+    [
+        ("vanish", FOUND, False),
+        ("vanish", dense((HERE, [0.4, 0.0, 0.0])), True),
+        ("mislabel", FOUND, False),
+        ("mislabel", dense((HERE, [0.4, 0.4, 0.0])), False),
+        ("mislabel", dense((HERE, [0.6, 0.9, 0.0])), False),
+        ("mislabel", dense((HERE, [0.4, 0.6, 0.0])), True),
+        ("mislabel", sparse((HERE, 2, 0.6), (AWAY, 0, 0.9)), True),
+        ("displace", FOUND, False),
+        ("displace", dense((HERE, [0.4, 0.0, 0.0])), False),
+        ("displace", dense((HERE, [0.4, 0.0, 0.0]), (AWAY, [0.6, 0.0, 0.0])), True),
+        ("displace", dense((HERE, [0.6, 0.0, 0.0]), (AWAY, [0.9, 0.0, 0.0])), False),
+        ("create", FOUND, False),
+        ("create", dense((HERE, [0.8, 0.6, 0.0]), (AWAY, [0.0, 0.0, 0.6])), True),
+        ("create", dense((HERE, [0.8, 0.6, 0.0]), ([0.25, 0.25, 0.35, 0.35], [0.9, 0.9, 0.0])), False),
+        ("create", sparse(), False),
+    ],
+)
+def test_an_objective_says_what_is_a_success(seek: str, output: list[dict[str, Tensor]], success: bool) -> None:
+    task = TASK.seeking(seek)
+    assert task.seek == seek and judged(task, output).success is success
+    assert (
+        get_objective(seek, task)(output, torch.zeros(1, 4, 4, 3), TRUTH).tolist() == task.score(output, TRUTH).tolist()
+    )
+
+
+def test_what_is_created_is_wrong_and_named() -> None:
+    task = TASK.seeking("create")
+    ghost = dense((HERE, [0.8, 0.0, 0.0]), (AWAY, [0.0, 0.0, 0.6]))
+    assert (judged(task, ghost).right, judged(task, ghost).answer.label) == (False, "dog elsewhere")
+    assert (judged(task, FOUND).right, judged(task, FOUND).answer.label) == (True, "cup")
+    assert judged(TASK, ghost).right, "nobody asked for what is beside the object"
+
+
+def test_a_target_is_a_name_for_the_box() -> None:
+    dog = replace(TASK, seek="mislabel", target=(2,))
+    assert not judged(dog, dense((HERE, [0.1, 0.9, 0.3]))).success
+    assert judged(dog, dense((HERE, [0.1, 0.9, 0.6]))).success and dog.target_names == ("dog",)
+    created = replace(TASK, seek="create", target=(2,))
+    assert not judged(created, dense((AWAY, [0.0, 0.9, 0.3]))).success
+    assert judged(created, dense((AWAY, [0.0, 0.1, 0.6]))).success
+    with pytest.raises(InputError, match="target: vanish has none; add `objective` mislabel or create"):
+        replace(TASK, target=(2,))
+    with pytest.raises(InputError, match="minimise: expected `objective` vanish"):
+        replace(TASK, minimise=True, seek="create")
+
+
+def test_easier_is_the_opposite_of_vanishing() -> None:
+    easier = replace(TASK, minimise=True)
+    assert judged(easier, FOUND).score == -judged(TASK, FOUND).score == pytest.approx(math.log(4.0), abs=1e-5)
+
+
+def test_where_nothing_of_the_object_is_seen_nothing_is_missed() -> None:
+    hidden = Place((0,), None, (20, 20))
+    for seek in ("vanish", "mislabel", "displace"):
+        found = judged(TASK.seeking(seek), FOUND, hidden)
+        assert found.right and not found.success and found.answer == Answer("out of view")
+    assert judged(TASK.seeking("create"), dense((HERE, [0.0, 0.7, 0.0])), hidden).success
+
+
+def test_a_score_that_is_no_number_is_neither_right_nor_a_success() -> None:
+    found = judged_anyway(dense((HERE, [math.nan, 0.1, 0.1])))
+    assert not found.right and not found.success and found.answer == Answer("no cup")
+
+
+def judged_anyway(output: list[dict[str, Tensor]]) -> Judgement:
+    return TASK.judge(output, TRUTH)[0]
+
+
+@pytest.mark.parametrize("seek", GOALS)
+def test_every_objective_has_a_derivative(seek: str) -> None:
+    boxes = torch.tensor([[0.22, 0.2, 0.6, 0.6], NEAR, AWAY], requires_grad=True)
+    scores = torch.tensor([[0.7, 0.2, 0.1], [0.6, 0.3, 0.1], [0.2, 0.3, 0.4]], requires_grad=True)
+    value = TASK.seeking(seek).score([{"boxes": boxes, "scores": scores}], TRUTH).sum()
+    found = torch.autograd.grad(value, [boxes, scores], allow_unused=True)
+    moved = [one is not None and bool(one.abs().sum() > 0.0) for one in found]
+    assert moved == ([True, False] if seek == "displace" else [False, True])
+    empty = sparse()
+    empty[0]["scores"].requires_grad_()
+    torch.autograd.grad(TASK.seeking(seek).score(empty, TRUTH).sum(), empty[0]["scores"])
+
+
+def test_log_odds_are_finite_everywhere() -> None:
+    ends = torch.tensor([0.0, 0.5, 1.0, -0.1, 1.1])
+    assert bool(log_odds(ends).isfinite().all()) and log_odds(ends)[1] == 0.0
+
+
+def test_the_payload_has_all_boxes_in_pixels_and_marks_show_those_that_count() -> None:
+    payload: Any = judged(
+        TASK, dense((HERE, [0.8, 0.15, 0.0]), (NEAR, [0.6, 0.0, 0.0]), (AWAY, [0.1, 0.05, 0.6]))
+    ).payload
+    assert payload["box"] == [4, 4, 12, 12]
+    assert [(one["label"], one["score"]) for one in payload["found"]] == [
+        ("cup", 0.8), ("dog", 0.6), ("bowl", 0.15), ("cup", 0.1),
+    ]  # fmt: skip
+    assert payload["found"][1]["box"] == pytest.approx([14.0, 14.0, 18.0, 18.0])
+    (marks,) = TASK.marks(FOUND, TRUTH)
+    assert [(one.text, one.true) for one in marks] == [("cup", True), ("cup 0.80", False)]
+    assert [one.box for one in marks] == [pytest.approx((4.0, 4.0, 12.0, 12.0))] * 2
+
+
+def test_answers_are_the_best_boxes_whatever_is_true() -> None:
+    rows = TASK.answers([*FOUND, *sparse()], 2)
+    assert [one.label for one in rows[0]] == ["cup", "bowl"] and rows[1] == (Answer("nothing"),)
+
+
+# ---- on a model -----------------------------------------------------------------------------------------------------
+
+
+class Pixels(nn.Module):
+    """One box in pixels of an input of 8 x 16, and scores of three classes."""
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        boxes = torch.tensor([[[2.0, 2.0, 6.0, 6.0]]]).expand(len(x), -1, -1)
+        return boxes, torch.stack([x.mean(dim=(1, 2, 3)), *[0.0 * x.sum(dim=(1, 2, 3))] * 2], dim=1)[:, None]
+
+
+def test_a_task_learns_names_size_and_unit_from_its_model() -> None:
+    model = load_model(Pixels(), input_size=(8, 16), read=Detection().reader, labels=NAMES)
+    task = Detection().on(model)
+    assert (task.labels, task.named, task.unit, task.input_size) == (NAMES, True, "pixels", (8, 16))
+    assert model.differentiable
+    output = model(torch.full((8, 16, 3), 0.9))
+    at = Place((0,), (4, 8, 12, 24), (32, 32))
+    assert task.judge(output, at)[0].right, "2 to 6 of 16 are 4 to 12 of 32"
+    unnamed = Detection(unit="fractions").on(load_model(Pixels(), input_size=(8, 16), read=Detection().reader))
+    assert unnamed.labels == ("class 0", "class 1", "class 2") and unnamed.unit == "fractions"
+    facts = Facts("mug", "#2", look=lambda: torch.ones(4, 4).bool())
+    assert unnamed.truth(facts) == Place((2,), (0, 0, 4, 4), (4, 4))
+    with pytest.raises(InputError, match="labels: 2 labels, but model Pixels has 3 classes"):
+        Detection().on(replace(model, labels=("a", "b")))
+    with pytest.raises(InputError, match=r"loaded for its logits; load it with read=Detection\(\).reader"):
+        Detection().on(replace(model, read=None))
+
+
+class Listed(nn.Module):
+    """As torchvision's detectors: for each picture a mapping, here without any box."""
+
+    def forward(self, x: Tensor) -> list[dict[str, Tensor]]:
+        none = x.new_zeros(0)
+        return [{"boxes": none.reshape(0, 4), "labels": none.long(), "scores": none} for _ in x]
+
+
+def test_a_list_of_mappings_is_in_pixels_and_needs_names() -> None:
+    model = load_model(Listed(), input_size=8, read=Detection().reader, labels=NAMES)
+    assert Detection().on(model).unit == "pixels" and len(model(torch.zeros(3, 8, 8, 3))) == 3
+    with pytest.raises(InputError, match="labels: expected a file with the names of the classes of model Listed"):
+        Detection().on(load_model(Listed(), input_size=8, read=Detection().reader))
+    with pytest.raises(ModelError, match=r"model Sequential: expected boxes \(N, D, 4\)"):
+        load_model(nn.Sequential(nn.Flatten(), nn.Linear(192, 3)), input_size=8, read=Detection().reader)
+
+
+def test_the_label_is_checked_before_anything_is_rendered() -> None:
+    with pytest.raises(InputError, match=r"label: the label of mug itself does not fit the model"):
+        TASK.check(Facts("mug", None, "mug"))
+    TASK.check(Facts("mug", "cup"))
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"iou": 0.0}, "iou: expected a number between 0 and 1"),
+        ({"iou": "half"}, "iou: expected a number"),
+        ({"confidence": 1.5}, "confidence: expected a number between 0 and 1"),
+        ({"boxes": "corners"}, "boxes: expected one of xyxy, xywh, cxcywh, yxyx"),
+        ({"unit": "miles"}, "unit: expected one of fractions, pixels"),
+        ({"seek": "hide"}, "seek: expected one of vanish, mislabel, displace, create"),
+    ],
+)
+def test_options_are_checked(options: dict[str, Any], text: str) -> None:
+    with pytest.raises(InputError, match=f"task detection: {text}"):
+        Detection(**options)
+
+
+def test_objectives_of_detection_are_for_detection() -> None:
+    check_objective("vanish", "detection")
+    with pytest.raises(
+        InputError, match="expected one of task detection \\(score, vanish, mislabel, displace, create\\)"
+    ):
+        check_objective("margin", "detection")
+    with pytest.raises(InputError, match="takes outputs of detection"):
+        check_objective("create", "classification")

@@ -1,0 +1,158 @@
+"""Semantic segmentation: how many of the object's pixels a model gets right."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from advsearch.attacks.objectives import get_objective
+from advsearch.errors import InputError, ModelError
+from advsearch.models import load_model
+from advsearch.tasks import Answer, Facts, Segmentation
+from advsearch.tasks.segmentation import Region
+
+NAMES = ("background", "bottle", "chair")
+TASK = Segmentation(labels=NAMES)
+MASK = torch.tensor([[0, 1, 1, 0], [0, 1, 1, 0]]).bool()
+TRUTH = Region((1,), MASK)
+
+
+def of(*classes: list[int], sure: float = 2.0) -> Tensor:
+    """Logits (1, 3, h, w) of which those of the given classes lead by `sure`."""
+    return sure * nn.functional.one_hot(torch.tensor(classes), 3).permute(2, 0, 1)[None].float()
+
+
+ALL, HALF, QUARTER = of([0, 1, 1, 0], [0, 1, 1, 0]), of([0, 1, 0, 0], [0, 2, 1, 0]), of([1, 1, 0, 1], [1, 2, 2, 1])
+
+
+@pytest.mark.parametrize(
+    ("output", "accuracy", "right", "answer"),
+    [
+        (ALL, 0.5, True, Answer("bottle", 1, 1.0)),
+        (HALF, 0.5, True, Answer("bottle", 1, 0.5)),
+        (HALF, 0.51, False, Answer("background", 0, 0.5)),
+        (QUARTER, 0.5, False, Answer("chair", 2, 0.25)),
+        (QUARTER, 0.25, True, Answer("bottle", 1, 0.25)),
+        (HALF, 1.0, False, Answer("background", 0, 0.5)),
+        (of([0, 0, 0, 0], [0, 0, 0, 0], sure=0.0), 1.0, True, Answer("bottle", 1, 1.0)),
+    ],
+)
+def test_enough_of_the_objects_pixels_have_to_be_right(
+    output: Tensor, accuracy: float, right: bool, answer: Answer
+) -> None:
+    task = replace(TASK, accuracy=accuracy)
+    (found,) = task.judge(output, TRUTH)
+    assert found.right is right and (found.margin <= 0.0) is right and found.success is not right
+    assert (found.answer.index, found.answer.probability) == (answer.index, answer.probability) or found.margin == 0.0
+    assert abs(found.margin) in (0.0, 2.0)
+
+
+def test_what_is_kept_has_accuracy_overlap_and_classes() -> None:
+    payload: Any = TASK.judge(QUARTER, TRUTH)[0].payload
+    assert payload == {"accuracy": 0.25, "iou": 0.125, "pixels": {"background": 0.25, "bottle": 0.25, "chair": 0.5}}
+
+
+def test_every_picture_is_judged_by_itself() -> None:
+    found = TASK.judge(torch.cat([ALL, QUARTER]), TRUTH)
+    assert [one.right for one in found] == [True, False]
+    alone = [float(TASK.pixel_margin(one, TRUTH)) for one in (ALL, QUARTER)]
+    assert TASK.pixel_margin(torch.cat([ALL, QUARTER]), TRUTH).tolist() == alone == [-2.0, 1.0]
+
+
+def test_the_objective_has_a_derivative_at_every_pixel_of_the_object() -> None:
+    output = ALL.clone().requires_grad_()
+    values = get_objective("pixel_margin", TASK)(output, torch.zeros(1, 2, 4, 3), TRUTH)
+    values.sum().backward()
+    assert output.grad is not None and output.grad[0].abs().amax(dim=0).gt(0.0).equal(MASK)
+    assert TASK.objective == "pixel_margin"
+    assert float(get_objective("pixel_margin", replace(TASK, minimise=True))(ALL, ALL, TRUTH)) == 2.0
+    (deciding,) = torch.autograd.grad(TASK.margin(output, TRUTH).sum(), output)
+    assert int(deciding[0].abs().amax(dim=0).gt(0.0).sum()) == 1
+
+
+def test_a_target_has_to_get_enough_of_the_pixels() -> None:
+    chair = replace(TASK, target=(2,), accuracy=0.5)
+    assert not chair.judge(HALF, TRUTH)[0].success and chair.judge(QUARTER, TRUTH)[0].success
+    assert float(chair.pixel_margin(QUARTER, TRUTH)) == 0.0 and float(chair.pixel_margin(ALL, TRUTH)) == -2.0
+    assert chair.target_names == ("chair",) and chair.goal == "a target answer"
+    easier = replace(TASK, minimise=True)
+    assert easier.judge(ALL, TRUTH)[0].success and not easier.judge(QUARTER, TRUTH)[0].success
+
+
+def test_where_nothing_of_the_object_is_seen_nothing_is_wrong() -> None:
+    output = QUARTER.clone().requires_grad_()
+    (found,) = TASK.judge(output, Region((1,), torch.zeros_like(MASK)))
+    assert found.right and found.answer == Answer("out of view") and found.payload is None
+    assert TASK.pixel_margin(output, Region((1,), torch.zeros_like(MASK))).requires_grad
+
+
+def test_logits_that_are_no_numbers_are_not_right() -> None:
+    (found,) = TASK.judge(torch.full((1, 3, 2, 4), math.nan), TRUTH)
+    assert not found.right and not found.success
+
+
+def test_a_mask_follows_the_size_of_the_output() -> None:
+    fine = MASK.repeat_interleave(3, dim=0).repeat_interleave(3, dim=1)
+    assert Region((1,), fine).at((2, 4)).equal(MASK) and TRUTH.at((6, 12)).equal(fine)
+    small = torch.zeros(8, 8).bool()
+    small[1, 1] = True
+    assert int(Region((1,), small).at((2, 2)).sum()) == 1, "an object that is smaller than a pixel is still seen"
+    assert TASK.judge(ALL, Region((1,), fine))[0].right
+
+
+def test_answers_are_the_classes_of_most_pixels() -> None:
+    assert TASK.answers(ALL, 5) == [(Answer("background", 0, 0.5), Answer("bottle", 1, 0.5))]
+    true, said = TASK.marks(QUARTER, TRUTH)[0]
+    assert true.true and true.mask is MASK and not said.true and said.mask is not None
+    assert said.mask.int().tolist() == [[1, 1, 0, 1], [1, 0, 0, 1]]
+
+
+# ---- on a model -----------------------------------------------------------------------------------------------------
+
+
+class Mapped(nn.Module):
+    """As torchvision's segmenters: a mapping with `out`."""
+
+    def forward(self, x: Tensor) -> dict[str, Tensor]:
+        return {"out": x, "aux": 0.0 * x}
+
+
+class Logits:
+    """An answer with a name, as transformers returns it."""
+
+    logits = ALL
+
+
+def test_logits_are_found_in_every_form() -> None:
+    known: list[Any] = [ALL, {"out": ALL}, {"logits": ALL}, (ALL, None), Logits()]
+    for answer in known:
+        assert TASK.read(answer, 1).equal(ALL)
+    others: list[Any] = [ALL[0], (), {"masks": ALL}, torch.cat([ALL, ALL]), ALL[:, :1], None]
+    for answer in others:
+        with pytest.raises(ValueError, match="expected logits"):
+            TASK.read(answer, 1)
+
+
+def test_a_task_learns_names_from_its_model() -> None:
+    model = load_model(Mapped(), input_size=4, read=Segmentation().reader, labels=NAMES)
+    task = Segmentation().on(model, target="chair")
+    assert (task.labels, task.target) == (NAMES, (2,)) and model.differentiable
+    facts = Facts("bottle", None, "bottle", look=lambda: MASK)
+    assert task.truth(facts) == TRUTH and task.truth_names(TRUTH) == ("bottle",)
+    with pytest.raises(InputError, match="target: the model has no label 'table'"):
+        Segmentation().on(model, target="table")
+    with pytest.raises(InputError, match=r"target: expected classes that are not right answers, got \[2\]"):
+        task.check(Facts("bottle", "chair"))
+    with pytest.raises(ModelError, match=r"expected logits \(N, classes, height, width\)"):
+        load_model(nn.Sequential(nn.Flatten(), nn.Linear(48, 3)), input_size=4, read=Segmentation().reader)
+
+
+@pytest.mark.parametrize("accuracy", [0.0, 1.1, "most", True])
+def test_options_are_checked(accuracy: Any) -> None:
+    with pytest.raises(InputError, match="task segmentation: accuracy: expected a number over 0, up to 1"):
+        Segmentation(accuracy=accuracy)
