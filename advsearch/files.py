@@ -149,7 +149,7 @@ def _whole_number(text: str) -> int:
     return int(text)
 
 
-def _inside(value: list[Any] | dict[str, Any]) -> list[Any]:
+def _inside(value: list[JsonValue] | JsonObject) -> list[JsonValue]:
     return value if isinstance(value, list) else list(value.values())
 
 

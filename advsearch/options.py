@@ -17,7 +17,7 @@ MOST = 1_000_000
 """Of whatever an option counts: no budget has more renders."""
 
 
-def options_of(kind: type[Any]) -> dict[str, Field[Any]]:
+def declared_options(kind: type[Any]) -> dict[str, Field[Any]]:
     """Return the options of a dataclass by name."""
     return {one.name: one for one in fields(kind) if one.init and one.metadata != FROM_RUN}
 
@@ -35,7 +35,7 @@ def check_options(what: str, name: str, kind: type[Any], given: Mapping[str, obj
         UnknownNameError: there is no such option.
         InputError: a value is of another type.
     """
-    known = options_of(kind)
+    known = declared_options(kind)
     for option, value in given.items():
         if option not in known:
             raise UnknownNameError(f"option of {what} {name!r}:", option, known)
@@ -73,7 +73,7 @@ def as_setting(entry: Any) -> str | dict[str, JsonValue]:
     An option that is no finite number, truth value or text has no form there and is left out.
     """
     name, given = str(entry.name), {}
-    for option, declared in options_of(type(entry)).items():
+    for option, declared in declared_options(type(entry)).items():
         value = getattr(entry, option)
         plain = isinstance(value, (bool, int, str)) or (isinstance(value, float) and math.isfinite(value))
         if plain and value != default_of(declared):

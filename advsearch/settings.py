@@ -17,7 +17,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
-from advsearch.files import read_text
+from advsearch.files import JsonObject, read_text
 from advsearch.yaml_text import LARGEST, parse_yaml
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ SCHEMA = 1
 HEADER = "# A run of advsearch. To repeat it: advsearch run FILE\n"
 """First line of every `run.yaml` that advsearch writes; a run directory is recognised by it."""
 
-PLACE: dict[str, Any] = {"run": None, "overwrite": False}
+PLACE: Mapping[str, bool | None] = {"run": None, "overwrite": False}
 """The settings that say where a run is kept, not what it does, as a repetition has them."""
 
 MOST_BASES = 4
@@ -70,7 +70,7 @@ def setting(
         otherwise: what a default of None comes to.
         constraints: as of `pydantic.Field`.
     """
-    notes: dict[str, Any] = {"group": group, "expects": expects, "unit": unit, "otherwise": otherwise}
+    notes: JsonObject = {"group": group, "expects": expects, "unit": unit, "otherwise": otherwise}
     alias = constraints.pop("alias", None)
     make = {"default_factory": default} if callable(default) else {"default": default}
     return Field(**make, description=description, json_schema_extra=notes, alias=alias, **constraints)
@@ -139,7 +139,7 @@ class Config(BaseModel):
         return self
 
     @classmethod
-    def from_yaml(cls, path: str | Path, overrides: Mapping[str, Any] | None = None) -> Self:
+    def from_yaml(cls, path: str | Path, overrides: Mapping[str, object] | None = None) -> Self:
         """Return the configuration that the YAML file at `path` describes, with `overrides` put over it.
 
         Args:
@@ -164,7 +164,7 @@ class Config(BaseModel):
         data = {"schema": SCHEMA, "command": self.command, **self.plain()}
         return HEADER + str(yaml.safe_dump(data, sort_keys=False))
 
-    def plain(self) -> dict[str, Any]:
+    def plain(self) -> JsonObject:
         """Return every setting by the name it has in YAML, as JSON values."""
         return self.model_dump(by_alias=True, mode="json")
 
@@ -183,11 +183,11 @@ class Config(BaseModel):
         places = {name: _absolute(getattr(self, name)) for name in FILES if name in type(self).model_fields}
         return self.model_copy(update={**places, **PLACE})
 
-    def deciding(self) -> dict[str, Any]:
+    def deciding(self) -> JsonObject:
         """Return the settings that decide a run's numbers, as JSON values: all that are not `free`. Files have their
         names only, since they may have been moved."""
         given = {name: value for name, value in self.plain().items() if name not in self.free}
-        files = {name: _bare(given[name]) for name in FILES if isinstance(given.get(name), str)}
+        files = {name: _bare(value) for name in FILES if isinstance(value := given.get(name), str)}
         return {**given, **files}
 
     def command_line(self) -> str:
@@ -262,7 +262,7 @@ def flag(name: str) -> str:
     return special.get(name) or "--" + name.replace("_", "-")
 
 
-def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
+def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, object]:
     """Return the mapping in the YAML file at `path`, laid over the files that its `base` names.
 
     A base is a file, or a list of files of which a later one goes over an earlier one; mappings are merged.
@@ -289,7 +289,7 @@ def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
     return _with_base(data, Path(path), above)
 
 
-def merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+def merged(under: Mapping[str, object], over: Mapping[str, object]) -> dict[str, object]:
     """Return `over` laid over `under`: mappings are merged, and everything else is replaced."""
     result = dict(under)
     for name, value in over.items():
@@ -299,7 +299,7 @@ def merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _with_base(data: dict[str, Any], path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
+def _with_base(data: dict[str, object], path: Path, above: tuple[Path, ...]) -> dict[str, object]:
     """Lay the settings over those of the files that their `base` names, relative to the file itself."""
     bases = data.pop("base", None) or []
     bases = [bases] if isinstance(bases, str) else bases
@@ -310,7 +310,7 @@ def _with_base(data: dict[str, Any], path: Path, above: tuple[Path, ...]) -> dic
         raise FileFormatError(f"{path}: base: expected at most {MOST_BASES} files, one over the other, got more")
     if bases and here in above:
         raise FileFormatError(f"{path}: base: the file is a base of itself; take it out of one of them")
-    result: dict[str, Any] = {}
+    result: dict[str, object] = {}
     for base in bases:
         result = merged(result, read_yaml(path.parent / base, (*above, here)))
     return merged(result, data)
@@ -392,19 +392,19 @@ def all_finite(value: Any) -> bool:
     return not isinstance(value, float) or math.isfinite(value)
 
 
-def _put(data: dict[str, Any], name: str, value: Any) -> None:
+def _put(data: dict[str, object], name: str, value: object) -> None:
     """Set a dotted name in nested mappings. What follows ``set.`` is one name, since parameters have dots in theirs."""
     first, _, rest = name.partition(".")
     if not rest:
         data[first] = value
         return
-    inner = data.get(first)
-    if isinstance(inner, list):
-        inner = {key: None for key in inner}
-    elif isinstance(inner, str):
-        inner = {"name": inner} if first in NAMED else {inner: None}
-    else:
-        inner = dict(inner) if isinstance(inner, dict) else {}
+    there, inner = data.get(first), dict[str, object]()
+    if isinstance(there, str):
+        inner = {"name": there} if first in NAMED else {there: None}
+    elif isinstance(there, list):
+        inner = {key: None for key in there}
+    elif isinstance(there, dict):
+        inner = dict(there)
     if first in ("set", "grid"):
         inner[rest] = value
     else:

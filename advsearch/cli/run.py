@@ -55,7 +55,7 @@ def command_in(file: str | Path) -> str:
     return str(read_yaml(file).get("command", "attack"))
 
 
-def described(command: str, file: str | Path, changes: Mapping[str, Any]) -> Config:
+def described(command: str, file: str | Path, changes: Mapping[str, object]) -> Config:
     """Return the configuration that a file describes; arguments and errors as for `carry_out`."""
     from advsearch.config import CONFIGS
 
@@ -65,7 +65,7 @@ def described(command: str, file: str | Path, changes: Mapping[str, Any]) -> Con
 
 
 def carry_out(
-    command: str, file: str | Path, changes: Mapping[str, Any], args: argparse.Namespace, resumed: Path | None = None
+    command: str, file: str | Path, changes: Mapping[str, object], args: argparse.Namespace, resumed: Path | None = None
 ) -> int:
     """Do what a file describes.
 

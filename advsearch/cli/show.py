@@ -115,7 +115,7 @@ def _show_options(kind: str, name: str, as_json: bool) -> int:
     with at_work(as_json=True, quiet=False):
         from advsearch.attacks import POLICIES
         from advsearch.cli.list import first_line
-        from advsearch.options import default_of, options_of, type_of
+        from advsearch.options import declared_options, default_of, type_of
         from advsearch.runs.results.base import plain
         from advsearch.tasks import TASKS
 
@@ -125,7 +125,7 @@ def _show_options(kind: str, name: str, as_json: bool) -> int:
     entry = registry[name]
     declared = [
         {"name": option, "type": type_of(one), "default": plain(getattr(default_of(one), "name", default_of(one)))}
-        for option, one in options_of(entry).items()
+        for option, one in declared_options(entry).items()
     ]
     if as_json:
         output.print_json({"schema": 1, kind: name, "options": declared})

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from pydantic import model_validator
+from pydantic import JsonValue, model_validator
 
 from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.named import name_in, read_named
-from advsearch.config.scene import SceneConfig
+from advsearch.config.scene import ControlsByName, SceneConfig
+from advsearch.files import JsonObject
 from advsearch.settings import PLACE, Clash, setting
 
 if TYPE_CHECKING:
@@ -83,7 +84,7 @@ class AttackConfig(DerivativeConfig):
         "measure which valid estimator of a derivative is best on this scene; full chooses step and samples too",
         "no, quick or full",
     )
-    policy: str | dict[str, Any] = setting(
+    policy: str | dict[str, JsonValue] = setting(
         "auto", "search", "the rule that proposes configurations", "the name of a policy, or NAME={OPTION: VALUE}"
     )
     steps: int = setting(
@@ -124,7 +125,7 @@ class AttackConfig(DerivativeConfig):
     smallest: bool = setting(
         False, "search", "find the smallest epsilon at which the model is wrong, up to --epsilon", "true or false"
     )
-    over: dict[str, dict[str, Any]] = setting(
+    over: ControlsByName = setting(
         dict,
         "search",
         "controls that vary by chance: one answer has to hold for all of them",
@@ -194,7 +195,7 @@ class AttackConfig(DerivativeConfig):
         return name_in(self.policy)
 
     @property
-    def policy_options(self) -> dict[str, Any]:
+    def policy_options(self) -> JsonObject:
         """Options of the policy."""
         return {} if isinstance(self.policy, str) else {k: v for k, v in self.policy.items() if k != "name"}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -11,7 +12,7 @@ from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import Clash, Config, check_once, setting, split_names
 
-OF_ALL: dict[str, Any] = {"object": "mug", "environment": None, "controls": {"texture": {}}, "set_": {}}
+OF_ALL: Mapping[str, object] = {"object": "mug", "environment": None, "controls": {"texture": {}}, "set_": {}}
 """What is as it is unless it is given, and has to be left so with `all`."""
 
 

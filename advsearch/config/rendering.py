@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from pydantic import field_validator
 
-from advsearch.config.scene import SceneConfig
+from advsearch.config.scene import ControlsByName, SceneConfig
 from advsearch.settings import setting
 
 PICTURE_SPP = 64
@@ -21,7 +21,7 @@ class RenderConfig(SceneConfig):
 
     command: ClassVar[str] = "render"
 
-    controls: dict[str, dict[str, Any]] = setting(
+    controls: ControlsByName = setting(
         dict,
         "picture",
         "what differs from the scene, separated by commas; a range stays where a search would start",

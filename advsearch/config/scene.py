@@ -15,6 +15,9 @@ from advsearch.settings import Clash, Config, check_once, number_or_text, settin
 DEFAULT_ENVIRONMENT = "studio"
 """What lights a scene of which nothing is said: `scene.description.DEFAULT_ENVIRONMENT`, which a test holds this to."""
 
+ControlsByName = dict[str, dict[str, object]]
+"""Controls as they are asked for: their names, each with its settings."""
+
 SEARCH_SPP = {"oidn": 8, "none": 16}
 """Samples a pixel of a search that asks for none. `benchmarks/formation.py` shows the noise that is left at each."""
 
@@ -112,7 +115,7 @@ class SceneConfig(Config):
         otherwise="the object's own",
     )
 
-    controls: dict[str, dict[str, Any]] = setting(
+    controls: ControlsByName = setting(
         lambda: {"texture": {}},
         "search",
         "what may change, separated by commas",

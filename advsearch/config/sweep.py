@@ -9,8 +9,11 @@ from typing import Any, ClassVar, Literal
 from pydantic import field_validator
 
 from advsearch.config.attack import FEWEST_TRIALS
-from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
+from advsearch.config.scene import DEFAULT_ENVIRONMENT, ControlsByName, SceneConfig
 from advsearch.settings import Clash, number_or_text, setting, split_names
+
+Grid = dict[str, object]
+"""Values, or numbers of them, by the parameters of the grid."""
 
 
 class SweepConfig(SceneConfig):
@@ -50,13 +53,13 @@ class SweepConfig(SceneConfig):
         "reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, or "
         "package.module:callable",
     )
-    grid: dict[str, Any] = setting(
+    grid: Grid = setting(
         dict,
         "sweep",
         "an axis of the grid; may be repeated",
         "PARAMETER=FIRST:LAST:COUNT, or values separated by commas",
     )
-    controls: dict[str, dict[str, Any]] = setting(
+    controls: ControlsByName = setting(
         dict,
         "sweep",
         "what is drawn by chance beside the grid, separated by commas",

@@ -23,6 +23,7 @@ from torch.export.pt2_archive import PT2ArchiveWriter
 
 from advsearch import files
 from advsearch.errors import FileFormatError
+from advsearch.files import JsonObject, JsonValue
 from advsearch.models import expressions
 from advsearch.models.archive import LARGEST_TEXT, Archive, open_archive, refused
 
@@ -97,11 +98,15 @@ def _copy_tensors(archive: Archive, writer: Any, folder: str, config: str) -> No
     table = content.get("config") if isinstance(content, dict) else None
     if not isinstance(table, dict) or not all(isinstance(entry, dict) for entry in table.values()):
         raise refused(archive.path, f"expected a table of tensors in {config!r}, got something else")
-    table = _checked(archive.path, table, "tensor_name")
+    table = _checked_object(archive.path, table, "tensor_name")
     copied: set[str] = set()
     for name, entry in table.items():
-        record = entry.get("path_name")
-        if entry.get("use_pickle") or not (isinstance(record, str) and _RECORD.fullmatch(record)):
+        record = entry.get("path_name") if isinstance(entry, dict) else None
+        if (
+            not isinstance(entry, dict)
+            or entry.get("use_pickle")
+            or not (isinstance(record, str) and _RECORD.fullmatch(record))
+        ):
             raise refused(archive.path, f"{name[:80]!r} is a pickled object or compiled code, which is never loaded")
         _check_tensor(archive, f"{folder}{record}", entry.get("tensor_meta"))
         if record not in copied:
@@ -125,19 +130,18 @@ def _check_tensor(archive: Archive, record: str, meta: Any) -> None:
 # the description of the network
 
 
-def _checked_program(archive: Archive, name: str) -> dict[str, Any]:
+def _checked_program(archive: Archive, name: str) -> JsonObject:
     """Return the description of the network as torch may see it."""
     program = archive.read_json(name)
     if not isinstance(program, dict) or not isinstance(program.get("graph_module"), dict):
         raise refused(archive.path, f"cannot be read as torch.export (expected a network in {name!r}, got other JSON)")
-    checked: dict[str, Any] = _checked(archive.path, program, "")
-    return checked
+    return _checked_object(archive.path, program, "")
 
 
-def _checked(path: Path, value: Any, key: str) -> Any:
+def _checked(path: Path, value: JsonValue, key: str) -> JsonValue:
     """Return a value of the description, which stands under `key`, without what is left out."""
     if isinstance(value, dict):
-        return {name: _checked_item(path, name, inner, key) for name, inner in value.items()}
+        return _checked_object(path, value, key)
     if isinstance(value, list):
         return [_checked(path, inner, key) for inner in value]
     wrong = _problem(value, key)
@@ -146,9 +150,13 @@ def _checked(path: Path, value: Any, key: str) -> Any:
     return value
 
 
-def _checked_item(path: Path, name: str, inner: Any, key: str) -> Any:
+def _checked_object(path: Path, value: JsonObject, key: str) -> JsonObject:
+    return {name: _checked_item(path, name, inner, key) for name, inner in value.items()}
+
+
+def _checked_item(path: Path, name: str, inner: JsonValue, key: str) -> JsonValue:
     if name in _FORGOTTEN:
-        return _FORGOTTEN[name]()
+        return {} if _FORGOTTEN[name] is dict else []
     wrong = "" if name == "" else _problem(name, key)
     if name in ("as_custom_obj", "custom_obj") or (name == "custom_obj_values" and inner):
         wrong = "holds a custom object, which is never loaded"

@@ -126,7 +126,7 @@ def _watch(
 ) -> None:
     """Run the network and append every call of the layers: the layer, what went in, what came out."""
 
-    def keep(layer: nn.Module, args: tuple[Any, ...], kwargs: dict[str, Any], made: Tensor) -> None:
+    def keep(layer: nn.Module, args: tuple[Tensor, ...], kwargs: dict[str, Tensor], made: Tensor) -> None:
         calls.append((layer, args[0] if args else kwargs["input"], made))
 
     handles = [layer.register_forward_hook(keep, with_kwargs=True) for layer in layers]

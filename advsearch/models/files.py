@@ -13,8 +13,9 @@ import logging
 import os
 import warnings
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import torch
 
@@ -144,11 +145,12 @@ def _load_exported(path: Path, archive: Archive) -> Source:
     with _damaged(path, "torch.export"), without_unpickling(), _quiet_export():
         program = torch.export.load(checked)
         module = program.module()
-    return source_of(module, path.stem, **_signature(program, path.stem))
+    return _with_signature(source_of(module, path.stem), program)
 
 
-def _signature(program: torch.export.ExportedProgram, name: str) -> dict[str, Any]:
-    """Return the fields of `Source` that the program's signature tells: input size, layout, batch limits, dtype."""
+def _with_signature(source: Source, program: torch.export.ExportedProgram) -> Source:
+    """Return the source with what the program's signature tells: input size, layout, batch limits, dtype."""
+    name = source.name
     inputs = program.graph_signature.user_inputs
     nodes = {node.name: node for node in program.graph.nodes if node.op == "placeholder"}
     values = [nodes[key].meta.get("val") for key in inputs if key in nodes]
@@ -157,12 +159,12 @@ def _signature(program: torch.export.ExportedProgram, name: str) -> dict[str, An
     value = values[0]
     if not value.is_floating_point():
         raise ModelError(f"model {name}: expected a floating-point image as input, the program takes {value.dtype}")
-    fields: dict[str, Any] = {"dtype": value.dtype, "batch_limits": _batch_limits(program, value.shape[0])}
-    fields["layout"] = "NHWC" if value.shape[3] == 3 and value.shape[1] != 3 else "NCHW"
-    height, width = value.shape[1:3] if fields["layout"] == "NHWC" else value.shape[2:4]
-    if isinstance(height, int) and isinstance(width, int):
-        fields["input_size"] = (height, width)
-    return fields
+    layout = "NHWC" if value.shape[3] == 3 and value.shape[1] != 3 else "NCHW"
+    limits = _batch_limits(program, value.shape[0])
+    source = replace(source, dtype=value.dtype, batch_limits=limits, layout=layout)
+    height, width = value.shape[1:3] if layout == "NHWC" else value.shape[2:4]
+    fixed = isinstance(height, int) and isinstance(width, int)
+    return replace(source, input_size=(height, width)) if fixed else source
 
 
 def _batch_limits(program: torch.export.ExportedProgram, batch: int | torch.SymInt) -> tuple[int, int]:

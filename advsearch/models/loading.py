@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -148,20 +148,21 @@ def _described(spec: object) -> str:
     return f"the class {spec.__name__} (pass an instance)" if isinstance(spec, type) else type(spec).__name__
 
 
-def _preprocessing(found: Source, given: dict[str, Any]) -> Preprocessing:
+def _preprocessing(found: Source, given: Mapping[str, object]) -> Preprocessing:
     """Return the source's own preprocessing with the caller's options on top."""
-    fields: dict[str, Any] = {"input_size": found.input_size or DEFAULT_INPUT_SIZE}
-    fields.update({key: getattr(found, key) for key in ("mean", "std", "layout") if getattr(found, key) is not None})
-    fields.update(pre.parse_normalisation(given.get("mean"), given.get("std")))
+    made = Preprocessing(found.input_size or DEFAULT_INPUT_SIZE)
+    own = {"mean": found.mean, "std": found.std, **pre.parse_normalisation(given.get("mean"), given.get("std"))}
+    made = dataclasses.replace(made, mean=own["mean"] or made.mean, std=own["std"] or made.std)
+    made = dataclasses.replace(made, layout=found.layout or made.layout)
     if "input_size" in given:
-        fields["input_size"] = pre.parse_input_size(given["input_size"])
+        made = dataclasses.replace(made, input_size=pre.parse_input_size(given["input_size"]))
     if "value_range" in given:
-        fields["value_range"] = pre.parse_value_range(given["value_range"])
+        made = dataclasses.replace(made, value_range=pre.parse_value_range(given["value_range"]))
     if "layout" in given:
-        fields["layout"] = pre.parse_choice("layout", given["layout"], pre.LAYOUTS)
+        made = dataclasses.replace(made, layout=pre.parse_choice("layout", given["layout"], pre.LAYOUTS))
     if "channels" in given:
-        fields["channels"] = pre.parse_choice("channels", given["channels"], pre.CHANNELS)
-    return Preprocessing(**fields)
+        made = dataclasses.replace(made, channels=pre.parse_choice("channels", given["channels"], pre.CHANNELS))
+    return made
 
 
 def _given_labels(given: Any) -> tuple[tuple[str, ...] | None, str]:
@@ -174,7 +175,7 @@ def _given_labels(given: Any) -> tuple[tuple[str, ...] | None, str]:
 
 
 def _relabelled(
-    model: Model, labels: tuple[str, ...] | None, origin: str, name: str | None, given: dict[str, Any]
+    model: Model, labels: tuple[str, ...] | None, origin: str, name: str | None, given: Mapping[str, object]
 ) -> Model:
     """Return a model that was complete already, with other labels or another name at most."""
     if given:

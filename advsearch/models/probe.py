@@ -67,9 +67,8 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
             "check its weights and the value range and normalisation that it expects"
         )
     found = fitting_labels(rows.shape[1], labels, labels_source, model.name) if logits else labels or ()
-    fields: dict[str, Any] = {"labels": found, "named": labels is not None}
-    fields["probabilities"] = logits and _probabilities(rows)
-    if fields["probabilities"]:
+    probabilities = logits and _probabilities(rows)
+    if probabilities:
         _warn(
             f"model {model.name} answers with probabilities. Their logarithm is used, so that margins are log-odds, "
             "but gradients vanish where a probability rounds to 0 or 1: remove the final softmax if you can"
@@ -77,9 +76,14 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
     repeatable = _same(rows[:1], again)
     if not repeatable:
         _warn(f"model {model.name} answers the same image differently each time: results hold for single draws only")
-    fields["batch_limits"] = _batch_limits(model, torch.cat([grey, noise]), rows if repeatable else None)
-    fields["differentiable"] = _gradient_reaches(model, noise, repeatable)
-    return dataclasses.replace(model, **fields)
+    return dataclasses.replace(
+        model,
+        labels=found,
+        named=labels is not None,
+        probabilities=probabilities,
+        batch_limits=_batch_limits(model, torch.cat([grey, noise]), rows if repeatable else None),
+        differentiable=_gradient_reaches(model, noise, repeatable),
+    )
 
 
 def _test_images(model: Model) -> tuple[Tensor, Tensor]:

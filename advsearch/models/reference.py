@@ -12,7 +12,6 @@ import math
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors import SafetensorError
@@ -21,6 +20,7 @@ from torch import Tensor, nn
 from torch.nn.utils import fuse_conv_bn_eval
 
 from advsearch.errors import ModelError
+from advsearch.files import JsonValue
 from advsearch.models.model import Model
 from advsearch.models.preprocessing import Preprocessing
 from advsearch.models.probe import probe
@@ -145,7 +145,7 @@ def with_temperature(state: Mapping[str, Tensor], temperature: float) -> dict[st
 
 
 def save(
-    folder: Path, state: Mapping[str, Tensor], labels: Sequence[str], figures: Mapping[str, Any] | None = None
+    folder: Path, state: Mapping[str, Tensor], labels: Sequence[str], figures: Mapping[str, JsonValue] | None = None
 ) -> tuple[Path, Path]:
     """Write ``reference.safetensors`` and ``reference.json`` to a folder and return the two paths.
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
 
 from advsearch.errors import UnknownNameError
 from advsearch.options import check_options
@@ -36,12 +35,13 @@ def make_task(task: AnyTask) -> Task:
     """
     if isinstance(task, Task):
         return task
-    options: dict[str, Any] = {} if isinstance(task, str) else dict(task)
-    name = task if isinstance(task, str) else str(options.pop("name", Classification.name))
+    given = {"name": task} if isinstance(task, str) else task
+    name, options = str(given.get("name", Classification.name)), {key: given[key] for key in given if key != "name"}
     if name not in TASKS:
         raise UnknownNameError("task", name, TASKS)
     check_options("task", name, TASKS[name], options)
-    return TASKS[name](**options)
+    build: Callable[..., Task] = TASKS[name]
+    return build(**options)
 
 
 __all__ = [

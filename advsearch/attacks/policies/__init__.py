@@ -50,7 +50,7 @@ POLICIES: Registry[type[Policy[Any]]] = Registry(
 )
 """Every policy by its word on the command line."""
 
-Spec = str | Mapping[str, Any] | Policy[Any]
+Spec = str | Mapping[str, object] | Policy[Any]
 """A policy inside another one: its name, a mapping with its `name` and options, or the policy itself."""
 
 
@@ -88,7 +88,7 @@ def _nested(spec: Spec, where: str) -> Policy[Any]:
         return make_policy(spec)
     if not isinstance(spec, Mapping) or not isinstance(spec.get("name"), str):
         raise InputError(f"{where}: expected a name or a mapping with a name and options, got {spec!r}")
-    return make_policy(**spec)
+    return make_policy(str(spec["name"]), **{option: spec[option] for option in spec if option != "name"})
 
 
 __all__ = [

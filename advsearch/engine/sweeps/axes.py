@@ -57,7 +57,7 @@ class Axis:
 # ---- reading --------------------------------------------------------------------------------------------------------
 
 
-def read_axes(grid: Mapping[str, Any], controls: Sequence[Control]) -> tuple[Axis, ...]:
+def read_axes(grid: Mapping[str, object], controls: Sequence[Control]) -> tuple[Axis, ...]:
     """Return the axes of a grid.
 
     Args:

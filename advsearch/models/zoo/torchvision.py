@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from torch import Tensor, nn
 
 from advsearch.errors import UnknownNameError
 from advsearch.models.imported import near_names, split_weights
-from advsearch.models.preprocessing import PRESETS
+from advsearch.models.preprocessing import PRESETS, Triple
 from advsearch.models.source import Source, load_weights, source_of
 from advsearch.models.zoo.library import library, reading
 
@@ -36,10 +38,9 @@ def load(spec: str) -> Source:
         module: nn.Module = models.get_model(name, weights=None if weights else default, **parts)
     if weights is not None:
         load_weights(module, weights, name)
-    described = _described(default, module if name in classifies else None)
-    if name in finds:
-        described.update(mean=None, std=None)
-    return source_of(_FromDictionary(module) if name in segments else module, name, **described)
+    source = source_of(_FromDictionary(module) if name in segments else module, name)
+    source = _with_defaults(source, default, module if name in classifies else None)
+    return replace(source, mean=None, std=None) if name in finds else source
 
 
 class _FromDictionary(nn.Module):
@@ -54,22 +55,26 @@ class _FromDictionary(nn.Module):
         return logits
 
 
-def _described(default: Any | None, classifier: nn.Module | None) -> dict[str, Any]:
-    """Return the fields of `Source` that default weights tell; the labels of a classifier only if they fit it."""
+def _with_defaults(source: Source, default: Any | None, classifier: nn.Module | None) -> Source:
+    """Return the source with what default weights tell; the labels of a classifier only if they fit it."""
     mean, std = PRESETS["imagenet"]
-    fields: dict[str, Any] = {"input_size": (224, 224), "mean": mean, "std": std}
+    source = replace(source, input_size=(224, 224), mean=mean, std=std)
     if default is None:
-        return fields
+        return source
     transforms = default.transforms()
     sides = getattr(transforms, "crop_size", None) or getattr(transforms, "resize_size", None)
     if sides:
-        fields["input_size"] = (int(sides[0]), int(sides[-1]))
-    for key in ("mean", "std"):
-        numbers = getattr(transforms, key, None)
-        if numbers is not None:
-            fields[key] = tuple(float(number) for number in numbers)
+        source = replace(source, input_size=(int(sides[0]), int(sides[-1])))
+    if getattr(transforms, "mean", None) is not None:
+        source = replace(source, mean=_triple(transforms.mean))
+    if getattr(transforms, "std", None) is not None:
+        source = replace(source, std=_triple(transforms.std))
     labels = tuple(str(label) for label in default.meta.get("categories", ()))
     last = [] if classifier is None else [p for p in classifier.parameters() if p.dim() == 1][-1:]
-    if labels and (classifier is None or (last and last[0].numel() == len(labels))):
-        fields["labels"] = labels
-    return fields
+    fit = classifier is None or (last and last[0].numel() == len(labels))
+    return replace(source, labels=labels) if labels and fit else source
+
+
+def _triple(numbers: Sequence[float]) -> Triple:
+    red, green, blue = (float(number) for number in numbers)
+    return red, green, blue

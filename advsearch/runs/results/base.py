@@ -34,7 +34,7 @@ Interval = tuple[Number, Number]
 def having(*names: str) -> AfterValidator:
     """Return the check that a mapping has these names."""
 
-    def check(values: Mapping[str, Any]) -> Mapping[str, Any]:
+    def check(values: Mapping[str, object]) -> Mapping[str, object]:
         missing = [name for name in names if name not in values]
         if missing:
             raise ValueError(f"expected {', '.join(missing)} among its names")
