@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
@@ -56,8 +56,24 @@ class SettingsError(InputError):
         self.problems = problems
 
 
+Form = Literal["text", "switch", "names", "assignments", "axes", "choices", "controls"]
+"""How a setting is written on a command line: as text; as a flag alone; or as what may come again: names, NAME=VALUE,
+NAME=VALUES, NAME=CHOICE or a choice for all, NAME or NAME={OPTION: VALUE}."""
+
+
 def setting(
-    default: Any, group: str, description: str, expects: str, *, unit: str = "", otherwise: str = "", **constraints: Any
+    default: Any,
+    group: str,
+    description: str,
+    expects: str,
+    *,
+    unit: str = "",
+    otherwise: str = "",
+    flag: str = "",
+    metavar: str = "",
+    form: Form = "text",
+    switched: str = "",
+    **constraints: Any,
 ) -> Any:
     """Return a pydantic field.
 
@@ -68,9 +84,14 @@ def setting(
         expects: completes "expected ..." in errors, and names the range in the help.
         unit: of the value.
         otherwise: what a default of None comes to.
+        flag: its flag, where that is not its name: "--control".
+        metavar: what stands for the value in the help, where that is not the last word of its name.
+        form: how it is written on a command line; what is true or false is a switch.
+        switched: what the flag does, where that is the opposite of the description.
         constraints: as of `pydantic.Field`.
     """
-    notes: JsonObject = {"group": group, "expects": expects, "unit": unit, "otherwise": otherwise}
+    notes: JsonObject = {"group": group, "expects": expects, "unit": unit, "otherwise": otherwise, "flag": flag}
+    notes |= {"metavar": metavar, "form": form, "switched": switched}
     alias = constraints.pop("alias", None)
     make = {"default_factory": default} if callable(default) else {"default": default}
     return Field(**make, description=description, json_schema_extra=notes, alias=alias, **constraints)
@@ -98,6 +119,8 @@ class Config(BaseModel):
     """
 
     command: ClassVar[str]
+    without: ClassVar[tuple[str, ...]] = ()
+    """Settings of a class above that the command does not have."""
     clashes: ClassVar[tuple[Clash, ...]] = ()
     free: ClassVar[tuple[str, ...]] = (*PLACE, "threads")
     """Settings that decide no number, so that they may be changed before a run goes on."""
@@ -133,8 +156,12 @@ class Config(BaseModel):
     def _without_clashes(self) -> Self:
         """Refuse what would be ignored, and settings that exclude each other."""
         defaults = {one.field: one.default for one in settings(type(self))}
+        for name in self.without:
+            if getattr(self, name) != type(self).model_fields[name].get_default(call_default_factory=True):
+                raise InputError(f"{name}: `advsearch {self.command}` has no such setting; leave it out")
         for clash in self.clashes:
-            if getattr(self, clash.setting) != defaults[clash.setting] and clash.with_others(self):
+            given = clash.setting not in self.without and getattr(self, clash.setting) != defaults[clash.setting]
+            if given and clash.with_others(self):
                 raise InputError(f"{clash.setting.rstrip('_')}: {clash.why}")
         return self
 
@@ -215,7 +242,9 @@ class Setting:
         default: the default; None when there is none.
         otherwise: what a default of None comes to; may be empty.
         required: whether it must be given.
-        is_switch: whether it is true or false.
+        metavar: what stands for its value in the help.
+        form: how it is written on a command line.
+        switched: what its flag does, where that is the opposite of the description; may be empty.
     """
 
     field: str
@@ -228,19 +257,23 @@ class Setting:
     default: Any
     otherwise: str
     required: bool
-    is_switch: bool
+    metavar: str
+    form: Form
+    switched: str
 
 
 def settings(config: type[Config]) -> tuple[Setting, ...]:
     """Return every setting of a configuration, in the order in which they are shown."""
     found = []
     for field, info in config.model_fields.items():
+        if field in config.without:
+            continue
         notes: Any = info.json_schema_extra
         found.append(
             Setting(
                 field=field,
                 name=info.alias or field,
-                flag=flag(field),
+                flag=notes["flag"] or "--" + field.replace("_", "-"),
                 group=notes["group"],
                 description=info.description or "",
                 expects=notes["expects"],
@@ -248,18 +281,12 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
                 default=None if info.is_required() else info.get_default(call_default_factory=True),
                 otherwise=notes["otherwise"],
                 required=info.is_required(),
-                is_switch=info.annotation is bool,
+                metavar=notes["metavar"] or field.rpartition("_")[2].upper(),
+                form="switch" if info.annotation is bool else notes["form"],
+                switched=notes["switched"],
             )
         )
     return tuple(found)
-
-
-def flag(name: str) -> str:
-    """Return the flag of the setting `name`: ``texture_resolution`` is ``--texture-resolution``."""
-    special = {"controls": "--control", "set_": "--set", "set": "--set"}
-    special |= {"estimators": "--estimator", "estimator": "--estimator"}
-    special |= {"baseline": "--no-baseline", "specialise": "--no-specialise"}
-    return special.get(name) or "--" + name.replace("_", "-")
 
 
 def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, object]:
@@ -345,7 +372,7 @@ def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchErr
         if name not in known:
             return UnknownNameError("setting", name, {one.name for one in declared})
         got = "nothing" if found["type"] == "missing" else _shown(found["input"])
-        if known[name].field in ("set_", "controls", "over") and len(found["loc"]) > 1:
+        if known[name].form in ("assignments", "controls") and len(found["loc"]) > 1:
             got = f"{found['loc'][1]}={got}"
         problems.setdefault(known[name].name, f"expected {known[name].expects}, got {got}")
     return SettingsError(tuple(problems.items()))
@@ -454,11 +481,11 @@ def _absolute_file(name: str) -> str:
 
 def _as_flags(setting: Setting, value: Any) -> list[str]:
     """Return the words of a command line that give `setting` the value."""
-    if setting.is_switch:
+    if setting.form == "switch":
         return [setting.flag]
-    if setting.field in ("set_", "grid", "estimators"):
+    if setting.form in ("assignments", "axes", "choices"):
         return [word for name, given in value.items() for word in (setting.flag, f"{name}={_number(given)}")]
-    if setting.field in ("controls", "over"):
+    if setting.form == "controls":
         plain, tuned = [name for name in value if not value[name]], [name for name in value if value[name]]
         words = [setting.flag, ",".join(plain)] if plain else []
         return words + [word for name in tuned for word in (setting.flag, f"{name}={_flow(value[name])}")]

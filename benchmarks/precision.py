@@ -20,7 +20,7 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.api.attack import problem_from_config  # noqa: E402
-from advsearch.api.precision import precision  # noqa: E402
+from advsearch.api.precision import precision_from_config  # noqa: E402
 from advsearch.config import PrecisionConfig  # noqa: E402
 from advsearch.engine.gradients import inside, smooth_loss  # noqa: E402
 from advsearch.evaluation.precision.gradient import GradientBench, parts_of  # noqa: E402
@@ -69,7 +69,7 @@ def one(scene: str, args: argparse.Namespace) -> bool:
             error=args.error,
             out=folder,
         )
-        report = precision(config)
+        report = precision_from_config(config)
     kept = True
     for found in report.recommendations:
         if found.estimator is None or found.measure == "margin_error" or found.among == "by path depth":

@@ -23,8 +23,8 @@ from typing import Any, get_args
 
 from pydantic.fields import FieldInfo
 
-from advsearch.cli.flags import GROUPS, help_text
-from advsearch.cli.main import COMMANDS
+from advsearch.cli.flags import help_text
+from advsearch.cli.main import COMMANDS, _command
 from advsearch.config import CONFIGS, AttackConfig
 from advsearch.controls import OWN
 from advsearch.runs.results.attack import AttackSummary
@@ -97,10 +97,9 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def flags(record: Record) -> str:
     """Every flag of `attack` with its values and default, group by group."""
     parts = []
-    for group, heading in GROUPS.items():
+    for group in sorted({one.group: None for one in settings(AttackConfig)}, key=lambda group: group == "run"):
         rows = [_flag_row(one) for one in settings(AttackConfig) if one.group == group]
-        if rows:
-            parts.append(f"**{heading.capitalize()}**\n\n" + table(FLAG_HEADS, rows))
+        parts.append(f"**{group.capitalize()}**\n\n" + table(FLAG_HEADS, rows))
     return "\n".join(parts)
 
 
@@ -127,7 +126,7 @@ def flags_of(command: str) -> set[str]:
     """Return the flags that a command takes, as its help shows them."""
     parser = argparse.ArgumentParser()
     subparsers = parser.add_subparsers()
-    importlib.import_module(COMMANDS[command]).add_parser(subparsers)
+    _command(importlib.import_module(COMMANDS[command])).add_parser(subparsers)
     return set(re.findall(r"^  (--[a-z][a-z-]*)", subparsers.choices[command].format_help(), re.MULTILINE))
 
 
@@ -138,7 +137,7 @@ def _wrapped(text: str) -> str:
 def _flag_row(one: Setting) -> list[str]:
     """A flag, what it is, its values and its default, cut from its help text."""
     text = help_text(one).replace("%%", "%")
-    if one.is_switch:
+    if one.form == "switch":
         return [f"`{one.flag}`", text, "no value", ""]
     values, marked, default = text.removeprefix(f"{one.description}: ").partition(" (default: ")
     shown = "required" if one.required else default.removesuffix(")") if marked else ""

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw, ImageFont
 
-from advsearch.cli.table import answer
+from advsearch.cli.attack import answer
 from advsearch.report.phrases import percent
 from advsearch.runs.directory import default_name
 from advsearch.runs.results.attack import AttackSummary, UsualAnswer

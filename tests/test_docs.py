@@ -42,7 +42,6 @@ from advsearch.attacks.verification import WORST_CASE
 from advsearch.cli.flags import config_from
 from advsearch.cli.list import REGISTRIES
 from advsearch.cli.main import COMMANDS, _parse
-from advsearch.cli.sweep import axes_as_text
 from advsearch.config import (
     CONFIGS,
     TRIALS,
@@ -412,8 +411,6 @@ def check_advsearch(words: list[str], folder: Path) -> None:
     """Parse a command with the real parser, and read its settings."""
     args = _parse(words, words[0])
     if args.command in CONFIGS:
-        if "grid" in args:
-            args.grid = axes_as_text(args.grid)
         otherwise = {"object": "mug"} if "around" in args and args.command == "region" else {}
         check_names(config_from(args, CONFIGS[args.command], **otherwise))
     if args.command == "run":

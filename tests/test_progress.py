@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,11 +11,9 @@ import pytest
 import torch
 from stand_ins import StandInProblem, attack_on, carry_out, configuration, rows
 
-from advsearch.api.attack import attack_from_config
-from advsearch.api.plan import plan
-from advsearch.api.precision import precision
-from advsearch.api.region import region_from_config
-from advsearch.api.sweep import resume_sweep, sweep_from_config
+from advsearch.api import carry_out as answered
+from advsearch.api.plan import plan_from_config
+from advsearch.api.sweep import sweep_from_config
 from advsearch.attacks import make_policy, region
 from advsearch.attacks.sample_count import choose_spp, most_samples
 from advsearch.cli.flags import with_flags
@@ -26,6 +23,7 @@ from advsearch.engine.memory import Memory
 from advsearch.engine.record import Findings, Stages
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.runs.directory import RunDirectory
+from advsearch.settings import Config
 
 JARGON = re.compile(r"set-up|rerank|adjoint|estimator|baseline|sample count|spp|bounces$|verification", re.IGNORECASE)
 """Words of our own, which nobody who waits should have to know."""
@@ -166,36 +164,20 @@ SMALL: dict[str, Any] = {"object": "mug", "resolution": 16, "spp": 1, "threads":
 
 
 @pytest.mark.parametrize(
-    ("make", "do"),
+    "config",
     [
-        (lambda run: AttackConfig(**SMALL, steps=3, trials=6, average=2, verify_spp=2, run=run), attack_from_config),
-        (lambda run: SweepConfig(**SMALL, grid={"pose.yaw": "0,90"}, trials=6, run=run), sweep_from_config),
-        (
-            lambda run: RegionConfig(
-                **SMALL, controls={"camera": {}}, vary="camera.azimuth", samples=8, verify_spp=1, run=run
-            ),
-            region_from_config,
-        ),
-        (
-            lambda run: PrecisionConfig(
-                **SMALL,
-                controls={"light": {}},
-                quantities="image",
-                seconds=1,
-                rounds=3,
-                samplers="independent",
-                run=run,
-            ),
-            precision,
+        AttackConfig(**SMALL, steps=3, trials=6, average=2, verify_spp=2),
+        SweepConfig(**SMALL, grid={"pose.yaw": "0,90"}, trials=6),
+        RegionConfig(**SMALL, controls={"camera": {}}, vary="camera.azimuth", samples=8, verify_spp=1),
+        PrecisionConfig(
+            **SMALL, controls={"light": {}}, quantities="image", seconds=1, rounds=3, samplers="independent"
         ),
     ],
-    ids=["attack", "sweep", "region", "precision"],
+    ids=lambda config: config.command,
 )
-def test_every_command_says_what_it_does_and_how_far_it_is(
-    tmp_path: Path, make: Callable[[str], Any], do: Callable[..., Any]
-) -> None:
+def test_every_command_says_what_it_does_and_how_far_it_is(tmp_path: Path, config: Config) -> None:
     progress = Recorded()
-    do(make(str(tmp_path / "run")), progress=progress)
+    answered(config.model_copy(update={"run": str(tmp_path / "run")}), progress=progress)
     progress.check()
     hints = [with_flags(one.hint) for one in progress.stages]
     assert any("--" in one for one in hints) and not any("`" in one for one in hints)
@@ -204,7 +186,7 @@ def test_every_command_says_what_it_does_and_how_far_it_is(
 @pytest.mark.slow
 def test_a_plan_counts_what_it_says(tmp_path: Path) -> None:
     progress = Recorded()
-    whole = plan(
+    whole = plan_from_config(
         PlanConfig(**SMALL, controls={"environment.rotation": {}}, run=str(tmp_path / "run")), progress=progress
     )
     progress.check()
@@ -260,7 +242,7 @@ def test_a_resumed_sweep_takes_the_probes_of_its_worst_configuration_from_the_st
     cut = sweep_from_config(config.model_copy(update={"run": str(tmp_path / "run")}))
     assert cut.summary.ending == "interrupted"
     stop, rendered = 0, 0
-    resumed = resume_sweep(tmp_path / "run")
+    resumed = sweep_from_config(config, resumed=tmp_path / "run")
     assert rendered + 4 == whole.summary.renders["verification"] == resumed.summary.renders["verification"]
     assert resumed.summary.worst == whole.summary.worst
     with RunDirectory.resume(tmp_path / "run") as run, RunDirectory.resume(tmp_path / "whole") as other:

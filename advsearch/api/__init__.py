@@ -1,8 +1,40 @@
 """Every question as a function, each in a module called as its command; `import advsearch` offers them all.
 
-The command line calls the functions that end in `_from_config`.
+Each module also has a function that ends in `_from_config`, by which `carry_out` does what a file or a command line
+says.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
+from typing import TYPE_CHECKING
+
 from advsearch import threads as threads  # before torch: it sets how OpenMP waits
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from advsearch.progress import Progress
+    from advsearch.runs.results.base import Result
+    from advsearch.settings import Config
+
+
+def carry_out(config: Config, *, progress: Progress | None = None, resumed: Path | None = None) -> Result:
+    """Answer the question that a configuration asks, and keep the run in a directory.
+
+    Args:
+        config: of any command.
+        progress: told how far it is.
+        resumed: the folder of a run to go on with; None for a new run.
+
+    Raises:
+        InputError: anything that whoever asked can put right; nothing is written then.
+    """
+    from advsearch.runs.results.base import Result
+
+    module = import_module(f"advsearch.api.{config.command}")
+    answer = getattr(module, f"{config.command}_from_config")(
+        config, progress=progress, **({} if resumed is None else {"resumed": resumed})
+    )
+    result: Result = answer if isinstance(answer, Result) else answer.summary
+    return result

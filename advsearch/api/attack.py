@@ -35,7 +35,8 @@ from advsearch.models import Model
 from advsearch.models.features import features_of
 from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress
-from advsearch.runs.directory import CONFIG, RunDirectory, check_free, find_run, is_run, run_path
+from advsearch.runs.directory import RunDirectory, check_free, is_run, run_path
+from advsearch.runs.results.gap import CurveResult
 from advsearch.scene.leaving_out import EVERYTHING, NOTHING
 from advsearch.scene.mitsuba_backend.samplers import next_count
 from advsearch.scene.renderer import Renderer
@@ -147,31 +148,34 @@ def attack(
     return _carry_out(job, progress or NullProgress())
 
 
-def attack_from_config(config: AttackConfig, *, progress: Progress | None = None) -> AttackResult:
-    """Do what a configuration describes and keep it in a run directory; see `attack`."""
-    if config.run is not None:
+def attack_from_config(
+    config: AttackConfig, *, progress: Progress | None = None, resumed: Path | None = None
+) -> AttackResult | CurveResult:
+    """Do what a configuration describes, one attack or a curve of several; see `attack`.
+
+    Args:
+        config: what.
+        progress: told how far it is.
+        resumed: the folder of a run to go on with: what was evaluated is not rendered again.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    if config.is_study:
+        from advsearch.api.gap import curve_from_config
+
+        return curve_from_config(config, progress=progress, resumed=resumed)
+    return attack_once(config, progress=progress, resumed=resumed)
+
+
+def attack_once(config: AttackConfig, *, progress: Progress | None = None, resumed: Path | None = None) -> AttackResult:
+    """Attack one object with one epsilon, in a run directory; arguments and errors as for `attack_from_config`."""
+    if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
     progress = progress or NullProgress()
     progress.stage(LOADING)
-    return _carry_out(_job(config), progress)
-
-
-def resume_attack(run: str | Path, *, progress: Progress | None = None) -> AttackResult:
-    """Go on with a run that was stopped, where it was stopped; what was evaluated is not rendered again.
-
-    Args:
-        run: its name or path.
-        progress: told how far it is.
-
-    Raises:
-        UnknownNameError: there is no such run.
-        InputError: another process works on it, or it cannot be continued.
-    """
-    progress = progress or NullProgress()
-    path = find_run(run)
-    config = AttackConfig.from_yaml(path / CONFIG)
-    progress.stage(LOADING)
-    return _go_on(_job(config), path, progress)
+    job = _job(config)
+    return _carry_out(job, progress) if resumed is None else _go_on(job, resumed, progress)
 
 
 def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> tuple[Problem, list[str]]:

@@ -51,7 +51,6 @@ from advsearch.scene.gradients.plan import STEP_RANGE
 
 SCENES = (("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"))
 """Bundled scenes that `check --all` goes through."""
-LOSSES = ("linear", "model")
 RAW_SPP = 16
 """Samples a pixel of a working gradient of the linear loss, which is taken without denoiser."""
 MOST = 256
@@ -67,28 +66,6 @@ IN_PARAMETERS = "one for each parameter; `resolution` or fewer controls shorten 
 """What whoever waits is told of the long stages."""
 
 
-def check(
-    config: CheckConfig, *, losses: Sequence[str] = LOSSES, everything: bool = False, progress: Progress | None = None
-) -> list[CheckedRow]:
-    """Compare the gradient of every parameter with differences, on the actual scene.
-
-    Args:
-        config: scene, model, controls, resolution, samples and seed.
-        losses: "linear", a smooth linear loss of the raw picture before the tone curve; "model", the model's own loss
-            in the run's image formation.
-        everything: every control, on each of `SCENES`.
-        progress: told how far it is.
-
-    Returns:
-        One row for each parameter, estimator and loss, as docs/gradients.md, "What check says" lists them. For the
-        model's loss the estimator, the step and the samples are those that reach the goal soonest, and rows with
-        `WHOLE` for their parameter have the cosine of a control's working gradients with the converged one.
-    """
-    results = Results(Memory(None))
-    parts = _parts(config, losses, everything)
-    return [row for part in parts for row in _rows_of(part, len(parts), results, progress or NullProgress())]
-
-
 def check_from_config(
     config: CheckConfig, *, progress: Progress | None = None, resumed: Path | None = None
 ) -> CheckResult:
@@ -102,7 +79,7 @@ def check_from_config(
     """
     progress, begun = progress or NullProgress(), time.perf_counter()
     progress.stage(LOADING)
-    parts = _parts(config, config.losses, config.all)
+    parts = _parts(config)
     with RunDirectory.of(config, resumed) as run:
         results, measured = Results(Memory(run), config.seconds), 0
 
@@ -140,7 +117,7 @@ class CheckedPart:
     Attributes:
         number: from 1.
         config: the scene, and what may vary.
-        loss: one of `LOSSES`.
+        loss: "linear" or "model".
     """
 
     number: int
@@ -153,13 +130,13 @@ class CheckedPart:
         return f"check {self.number}"
 
 
-def _parts(config: CheckConfig, losses: Sequence[str], everything: bool) -> list[CheckedPart]:
-    asked = [(one, loss) for one in _configurations(config, everything) for loss in losses]
+def _parts(config: CheckConfig) -> list[CheckedPart]:
+    asked = [(one, loss) for one in _configurations(config) for loss in config.losses]
     return [CheckedPart(number, one, loss) for number, (one, loss) in enumerate(asked, start=1)]
 
 
-def _configurations(config: CheckConfig, everything: bool) -> Iterator[CheckConfig]:
-    if not everything:
+def _configurations(config: CheckConfig) -> Iterator[CheckConfig]:
+    if not config.all:
         yield config
         return
     shared = RunSettings(config.epsilon, config.norm, config.texture_resolution)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal, TypeVar
 
-from advsearch.api.attack import attack_from_config, resume_attack
+from advsearch.api.attack import attack_once
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.config import AttackConfig, GapConfig
@@ -193,10 +193,11 @@ class _Parts:
         what = f"{config.object}, {' and '.join(config.controls)}{budget}"
         self._progress.message(f"attack {len(self.names)} of at most {self._most}: {what}")
         if is_run(path) and (path / CONFIG).is_file():
-            summary = attack_of(path) if finished(path) else resume_attack(path, progress=self._progress).summary
+            began = None if finished(path) else AttackConfig.from_yaml(path / CONFIG)
+            summary = attack_once(began, progress=self._progress, resumed=path).summary if began else attack_of(path)
         else:
             own = config.model_copy(update={"run": str(path), "overwrite": True})
-            summary = attack_from_config(own, progress=self._progress).summary
+            summary = attack_once(own, progress=self._progress).summary
         self.warnings += [text for text in summary.warnings if text not in self.warnings]
         self.interrupted = summary.ending == INTERRUPTED
         return None if self.interrupted else summary

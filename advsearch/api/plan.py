@@ -35,7 +35,9 @@ from advsearch.scene.gradients.plan import BY_DIFFERENCES
 PlannedRow = CosineRow | PathLength | GainRow | TexelRow
 
 
-def plan(config: PlanConfig, *, progress: Progress | None = None, resumed: Path | None = None) -> PlanResult:
+def plan_from_config(
+    config: PlanConfig, *, progress: Progress | None = None, resumed: Path | None = None
+) -> PlanResult:
     """Choose how every derivative is obtained and what is left out, by measurement, and say why.
 
     What is measured is kept at once in a run directory, so that a plan that was stopped, by Ctrl-C, by a kill or

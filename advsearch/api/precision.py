@@ -50,16 +50,23 @@ VERIFY_SPP, VERIFY_RENDERS = 64, 4
 NUMBERS, FIGURE = "precision.json", "precision"
 
 
-def precision(config: PrecisionConfig, *, progress: Progress | None = None) -> PrecisionResult:
+def precision_from_config(
+    config: PrecisionConfig, *, progress: Progress | None = None, resumed: Path | None = None
+) -> PrecisionResult:
     """Measure error against run time and write figures and numbers.
 
     Args:
         config: scene, model, controls, what to measure and for how long.
         progress: told how far it is.
+        resumed: refused: times are measured in one sitting.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
+    if resumed is not None:
+        raise InputError(
+            f"{resumed}: times are measured in one sitting, so that there is nothing to go on with; run again"
+        )
     progress = progress or NullProgress()
     if config.run is not None and config.out is None:
         check_free(config.run, overwrite=config.overwrite)

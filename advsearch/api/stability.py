@@ -15,7 +15,7 @@ from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.stability import CaseRow, StabilityResult
 
 
-def stability(
+def stability_from_config(
     config: StabilityConfig, *, progress: Progress | None = None, resumed: Path | None = None
 ) -> StabilityResult:
     """Run cases of the suite one after the other, until they are done, the time is up or there is an interrupt.

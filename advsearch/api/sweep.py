@@ -22,7 +22,7 @@ from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress
-from advsearch.runs.directory import CONFIG, RunDirectory, check_free, find_run, is_run, run_path
+from advsearch.runs.directory import CONFIG, RunDirectory, check_free, is_run, run_path
 from advsearch.runs.listing import finished
 from advsearch.scene.description import NO_MAP
 from advsearch.scene.mitsuba_backend.samplers import next_count
@@ -113,31 +113,24 @@ def sweep(
     return _kept(config, job, progress, resumed) if config.run is not None else carry_out(job, None, progress)
 
 
-def sweep_from_config(config: SweepConfig, *, progress: Progress | None = None) -> SweepResult:
-    """Do what a configuration describes and keep it in a run directory; see `sweep`."""
-    if config.run is not None:
+def sweep_from_config(
+    config: SweepConfig, *, progress: Progress | None = None, resumed: Path | None = None
+) -> SweepResult:
+    """Do what a configuration describes and keep it in a run directory; see `sweep`.
+
+    Args:
+        config: what.
+        progress: told how far it is.
+        resumed: the folder of a run to go on with: what is stored is not rendered again.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
     progress = progress or NullProgress()
     progress.stage(LOADING)
-    return _kept(config, _job_of(config), progress, None)
-
-
-def resume_sweep(run: str | Path, *, progress: Progress | None = None) -> SweepResult:
-    """Go on with a sweep that was stopped; what is stored is not rendered again.
-
-    Args:
-        run: its name or path.
-        progress: told how far it is.
-
-    Raises:
-        UnknownNameError: there is no such run.
-        InputError: another process works on it, or what it names is no longer there.
-    """
-    progress = progress or NullProgress()
-    path = find_run(run)
-    progress.stage(LOADING)
-    config = SweepConfig.from_yaml(path / CONFIG)
-    return _kept(config, _job_of(config), progress, path)
+    return _kept(config, _job_of(config), progress, resumed)
 
 
 # ---- from names to things -------------------------------------------------------------------------------------------

@@ -1,66 +1,81 @@
-"""`advsearch attack`: the worst configuration of a scene, searched for and verified."""
+"""`advsearch attack`: the worst configuration of a scene, in a table that a person reads in five seconds."""
 
 from __future__ import annotations
 
-import argparse
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from advsearch.cli import output
+from advsearch.cli.output import columns
+from advsearch.cli.question import QuestionCommand
+from advsearch.report import wording
+from advsearch.report.phrases import cells
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from advsearch.config import AttackConfig
-    from advsearch.runs.results.attack import AttackSummary
+    from advsearch.runs.results.attack import AttackSummary, VerifiedRate
+    from advsearch.runs.results.base import Interval
     from advsearch.runs.results.gap import CurveResult
 
 HELP = "find the configuration of a scene that the model gets wrong most badly"
 
-_EXAMPLES = """examples:
-  advsearch attack --object mug --control texture
-  advsearch attack --object mug --control texture --epsilon 0.03 --set camera.azimuth=130 --seed 1
-"""
+
+def answer(summary: AttackSummary | CurveResult) -> str:
+    """Return the verdict, the rates, the cost and the place of the pictures; of a curve, its tables."""
+    from advsearch.runs.results.gap import CurveResult
+
+    if isinstance(summary, CurveResult):
+        from advsearch.cli import gap
+
+        return gap.answer(summary)
+    facts = [[name, text] for name, text in _facts(summary).items() if text]
+    parts = [wording.verdict(summary), columns(_rates(summary)), columns(facts)]
+    return "\n\n".join(parts) + "".join(f"\n\nNote: {text}" for text in wording.remarks(summary))
 
 
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    from advsearch.cli.flags import add_settings
-
-    parser = subparsers.add_parser(
-        "attack",
-        help=HELP,
-        description=f"{HELP[0].upper()}{HELP[1:]}, and verify it with fresh renders.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    add_settings(parser)
-    output.add_flags(parser, quiet=True)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Search, verify, print the answer; 0 also when nothing was found."""
-    from advsearch.cli.flags import config_from
-    from advsearch.config import AttackConfig
-
-    return carry_out(config_from(args, AttackConfig), as_json=args.json, quiet=args.quiet)
+def _rates(summary: AttackSummary) -> list[list[str]]:
+    clean, control, success = summary.clean, summary.clean.control, wording.success(summary)
+    rated = _rate("right", control.correct, control.trials, control.interval) if control else ["not verified"]
+    rows = [["clean", *cells(summary.task, clean), *rated]]
+    if summary.adversarial:
+        rows.append(["adversarial", *cells(summary.task, summary.adversarial), *_verified(success, summary.verified)])
+    if summary.baseline:
+        pictures = f"{summary.baseline.renders} pictures"
+        rows.append(["random search", pictures, "", *_verified(success, summary.baseline.verified)])
+    if summary.average:
+        average = summary.average
+        drawn = wording.count(average.configurations, "configuration")
+        rows.append(
+            ["average case", drawn, "", *_rate("right", average.correct, average.configurations, average.interval)]
+        )
+    return rows
 
 
-def carry_out(config: AttackConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
-    """Run the attack that `config` describes, or go on with it; print its answer and return the exit status."""
-    from advsearch.cli.progress import at_work
+def _verified(what: str, rated: VerifiedRate | None) -> list[str]:
+    return _rate(what, rated.successes, rated.trials, rated.interval) if rated else ["not verified"]
 
-    with at_work(as_json=as_json, quiet=quiet) as progress:
-        from advsearch.api.attack import attack_from_config, resume_attack
-        from advsearch.api.gap import curve_from_config
 
-        result: CurveResult | AttackSummary
-        if config.is_study:
-            result = curve_from_config(config, progress=progress, resumed=resumed)
-        elif resumed is not None:
-            result = resume_attack(resumed, progress=progress).summary
-        else:
-            result = attack_from_config(config, progress=progress).summary
-    from advsearch.cli import studies, table
+def _rate(what: str, number: int, trials: int, interval: Interval) -> list[str]:
+    return [f"{what} in {number} of {trials}", wording.interval_text(interval)]
 
-    return output.finish(result, (studies if config.is_study else table).answer, as_json=as_json)
+
+def _facts(summary: AttackSummary) -> dict[str, str]:
+    return {
+        "wanted": wording.goal_text(summary),
+        "changed": wording.changed_text(summary),
+        "over": wording.over_text(summary),
+        "smallest": wording.smallest_text(summary),
+        "search": f"{summary.policy}, {wording.count(summary.steps, 'step')}: {summary.ending}",
+        "renders": wording.renders_text(summary),
+        "time": wording.seconds_text(summary.seconds["total"]),
+        "pictures": summary.run or "",
+    }
+
+
+COMMAND = QuestionCommand(
+    "attack",
+    HELP,
+    answer,
+    (
+        "attack --object mug --control texture",
+        "attack --object mug --control texture --epsilon 0.03 --set camera.azimuth=130 --seed 1",
+    ),
+    more=", and verify it with fresh renders",
+)

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from advsearch.cli import output
+from advsearch.cli.question import QuestionCommand
 from advsearch.report import wording
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from advsearch.config import CheckConfig
     from advsearch.runs.results.check import CheckedRow, CheckResult, DerivativeRow
 
 HELP = "check the gradient of every parameter of a scene against differences"
-FELL_SHORT = 3
 READING = (
     "Each row sets a derivative as a search gets it (gradient) beside one that takes far more renders (reference).\n"
     "ok: they agree within 5 %, and one gradient scatters by less than 20 % (noise); biased: they disagree; noisy: it\n"
@@ -38,54 +34,10 @@ SINGLE = (
 )
 """Heads of a table of single parameters."""
 
-_EXAMPLES = """examples:
-  advsearch check --object mug --control pose
-  advsearch check --object mug --control environment.rotation --loss linear --json
-  advsearch check --all --resolution 128 --loss linear --seconds 600 --run gradients
-  advsearch resume gradients
-"""
 
-
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    from advsearch.cli.flags import add_settings
-    from advsearch.config import CheckConfig
-
-    parser = subparsers.add_parser(
-        "check",
-        help=HELP,
-        description=f"{HELP[0].upper()}{HELP[1:]}. Exit status 3 if one is biased or noisy.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    add_settings(parser, config=CheckConfig)
-    output.add_flags(parser, quiet=True)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Check, print the table; 3 if a gradient falls short."""
-    from advsearch.cli.flags import config_from
-    from advsearch.config import CheckConfig
-
-    return carry_out(config_from(args, CheckConfig), as_json=args.json, quiet=args.quiet)
-
-
-def carry_out(config: CheckConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
-    """Check what `config` describes, or go on with it; print the table and return the exit status."""
-    from advsearch.cli.progress import at_work
-
-    with at_work(as_json=as_json, quiet=quiet) as progress:
-        from advsearch.api.check import check_from_config
-
-        result = check_from_config(config, progress=progress, resumed=resumed)
-    status = output.finish(result, answer, as_json=as_json)
-    return status or (FELL_SHORT if fell_short(result.rows) else 0)
-
-
-def fell_short(rows: Sequence[CheckedRow]) -> bool:
+def fell_short(result: CheckResult) -> bool:
     """Whether a parameter has no good gradient by any estimator."""
-    return any(row.short for row in _best(rows))
+    return any(row.short for row in _best(result.rows))
 
 
 def answer(result: CheckResult) -> str:
@@ -175,3 +127,18 @@ def _single(row: DerivativeRow) -> list[str]:
         f"{row.seconds:.2f}",
         row.status,
     ]
+
+
+COMMAND = QuestionCommand(
+    "check",
+    HELP,
+    answer,
+    (
+        "check --object mug --control pose",
+        "check --object mug --control environment.rotation --loss linear --json",
+        "check --all --resolution 128 --loss linear --seconds 600 --run gradients",
+        "resume gradients",
+    ),
+    more=". Exit status 3 if one is biased or noisy",
+    short=fell_short,
+)

@@ -7,71 +7,42 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 from advsearch.config import CONFIGS, AttackConfig
+from advsearch.errors import InputError
+from advsearch.files import Json
 from advsearch.settings import Config, Setting, check_once, parse_assignment, settings
-
-GROUPS = {
-    "scene": "scene",
-    "model": "model",
-    "search": "search",
-    "sweep": "sweep",
-    "region": "region",
-    "check": "check",
-    "picture": "picture",
-    "verification": "verification",
-    "run": "run",
-}
 
 _NO_SETTINGS = {"code": "--code"}
 """Flags which messages name too and which are no setting of a configuration."""
-
-_LISTS = ("controls", "over", "set_", "estimators", "grid", "case", "group")
 
 Given = TypeVar("Given", bound=Config)
 
 
 def add_settings(
-    parser: argparse.ArgumentParser,
-    groups: Sequence[str] = tuple(GROUPS),
-    fields: Sequence[str] = (),
-    config: type[Config] = AttackConfig,
-    without: Sequence[str] = (),
+    parser: argparse.ArgumentParser, config: type[Config] = AttackConfig, only: Collection[str] = ()
 ) -> None:
-    """Add flags for settings, under the headings of their groups.
-
-    Args:
-        parser: gets them.
-        groups: all settings of these groups.
-        fields: and these settings.
-        config: whose settings.
-        without: but not these settings.
-    """
-    asked = [one for one in settings(config) if one.group in groups or one.field in fields]
-    wanted = [one for one in asked if one.field not in without]
-    headings = {one.group: parser.add_argument_group(GROUPS[one.group]) for one in wanted}
-    for setting in wanted:
-        group = headings[setting.group]
-        if setting.is_switch:
-            group.add_argument(
-                setting.flag,
-                dest=setting.field,
-                action="store_const",
-                const=not setting.default,
-                default=argparse.SUPPRESS,
-                help=help_text(setting),
-            )
+    """Add a flag for each setting of a configuration, or for some of them, under the headings of their groups."""
+    headings: dict[str, argparse._ArgumentGroup] = {}
+    for setting in settings(config):
+        if only and setting.field not in only:
+            continue
+        if setting.group not in headings:
+            headings[setting.group] = parser.add_argument_group(setting.group)
+        add = partial(
+            headings[setting.group].add_argument,
+            setting.flag,
+            dest=setting.field,
+            default=argparse.SUPPRESS,
+            help=help_text(setting),
+        )
+        if setting.form == "switch":
+            add(action="store_const", const=not setting.default)
         else:
-            group.add_argument(
-                setting.flag,
-                dest=setting.field,
-                action="append" if setting.field in _LISTS else "store",
-                default=argparse.SUPPRESS,
-                metavar=_metavar(setting),
-                help=help_text(setting),
-            )
+            add(action="store" if setting.form == "text" else "append", metavar=setting.metavar)
 
 
 def config_from(args: argparse.Namespace, config: type[Given], **otherwise: Any) -> Given:
@@ -85,18 +56,12 @@ def config_from(args: argparse.Namespace, config: type[Given], **otherwise: Any)
     Raises:
         InputError: a value is not allowed.
     """
-    known = {setting.field for setting in settings(config)}
-    data: dict[str, Any] = {name: value for name, value in vars(args).items() if name in known}
-    for name, flag in (("controls", "--control"), ("over", "--over")):
-        if name in data:
-            data[name] = _controls(data[name], flag)
-    for name, flag in (("set_", "--set"), ("grid", "--grid")):
-        if name in data:
-            data[name] = _assignments(data[name], flag)
-    if "estimators" in data:
-        pairs = [text if "=" in text else f"*={text}" for text in data["estimators"]]
-        data["estimators"] = _assignments(pairs, "--estimator")
-    return config(**{**otherwise, **data})
+    data = dict(otherwise)
+    for one in settings(config):
+        if one.field in args:
+            text, read = getattr(args, one.field), READERS.get(one.form)
+            data[one.field] = text if read is None else read(text, one.flag)
+    return config(**data)
 
 
 def with_flags(message: str) -> str:
@@ -108,7 +73,7 @@ def with_flags(message: str) -> str:
     """
     known = [one for config in CONFIGS.values() for one in settings(config)]
     flags = {**_NO_SETTINGS, **{one.name: one.flag for one in known}}
-    switches = {one.name for one in known if one.is_switch}
+    switches = {one.name for one in known if one.form == "switch"}
 
     def written(match: re.Match[str]) -> str:
         name, value = match["name"], match["value"]
@@ -121,26 +86,41 @@ def with_flags(message: str) -> str:
 
 def help_text(setting: Setting) -> str:
     """Return what the help says of a setting: what it is, its values with range and unit, and its default."""
-    if setting.is_switch:
-        without = {
-            "baseline": "without the random search that runs beside the search",
-            "specialise": "compute what the scene and the search don't need too; `advsearch plan` shows what that is",
-        }
-        return without.get(setting.field, setting.description)
+    if setting.form == "switch":
+        return setting.switched or setting.description
     unit = f", in {setting.unit}" if setting.unit else ""
     default = setting.otherwise if setting.default is None else _default(setting.default)
     text = f"{setting.description}: {setting.expects}{unit}" + (f" (default: {default})" if default else "")
     return text.replace("%", "%%")
 
 
-def _assignments(given: Sequence[str], flag: str) -> dict[str, Any]:
+def _assignments(given: Sequence[str], flag: str) -> Json:
     """Return name to value from ``NAME=VALUE``, each name once."""
     pairs = [parse_assignment(text, flag) for text in given]
     check_once((name for name, _ in pairs), flag)
     return dict(pairs)
 
 
-def _controls(given: Sequence[str], flag: str) -> dict[str, Any]:
+def _choices(given: Sequence[str], flag: str) -> Json:
+    """Return name to choice from ``NAME=CHOICE`` or a choice for all."""
+    return _assignments([text if "=" in text else f"*={text}" for text in given], flag)
+
+
+def _axes(given: Sequence[str], flag: str) -> Json:
+    """Return parameter to values from ``PARAMETER=VALUES``, which YAML would take for numbers to the base of 60.
+
+    Raises:
+        InputError: a parameter is given twice.
+    """
+    names = [text.partition("=")[0].strip() for text in given]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise InputError(f"{flag} {twice[0]}: given twice; write all values in one, separated by commas")
+    quoted = [re.sub(r"=\s*([^\s\"'\[{].*)", lambda found: f'="{found[1]}"', text, count=1) for text in given]
+    return _assignments(quoted, flag)
+
+
+def _controls(given: Sequence[str], flag: str) -> Json:
     """Return control to settings from ``texture,pose``, ``texture={resolution: 64}`` and ``pose,texture={...}``."""
     found: list[tuple[str, Any]] = []
     for text in given:
@@ -153,16 +133,8 @@ def _controls(given: Sequence[str], flag: str) -> dict[str, Any]:
     return dict(found)
 
 
-def _metavar(setting: Setting) -> str:
-    names = {
-        "set_": "PARAMETER=VALUE",
-        "controls": "NAME",
-        "over": "NAME",
-        "grid": "PARAMETER=VALUES",
-        "labels": "FILE",
-        "estimators": "NAME",
-    }
-    return names.get(setting.field, setting.field.rpartition("_")[2].upper())
+READERS = {"assignments": _assignments, "choices": _choices, "axes": _axes, "controls": _controls}
+"""What reads the flags of each form that is not left to the configuration."""
 
 
 def _default(value: Any) -> str:

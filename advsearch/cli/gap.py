@@ -1,57 +1,94 @@
-"""`advsearch gap`: the worst case beside the average, for each object and each control."""
+"""`advsearch gap`: the worst case beside the average, and the curve of an attack: what takes several attacks."""
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from advsearch.cli import output
+from advsearch.cli.output import columns
+from advsearch.cli.question import QuestionCommand
+from advsearch.report import wording
+from advsearch.report.phrases import margin_text, percent
 
 if TYPE_CHECKING:
-    from advsearch.config import GapConfig
+    from advsearch.runs.results.attack import VerifiedRate
+    from advsearch.runs.results.gap import CurveResult, EpsilonBudget, GapResult, ObjectRow
 
 HELP = "compare the worst case with the average over the same space, for each object and each control"
 
-_EXAMPLES = """examples:
-  advsearch gap --object mug --control pose,camera,texture
-  advsearch gap --object mug,bowl,bottle --control pose --average 500 --steps 80
-"""
+
+def _meaning(result: CurveResult | GapResult) -> str:
+    return f"\n  margin: {margin_text(result.task)}, in the trials of the worst case"
 
 
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    from advsearch.cli.flags import add_settings
-    from advsearch.config import GapConfig
+def answer(result: CurveResult | GapResult) -> str:
+    """Return the tables of a study."""
+    from advsearch.runs.results.base import INTERRUPTED
+    from advsearch.runs.results.gap import GapResult
 
-    parser = subparsers.add_parser(
-        "gap",
-        help=HELP,
-        description=f"{HELP[0].upper()}{HELP[1:]}.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    add_settings(parser, config=GapConfig, without=("smallest",))
-    output.add_flags(parser, quiet=True)
+    parts = [_gap(result)] if isinstance(result, GapResult) else [_objects(result), _curve(result)]
+    facts = [["time", wording.seconds_text(result.seconds["total"])], ["run", str(result.run)]]
+    ending = "Interrupted." if result.ending == INTERRUPTED else ""
+    return "\n\n".join(part for part in (*parts, columns(facts), ending) if part)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Compare and print the table."""
-    from advsearch.cli.flags import config_from
-    from advsearch.config import GapConfig
-
-    return carry_out(config_from(args, GapConfig), as_json=args.json, quiet=args.quiet)
+def _objects(result: CurveResult) -> str:
+    heads = ["object", "clean right", "ending", "epsilon", "wrong", "margin"]
+    return columns([heads, *([row.object, *_seen(row)] for row in result.table)]) + _meaning(result)
 
 
-def carry_out(config: GapConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
-    """Do what `config` describes, or go on with it; print the table and return the exit status."""
-    from advsearch.cli.progress import at_work
+def _seen(row: ObjectRow) -> list[str]:
+    if row.ending is None:
+        return ["not reached"]
+    clean = f"{row.clean.correct}/{row.clean.trials}" if row.clean else ""
+    return [clean, row.ending, _plain(row.epsilon), _rate(row.verified), _margin(row.margin)]
 
-    with at_work(as_json=as_json, quiet=quiet) as progress:
-        from advsearch.api.gap import gap_from_config
 
-        summary = gap_from_config(config, progress=progress, resumed=resumed)
-    from advsearch.cli.studies import answer
+def _curve(result: CurveResult) -> str:
+    heads = ["epsilon", "robust", "accuracy", "95 % interval", "wrong already"]
+    rows = [
+        [
+            _plain(one.epsilon) or "own",
+            f"{one.robust}/{one.objects}",
+            percent(one.accuracy),
+            wording.interval_text(one.interval),
+            str(one.already_wrong),
+        ]
+        for one in result.curve
+        if one.accuracy is not None
+    ]
+    return columns([heads, *rows]) if rows else ""
 
-    return output.finish(summary, answer, as_json=as_json)
+
+def _gap(result: GapResult) -> str:
+    rows = [["object", "control", "right on average", "95 % interval", "worst: wrong", "margin", "ending"]]
+    for row in result.table:
+        average = row.average
+        right = f"{average.correct}/{average.configurations} ({percent(average.accuracy)})"
+        worst = _rate(row.worst), _margin(row.margin)
+        rows.append([row.object, row.control, right, wording.interval_text(average.interval), *worst, row.ending])
+    return columns(rows) + _meaning(result)
+
+
+def _rate(rated: VerifiedRate | None) -> str:
+    return f"{rated.successes}/{rated.trials}" if rated else ""
+
+
+def _margin(margin: float | None) -> str:
+    return "" if margin is None else f"{margin:.2f}"
+
+
+def _plain(value: EpsilonBudget) -> str:
+    if isinstance(value, dict):
+        return ",".join(f"{name}={_plain(one)}" for name, one in value.items())
+    return "" if value is None else wording.number_text(value)
+
+
+COMMAND = QuestionCommand(
+    "gap",
+    HELP,
+    answer,
+    (
+        "gap --object mug --control pose,camera,texture",
+        "gap --object mug,bowl,bottle --control pose --average 500 --steps 80",
+    ),
+)

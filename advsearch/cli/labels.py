@@ -30,7 +30,7 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         allow_abbrev=False,
     )
     parser.add_argument("word", metavar="WORD", nargs="?", help="what the names should be like; all without it")
-    add_settings(parser, groups=(), fields=("model", "labels"))
+    add_settings(parser, only=("model", "labels"))
     output.add_flags(parser)
 
 

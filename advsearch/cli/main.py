@@ -1,7 +1,8 @@
 """`advsearch`: find the command, run it, and turn what goes wrong into a message and an exit status.
 
-A command is a module with `HELP` (one line), `add_parser(subparsers)` and `run(args) -> int`. It imports what is heavy
-inside `run`, so that `advsearch --help` answers at once.
+A command is a module with `HELP` (one line) and a `QuestionCommand` called `COMMAND`, or else with
+`add_parser(subparsers)` and `run(args) -> int`. It imports what is heavy inside functions, so that `advsearch --help`
+answers at once.
 
 Exit status: 0 the command did its work, 1 a bug, 2 bad input, 3 a check that fell short, 130 interrupted.
 """
@@ -16,7 +17,7 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from types import ModuleType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from advsearch import __version__
 from advsearch.cli.interrupts import INTERRUPTS
@@ -114,7 +115,7 @@ def _run(given: list[str]) -> int:
         args = _parse(given, command)
     except SystemExit as stop:  # --help and --version have printed their text
         return int(stop.code or 0)
-    return int(_module(COMMANDS[args.command]).run(args))
+    return int(_command(_module(COMMANDS[args.command])).run(args))
 
 
 def _parse(given: list[str], command: str | None) -> argparse.Namespace:
@@ -136,7 +137,7 @@ def _parse(given: list[str], command: str | None) -> argparse.Namespace:
     for name, path in COMMANDS.items():
         module = _module(path)
         if name == command:
-            module.add_parser(subparsers)
+            _command(module).add_parser(subparsers)
         else:
             subparsers.add_parser(name, help=module.HELP)
     args, unknown = parser.parse_known_args(given)
@@ -158,6 +159,11 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
 
 def _module(path: str) -> ModuleType:
     return importlib.import_module(path)
+
+
+def _command(module: ModuleType) -> Any:
+    """What adds a command and runs it: its `QuestionCommand`, or the module itself."""
+    return getattr(module, "COMMAND", module)
 
 
 if __name__ == "__main__":

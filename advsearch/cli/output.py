@@ -64,7 +64,8 @@ def finish(result: Result, answer: Callable[[Any], str], *, as_json: bool) -> in
         print_json(result)
     else:
         print(answer(result) + go_on_text(result))
-    return INTERRUPTED if getattr(result, "ending", None) == "interrupted" else OK
+    stopped = getattr(result, "ending", None) == "interrupted" or getattr(result, "interrupted", False)
+    return INTERRUPTED if stopped else OK
 
 
 def go_on_text(result: Result) -> str:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from advsearch.cli import output
+from advsearch.cli.question import QuestionCommand
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from advsearch.config import PlanConfig
     from advsearch.runs.results.plan import GroupDerivative, PlanResult
 
 HELP = "show how a search gets its derivatives and what it leaves out, measured on its scene, and why"
@@ -28,42 +25,6 @@ _EXAMPLES = """examples:
   advsearch plan --object mug --control camera --seconds 60 --run derivatives
   advsearch resume derivatives
 """
-
-
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    from advsearch.cli.flags import add_settings
-    from advsearch.config import PlanConfig
-
-    parser = subparsers.add_parser(
-        "plan",
-        help=HELP,
-        description=HELP[0].upper() + HELP[1:] + ".",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    add_settings(parser, config=PlanConfig)
-    output.add_flags(parser, quiet=True)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Measure and print the plan."""
-    from advsearch.cli.flags import config_from
-    from advsearch.config import PlanConfig
-
-    return carry_out(config_from(args, PlanConfig), as_json=args.json, quiet=args.quiet)
-
-
-def carry_out(config: PlanConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
-    """Measure what `config` describes, or go on with it; print the plan and return the exit status."""
-    from advsearch.cli.progress import at_work
-
-    with at_work(as_json=as_json, quiet=quiet) as progress:
-        from advsearch.api.plan import plan
-
-        chosen = plan(config, progress=progress, resumed=resumed)
-    return output.finish(chosen, answer, as_json=as_json)
 
 
 def _step(group: GroupDerivative) -> str:
@@ -168,3 +129,15 @@ def _left_out(chosen: PlanResult) -> list[str]:
 def _agreement(share: float) -> str:
     """How a picture or gradient compares with another seed's."""
     return "not at all" if share == 0.0 else f"by {share:.2g} of its noise"
+
+
+COMMAND = QuestionCommand(
+    "plan",
+    HELP,
+    answer,
+    (
+        "plan --object mug --control pose,texture",
+        "plan --object mug --control camera --seconds 60 --run derivatives",
+        "resume derivatives",
+    ),
+)

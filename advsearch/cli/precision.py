@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from advsearch.cli import output
-from advsearch.errors import InputError
+from advsearch.cli.question import QuestionCommand
 
 if TYPE_CHECKING:
-    from advsearch.config import PrecisionConfig
     from advsearch.runs.results.precision import (
         MeasuredError,
         NotMeasured,
@@ -24,67 +21,12 @@ if TYPE_CHECKING:
     )
 
 HELP = "draw error against run time: of the picture, of gradients and of policies, and what follows from it"
-INTERRUPTED = 130
 READING = (
     "Each row is a setting: its error beside a reference of far more samples, with the 95 % interval of that error,\n"
     "and the seconds that one picture or gradient takes. A margin is how far the wrong answer leads the right one, in\n"
     "logits; a cosine of 1 means that a gradient points the right way."
 )
 """What the tables show, and how to read them."""
-
-_EXAMPLES = """examples:
-  advsearch precision --object mug --control pose
-  advsearch precision --object mug --control texture --seconds 300 --error 0.1 --out diagrams
-  advsearch precision --object bowl --control camera --quantities gradient --loss model --json
-"""
-
-
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    from advsearch.cli.flags import add_settings
-    from advsearch.config import PrecisionConfig
-
-    parser = subparsers.add_parser(
-        "precision",
-        help=HELP,
-        description=HELP[0].upper() + HELP[1:] + ".",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    add_settings(parser, config=PrecisionConfig)
-    output.add_flags(parser, quiet=True)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Measure and print; 130 if it was interrupted, after what there is."""
-    from advsearch.cli.flags import config_from
-    from advsearch.config import PrecisionConfig
-
-    return carry_out(config_from(args, PrecisionConfig), as_json=args.json, quiet=args.quiet)
-
-
-def carry_out(config: PrecisionConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
-    """Measure what `config` describes, print it and return the exit status.
-
-    Raises:
-        InputError: a run is to be resumed; measured times are of one sitting.
-    """
-    from advsearch.cli.progress import at_work
-
-    if resumed is not None:
-        raise InputError(
-            f"{resumed}: times are measured in one sitting, so that there is nothing to go on with; run again"
-        )
-    with at_work(as_json=as_json, quiet=quiet) as progress:
-        from advsearch.api.precision import precision
-
-        report = precision(config, progress=progress)
-    if as_json:
-        output.print_json(report)
-    else:
-        print(answer(report))
-    return INTERRUPTED if report.interrupted else 0
 
 
 def answer(report: PrecisionResult) -> str:
@@ -208,3 +150,15 @@ def _left_out(left_out: Sequence[NotMeasured]) -> list[str]:
 
 def _percent(error: MeasuredError) -> str:
     return ("" if error.known else "< ") + f"{100 * error.value:.3g} %"
+
+
+COMMAND = QuestionCommand(
+    "precision",
+    HELP,
+    answer,
+    (
+        "precision --object mug --control pose",
+        "precision --object mug --control texture --seconds 300 --error 0.1 --out diagrams",
+        "precision --object bowl --control camera --quantities gradient --loss model --json",
+    ),
+)

@@ -3,75 +3,45 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import AbstractContextManager, nullcontext
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
+from advsearch.cli.question import QuestionCommand
 from advsearch.errors import InputError
-from advsearch.files import Json
 
 if TYPE_CHECKING:
-    from advsearch.config import RegionConfig
     from advsearch.runs.results.region import RegionResult
 
 HELP = "grow a box around a configuration in which the model's verdict stays the same"
 
-_EXAMPLES = """examples:
-  advsearch region --object mug --control pose.yaw,camera.elevation --map 24
-  advsearch region --around mug-pose-001 --vary pose.yaw,pose.pitch
-"""
 
+class _Region(QuestionCommand):
+    """The command, which may take scene and controls from the run that it goes around."""
 
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    from advsearch.cli.flags import add_settings
-    from advsearch.config import RegionConfig
+    def add_parser(self, subparsers: argparse._SubParsersAction[Any]) -> argparse.ArgumentParser:
+        """Add the command."""
+        parser = super().add_parser(subparsers)
+        output.add_code_flag(parser)
+        return parser
 
-    parser = subparsers.add_parser(
-        "region",
-        help=HELP,
-        description=f"{HELP[0].upper()}{HELP[1:]}.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    add_settings(parser, config=RegionConfig, without=("spp",))  # nothing is searched, so there is no such count
-    output.add_code_flag(parser)
-    output.add_flags(parser, quiet=True)
+    def run(self, args: argparse.Namespace) -> int:
+        """Grow the region and print it."""
+        if "around" not in args:
+            if "object" not in args:
+                raise InputError(
+                    "advsearch region: expected --object NAME, or --around RUN; see advsearch region --help"
+                )
+            return super().run(args)
+        from advsearch.cli.flags import config_from
+        from advsearch.config import AttackConfig, RegionConfig
+        from advsearch.registry import only_named_code
+        from advsearch.runs.directory import CONFIG, find_run
 
-
-def run(args: argparse.Namespace) -> int:
-    """Grow the region and print it."""
-    from advsearch.cli.flags import config_from
-    from advsearch.config import AttackConfig, RegionConfig, SceneConfig
-    from advsearch.registry import only_named_code
-    from advsearch.runs.directory import CONFIG, find_run
-
-    otherwise: Json = {}
-    guard: AbstractContextManager[None] = nullcontext()
-    if "around" in args:
         file = find_run(args.around) / CONFIG
         theirs = AttackConfig.from_yaml(file)
-        guard = only_named_code(file, [*args.code, getattr(args, "model", "").partition("@")[0]])
-        otherwise = {
-            name: getattr(theirs, name) for name in SceneConfig.model_fields if name not in ("run", "overwrite")
-        }
-    elif "object" not in args:
-        raise InputError("advsearch region: expected --object NAME, or --around RUN; see advsearch region --help")
-    with guard:
-        return carry_out(config_from(args, RegionConfig, **otherwise), as_json=args.json, quiet=args.quiet)
-
-
-def carry_out(config: RegionConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
-    """Do what `config` describes, or go on with it; print the region and return the exit status."""
-    from advsearch.cli.progress import at_work
-
-    with at_work(as_json=as_json, quiet=quiet) as progress:
-        from advsearch.api.region import region_from_config
-
-        result = region_from_config(config, progress=progress, resumed=resumed)
-    return output.finish(result, answer, as_json=as_json)
+        with only_named_code(file, [*args.code, getattr(args, "model", "").partition("@")[0]]):
+            config = config_from(args, RegionConfig, **RegionConfig.shared(theirs))
+            return self.carry_out(config, as_json=args.json, quiet=args.quiet)
 
 
 def answer(result: RegionResult) -> str:
@@ -94,3 +64,14 @@ def answer(result: RegionResult) -> str:
     rows += [[one.name, f"{one.low:.4g}", f"{one.high:.4g}", f"{one.centre:.4g}", one.unit] for one in result.box]
     facts = [["share of the space", percent(result.volume)], *cost]
     return "\n\n".join([said, output.columns(rows), output.columns(facts)])
+
+
+COMMAND = _Region(
+    "region",
+    HELP,
+    answer,
+    (
+        "region --object mug --control pose.yaw,camera.elevation --map 24",
+        "region --around mug-pose-001 --vary pose.yaw,pose.pitch",
+    ),
+)

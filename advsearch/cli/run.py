@@ -84,4 +84,4 @@ def carry_out(
     config = described(command, file, changes)
     module = importlib.import_module(f"advsearch.cli.{command}")
     with only_named_code(file, args.code):
-        return int(module.carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))
+        return int(module.COMMAND.carry_out(config, as_json=args.json, quiet=args.quiet, resumed=resumed))

@@ -48,16 +48,13 @@ def show_run(name: str, as_json: bool) -> int:
 
     from advsearch.runs.directory import find_run
     from advsearch.runs.listing import described
-    from advsearch.runs.results.gap import CurveResult
     from advsearch.runs.summary import NAME, read_result
 
     path = find_run(name)
     if not (path / NAME).is_file():
         return _show_unfinished(described(path), as_json)
     result = read_result(path)
-    tables = {"attack": "table", "sweep": "sweep_table", "gap": "studies"}
-    table = "studies" if isinstance(result, CurveResult) else tables.get(result.command, result.command)
-    answer = importlib.import_module(f"advsearch.cli.{table}").answer
+    answer = importlib.import_module(f"advsearch.cli.{result.command}").answer
     if as_json:
         output.print_json(result)
     else:

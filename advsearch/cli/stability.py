@@ -8,73 +8,38 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
+from advsearch.cli.question import QuestionCommand
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from advsearch.config import StabilityConfig
     from advsearch.evaluation.stability.case import Case
     from advsearch.runs.results.stability import StabilityResult
 
 HELP = "check numerical stability on stiff and extreme cases"
-EXIT_FELL_SHORT = 3
-
-_EXAMPLES = """examples:
-  advsearch stability
-  advsearch stability --group objective --group stiff
-  advsearch stability --case hdri-texel-100000 --json
-  advsearch stability --seconds 120 --run extremes
-  advsearch resume extremes
-  advsearch stability --list
-"""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    from advsearch.cli.flags import add_settings
-    from advsearch.config import StabilityConfig
+class _Stability(QuestionCommand):
+    """The command, which can list its cases too."""
 
-    parser = subparsers.add_parser(
-        "stability",
-        help=HELP,
-        description=f"{HELP[0].upper()}{HELP[1:]}. Exit status 3 if one falls short.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
-    add_settings(parser, config=StabilityConfig)
-    parser.add_argument("--list", action="store_true", help="list the cases and run none")
-    output.add_flags(parser, quiet=True)
+    def add_parser(self, subparsers: argparse._SubParsersAction[Any]) -> argparse.ArgumentParser:
+        """Add the command."""
+        parser = super().add_parser(subparsers)
+        parser.add_argument("--list", action="store_true", help="list the cases and run none")
+        return parser
 
+    def run(self, args: argparse.Namespace) -> int:
+        """Run the cases, or list them."""
+        if not args.list:
+            return super().run(args)
+        from advsearch.cli.flags import config_from
+        from advsearch.cli.progress import at_work
+        from advsearch.config import StabilityConfig
 
-def run(args: argparse.Namespace) -> int:
-    """Run the cases, or list them; 3 if one falls short."""
-    from advsearch.cli.flags import config_from
-    from advsearch.config import StabilityConfig
+        config = config_from(args, StabilityConfig)
+        with at_work(as_json=args.json, quiet=args.quiet):
+            from advsearch.evaluation.stability.suite import chosen
 
-    config = config_from(args, StabilityConfig)
-    if not args.list:
-        return carry_out(config, as_json=args.json, quiet=args.quiet)
-    from advsearch.cli.progress import at_work
-
-    with at_work(as_json=args.json, quiet=args.quiet):
-        from advsearch.evaluation.stability.suite import chosen
-
-        cases = chosen(config.cases, config.groups)
-    return _print_cases(cases, as_json=args.json)
-
-
-def carry_out(config: StabilityConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
-    """Run the cases that `config` describes, or go on with them; print the table and return the exit status."""
-    from advsearch.cli.progress import at_work
-
-    with at_work(as_json=as_json, quiet=quiet) as progress:
-        from advsearch.api.stability import stability
-        from advsearch.evaluation.stability.suite import OK
-
-        result = stability(config, progress=progress, resumed=resumed)
-    status = output.finish(result, answer, as_json=as_json)
-    return status or (0 if all(row.status == OK for row in result.rows) else EXIT_FELL_SHORT)
+            cases = chosen(config.cases, config.groups)
+        return _print_cases(cases, as_json=args.json)
 
 
 def _print_cases(cases: Sequence[Case], *, as_json: bool) -> int:
@@ -85,6 +50,13 @@ def _print_cases(cases: Sequence[Case], *, as_json: bool) -> int:
         rows = [[one.group, one.name, one.holds] for one in cases]
         print(output.columns([["group", "case", "what must hold"], *rows]))
     return 0
+
+
+def fell_short(result: StabilityResult) -> bool:
+    """Whether a case does not hold."""
+    from advsearch.evaluation.stability.suite import OK
+
+    return any(row.status != OK for row in result.rows)
 
 
 def answer(result: StabilityResult) -> str:
@@ -127,3 +99,20 @@ def table(result: StabilityResult) -> str:
     total = sum(row.seconds for row in rows)
     parts.append(f"{len(rows) - len(short)} of {len(rows)} cases hold, in {total:.0f} seconds")
     return "\n\n".join(parts)
+
+
+COMMAND = _Stability(
+    "stability",
+    HELP,
+    answer,
+    (
+        "stability",
+        "stability --group objective --group stiff",
+        "stability --case hdri-texel-100000 --json",
+        "stability --seconds 120 --run extremes",
+        "resume extremes",
+        "stability --list",
+    ),
+    more=". Exit status 3 if one falls short",
+    short=fell_short,
+)

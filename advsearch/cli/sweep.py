@@ -1,79 +1,119 @@
-"""`advsearch sweep`: the average case, over a grid, over draws by chance, or both."""
+"""`advsearch sweep`: how often the model is right over a grid or draws, where it is not, and what it cost."""
 
 from __future__ import annotations
 
-import argparse
-import re
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from advsearch.cli import output
-from advsearch.errors import InputError
+from advsearch.cli.output import columns
+from advsearch.cli.question import QuestionCommand
+from advsearch.report import wording
+from advsearch.report.phrases import answer_text, margin_text, percent
 
 if TYPE_CHECKING:
-    from advsearch.config import SweepConfig
+    from advsearch.runs.results.sweep import AxisRow, SweepSummary, WorstConfiguration
 
 HELP = "measure how often the model is right over a grid or a random sample of configurations"
+READING = "How often it is right at each value, over all others, with the 95 % interval:"
+"""What the tables show."""
 
-_EXAMPLES = """examples:
-  advsearch sweep --object mug --grid pose.yaw=0:360:24 --grid camera.elevation=5:60:8
-  advsearch sweep --object mug,bowl --environment studio,noon --grid camera.azimuth=0,90,180,270
-  advsearch sweep --object mug --control pose,camera --samples 1000
-"""
+BAR = 20
+"""Width of a bar in characters."""
+
+MOST_ROWS = 24
+"""Values of an axis that are all shown; of more, half as many: those where the model does worst."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    from advsearch.cli.flags import add_settings
-    from advsearch.config import SweepConfig
+def answer(summary: SweepSummary) -> str:
+    """Return accuracy in total and by axis, the worst configuration and the cost."""
+    facts = [[name, text] for name, text in _facts(summary).items() if text]
+    parts = [_verdict(summary), *_tables(summary), columns(facts)]
+    return "\n\n".join(part for part in parts if part) + "".join(f"\n\nNote: {text}" for text in summary.warnings)
 
-    parser = subparsers.add_parser(
-        "sweep",
-        help=HELP,
-        description=f"{HELP[0].upper()}{HELP[1:]}.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
+
+def _verdict(summary: SweepSummary) -> str:
+    from advsearch.runs.results.base import INTERRUPTED
+
+    seen, correct = summary.configurations, summary.correct
+    if not seen:
+        return "Interrupted before the first configuration."
+    rate = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}"
+    if summary.ending == INTERRUPTED and seen < summary.planned:
+        return f"Interrupted after {seen} of {summary.planned} configurations: right in {correct} ({rate})."
+    return f"The model is right in {correct} of {wording.count(seen, 'configuration')} ({rate})."
+
+
+def _tables(summary: SweepSummary) -> list[str]:
+    by_axis: dict[str, list[AxisRow]] = {}
+    for row in summary.axes:
+        by_axis.setdefault(row.axis, []).append(row)
+    return [READING, *(_table(name, rows) for name, rows in by_axis.items())] if by_axis else []
+
+
+def _table(name: str, rows: Sequence[AxisRow]) -> str:
+    """One axis: a bar and a rate for each value."""
+    shown, title = list(rows), name + (f", {rows[0].unit}" if rows[0].unit not in ("", "name", "1") else "")
+    if len(rows) > MOST_ROWS:
+        worst = sorted(range(len(rows)), key=lambda number: rows[number].accuracy or 0.0)[: MOST_ROWS // 2]
+        shown = [rows[number] for number in sorted(worst)]
+        title += f" (the {len(shown)} of {len(rows)} values where the model is right least often)"
+    lines = [
+        [
+            _value(row.value),
+            _bar(row.accuracy or 0.0),
+            percent(row.accuracy),
+            f"{row.correct} of {row.configurations}",
+            wording.interval_text(row.interval),
+        ]
+        for row in shown
+    ]
+    return f"{title}\n{columns(lines)}"
+
+
+def _bar(share: float) -> str:
+    filled = round(share * BAR)
+    return "#" * filled + "." * (BAR - filled)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, (list, tuple)):
+        return " to ".join(_value(end) for end in value)
+    return f"{value:.4g}" if isinstance(value, float) else wording.short_name(value)
+
+
+def _facts(summary: SweepSummary) -> dict[str, str]:
+    speed, worst = summary.renders_per_second, summary.worst
+    return {
+        "worst": _configuration(worst) if worst else "",
+        "": _said(worst, summary.task) if worst else "",
+        "renders": f"{summary.renders['sweep']}" + (f", {speed:.3g} a second" if speed else ""),
+        "time": wording.seconds_text(summary.seconds["total"]),
+        "kept in": summary.run or "",
+    }
+
+
+def _configuration(worst: WorstConfiguration) -> str:
+    outer = ("object", "environment", "model")
+    names = [f"{name} {_value(one.value)}" for name, one in worst.values.items() if name not in outer]
+    return ", ".join(
+        [*(wording.short_name(worst.values[name].value) for name in outer if name in worst.values), *names]
     )
-    add_settings(parser, config=SweepConfig)
-    output.add_flags(parser, quiet=True)
 
 
-def run(args: argparse.Namespace) -> int:
-    """Sweep and print the answer."""
-    from advsearch.cli.flags import config_from
-    from advsearch.config import SweepConfig
-
-    if "grid" in args:
-        args.grid = axes_as_text(args.grid)
-    return carry_out(config_from(args, SweepConfig), as_json=args.json, quiet=args.quiet)
+def _said(worst: WorstConfiguration, task: str) -> str:
+    claim, checked = worst.claimed, worst.verified
+    text = f"answer {answer_text(task, claim)}"
+    rate = f"wrong in {wording.rate_text(checked)}" if checked else "not verified"
+    return f"{text}; margin ({margin_text(task)}) {claim.margin:.3g}; {rate}"
 
 
-def carry_out(config: SweepConfig, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
-    """Do the sweep that `config` describes, or go on with it; print its answer and return the exit status."""
-    from advsearch.cli.progress import at_work
-
-    with at_work(as_json=as_json, quiet=quiet) as progress:
-        from advsearch.api.sweep import resume_sweep, sweep_from_config
-
-        if resumed is not None:
-            result = resume_sweep(resumed, progress=progress)
-        else:
-            result = sweep_from_config(config, progress=progress)
-    from advsearch.cli.sweep_table import answer
-
-    return output.finish(result.summary, answer, as_json=as_json)
-
-
-def axes_as_text(given: Sequence[str]) -> list[str]:
-    """Return ``PARAMETER=VALUES`` such that YAML takes 5:50:8 for text and not for a number to the base of 60.
-
-    Raises:
-        InputError: a parameter is given twice.
-    """
-    names = [text.partition("=")[0].strip() for text in given]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise InputError(f"--grid {twice[0]}: given twice; write all values in one, separated by commas")
-    return [re.sub(r"=\s*([^\s\"'\[{].*)", lambda found: f'="{found[1]}"', text, count=1) for text in given]
+COMMAND = QuestionCommand(
+    "sweep",
+    HELP,
+    answer,
+    (
+        "sweep --object mug --grid pose.yaw=0:360:24 --grid camera.elevation=5:60:8",
+        "sweep --object mug,bowl --environment studio,noon --grid camera.azimuth=0,90,180,270",
+        "sweep --object mug --control pose,camera --samples 1000",
+    ),
+)

@@ -11,7 +11,7 @@ from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.named import name_in, read_named
 from advsearch.config.scene import ControlsByName, SceneConfig
 from advsearch.files import JsonObject
-from advsearch.settings import PLACE, Clash, setting
+from advsearch.settings import Clash, setting
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -130,6 +130,8 @@ class AttackConfig(DerivativeConfig):
         "search",
         "controls that vary by chance: one answer has to hold for all of them",
         "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
+        metavar="NAME",
+        form="controls",
     )
     draws: int = setting(
         4, "search", "conditions that a step of --over looks at", "a whole number from 1 to 1000", ge=1, le=1000
@@ -143,7 +145,14 @@ class AttackConfig(DerivativeConfig):
         ge=0,
         le=1_000_000,
     )
-    baseline: bool = setting(True, "search", "run a random search with as many renders beside it", "true or false")
+    baseline: bool = setting(
+        True,
+        "search",
+        "run a random search with as many renders beside it",
+        "true or false",
+        flag="--no-baseline",
+        switched="without the random search that runs beside the search",
+    )
 
     verify_spp: int | None = setting(
         None,
@@ -185,9 +194,7 @@ class AttackConfig(DerivativeConfig):
             config: gives the settings that its command and this one have from the same class.
             **other: settings that are different.
         """
-        both = next(one for one in cls.__mro__ if issubclass(one, SceneConfig) and isinstance(config, one))
-        shared = {name: getattr(config, name) for name in both.model_fields if name not in PLACE}
-        return cls(**{**shared, **other})
+        return cls(**{**cls.shared(config), **other})
 
     @property
     def policy_name(self) -> str:

@@ -91,9 +91,11 @@ class StabilityConfig(Config):
     free: ClassVar[tuple[str, ...]] = (*Config.free, "seconds")
     clashes: ClassVar[tuple[Clash, ...]] = tuple(one for one in SceneConfig.clashes if one.setting == "overwrite")
 
-    case: str | None = setting(None, "check", "cases to try, separated by commas", "names of cases", otherwise="all")
+    case: str | None = setting(
+        None, "check", "cases to try, separated by commas", "names of cases", otherwise="all", form="names"
+    )
     group: str | None = setting(
-        None, "check", "groups of cases to try, separated by commas", "names of groups", otherwise="all"
+        None, "check", "groups of cases to try, separated by commas", "names of groups", otherwise="all", form="names"
     )
     seconds: float | None = _sitting()
     run: str | None = setting(

@@ -49,11 +49,21 @@ class DerivativeConfig(SceneConfig):
         "force how derivatives are obtained",
         "NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME; `advsearch plan` shows the names",
         alias="estimator",
+        flag="--estimator",
+        metavar="NAME",
+        form="choices",
     )
     objective: str | None = setting(
         None, "search", "what is maximised", "the name of an objective", otherwise="the task's own: margin"
     )
-    specialise: bool = setting(True, "search", "leave out what the scene and the search don't need", "true or false")
+    specialise: bool = setting(
+        True,
+        "search",
+        "leave out what the scene and the search don't need",
+        "true or false",
+        flag="--no-specialise",
+        switched="compute what the scene and the search don't need too; `advsearch plan` shows what that is",
+    )
 
     @field_validator("epsilon", mode="before")
     @classmethod

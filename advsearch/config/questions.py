@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import Clash, setting
+from advsearch.settings import setting
 
 FEWEST_SAMPLES = 8
 """With fewer, not even a box without exceptions has one verdict in more than half of it, at the confidence of
@@ -18,14 +18,7 @@ class GapConfig(AttackConfig):
 
     command: ClassVar[str] = "gap"
     several: ClassVar[tuple[str, ...]] = ("object",)
-    clashes: ClassVar[tuple[Clash, ...]] = (
-        *AttackConfig.clashes,
-        Clash(
-            "smallest",
-            lambda one: True,
-            "is not for `advsearch gap`, which compares over one space; leave it out",
-        ),
-    )
+    without: ClassVar[tuple[str, ...]] = ("smallest",)
 
     average: int = setting(
         200,
@@ -42,6 +35,7 @@ class RegionConfig(SceneConfig):
     """Everything that decides what `region` does: the box around a configuration in which the verdict stays."""
 
     command: ClassVar[str] = "region"
+    without: ClassVar[tuple[str, ...]] = ("spp",)
 
     around: str | None = setting(
         None,

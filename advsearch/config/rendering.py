@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from pydantic import field_validator
 
-from advsearch.config.scene import ControlsByName, SceneConfig
+from advsearch.config.scene import CONTROLS, ControlsByName, SceneConfig
 from advsearch.settings import setting
 
 PICTURE_SPP = 64
@@ -20,12 +20,14 @@ class RenderConfig(SceneConfig):
     """Everything that decides what `render` does: pictures of a scene, and what the model says of them."""
 
     command: ClassVar[str] = "render"
+    without: ClassVar[tuple[str, ...]] = ("label", "run", "overwrite")
 
     controls: ControlsByName = setting(
         dict,
         "picture",
         "what differs from the scene, separated by commas; a range stays where a search would start",
         "names of controls, or NAME={PARAMETER: VALUE}",
+        **CONTROLS,
     )
     around: int | None = setting(
         None,

@@ -10,7 +10,8 @@ from pydantic import JsonValue, field_validator, model_validator
 
 from advsearch.config.named import name_in, read_named
 from advsearch.errors import InputError
-from advsearch.settings import Clash, Config, check_once, number_or_text, setting, split_names
+from advsearch.files import Json
+from advsearch.settings import PLACE, Clash, Config, check_once, number_or_text, setting, split_names
 
 DEFAULT_ENVIRONMENT = "studio"
 """What lights a scene of which nothing is said: `scene.description.DEFAULT_ENVIRONMENT`, which a test holds this to."""
@@ -25,6 +26,10 @@ AUTO_SHARE = 2
 """With `--spp auto` a search takes the default's samples divided by this."""
 CLOSE_LOOKS = 4
 """Then a candidate is rendered so many times more, at most, while it is not clearly worse than the best."""
+
+
+CONTROLS: Any = {"flag": "--control", "metavar": "NAME", "form": "controls"}
+"""How controls are written on a command line."""
 
 
 class SceneConfig(Config):
@@ -74,6 +79,9 @@ class SceneConfig(Config):
         "fix a parameter of the scene, such as camera.azimuth=130",
         "PARAMETER=VALUE with a finite number, a name or a list of numbers",
         alias="set",
+        flag="--set",
+        metavar="PARAMETER=VALUE",
+        form="assignments",
     )
     exposure: float = setting(
         0.0, "scene", "brightness of the picture", "a number from -10 to 10", unit="stops", ge=-10.0, le=10.0
@@ -99,6 +107,7 @@ class SceneConfig(Config):
         "model",
         "names of the model's classes",
         "a JSON or text file, imagenet, cifar10, cifar100, coco, coco91 or voc",
+        metavar="FILE",
         otherwise="the model's own",
     )
     task: str | dict[str, JsonValue] = setting(
@@ -120,6 +129,7 @@ class SceneConfig(Config):
         "search",
         "what may change, separated by commas",
         "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
+        **CONTROLS,
         min_length=1,
     )
     texture_resolution: int | None = setting(
@@ -177,6 +187,13 @@ class SceneConfig(Config):
             if len(names) > 1 and name not in self.several:
                 raise one_only(name, names)
         return self
+
+    @classmethod
+    def shared(cls, config: SceneConfig) -> Json:
+        """Return the settings that this command and another one's have from the same class, but for the run's place."""
+        both = next(one for one in cls.__mro__ if issubclass(one, SceneConfig) and isinstance(config, one))
+        apart = (*PLACE, *cls.without, *config.without)
+        return {name: getattr(config, name) for name in both.model_fields if name not in apart}
 
     @property
     def title(self) -> tuple[str, ...]:

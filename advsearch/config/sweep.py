@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import field_validator
 
 from advsearch.config.attack import FEWEST_TRIALS
-from advsearch.config.scene import DEFAULT_ENVIRONMENT, ControlsByName, SceneConfig
+from advsearch.config.scene import CONTROLS, DEFAULT_ENVIRONMENT, ControlsByName, SceneConfig
 from advsearch.settings import Clash, number_or_text, setting, split_names
 
 Grid = dict[str, object]
@@ -58,12 +58,15 @@ class SweepConfig(SceneConfig):
         "sweep",
         "an axis of the grid; may be repeated",
         "PARAMETER=FIRST:LAST:COUNT, or values separated by commas",
+        metavar="PARAMETER=VALUES",
+        form="axes",
     )
     controls: ControlsByName = setting(
         dict,
         "sweep",
         "what is drawn by chance beside the grid, separated by commas",
         "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
+        **CONTROLS,
     )
     samples: int | None = setting(
         None,

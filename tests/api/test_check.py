@@ -159,6 +159,6 @@ def test_a_finished_part_is_not_even_loaded(whole: CheckResult, monkeypatch: pyt
 
 
 def test_all_goes_through_every_control_on_three_scenes() -> None:
-    parts = checking._parts(CheckConfig(object="mug", all=True), ("linear", "model"), everything=True)
+    parts = checking._parts(CheckConfig(all=True))
     assert [part.number for part in parts] == list(range(1, len(parts) + 1))
     assert {part.config.object for part in parts} == {"mug", "bowl", "bottle"} and len(parts) > 80

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from advsearch.api import plan as planning
-from advsearch.api.plan import plan, quieter
+from advsearch.api.plan import plan_from_config, quieter
 from advsearch.cli.main import main
 from advsearch.cli.plan import READING, answer
 from advsearch.config import PlanConfig
@@ -100,13 +100,13 @@ class Stop(NullProgress):
 def test_a_plan_that_is_stopped_anywhere_goes_on_to_the_same_result(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    whole = plan(PlanConfig(**FORCED, run=str(tmp_path / "whole")))
+    whole = plan_from_config(PlanConfig(**FORCED, run=str(tmp_path / "whole")))
     assert whole.ending == "done" and whole.not_measured == [] and finished(tmp_path / "whole")
     assert whole.gains and whole.bounces is not None and {row.denoise for row in whole.cosines} == {"oidn", "none"}
     config, folder, before = PlanConfig(**FORCED, run=str(tmp_path / "run")), tmp_path / "run", 0
     stops = (Stop(1), Stop(2), Stop(stage="saves"), Stop(stage="denoiser none"))
     for number, stop in enumerate(stops):
-        stopped = plan(config, progress=stop, resumed=folder if number else None)
+        stopped = plan_from_config(config, progress=stop, resumed=folder if number else None)
         assert stopped.ending == "interrupted" and not finished(folder)
         assert len(stopped.cosines) > before or stopped.bounces is not None
         assert timeless(kept(folder)) == timeless(stopped)
@@ -126,7 +126,7 @@ def test_seconds_end_a_plan_and_may_be_changed_before_it_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, asked = tmp_path / "run", []
-    cut = plan(PlanConfig(**SMALL, seconds=1e-9, run=str(folder)))
+    cut = plan_from_config(PlanConfig(**SMALL, seconds=1e-9, run=str(folder)))
     assert cut.ending == "out of time" and not cut.cosines and cut.not_measured == LEFT
     assert "not measured, the time was up:\n  step and samples of camera\n" in answer(cut)
     written = (folder / "run.yaml").read_text("utf-8")
@@ -170,7 +170,7 @@ def test_a_run_that_goes_on_is_not_removed_when_that_fails(tmp_path: Path) -> No
     with RunDirectory.create_for(PlanConfig(**SMALL, run=str(folder))):
         pass  # a kill before anything was measured
     with pytest.raises(KeyboardInterrupt):
-        plan(PlanConfig(**SMALL), progress=Stop(stage="loading"), resumed=folder)
+        plan_from_config(PlanConfig(**SMALL), progress=Stop(stage="loading"), resumed=folder)
     assert (folder / "run.yaml").is_file()
     with pytest.raises(InputError), RunDirectory.create_for(PlanConfig(**SMALL, run=str(tmp_path / "new"))):
         raise InputError("")
@@ -179,9 +179,9 @@ def test_a_run_that_goes_on_is_not_removed_when_that_fails(tmp_path: Path) -> No
 
 def test_a_summary_keeps_its_rows_when_reading_them_back_is_interrupted(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    before = plan(PlanConfig(**FORCED, run=str(folder)), progress=Stop(3))
+    before = plan_from_config(PlanConfig(**FORCED, run=str(folder)), progress=Stop(3))
     assert len(before.cosines) == 3
-    again = plan(PlanConfig(**FORCED), progress=Stop(1), resumed=folder)
+    again = plan_from_config(PlanConfig(**FORCED), progress=Stop(1), resumed=folder)
     assert timeless(again) == timeless(before) == timeless(kept(folder))
 
 

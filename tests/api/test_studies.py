@@ -10,15 +10,17 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import samples
 from samples import ATTACK, AVERAGE, rated
 from samples import attack as attacked
 
 import advsearch
+from advsearch.api import carry_out
 from advsearch.api import gap as studies
 from advsearch.api import region as mapping
+from advsearch.cli.gap import answer
 from advsearch.cli.main import main
 from advsearch.cli.region import answer as region_text
-from advsearch.cli.studies import answer
 from advsearch.config import AttackConfig, GapConfig, RegionConfig
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.runs.directory import RunDirectory
@@ -44,7 +46,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[AttackConfig]
             run.write_summary(summary)
         return SimpleNamespace(summary=summary)
 
-    monkeypatch.setattr(studies, "attack_from_config", attack)
+    monkeypatch.setattr(studies, "attack_once", attack)
     return done
 
 
@@ -85,6 +87,14 @@ def test_a_label_for_several_objects_says_whose_own_it_is_not(asked: list[Attack
     assert any("also for bowl (its own is 'bowl')" in text for text in summary.warnings)
 
 
+@pytest.mark.parametrize("several", [{"object": "mug,bowl"}, {"object": "mug", "epsilon": (0.1, 0.2)}])
+def test_an_attack_on_several_objects_or_epsilons_is_a_curve(
+    several: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(studies, "curve_from_config", lambda config, **more: samples.curve(run=config.run))
+    assert carry_out(AttackConfig(**several, run="it")) == samples.curve(run="it")
+
+
 def test_several_objects_and_one_budget_make_one_row_each(asked: list[AttackConfig]) -> None:
     summary = studies.curve_from_config(AttackConfig(object="mug,pan", run="study"))
     assert [row.ending for row in summary.table] == ["found", "budget spent"]
@@ -95,18 +105,18 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
     asked: list[AttackConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = GapConfig(object="mug,bowl", controls="texture,geometry", run="study")
-    carry_out: Callable[..., Any] = vars(studies)["attack_from_config"]
+    carry_out: Callable[..., Any] = vars(studies)["attack_once"]
 
     def stopped(config: AttackConfig, *, progress: Any) -> Any:
         if len(asked) == 2:
             raise KeyboardInterrupt
         return carry_out(config, progress=progress)
 
-    monkeypatch.setattr(studies, "attack_from_config", stopped)
+    monkeypatch.setattr(studies, "attack_once", stopped)
     with pytest.raises(KeyboardInterrupt):
         studies.gap_from_config(config)
     assert Path("runs/study/parts/00-00-mug-texture/summary.json").is_file()
-    monkeypatch.setattr(studies, "attack_from_config", carry_out)
+    monkeypatch.setattr(studies, "attack_once", carry_out)
     summary = studies.gap_from_config(config, resumed=Path("runs/study"))
     assert [(row.object, row.control) for row in summary.table] == [
         ("mug", "texture"), ("mug", "geometry"), ("bowl", "texture"), ("bowl", "geometry"),

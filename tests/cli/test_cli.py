@@ -28,53 +28,22 @@ from samples import ATTACK, AVERAGE, BRACKET, EASIER, SUMMARY, TARGET, make_run,
 import advsearch
 from advsearch import __version__
 from advsearch.cli import list as listing
+from advsearch.cli.attack import answer
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import COMMANDS, main
 from advsearch.cli.output import columns
 from advsearch.cli.progress import BarProgress, LineProgress, watching
-from advsearch.cli.table import answer
 from advsearch.config import AttackConfig, GapConfig, RegionConfig, SweepConfig
 from advsearch.described import Value
 from advsearch.errors import InputError, StorageError
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
-from advsearch.settings import settings
+from advsearch.settings import Config, settings
 
 HEAVY = ("torch", "mitsuba", "drjit", "numpy", "scipy", "pydantic", "rich", "yaml", "PIL", "trimesh")
 
 Api = Callable[..., Any]
-
-
-@dataclass
-class Result:
-    """What the API returns, as far as the command line looks at it."""
-
-    summary: Any
-    run: Path = Path("runs/x")
-
-
-API = {
-    "advsearch.api.attack": ("attack_from_config", "resume_attack"),
-    "advsearch.api.gap": ("curve_from_config", "gap_from_config"),
-    "advsearch.api.region": ("region_from_config",),
-    "advsearch.api.sweep": ("sweep_from_config", "resume_sweep"),
-}
-"""What the command line calls, by module."""
-
-
-def stand_ins(attack: Api | None, **others: Api) -> dict[str, types.ModuleType]:
-    """Modules in the place of those of `advsearch.api`: the functions given, and others that must not be called."""
-
-    def not_wanted(*args: Any, **named: Any) -> Any:
-        raise AssertionError("the command line called something else than what was asked for")
-
-    given = others if attack is None else {"attack_from_config": attack, **others}
-    found = {}
-    for module, names in API.items():
-        found[module] = types.ModuleType(module)
-        vars(found[module]).update({name: given.get(name, not_wanted) for name in names})
-    return found
 
 
 def noting(given: list[Any], answer: Any) -> Api:
@@ -90,13 +59,12 @@ def noting(given: list[Any], answer: Any) -> Api:
 
 @pytest.fixture
 def api(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Put stand-ins in the place of `attack_from_config` and of what else is named."""
+    """Put a stand-in in the place of `advsearch.api.carry_out`."""
 
-    def install(attack: Api | None = None, **others: Api) -> None:
-        for name, module in stand_ins(attack, **others).items():
-            monkeypatch.setitem(sys.modules, name, module)
+    def not_wanted(config: Config, **named: Any) -> Any:
+        raise AssertionError(f"the command line asked for {config.command}")
 
-    return install
+    return lambda answering=not_wanted: monkeypatch.setattr("advsearch.api.carry_out", answering)
 
 
 @pytest.fixture
@@ -104,9 +72,9 @@ def asked(api: Callable[..., None]) -> list[AttackConfig]:
     """The configurations that a successful stand-in was given."""
     given: list[AttackConfig] = []
 
-    def attack(config: AttackConfig, *, progress: Progress) -> Result:
+    def attack(config: AttackConfig, *, progress: Progress, resumed: Path | None = None) -> Any:
         given.append(config)
-        return Result(SUMMARY)
+        return SUMMARY
 
     api(attack)
     return given
@@ -148,7 +116,7 @@ def test_help_of_attack_shows_every_setting_with_range_and_default(capsys: pytes
     text = " ".join(capsys.readouterr().out.split())
     for setting in settings(AttackConfig):
         assert f"{setting.flag} " in text
-        if not setting.is_switch:
+        if setting.form != "switch":
             assert setting.expects in text and setting.unit in text
     assert "a whole number from 1 to 1000000 (default: 40)" in text
     assert "in texels (default: chosen from the object's own)" in text
@@ -246,7 +214,7 @@ def test_a_bug_keeps_its_traceback_and_ends_with_1() -> None:
 def test_what_the_api_raises_becomes_a_status(
     api: Callable[..., None], capsys: pytest.CaptureFixture[str], error: BaseException, status: int, message: str
 ) -> None:
-    def attack(config: AttackConfig, *, progress: Progress) -> Result:
+    def attack(config: AttackConfig, *, progress: Progress, resumed: Path | None = None) -> Any:
         raise error
 
     api(attack)
@@ -257,8 +225,7 @@ def test_what_the_api_raises_becomes_a_status(
 SWALLOWING = """
 import importlib.abc, importlib.util, os, signal, sys
 
-class Done:
-    summary = {'ending': 'found'}
+Done = {'ending': 'found'}
 
 def interrupted():
     try:
@@ -268,7 +235,7 @@ def interrupted():
     except KeyboardInterrupt:
         print("swallowed", flush=True)
 
-def attack_from_config(config, *, progress):
+def carry_out(config, *, progress, resumed):
     {loading}
     print("searched", flush=True)
     sys.exit("expected nothing to be searched")
@@ -278,8 +245,7 @@ class Swallows(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         return importlib.util.spec_from_loader(name, self) if name.startswith("advsearch.api") else None
 
     def exec_module(self, module):
-        names = "attack_from_config", "resume_attack", "curve_from_config"
-        vars(module).update(dict.fromkeys(names, attack_from_config), __path__=[])
+        vars(module).update(carry_out=carry_out, __path__=[])
         {importing}
 
 sys.meta_path.insert(0, Swallows())
@@ -358,12 +324,12 @@ def test_attack_prints_the_table(asked: list[AttackConfig], capsys: pytest.Captu
 def test_json_is_all_that_stands_on_standard_output(
     api: Callable[..., None], capfd: pytest.CaptureFixture[str]
 ) -> None:
-    def attack(config: AttackConfig, *, progress: Progress) -> Result:
+    def attack(config: AttackConfig, *, progress: Progress, resumed: Path | None = None) -> Any:
         print("an objective of the user prints")
         os.write(1, b"so does a native library\n")
         ctypes.CDLL(None).puts(b"and one that buffers")
         progress.message("a warning")
-        return Result(samples.attack(seconds={"total": float("nan")}))
+        return samples.attack(seconds={"total": float("nan")})
 
     api(attack)
     assert main(["attack", "--object", "mug", "--json"]) == 0
@@ -378,7 +344,7 @@ def test_json_is_all_that_stands_on_standard_output(
     ("ending", "status"), [("found", 0), ("budget spent", 0), ("already wrong", 0), ("interrupted", 130)]
 )
 def test_the_status_of_an_attack(api: Callable[..., None], ending: str, status: int) -> None:
-    api(lambda config, progress: Result(samples.attack(ending=ending)))
+    api(lambda config, progress, resumed: samples.attack(ending=ending))
     assert main(["attack", "--object", "mug"]) == status
     assert main(["attack", "--object", "mug", "--json"]) == status
 
@@ -424,19 +390,12 @@ def test_a_bad_file_or_change_is_told(
 # ---- studies, regions and sweeps ----
 
 
-STUDIES: dict[str, Any] = {
-    "curve_from_config": samples.curve(),
-    "gap_from_config": samples.gap(),
-    "region_from_config": samples.region(),
-}
-
-
 @pytest.mark.parametrize("line", ["--object mug,bowl", "--object mug --epsilon 0.01,0.1"])
 def test_several_objects_or_epsilons_are_a_curve(
     api: Callable[..., None], capsys: pytest.CaptureFixture[str], line: str
 ) -> None:
     given: list[Any] = []
-    api(curve_from_config=noting(given, samples.curve()))
+    api(noting(given, samples.curve()))
     assert main(["attack", *line.split(), "--quiet"]) == 0
     assert given[0].is_study
     assert capsys.readouterr().out == (
@@ -457,7 +416,7 @@ def test_gap_builds_its_configuration_and_prints_a_row_for_each_control(
     api: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     given: list[Any] = []
-    api(gap_from_config=noting(given, samples.gap()))
+    api(noting(given, samples.gap()))
     argv = ["gap", "--object", "mug,bowl", "--control", "pose,light", "--average", "50", "--run", "x", "--quiet"]
     assert main(argv) == 0
     assert given == [GapConfig(object="mug,bowl", controls={"pose": {}, "light": {}}, average=50, run="x")]
@@ -475,7 +434,7 @@ def test_an_interrupted_study_says_how_to_go_on(
     api: Callable[..., None], capsys: pytest.CaptureFixture[str], command: str, summary: Any
 ) -> None:
     answer = summary(ending="interrupted")
-    api(**{name: lambda config, progress, resumed: answer for name in ("gap_from_config", "curve_from_config")})
+    api(lambda config, progress, resumed: answer)
     assert main([command, "--object", "mug,bowl"]) == 130
     assert capsys.readouterr().out.endswith(
         f"\n\nInterrupted.\n\nGo on with: advsearch resume {Path(answer.run).name}\n"
@@ -486,7 +445,7 @@ def test_region_builds_its_configuration_and_prints_the_box(
     api: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     given: list[Any] = []
-    api(region_from_config=noting(given, samples.region()))
+    api(noting(given, samples.region()))
     argv = "region --object mug --control pose.yaw,pose.pitch --vary pose.yaw,pose.pitch --map 24 --samples 50 --quiet"
     assert main(argv.split()) == 0
     assert given == [
@@ -515,10 +474,10 @@ def test_region_takes_scene_and_controls_from_the_run_that_it_goes_around(
     with RunDirectory.create_for(theirs):
         pass
     given: list[Any] = []
-    api(region_from_config=noting(given, samples.region()))
+    api(noting(given, samples.region()))
     assert main("region --around first --vary pose.yaw --seed 9 --quiet".split()) == 0
     (config,) = given
-    assert (config.object, config.controls, config.spp) == ("bowl", {"pose": {"yaw": [0, 90]}}, 4)
+    assert (config.object, config.controls) == ("bowl", {"pose": {"yaw": [0, 90]}})
     assert (config.seed, config.run, config.around, config.set_) == (9, None, "first", {"camera.azimuth": 20.0})
 
 
@@ -531,40 +490,34 @@ def test_sweep_builds_its_configuration_and_passes_its_ending_on(
     api: Callable[..., None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     given: list[Any] = []
-    api(sweep_from_config=noting(given, Result(samples.sweep())))
+    api(noting(given, samples.sweep()))
     assert main("sweep --object mug --grid pose.yaw=5:50:8 --grid camera.elevation=10,30 --quiet".split()) == 0
     assert given == [SweepConfig(object="mug", grid={"pose.yaw": "5:50:8", "camera.elevation": [10, 30]})]
     assert capsys.readouterr().out.startswith(
         "The model is right in 6 of 8 configurations (75 %, 95 % interval 35-97 %)."
     )
-    api(sweep_from_config=lambda config, progress: Result(samples.sweep(ending="interrupted")))
+    api(lambda config, progress, resumed: samples.sweep(ending="interrupted"))
     assert main("sweep --object mug --grid pose.yaw=5:50:8 --json".split()) == 130
 
 
 @pytest.mark.parametrize(
-    ("config", "called"),
+    ("config", "answer"),
     [
-        (AttackConfig(object="mug", steps=9), "attack_from_config"),
-        (AttackConfig(object="mug", epsilon=(0.1, 0.2)), "curve_from_config"),
-        (GapConfig(object="mug", average=9), "gap_from_config"),
-        (RegionConfig(object="mug", samples=9), "region_from_config"),
-        (SweepConfig(object="mug", grid={"pose.yaw": [1, 2]}), "sweep_from_config"),
+        (AttackConfig(object="mug", steps=9), SUMMARY),
+        (AttackConfig(object="mug", epsilon=(0.1, 0.2)), samples.curve()),
+        (GapConfig(object="mug", average=9), samples.gap()),
+        (RegionConfig(object="mug", samples=9), samples.region()),
+        (SweepConfig(object="mug", grid={"pose.yaw": [1, 2]}), samples.sweep()),
     ],
-    ids=lambda value: value if isinstance(value, str) else "",
+    ids=lambda value: value.command if isinstance(value, Config) else "",
 )
 def test_run_does_what_the_command_of_a_file_says(
-    api: Callable[..., None], tmp_path: Path, config: Any, called: str
+    api: Callable[..., None], tmp_path: Path, config: Config, answer: Any
 ) -> None:
     path = tmp_path / "run.yaml"
     path.write_text(config.to_yaml())
     given: list[Any] = []
-    summaries = {
-        "curve_from_config": samples.curve(),
-        "gap_from_config": samples.gap(),
-        "region_from_config": samples.region(),
-    }
-    answer = summaries.get(called) or Result(samples.sweep() if called == "sweep_from_config" else SUMMARY)
-    api(**{called: noting(given, answer)})
+    api(noting(given, answer))
     assert main(["run", str(path), "seed=8", "--quiet"]) == 0
     assert given == [config.model_copy(update={"seed": 8})]
 
@@ -584,35 +537,30 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("config", "called"),
+    ("config", "answer"),
     [
-        (AttackConfig(object="mug", run="stopped"), "resume_attack"),
-        (AttackConfig(object="mug,bowl", run="stopped"), "curve_from_config"),
-        (GapConfig(object="mug", run="stopped"), "gap_from_config"),
-        (RegionConfig(object="mug", run="stopped"), "region_from_config"),
-        (SweepConfig(object="mug", grid={"pose.yaw": [1, 2]}, run="stopped"), "resume_sweep"),
+        (AttackConfig(object="mug", run="stopped"), SUMMARY),
+        (AttackConfig(object="mug,bowl", run="stopped"), samples.curve()),
+        (GapConfig(object="mug", run="stopped"), samples.gap()),
+        (RegionConfig(object="mug", run="stopped"), samples.region()),
+        (SweepConfig(object="mug", grid={"pose.yaw": [1, 2]}, run="stopped"), samples.sweep()),
     ],
-    ids=lambda value: value if isinstance(value, str) else "",
+    ids=lambda value: value.command if isinstance(value, Config) else "",
 )
-def test_resume_goes_on_with_what_was_stopped(api: Callable[..., None], runs: Path, config: Any, called: str) -> None:
+def test_resume_goes_on_with_what_was_stopped(
+    api: Callable[..., None], runs: Path, config: Config, answer: Any
+) -> None:
     with RunDirectory.create_for(config) as run:
         run.record(Row("search", 0))
-    resumed: list[Path] = []
-    summaries = {
-        "curve_from_config": samples.curve(),
-        "gap_from_config": samples.gap(),
-        "region_from_config": samples.region(),
-    }
-    answer = summaries.get(called) or Result(samples.sweep() if called == "resume_sweep" else SUMMARY)
+    found: list[Any] = []
 
-    def goes_on(first: Any, *, progress: Progress, resumed: Path | None = None) -> Any:
-        found.append(resumed or first)
+    def goes_on(config: Config, *, progress: Progress, resumed: Path | None) -> Any:
+        found.append((config.command, resumed))
         return answer
 
-    found: list[Any] = []
-    api(**{called: goes_on})
+    api(goes_on)
     assert main(["resume", "stopped", "--quiet"]) == 0
-    assert found == [Path("runs/stopped")] and not resumed
+    assert found == [(config.command, Path("runs/stopped"))]
 
 
 def test_resume_of_a_run_that_is_done_shows_its_answer(

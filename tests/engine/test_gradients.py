@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from advsearch import load_scene
 from advsearch.api.attack import problem_from_config
-from advsearch.api.check import attempts, check
+from advsearch.api.check import attempts, check_from_config
 from advsearch.cli.check import table
 from advsearch.config import AttackConfig, CheckConfig
 from advsearch.controls import make_control
@@ -613,9 +614,9 @@ def test_the_smooth_loss_does_not_see_the_edge_of_the_picture() -> None:
 # ---- the whole check ------------------------------------------------------------------------------------------------
 
 
-def test_a_check_says_of_both_losses_how_good_a_gradient_is() -> None:
-    config = CheckConfig(controls={"background": {}}, resolution=(24, 24), spp=4)
-    rows = check(config)
+def test_a_check_says_of_both_losses_how_good_a_gradient_is(tmp_path: Path) -> None:
+    config = CheckConfig(controls={"background": {}}, resolution=(24, 24), spp=4, run=str(tmp_path / "run"))
+    rows = check_from_config(config).rows
     linear = [row for row in rows if row.loss == "linear"]
     assert {row.parameter for row in linear} >= {"hue", "saturation", "value"}
     for row in linear:

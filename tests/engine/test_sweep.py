@@ -26,15 +26,14 @@ from samples import sweep as swept
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.sweep import _job_of, resume_sweep, sweep_from_config
+from advsearch.api.sweep import _job_of, sweep_from_config
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.draws import NET, Draws, Seeds
 from advsearch.attacks.product import Product, batches
-from advsearch.cli import sweep as cli_sweep
-from advsearch.cli.flags import help_text, with_flags
+from advsearch.cli.flags import READERS, help_text, with_flags
 from advsearch.cli.main import main
-from advsearch.cli.sweep import axes_as_text
-from advsearch.cli.sweep_table import answer
+from advsearch.cli.question import QuestionCommand
+from advsearch.cli.sweep import answer
 from advsearch.config import SweepConfig
 from advsearch.controls import CONTROLS, make_control, make_space
 from advsearch.controls.base import Parameter
@@ -690,7 +689,7 @@ def test_resume_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     FakeRenderer.stops_at = 20
     assert sweep_from_config(config).summary.configurations == 16
     FakeRenderer.stops_at = None
-    summary = resume_sweep("mine").summary
+    summary = sweep_from_config(config, resumed=Path("runs/mine")).summary
     assert summary.configurations == 40 and summary.ending == "finished"
     other = sweep_from_config(config.model_copy(update={"run": "other"}))
     assert rows_of(tmp_path / "runs" / "mine") == rows_of(tmp_path / "runs" / "other")
@@ -761,14 +760,14 @@ def test_the_recipe_repeats_the_sweep(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_yaml_does_not_read_a_range_as_a_number_to_the_base_of_60() -> None:
     given = ["camera.elevation=5:50:8", "pose.yaw=0,90", "pose.x=[0,1]", "environment.which=noon"]
-    assert axes_as_text(given) == [
-        'camera.elevation="5:50:8"',
-        'pose.yaw="0,90"',
-        "pose.x=[0,1]",
-        'environment.which="noon"',
-    ]
+    assert READERS["axes"](given, "--grid") == {
+        "camera.elevation": "5:50:8",
+        "pose.yaw": "0,90",
+        "pose.x": [0, 1],
+        "environment.which": "noon",
+    }
     with pytest.raises(InputError, match=r"--grid pose.yaw: given twice"):
-        axes_as_text(["pose.yaw=0,90", "pose.yaw=180"])
+        READERS["axes"](["pose.yaw=0,90", "pose.yaw=180"], "--grid")
 
 
 def command(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
@@ -842,7 +841,7 @@ EXAMPLES = [words for name in ("sweeps.md", "command-line.md") for words in exam
 @pytest.mark.parametrize("words", EXAMPLES, ids=" ".join)
 def test_every_example_of_the_documentation_is_a_sweep(words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[SweepConfig] = []
-    monkeypatch.setattr(cli_sweep, "carry_out", lambda config, **rest: kept(asked, config, 0))
+    monkeypatch.setattr(QuestionCommand, "carry_out", lambda self, config, **rest: kept(asked, config, 0))
     assert main(words[1:]) == 0
     job = _job_of(asked[0])
     assert Sweep(job, None, NullProgress()).total > 1

@@ -10,7 +10,7 @@ import torch
 
 from advsearch import attack, load_scene
 from advsearch.api.attack import problem_from_config
-from advsearch.api.plan import plan
+from advsearch.api.plan import plan_from_config
 from advsearch.cli.plan import answer
 from advsearch.config import AttackConfig, PlanConfig
 from advsearch.controls import LightControl, TextureControl
@@ -163,7 +163,7 @@ def test_the_plan_shows_what_is_left_out(specialise: bool, tmp_path: Path) -> No
         specialise=specialise,
         run=str(tmp_path / "run"),
     )
-    found = plan(config)
+    found = plan_from_config(config)
     said = answer(found)
     assert found.specialised is specialise
     if specialise:
