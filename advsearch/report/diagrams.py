@@ -6,10 +6,11 @@ line falls as independent samples do.
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from advsearch.report.drawing import BLUE, GREY, RED, Figures, drawn
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -20,31 +21,14 @@ if TYPE_CHECKING:
 
 Points = Sequence["PrecisionPoint"]
 
-COLORS = ("#1d5fd0", "#b4540a", "#1f7a45", "#7a3fa8", "#b3261e", "#4a7d8c", "#8a6d00", "#5c606a", "#c2488f")
+COLORS = (BLUE, "#b4540a", "#1f7a45", "#7a3fa8", RED, "#4a7d8c", "#8a6d00", GREY, "#c2488f")
 MARKERS = "osD^vP*X<"
-STYLE: dict[Any, Any] = {
-    "font.family": ["DejaVu Sans"],
-    "font.size": 9.0,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": "#5c606a",
-    "axes.labelcolor": "#1c1d20",
-    "axes.titlelocation": "left",
-    "axes.titlesize": 10.0,
-    "axes.titleweight": "bold",
-    "grid.color": "#dfe0e3",
-    "grid.linewidth": 0.7,
-    "legend.frameon": False,
-    "legend.fontsize": 8.0,
-    "svg.hashsalt": "advsearch",
-    "svg.fonttype": "none",
-}
 PANEL = (5.6, 3.9)
 """Width and height of one diagram in inches."""
 PERCENT = 100.0
 
 
-def precision_figures(report: PrecisionResult) -> dict[str, bytes]:
+def precision_figures(report: PrecisionResult) -> Figures:
     """Return the diagrams of a report as files.
 
     Args:
@@ -53,22 +37,20 @@ def precision_figures(report: PrecisionResult) -> dict[str, bytes]:
     Returns:
         "png" and "svg" to their content; empty where nothing was measured.
     """
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
     panels = _panels(report)
     if not panels:
         return {}
     wide = min(2, len(panels))
     tall = math.ceil(len(panels) / wide)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(PANEL[0] * wide, PANEL[1] * tall + 0.8), layout="constrained")
+
+    def draw(figure: Figure) -> None:
         for number, (title, kind, points) in enumerate(panels):
             axes = figure.add_subplot(tall, wide, number + 1)
             axes.set_title(title)
             (_gains if kind == "objective" else _errors)(axes, points, kind, report)
         _explain(figure, report)
-        return {kind: _rendered(figure, kind) for kind in ("png", "svg")}
+
+    return drawn(draw, (PANEL[0] * wide, PANEL[1] * tall + 0.8))
 
 
 def _panels(report: PrecisionResult) -> list[tuple[str, str, Points]]:
@@ -164,11 +146,9 @@ def _theory(axes: Axes, points: Points, measure: str) -> None:
     if high < 1.5 * low:
         return
     at = PERCENT * min(one.error_by(measure).value * math.sqrt(one.seconds) for one in points) * 0.8
-    axes.plot([low, high], [at / math.sqrt(low), at / math.sqrt(high)], color="#5c606a", linewidth=1.0, linestyle="--")
+    axes.plot([low, high], [at / math.sqrt(low), at / math.sqrt(high)], color=GREY, linewidth=1.0, linestyle="--")
     middle = math.sqrt(low * high)
-    axes.annotate(
-        "\N{MINUS SIGN}1/2", (middle, at / math.sqrt(middle)), fontsize=8, color="#5c606a", ha="right", va="top"
-    )
+    axes.annotate("\N{MINUS SIGN}1/2", (middle, at / math.sqrt(middle)), fontsize=8, color=GREY, ha="right", va="top")
 
 
 def _plain_axis(axis: Axis) -> None:
@@ -230,11 +210,4 @@ def _explain(figure: Figure, report: PrecisionResult) -> None:
     figure.suptitle(what, fontsize=11, fontweight="bold", x=0.01, ha="left")
     place = f"{machine.cpu}, {machine.cores} cores, {threads}; seconds are medians of interleaved repeats."
     key = "Filled: known, with its 95 % interval. Open, with an arrow: at most this, the reference is no better."
-    figure.supxlabel(f"{place}\n{key}", fontsize=8, color="#5c606a", x=0.01, ha="left")
-
-
-def _rendered(figure: Figure, kind: str) -> bytes:
-    held = io.BytesIO()
-    metadata = {"Date": None} if kind == "svg" else None
-    figure.savefig(held, format=kind, dpi=144, metadata=metadata)
-    return held.getvalue()
+    figure.supxlabel(f"{place}\n{key}", fontsize=8, color=GREY, x=0.01, ha="left")

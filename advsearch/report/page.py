@@ -11,7 +11,7 @@ from pathlib import Path
 
 from advsearch import __version__
 from advsearch.report import wording
-from advsearch.report.charts import NARROW, WIDE, Curve, interval_bar, objective_chart
+from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
 from advsearch.report.markup import Html, element, join
 from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text
 from advsearch.report.style import CSS
@@ -162,7 +162,7 @@ def _rates(summary: AttackSummary) -> Html:
             element("td", what),
             element("td", f"{number} of {trials}", class_="number"),
             element("td", wording.interval_text(interval), class_="number"),
-            element("td", interval_bar(number / trials, interval), class_="hide-small"),
+            element("td", _bar(number / trials, interval), class_="hide-small"),
         )
         for name, what, number, trials, interval in rows
     ]
@@ -179,6 +179,18 @@ def _rates(summary: AttackSummary) -> Html:
     )
 
 
+def _bar(rate: float, interval: tuple[float, float]) -> Html:
+    """A bar from 0 to 1 with the confidence interval and the rate on it; decoration beside the numbers."""
+    low, high = interval
+    return element(
+        "div",
+        element("span", style=f"left: {low:.1%}; width: {high - low:.1%}", class_="range"),
+        element("span", style=f"left: {rate:.1%}", class_="mark"),
+        class_="interval",
+        aria_hidden="true",
+    )
+
+
 def _curve(data: RunData) -> Html:
     known = (("search", data.summary.policy), ("baseline", "random"))
     curves = [
@@ -191,7 +203,7 @@ def _curve(data: RunData) -> Html:
     objective = data.summary.objective
     above = "right" if data.summary.minimises else wording.success(data.summary)
     zero = f"above: {above}" if objective in SUCCESS_ABOVE_ZERO else ""
-    charts = [objective_chart(curves, objective, zero, paper) for paper in (WIDE, NARROW)]
+    charts = [objective_chart(curves, objective, zero, width) for width in (WIDE, NARROW)]
     note = "Lines: the best so far. Dots: each evaluation. These are the search's claims; the table above is verified."
     return join(
         element("h2", "The search"),

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from advsearch.report.diagrams import STYLE
+from advsearch.report.drawing import BLUE, GREY, RED, Figures, drawn
 from advsearch.runs.results.gap import CurveResult, GapResult, GapRow
 from advsearch.runs.results.region import BoxSide, MarginMap
 from advsearch.runs.results.sweep import AxisRow, SweepMap, SweepSummary
-
-BLUE, RED, GREY = "#1d5fd0", "#b3261e", "#5c606a"
-
-Figures = dict[str, bytes]
-"""A suffix, png or svg, to the content of a file."""
 
 
 def curve_figure(answer: CurveResult) -> Figures:
@@ -188,18 +182,5 @@ def _worst(row: GapRow) -> float:
     return 0.0 if row.ending == "already wrong" else 1.0 - row.worst.rate if row.worst else 1.0
 
 
-def _figure(draw: Any, size: tuple[float, float]) -> Figures:
-    import matplotlib as mpl
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=size, layout="constrained")
-        FigureCanvasAgg(figure)
-        draw(figure.subplots())
-        files = {}
-        for suffix in ("png", "svg"):
-            stream = io.BytesIO()
-            figure.savefig(stream, format=suffix, dpi=150, metadata={"Date": None} if suffix == "svg" else None)
-            files[suffix] = stream.getvalue()
-    return files
+def _figure(draw: Callable[[Any], object], size: tuple[float, float]) -> Figures:
+    return drawn(lambda figure: draw(figure.subplots()), size)

@@ -39,17 +39,13 @@ td.number { white-space: nowrap; }
 .facts { max-width: 46rem; }
 .facts th { color: var(--soft); font-weight: 400; width: 11rem; vertical-align: top; }
 .facts td { overflow-wrap: anywhere; }
-svg { display: block; }
-svg.interval { width: 100%; min-width: 7rem; max-width: 16rem; height: 12px; }
-svg .track { fill: var(--track); } svg .range { fill: var(--soft); opacity: 0.55; } svg .mark { fill: var(--ink); }
-svg.chart { width: 100%; height: auto; } svg.narrow { display: none; }
-svg.chart text { font-size: 13px; fill: var(--soft); }
-svg.chart .grid { stroke: var(--line); } svg.chart .zero { stroke: var(--soft); stroke-dasharray: 5 4; }
-svg.chart polyline { fill: none; stroke-width: 2; stroke-linejoin: round; }
-.search polyline { stroke: var(--search); } svg .search circle, svg.chart .search text { fill: var(--search); }
-.baseline polyline { stroke: var(--baseline); stroke-dasharray: 7 3; }
-svg .baseline circle, svg.chart .baseline text { fill: var(--baseline); }
-svg circle { opacity: 0.35; }
+.interval { position: relative; height: 12px; min-width: 7rem; max-width: 16rem;
+  background: linear-gradient(var(--track), var(--track)) 0 50% / 100% 2px no-repeat; }
+.interval span { position: absolute; } .interval .range { top: 3px; height: 6px; min-width: 1px; border-radius: 1px;
+  background: var(--soft); opacity: 0.55; }
+.interval .mark { top: 0; height: 12px; width: 2px; margin-left: -1px; background: var(--ink); }
+svg.chart { display: block; width: 100%; height: auto; } svg.narrow { display: none; }
+svg.chart text { font-family: inherit !important; }
 details { margin-top: 1.2rem; }
 summary { cursor: pointer; font-weight: 500; }
 details > :not(summary) { margin-top: 0.8rem; }
