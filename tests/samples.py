@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenEXR
 
 from advsearch.config import AttackConfig
 from advsearch.runs.directory import RunDirectory
@@ -14,6 +15,14 @@ from advsearch.runs.results.gap import CurveResult, GapResult
 from advsearch.runs.results.region import RegionResult
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
+
+
+def exr(path: Path) -> np.ndarray:
+    """Return the values, (H, W, 3) or (H, W) float32, in an EXR of a run."""
+    with OpenEXR.File(str(path)) as file:
+        channels = file.channels()
+        return np.array((channels["RGB"] if "RGB" in channels else channels["Y"]).pixels, dtype=np.float32)
+
 
 FORMATION: dict[str, Any] = {
     "denoiser": "oidn", "filter": "box", "sampler": "multijitter", "exposure": 0.0, "resolution": [128, 128],

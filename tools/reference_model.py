@@ -123,11 +123,11 @@ def train(cache: Path, counts: dict[str, int], epochs: int, seed: int) -> None:
     )
     folder = reference.data_folder()
     folder.mkdir(exist_ok=True)
-    reference.save(folder, state, labels())
+    training.save(folder, state, labels())
     logits = calibration.predict(reference.load(folder), held)
     temperature = calibration.fit_temperature(logits, held_truth)
     figures = {"pictures": counts["train"], "epochs": epochs, "seed": seed, "temperature": temperature}
-    reference.save(folder, reference.with_temperature(state, temperature), labels(), figures)
+    training.save(folder, training.with_temperature(state, temperature), labels(), figures)
 
 
 def evaluate(cache: Path, count: int, seed: int) -> None:

@@ -1,21 +1,25 @@
-"""Training of the reference network: AdamW, cosine schedule, moving average of the weights. Seeded; torch only."""
+"""Training of the reference network, and its files: AdamW, cosine schedule, moving average of the weights. Seeded."""
 
 from __future__ import annotations
 
+import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from reference_augmentation import Augmentation
 from reference_calibration import Images, as_floats
+from safetensors import torch as safetensors
 from torch import Tensor, nn
 
-from advsearch.errors import InputError
-from advsearch.models.reference import ReferenceNet, build
+from advsearch.errors import InputError, ModelError
+from advsearch.files import JsonValue
+from advsearch.models.reference import INPUT_SIZE, RECORD, WEIGHTS, ReferenceNet, build
 
 WARM_UP = 0.05
 WEIGHT_DECAY = 0.05
@@ -183,3 +187,36 @@ def _check(images: Images, labels: Tensor, classes: int, epochs: int, batch_size
         raise InputError(f"epochs: expected at least 1, got {epochs}")
     if not (math.isfinite(lr) and lr > 0):
         raise InputError(f"lr: expected a finite number greater than 0, got {lr}")
+
+
+# ---- what is stored --------------------------------------------------------------------------------------------------
+
+
+def with_temperature(state: Mapping[str, Tensor], temperature: float) -> dict[str, Tensor]:
+    """Return the state dict whose logits are those of `state` divided by the temperature (greater than 0)."""
+    if not (math.isfinite(temperature) and temperature > 0):
+        raise ModelError(f"temperature: expected a finite number greater than 0, got {temperature}")
+    scaled = ("head.weight", "head.bias")
+    return {key: value / temperature if key in scaled else value for key, value in state.items()}
+
+
+def save(
+    folder: Path, state: Mapping[str, Tensor], labels: Sequence[str], figures: Mapping[str, JsonValue] | None = None
+) -> tuple[Path, Path]:
+    """Write ``reference.safetensors`` and ``reference.json`` to a folder and return the two paths.
+
+    Args:
+        folder: made if it is not there; that of the package is `reference.data_folder()`.
+        state: the state dict of a `ReferenceNet` for ``len(labels)`` classes.
+        labels: the label names in index order.
+        figures: what is known of it (accuracy, calibration, seed, ...), kept in the record as it is.
+    """
+    net = build(len(labels))
+    net.load_state_dict(dict(state))
+    folder.mkdir(parents=True, exist_ok=True)
+    weights, record = folder / WEIGHTS, folder / RECORD
+    tensors = {key: value.contiguous() for key, value in net.state_dict().items()}
+    weights.write_bytes(safetensors.save(tensors))
+    content = {"schema": 1, "labels": list(labels), "input_size": list(INPUT_SIZE), "figures": dict(figures or {})}
+    record.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    return weights, record

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import copy
 import json
-import math
-from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 
@@ -20,7 +18,6 @@ from torch import Tensor, nn
 from torch.nn.utils import fuse_conv_bn_eval
 
 from advsearch.errors import ModelError
-from advsearch.files import JsonValue
 from advsearch.models.model import Model
 from advsearch.models.preprocessing import Preprocessing
 from advsearch.models.probe import probe
@@ -117,7 +114,7 @@ class _Residual(nn.Module):
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# making, folding, storing, loading
+# making, folding, loading
 
 
 def build(classes: int, *, dropout: float = 0.1) -> ReferenceNet:
@@ -134,36 +131,6 @@ def folded(net: ReferenceNet) -> ReferenceNet:
         if isinstance(module, _Convolution):
             module.fold()
     return copied.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
-
-
-def with_temperature(state: Mapping[str, Tensor], temperature: float) -> dict[str, Tensor]:
-    """Return the state dict whose logits are those of `state` divided by the temperature (greater than 0)."""
-    if not (math.isfinite(temperature) and temperature > 0):
-        raise ModelError(f"temperature: expected a finite number greater than 0, got {temperature}")
-    scaled = ("head.weight", "head.bias")
-    return {key: value / temperature if key in scaled else value for key, value in state.items()}
-
-
-def save(
-    folder: Path, state: Mapping[str, Tensor], labels: Sequence[str], figures: Mapping[str, JsonValue] | None = None
-) -> tuple[Path, Path]:
-    """Write ``reference.safetensors`` and ``reference.json`` to a folder and return the two paths.
-
-    Args:
-        folder: made if it is not there; that of the package is `data_folder()`.
-        state: the state dict of a `ReferenceNet` for ``len(labels)`` classes.
-        labels: the label names in index order.
-        figures: what is known of it (accuracy, calibration, seed, ...), kept in the record as it is.
-    """
-    net = build(len(labels))
-    net.load_state_dict(dict(state))
-    folder.mkdir(parents=True, exist_ok=True)
-    weights, record = folder / WEIGHTS, folder / RECORD
-    tensors = {key: value.contiguous() for key, value in net.state_dict().items()}
-    weights.write_bytes(safetensors.save(tensors))
-    content = {"schema": 1, "labels": list(labels), "input_size": list(INPUT_SIZE), "figures": dict(figures or {})}
-    record.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    return weights, record
 
 
 def data_folder() -> Path:

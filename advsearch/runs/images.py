@@ -127,25 +127,6 @@ def write_exr(path: Path, image: Any) -> Path:
     return path
 
 
-def read_exr(path: Path) -> Floats:
-    """Return the values, (H, W, 3) or (H, W) float32, in an EXR that `write_exr` wrote.
-
-    Raises:
-        FileFormatError: it is missing or not such a file.
-    """
-    import OpenEXR
-
-    try:
-        with OpenEXR.File(os.fspath(path)) as file:
-            channels = file.channels()
-            pixels: Floats = np.array(
-                (channels["RGB"] if "RGB" in channels else channels["Y"]).pixels, dtype=np.float32
-            )
-            return pixels
-    except (RuntimeError, OSError, KeyError) as error:
-        raise FileFormatError(f"{path}: expected an EXR picture of advsearch, got {error}") from None
-
-
 def animation_bytes(frames: Sequence[Any]) -> bytes:
     """Return the display-referred pictures as a GIF that repeats, holds its last frame and is at most 3 MB.
 

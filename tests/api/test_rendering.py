@@ -8,13 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import samples
 import torch
 
 import advsearch
 from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.report.contact_sheet import GAP, LINE, NARROWEST, columns_for, contact_sheet
-from advsearch.runs.images import read_exr, read_png
+from advsearch.runs.images import read_png
 from advsearch.scene.color import linear_to_srgb
 
 SMALL = ["--resolution", "16", "--spp", "1", "--quiet"]
@@ -51,7 +52,7 @@ def test_a_picture_and_the_five_first_answers(tmp_path: Path, capsys: pytest.Cap
     assert [one["label"] for one in answers] == [model.labels[one["index"]] for one in answers]
     assert answers[0]["probability"] == pytest.approx(float(probabilities.max()), abs=1e-5)
     render(capsys, "--object", "mug", "--out", str(exr))
-    linear = read_exr(exr)  # the same picture before the tone curve
+    linear = samples.exr(exr)  # the same picture before the tone curve
     assert np.abs(linear_to_srgb(linear) - picture.numpy()).max() <= 0.5 / 255 + 1e-4
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import conftest
 import numpy as np
 import pytest
+import reference_training as training
 import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
@@ -744,7 +745,7 @@ def test_mobilenet_from_the_data_folder() -> None:
 
 
 # ---------------------------------------------------------------------------------------------------------------------
-# the reference network, its training and its figures
+# the reference network
 
 
 def test_reference_network_is_small_and_folding_changes_nothing() -> None:
@@ -767,8 +768,8 @@ def test_reference_network_is_small_and_folding_changes_nothing() -> None:
 
 def test_reference_is_stored_and_loaded(tmp_path: Path) -> None:
     net = reference.build(3)
-    state = reference.with_temperature(net.state_dict(), 2.0)
-    weights, record = reference.save(tmp_path, state, ["mug", "bowl", "vase"], {"accuracy": 0.9})
+    state = training.with_temperature(net.state_dict(), 2.0)
+    weights, record = training.save(tmp_path, state, ["mug", "bowl", "vase"], {"accuracy": 0.9})
     assert weights.stat().st_size < 6e6 and json.loads(record.read_text())["figures"] == {"accuracy": 0.9}
     model = reference.load(tmp_path)
     assert (model.name, model.labels, model.input_size) == ("reference", ("mug", "bowl", "vase"), (128, 128))
@@ -781,7 +782,7 @@ def test_reference_is_stored_and_loaded(tmp_path: Path) -> None:
 def test_reference_files_that_are_wrong(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"the reference model is not there .* run `make reference`"):
         reference.load(tmp_path)
-    reference.save(tmp_path, reference.build(3).state_dict(), ["a", "b", "c"])
+    training.save(tmp_path, reference.build(3).state_dict(), ["a", "b", "c"])
     record = json.loads((tmp_path / reference.RECORD).read_text())
     (tmp_path / reference.RECORD).write_text(json.dumps({**record, "labels": ["a", "b"]}))
     with pytest.raises(ModelError, match=r"are of another network; run `make reference`"):
@@ -790,7 +791,7 @@ def test_reference_files_that_are_wrong(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"cannot be read .* run `make reference`"):
         reference.load(tmp_path)
     with pytest.raises(ModelError, match=r"temperature: expected a finite number greater than 0, got 0"):
-        reference.with_temperature({}, 0)
+        training.with_temperature({}, 0)
 
 
 def test_bundled_reference_or_what_to_do() -> None:

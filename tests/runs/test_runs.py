@@ -25,7 +25,7 @@ import pyarrow.parquet
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from samples import attack, rated, sweep
+from samples import attack, exr, rated, sweep
 
 from advsearch.config import AttackConfig
 from advsearch.errors import FileFormatError, InputError, RunExistsError, StorageError, UnknownNameError
@@ -523,19 +523,18 @@ def test_exr_round_trip_is_exact_and_equal_bytes(tmp_path: Path) -> None:
     image = np.random.default_rng(0).normal(scale=1e4, size=(5, 7, 3)).astype(np.float32)
     image[0, 0] = np.inf, -0.0, np.nan
     first, second = (images.write_exr(tmp_path / f"{name}.exr", image) for name in "ab")
-    np.testing.assert_array_equal(images.read_exr(first), image)
+    np.testing.assert_array_equal(exr(first), image)
     assert first.read_bytes() == second.read_bytes()
     grey = images.write_exr(tmp_path / "grey.exr", image[..., 1])
-    np.testing.assert_array_equal(images.read_exr(grey), image[..., 1])
+    np.testing.assert_array_equal(exr(grey), image[..., 1])
 
 
-@pytest.mark.parametrize("read", [images.read_exr, images.read_png])
-def test_what_is_no_picture_is_refused(tmp_path: Path, read: Any) -> None:
+def test_what_is_no_picture_is_refused(tmp_path: Path) -> None:
     for content in (None, b"", b"no picture"):
         if content is not None:
             (tmp_path / "x").write_bytes(content)
-        with pytest.raises(FileFormatError, match=r"x: expected an? (EXR|PNG) picture"):
-            read(tmp_path / "x")
+        with pytest.raises(FileFormatError, match="x: expected a PNG picture"):
+            images.read_png(tmp_path / "x")
 
 
 def test_the_difference_is_grey_where_nothing_changed() -> None:
