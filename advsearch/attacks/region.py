@@ -30,7 +30,6 @@ class Region:
         low, high: (d,) its corners, inside the unit box.
         same: how many of the final samples had the centre's answer.
         samples: how many there were.
-        attempts: how many boxes might have been sampled until there was no exception.
         renders: pictures in all.
     """
 
@@ -39,13 +38,12 @@ class Region:
     high: Tensor
     same: int
     samples: int
-    attempts: int
     renders: int
 
     @property
     def interval(self) -> tuple[float, float]:
         """95 % interval of the share of the box with the centre's answer; see the module."""
-        return clopper_pearson(self.same, self.samples, 1.0 - 0.05 / self.attempts)
+        return clopper_pearson(self.same, self.samples, 1.0 - 0.05 / ATTEMPTS)
 
     @property
     def volume(self) -> float:
@@ -67,9 +65,6 @@ def grow(
     *,
     seed: int,
     samples: int = 200,
-    probes: int = PROBES,
-    levels: int = LEVELS,
-    attempts: int = ATTEMPTS,
     on_check: Callable[[], None] = lambda: None,
 ) -> Region:
     """Grow a box around the centre, then check it with samples that nothing was fitted to.
@@ -78,16 +73,13 @@ def grow(
     which no face can move any more). The slab that it would win is probed at random points; if all have the centre's
     answer, it moves. Growing ends after `MOST_PROBED` pictures for each parameter at the latest. Then the box is
     sampled; on an exception, the face that cuts off the least of the box moves in to it and the box is sampled anew,
-    with other seeds, `attempts` times at most.
+    with other seeds, `ATTEMPTS` times at most; the last check counts whatever it shows.
 
     Args:
         same: judges a configuration.
         centre: (d,) in [0, 1].
         seed: root of the random points.
         samples: of the final check, at least 1.
-        probes: of a slab.
-        levels: how often the step of the faces is halved.
-        attempts: final checks at most; the last one counts whatever it shows.
         on_check: told the beginning of each final check.
 
     Raises:
@@ -100,20 +92,20 @@ def grow(
     judge = _Judge(same, seed)
     low, high = centre.clone(), centre.clone()
     share, faces = 0.5, range(2 * centre.numel())
-    last = MOST_PROBED * centre.numel() - len(faces) * probes
-    for _ in range(levels):
-        while judge.count <= last and any([_push(judge, low, high, face, share, probes) for face in faces]):
+    last = MOST_PROBED * centre.numel() - len(faces) * PROBES
+    for _ in range(LEVELS):
+        while judge.count <= last and any([_push(judge, low, high, face, share) for face in faces]):
             pass
         share /= 2.0
-    for attempt in range(attempts):
+    for attempt in range(ATTEMPTS):
         on_check()
         points = judge.points(low, high, samples)
         wrong = points[[not judge(point) for point in points]]
-        if len(wrong) == 0 or attempt == attempts - 1:
+        if len(wrong) == 0 or attempt == ATTEMPTS - 1:
             break
         for point in wrong:
             _cut(low, high, centre, point)
-    return Region(centre, low, high, samples - len(wrong), samples, attempts, judge.count)
+    return Region(centre, low, high, samples - len(wrong), samples, judge.count)
 
 
 class _Judge:
@@ -138,7 +130,7 @@ SHORTEST = 1e-3
 """A face does not move by less."""
 
 
-def _push(judge: _Judge, low: Tensor, high: Tensor, face: int, share: float, probes: int) -> bool:
+def _push(judge: _Judge, low: Tensor, high: Tensor, face: int, share: float) -> bool:
     """Move one face out if the slab that it wins has the centre's answer; whether it moved."""
     axis, up = divmod(face, 2)
     room = float(1.0 - high[axis] if up else low[axis])
@@ -152,7 +144,7 @@ def _push(judge: _Judge, low: Tensor, high: Tensor, face: int, share: float, pro
         bottom[axis], top[axis] = high[axis], high[axis] + step
     else:
         bottom[axis], top[axis] = low[axis] - step, low[axis]
-    points = judge.points(bottom, top, probes)
+    points = judge.points(bottom, top, PROBES)
     points[0, axis] = top[axis] if up else bottom[axis]
     if not all(judge(point) for point in points):
         return False

@@ -90,14 +90,14 @@ def shrunk(domain: Domain, u: Tensor, scale: float) -> Tensor:
     return domain.project(domain.start + scale * (u - domain.start))
 
 
-def smallest(search: Search, passes: Passes, domain: Domain, *, rounds: int = ROUNDS) -> Bracket:
+def smallest(search: Search, passes: Passes, domain: Domain) -> Bracket:
     """Bracket the smallest scale of the domain's budgets at which a configuration passes.
 
     1. A search in the whole budget. If its answer fails the trials, there is nothing to shrink.
     2. The answer is moved towards the start, by bisection in the logarithm of its length, to the shortest that passes:
        a handful of trials, no search.
     3. A search at half the scale reached, then at the geometric mean of the bracket's ends; each answer that passes is
-       shortened as in 2, each that fails raises the lower end; until the bracket is closed or the rounds are used up.
+       shortened as in 2, each that fails raises the lower end; until it is closed or `ROUNDS` searches are done.
 
     For a linear model and a gradient policy the first search points the right way and 2 ends within its own step of the
     optimum, so that the result is within `RATIO` of the closed form.
@@ -106,17 +106,16 @@ def smallest(search: Search, passes: Passes, domain: Domain, *, rounds: int = RO
         search: finds the best configuration of a domain.
         passes: verifies one.
         domain: the largest budget.
-        rounds: searches at most, at least 2.
 
     Returns:
-        The bracket; not `closed` if the rounds did not suffice.
+        The bracket; not `closed` if the searches did not suffice.
     """
     u = search(domain, 0)
     state = Bracket(0.0, math.inf, None, 1, 1)
     if not passes(u, 0):
         return replace(state, low=1.0)
     state = _shorten(replace(state, high=1.0, u=u), passes, domain)
-    while state.searches < rounds and state.high > RATIO * state.low and state.high > SMALLEST_SCALE:
+    while state.searches < ROUNDS and state.high > RATIO * state.low and state.high > SMALLEST_SCALE:
         floor = state.high / 2.0 if state.low == 0.0 else math.sqrt(state.low * state.high)
         scale = max(floor, state.high / RATIO if state.high <= RATIO**2 * state.low else floor)
         inside = scaled(domain, scale)

@@ -62,7 +62,7 @@ def degenerate() -> Outcome:
     """A square with faces that have no area: a repeated corner, three points on a line, one point three times."""
     line = [[0.0, 0.0, 0.5], [0.0, 0.1, 0.5], [0.0, 0.2, 0.5]]
     faces = [*HALVES, [0, 0, 1], [4, 5, 6], [4, 4, 4]]
-    same = _difference(_mesh(QUAD + line, faces), _mesh(QUAD, HALVES))
+    same = _difference(mesh_of(QUAD + line, faces), mesh_of(QUAD, HALVES))
     text = _obj(np.array(QUAD + line), faces)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "degenerate.obj"
@@ -92,16 +92,16 @@ def sliver() -> Outcome:
 @GROUP.case("coincident-faces", "Two faces in one place look like one.", _SCENE, "texture, pose", cheap=False)
 def coincident() -> Outcome:
     """Two squares in one place: which is hit is chance, but not what the picture is."""
-    twice = _mesh(QUAD + QUAD, [*HALVES, [4, 5, 6], [4, 6, 7]])
+    twice = mesh_of(QUAD + QUAD, [*HALVES, [4, 5, 6], [4, 6, 7]])
     found = mesh(twice)
-    same = Check("mean difference from one square", _difference(twice, _mesh(QUAD, HALVES)), most=SAME_PICTURE)
+    same = Check("mean difference from one square", _difference(twice, mesh_of(QUAD, HALVES)), most=SAME_PICTURE)
     return Outcome((*found.checks, same), found.finite, found.relative_error, found.ending, found.measured)
 
 
 @GROUP.case("one-triangle", "Finite, and both gradients are right.", _SCENE, "texture, pose", cheap=False)
 def one_triangle() -> Outcome:
     """A mesh of one triangle."""
-    return mesh(_mesh([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 1.0]], [[0, 1, 2]]))
+    return mesh(mesh_of([[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.0, 1.0]], [[0, 1, 2]]))
 
 
 @GROUP.case(
@@ -257,10 +257,6 @@ for name in ("pose.yaw", "camera.azimuth", "environment.rotation"):
 
 
 # ---- inside ---------------------------------------------------------------------------------------------------------
-
-
-def _mesh(vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]]) -> Mesh:
-    return mesh_of(vertices, faces)
 
 
 def _shown(u: Tensor, renderer: object) -> Tensor:

@@ -54,9 +54,7 @@ def small(
     environment: str | Path | EnvironmentAsset | None = None,
     settings: Mapping[str, float] | None = None,
     parts: Sequence[ScenePart] = (),
-    size: int = SIZE,
     denoise: str = "none",
-    estimators: Mapping[str, str] | None = None,
 ) -> Renderer:
     """Return `render(u, seed, spp)` of a small picture: as `Scene.renderer`, with parts of our own.
 
@@ -67,10 +65,10 @@ def small(
         description = description.with_part(part)
     space = make_space([make_control(name, given) for name, given in controls.items()], description)
     description = space.scene or description
-    formation = ImageFormation(denoiser=denoise, resolution=(size, size), gain=description.gain)
-    scene = MitsubaScene(description, (size, size), filter=formation.filter)
-    motion = Motion(description, (size, size), scene.assembly)
-    renderer = Renderer(scene, space, formation, 0, motion=motion, estimators=estimators)
+    formation = ImageFormation(denoiser=denoise, resolution=(SIZE, SIZE), gain=description.gain)
+    scene = MitsubaScene(description, (SIZE, SIZE), filter=formation.filter)
+    motion = Motion(description, (SIZE, SIZE), scene.assembly)
+    renderer = Renderer(scene, space, formation, 0, motion=motion)
     renderer.plan = renderer.plan.at_a_pixel()
     return renderer
 
@@ -78,21 +76,17 @@ def small(
 # ---- things to put into a scene -------------------------------------------------------------------------------------
 
 
-def plain_environment(value: float = 0.4) -> EnvironmentAsset:
+def plain_environment() -> EnvironmentAsset:
     """Return a sky brighter on one side and above, (16, 32, 3), so that turning it changes something."""
     rows, columns = np.mgrid[0:16, 0:32].astype(np.float32)
-    light = value * (1.0 + 0.6 * np.sin(columns * (2.0 * np.pi / 32.0)) + 0.8 * np.cos(rows * (np.pi / 16.0)))
+    light = 0.4 * (1.0 + 0.6 * np.sin(columns * (2.0 * np.pi / 32.0)) + 0.8 * np.cos(rows * (np.pi / 16.0)))
     return EnvironmentAsset("plain", np.repeat(light[:, :, None], 3, axis=2).clip(0.05).astype(np.float32))
 
 
-def mesh_of(
-    vertices: Sequence[Sequence[float]],
-    faces: Sequence[Sequence[int]],
-    normals: Sequence[Sequence[float]] | None = None,
-) -> Mesh:
-    """Return a mesh with UVs from x and z; normals face +x unless they are given."""
+def mesh_of(vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]]) -> Mesh:
+    """Return a mesh with UVs from x and z, whose normals face +x."""
     points = np.asarray(vertices, np.float32)
-    facing = np.tile([1.0, 0.0, 0.0], (len(points), 1)) if normals is None else np.asarray(normals)
+    facing = np.tile([1.0, 0.0, 0.0], (len(points), 1))
     low, high = points.min(axis=0), points.max(axis=0)
     uvs = ((points - low) / np.maximum(high - low, 1e-12))[:, 1:]
     return Mesh(points, np.asarray(faces, np.uint32), facing.astype(np.float32), uvs.astype(np.float32))
@@ -118,12 +112,12 @@ def sphere(rows: int, columns: int) -> Mesh:
     )
 
 
-def thing(mesh: Mesh, name: str = "thing", colour: float = 0.5, material: Material | None = None) -> ObjectAsset:
+def thing(mesh: Mesh) -> ObjectAsset:
     """Return an object with a checked texture around a display-referred grey."""
     checks = np.indices((4, 4)).sum(axis=0) % 2
-    base = np.float32(colour) + np.float32(0.3) * (checks - np.float32(0.5))
+    base = np.float32(0.5) + np.float32(0.3) * (checks - np.float32(0.5))
     texels = np.repeat(base[:, :, None], 3, axis=2).clip(0.0, 1.0).astype(np.float32)
-    return ObjectAsset(name, mesh, texels, material or Material())
+    return ObjectAsset("thing", mesh, texels, Material())
 
 
 # ---- what is asked of a scene ---------------------------------------------------------------------------------------
@@ -189,9 +183,9 @@ class Examined:
         return Outcome((*checks, *more), self.finite, error, self.result.ending.value, measured, rule)
 
 
-def dark(name: str = "mug") -> ObjectAsset:
-    """Return a bundled object in black: what moves in the picture is its outline and nothing else, so little noise."""
-    return replace(library.load_object(name), name=f"dark-{name}", base_color=np.full((4, 4, 3), 0.02, np.float32))
+def dark() -> ObjectAsset:
+    """Return the mug in black: what moves in the picture is its outline and nothing else, so little noise."""
+    return replace(library.load_object("mug"), name="dark-mug", base_color=np.full((4, 4, 3), 0.02, np.float32))
 
 
 def examine(
@@ -274,19 +268,17 @@ def _beside(
     return rows
 
 
-def searched(
-    renderer: Renderer, u: Tensor, evaluations: int, policy: Policy[Any], *, spp: int = SPP, gain: float = SHARPNESS
-) -> SearchResult:
+def searched(renderer: Renderer, u: Tensor, evaluations: int, policy: Policy[Any], *, spp: int = SPP) -> SearchResult:
     """Search for a picture that a linear model of two classes gets wrong.
 
-    Its logits are 0 and `gain` times the rise of the smooth linear loss over the configuration u, less 1.
+    Its logits are 0 and `SHARPNESS` times the rise of the smooth linear loss over the configuration u, less 1.
     """
     loss = smooth_loss(renderer.formation.resolution)
     with torch.no_grad():
         here = float(loss(renderer(u, seed=0, spp=spp)))
 
     def margin(image: Tensor) -> Tensor:
-        return gain * (loss(image) - here) - 1.0
+        return SHARPNESS * (loss(image) - here) - 1.0
 
     domain = domain_of(renderer, u)
     steps = evaluations * (1 + domain.gradient_cost) + 1

@@ -274,7 +274,7 @@ def _shaded(soup: Soup) -> tuple[Soup, list[str]]:
     return replace(soup, normals=normals), notes
 
 
-def smooth_normals(soup: Soup, crease_degrees: float = CREASE_DEGREES) -> Array:
+def smooth_normals(soup: Soup) -> Array:
     """Compute corner normals, smooth except across creases.
 
     At each point, the faces that can be reached from one another over edges with less than the crease angle share one
@@ -285,7 +285,7 @@ def smooth_normals(soup: Soup, crease_degrees: float = CREASE_DEGREES) -> Array:
     """
     unit = unit_vectors(soup.face_vectors())
     left, right, same_way = neighbours(soup.faces)
-    gentle = (unit[left // 3] * unit[right // 3]).sum(axis=1) >= np.cos(np.radians(crease_degrees))
+    gentle = (unit[left // 3] * unit[right // 3]).sum(axis=1) >= np.cos(np.radians(CREASE_DEGREES))
     left, right = left[gentle & ~same_way], right[gentle & ~same_way]
     after = [corner - corner % 3 + (corner + 1) % 3 for corner in (left, right)]
     a, b = np.concatenate([left, after[0]]), np.concatenate([after[1], right])
