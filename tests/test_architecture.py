@@ -22,7 +22,18 @@ ROOT = Path(__file__).resolve().parents[1]
 SOURCES = {"advsearch": ROOT / "advsearch", "advsearch.bundled": ROOT / "scenes"}
 
 RENDERER = {"mitsuba", "drjit", "mitsuba_oidn"}
-COMMON = {"described", "errors", "files", "options", "registry", "seeds", "threads", "progress", "yaml_text"}
+COMMON = {
+    "described",
+    "errors",
+    "files",
+    "interrupts",
+    "options",
+    "registry",
+    "seeds",
+    "threads",
+    "progress",
+    "yaml_text",
+}
 """Small modules that anyone may import and that import nobody but each other."""
 
 

@@ -413,7 +413,7 @@ def check_advsearch(words: list[str], folder: Path) -> None:
     if args.command in CONFIGS:
         otherwise = {"object": "mug"} if "around" in args and args.command == "region" else {}
         check_names(config_from(args, CONFIGS[args.command], **otherwise))
-    if args.command == "run":
+    if args.command in ("run", "resume"):
         recipe = folder / "run.yaml"
         recipe.write_text("object: mug\n", encoding="utf-8")
         check_names(AttackConfig.from_yaml(recipe, dict(parse_assignment(text, text) for text in args.change)))

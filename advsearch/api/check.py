@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
@@ -207,15 +208,20 @@ def _model(part: CheckedPart, title: str, results: Results, progress: Progress) 
     renderer, u = problem.renderer, inside(problem.renderer)
     counts = tuple(count for count in (*COUNTS, MOST) if count >= problem.spp) or (problem.spp,)
 
-    def measured() -> Json:
-        progress.stage(f"{title}: comparing ways to differentiate", plan_gradients(renderer.plan))
-        seed, tick = seeds.stream(config.seed, "measure"), lambda: progress.advance(1)
-        return measured_plan(renderer, problem.loss, u, seed=seed, spp=problem.spp, counted=True, tick=tick).to_dict()
+    def kept(name: str, measure: Callable[[], Any]) -> Any:
+        return results.get(f"{part.key} {name}", measure)
 
-    def kept(name: str, measure: Callable[[], Sequence[CosineRow]]) -> list[CosineRow]:
-        return results.rows(f"{part.key} cosines {name}", CosineRow, measure)
-
-    renderer.plan = renderer.plan.restored(results.get(f"{part.key} plan", measured))
+    progress.stage(f"{title}: comparing ways to differentiate", plan_gradients(renderer.plan))
+    renderer.plan = measured_plan(
+        renderer,
+        problem.loss,
+        u,
+        seed=seeds.stream(config.seed, "measure"),
+        spp=problem.spp,
+        counted=True,
+        tick=lambda: progress.advance(1),
+        keep=kept,
+    )
     steps = {group.name: group.step for group in renderer.plan.groups}
     most = cosine_samples(renderer.plan, counts=counts)
     progress.stage(f"{title}: the model's gradients", most, hint=IN_SAMPLES, at_most=True)

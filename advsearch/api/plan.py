@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
@@ -12,11 +13,10 @@ from advsearch.config import PlanConfig
 from advsearch.engine.bounces import bounces_of, most_pictures
 from advsearch.engine.gradients import inside
 from advsearch.engine.measuring import Results, kept_rows
-from advsearch.engine.memory import PLAN, Memory
+from advsearch.engine.memory import Memory
 from advsearch.engine.planning import GOAL, cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.engine.problem import Problem
 from advsearch.evaluation.leaving_out import measured_gains, most_gradients, resolved_texels
-from advsearch.files import Json
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory
@@ -55,8 +55,8 @@ def plan_from_config(
     progress, begun = progress or NullProgress(), time.perf_counter()
     with RunDirectory.of(config, resumed) as run:
         progress.stage(LOADING)
-        problem, _ = problem_from_config(config)
         results = Results(Memory(run), config.seconds)
+        problem, _ = problem_from_config(config)
         work = _Measurements(problem, config, results, progress)
 
         def result(rows: Sequence[PlannedRow], ending: str) -> PlanResult:
@@ -160,21 +160,24 @@ class _Measurements:
     def _compare_estimators(self) -> None:
         """Choose every contested estimator."""
         problem, renderer = self._problem, self._problem.renderer
-
-        def measured() -> Json:
-            hint = f"{self._gradients} gradients of {count(problem.spp, 'sample')} a pixel; `resolution` shortens it"
-            self._progress.stage("comparing ways to differentiate", self._gradients, hint=hint)
-            u, tick = inside(renderer), lambda: self._progress.advance(1)
-            found = measured_plan(renderer, problem.loss, u, seed=self._seed, spp=problem.spp, every=True, tick=tick)
-            return found.to_dict()
-
-        self._plan = renderer.plan = self._plan.restored(self._results.get(PLAN, measured))
+        hint = f"{self._gradients} gradients of {count(problem.spp, 'sample')} a pixel; `resolution` shortens it"
+        self._progress.stage("comparing ways to differentiate", self._gradients, hint=hint)
+        self._plan = renderer.plan = measured_plan(
+            renderer,
+            problem.loss,
+            inside(renderer),
+            seed=self._seed,
+            spp=problem.spp,
+            every=True,
+            tick=lambda: self._progress.advance(1),
+            keep=self._results.get,
+        )
 
     def _cosines(self, problem: Problem, control: str, title: str) -> Iterator[CosineRow]:
         renderer, only = problem.renderer, (control,)
 
-        def kept(name: str, measure: Callable[[], Sequence[CosineRow]]) -> list[CosineRow]:
-            return self._results.rows(f"{renderer.formation.denoiser} {name}", CosineRow, measure)
+        def kept(name: str, measure: Callable[[], Any]) -> Any:
+            return self._results.get(f"{renderer.formation.denoiser} {name}", measure)
 
         hint = "counted in samples a pixel; `resolution` shortens it, `seconds` ends it"
         self._progress.stage(title, cosine_samples(renderer.plan, controls=only), hint=hint, at_most=True)

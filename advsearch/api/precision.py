@@ -29,6 +29,7 @@ from advsearch.evaluation.precision.points import MeasuredSetting, Point, Sample
 from advsearch.evaluation.precision.report import Section, report_of
 from advsearch.evaluation.precision.rounds import Rounds, TimeBudget, in_rounds
 from advsearch.files import Json
+from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.diagrams import precision_figures
 from advsearch.runs.directory import RunDirectory, check_free
@@ -89,8 +90,9 @@ def precision_from_config(
         "objective": lambda share: job.objective(share, policies),
     }
     try:
-        for number, name in enumerate(wanted):
-            measure[name](job.budget.share(SHARES[name] / sum(SHARES[one] for one in wanted[number:])))
+        with interruptible():
+            for number, name in enumerate(wanted):
+                measure[name](job.budget.share(SHARES[name] / sum(SHARES[one] for one in wanted[number:])))
     except KeyboardInterrupt:
         job.section.interrupted = True
     seconds = {"budget": config.seconds, "setup": setup, "total": time.perf_counter() - begun}

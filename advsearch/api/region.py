@@ -23,6 +23,7 @@ from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.stages import Attack
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import Json
+from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.studies import map_figure
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
@@ -112,7 +113,8 @@ def region_from_config(
         spent = RenderBudget(ladder=verification_ladder(config.pixel_sampler, config.verify_spp))
         attack = Attack(problem, spent, make_policy("random"), Recorder(run, problem, memory), memory, stages)
         try:
-            found, ending = _found(attack, config, varied, centre, run), "done"
+            with interruptible():
+                found, ending = _found(attack, config, varied, centre, run), "done"
         except KeyboardInterrupt:
             found, ending = {}, INTERRUPTED
         stages.end()

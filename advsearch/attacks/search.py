@@ -20,6 +20,7 @@ from advsearch.attacks.evaluation import Evaluate, Evaluation, usable
 from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, affordable
 from advsearch.attacks.policies.choices import with_choices
 from advsearch.errors import InputError
+from advsearch.interrupts import interruptible
 from advsearch.seeds import stream
 
 NON_FINITE_LIMIT = 3
@@ -178,10 +179,11 @@ def search(
     begun = time.perf_counter()
     log = _Log(evaluate, domain, on_step, max(1, candidates))
     try:
-        in_time = math.inf if seconds is None else begun + seconds
-        stopped = _explore(log, policy, steps, seed, late or (lambda _: time.perf_counter() >= in_time))
-        if candidates:
-            _rank(log, steps, repeats, close)
+        with interruptible():
+            in_time = math.inf if seconds is None else begun + seconds
+            stopped = _explore(log, policy, steps, seed, late or (lambda _: time.perf_counter() >= in_time))
+            if candidates:
+                _rank(log, steps, repeats, close)
     except KeyboardInterrupt:
         stopped = Ending.INTERRUPTED
     return _result(log, stopped, time.perf_counter() - begun)

@@ -2,30 +2,8 @@
 
 from __future__ import annotations
 
-from types import FrameType
-
+from advsearch.interrupts import INTERRUPTS
 from advsearch.progress import Progress
-
-
-class Interrupts:
-    """A handler of Ctrl-C as Python's own, which counts."""
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Take a signal."""
-        self.count += 1
-        raise KeyboardInterrupt
-
-    def check(self) -> None:
-        """Raise an interrupt that has come already."""
-        if self.count:
-            raise KeyboardInterrupt
-
-
-INTERRUPTS = Interrupts()
-"""Those of this process."""
 
 LOADING_STAGES = 2
 """The first stages of a command: modules are imported, then a scene and a model are loaded, which imports more."""

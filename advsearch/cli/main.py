@@ -20,9 +20,9 @@ from types import ModuleType
 from typing import Any, NoReturn
 
 from advsearch import __version__
-from advsearch.cli.interrupts import INTERRUPTS
 from advsearch.cli.screen import end_output, open_descriptors, screens, shortened
 from advsearch.errors import AdvsearchError, InputError, UnknownNameError
+from advsearch.interrupts import INTERRUPTS
 
 COMMANDS = {
     "attack": "advsearch.cli.attack",

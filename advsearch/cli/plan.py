@@ -31,17 +31,20 @@ def _step(group: GroupDerivative) -> str:
     """The step of a difference in u, and in the parameter's unit where it has one."""
     if not group.step_reason:
         return ""
-    own = "" if group.step_in_unit is None else f" ({group.step_in_unit:.3g} {group.unit})"
+    unit = "" if group.unit == "1" else f" {group.unit}"
+    own = "" if group.step_in_unit is None else f" ({group.step_in_unit:.3g}{unit})"
     return f"{group.step:.3g}{own}"
 
 
-def _steps(chosen: PlanResult) -> list[str]:
-    """Why the steps are as wide as they are, each reason once with its parameters."""
-    reasons: dict[str, list[str]] = {}
+def _why(chosen: PlanResult) -> list[str]:
+    """Why the estimators and the steps are what they are, each reason once with its parameters."""
+    reasons: dict[tuple[str, str], list[str]] = {}
+    for group in chosen.groups:
+        reasons.setdefault((group.estimator, group.reason), []).append(group.name)
     for group in chosen.groups:
         if group.step_reason:
-            reasons.setdefault(group.step_reason, []).append(group.name)
-    return [f"step of {', '.join(names)}: {reason}" for reason, names in reasons.items()]
+            reasons.setdefault(("step", group.step_reason), []).append(group.name)
+    return [f"{what} of {', '.join(names)}: {reason}" for (what, reason), names in reasons.items()]
 
 
 def answer(chosen: PlanResult) -> str:
@@ -49,10 +52,8 @@ def answer(chosen: PlanResult) -> str:
     from advsearch.report import wording
     from advsearch.runs.results.base import OUT_OF_TIME
 
-    rows = [["parameter", "numbers", "estimator", "step", "why"]]
-    for group in chosen.groups:
-        step = _step(group)
-        rows.append([group.name, str(group.size), group.estimator, step, group.reason])
+    rows = [["parameter", "numbers", "estimator", "step"]]
+    rows += [[group.name, str(group.size), group.estimator, _step(group)] for group in chosen.groups]
     lines = [
         READING,
         "",
@@ -60,7 +61,7 @@ def answer(chosen: PlanResult) -> str:
         "",
         f"renders for one gradient beside the picture itself: {chosen.renders_per_gradient}",
         f"samples a pixel: {chosen.spp}",
-        *_steps(chosen),
+        *_why(chosen),
         *_left_out(chosen),
     ]
     if chosen.cosines:

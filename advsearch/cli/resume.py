@@ -10,6 +10,11 @@ from advsearch.errors import InputError
 
 HELP = "go on with a run that was stopped, where it was stopped"
 
+_EXAMPLES = """examples:
+  advsearch resume mug-texture-001
+  advsearch resume mug-plan-001 seconds=600
+"""
+
 
 def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add the command."""
@@ -17,9 +22,14 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         "resume",
         help=HELP,
         description=HELP[0].upper() + HELP[1:] + "; what it has evaluated is not rendered again.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
     parser.add_argument("run", metavar="RUN", help="a run's name or folder")
+    parser.add_argument(
+        "change", metavar="NAME=VALUE", nargs="*", help="a setting to change that decides no number: threads=2"
+    )
     output.add_code_flag(parser)
     output.add_flags(parser, quiet=True)
 
@@ -28,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     """Do what is left of the run and print its answer; of a run that is done, its answer."""
     import sys
 
-    from advsearch.cli.run import carry_out, command_in
+    from advsearch.cli.run import carry_out, changes_in, command_in
     from advsearch.runs.directory import CONFIG, find_run
     from advsearch.runs.listing import finished
 
@@ -40,4 +50,4 @@ def run(args: argparse.Namespace) -> int:
 
         print(f"advsearch: {path} is done already", file=sys.stderr)
         return show_run(str(path), args.json)
-    return carry_out(command_in(path / CONFIG), path / CONFIG, {}, args, resumed=path)
+    return carry_out(command_in(path / CONFIG), path / CONFIG, changes_in(args.change), args, resumed=path)

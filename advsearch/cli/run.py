@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,15 +33,24 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read the file, put the changes over it and do what it says."""
-    from advsearch.settings import parse_assignment
-
     command = command_in(args.file)
-    changes = dict(parse_assignment(text, f"change {text!r}") for text in args.change)
+    changes = changes_in(args.change)
     if args.run is not None:
         changes["run"] = args.run
     if args.overwrite:
         changes["overwrite"] = True
     return carry_out(command, args.file, changes, args)
+
+
+def changes_in(words: Sequence[str]) -> dict[str, object]:
+    """Return setting to value from ``NAME=VALUE``.
+
+    Raises:
+        InputError: a word is no such assignment.
+    """
+    from advsearch.settings import parse_assignment
+
+    return dict(parse_assignment(text, f"change {text!r}") for text in words)
 
 
 def command_in(file: str | Path) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 
 from advsearch.engine.memory import Memory
+from advsearch.interrupts import interruptible
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME, Fields, Result
 from advsearch.runs.summary import NAME, read_result
@@ -95,11 +96,12 @@ def kept_rows(
     taken: list[Row] = []
     ending = INTERRUPTED
     try:
-        for row in rows:
-            taken.append(row)
-            if results.made:
-                run.write_summary(result(taken, ending))  # what a kill leaves
-        ending = "done"
+        with interruptible():
+            for row in rows:
+                taken.append(row)
+                if results.made:
+                    run.write_summary(result(taken, ending))  # what a kill leaves
+            ending = "done"
     except KeyboardInterrupt:
         pass
     except OutOfTime:

@@ -8,18 +8,21 @@ to noise).
 
 from __future__ import annotations
 
+import base64
 import itertools
 import statistics
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
 from advsearch.engine.gradients import EXPENSIVE, Loss, estimated, only
+from advsearch.files import Json
 from advsearch.runs.results.check import GradientStatus
 from advsearch.runs.results.plan import CosineRow
 from advsearch.scene.gradients.group import Group
@@ -49,8 +52,13 @@ TELLS = 0.5
 the truth is then about sqrt(3 c / (1 + 2 c)) (Spearman and Brown), 0.87 and less. Above it the noise of the converged
 one, which is independent of the working one's, only makes the measured cosine smaller: what is called `ok` is so."""
 
-Keep = Callable[[str, Callable[[], Sequence[CosineRow]]], Sequence[CosineRow]]
-"""From the name of a measurement, and what makes it, to its rows: those that are known already, or those it makes."""
+Keep = Callable[[str, Callable[[], Any]], Any]
+"""From the name of a measurement, and what makes it, to a JSON value: one that is known already, or what it makes."""
+
+
+def measured_now(name: str, measure: Callable[[], Any]) -> Any:
+    """Return what a measurement makes: the `Keep` that keeps nothing."""
+    return measure()
 
 
 def status_of(cosine: float, converged: float) -> GradientStatus:
@@ -110,6 +118,7 @@ def measured_plan(
     every: bool = False,
     counted: bool = False,
     tick: Callable[[], None] = lambda: None,
+    keep: Keep = measured_now,
 ) -> GradientPlan:
     """Return the renderer's plan with every contested choice made by measurement at u.
 
@@ -124,10 +133,11 @@ def measured_plan(
         counted: take the renders that an estimator needs for its time (an adjoint for `ADJOINT_RENDERS`), so that the
             choice is the same on a busy machine.
         tick: called after each gradient.
+        keep: asked for each gradient, by a name.
     """
     plan = renderer.plan
     for groups, candidates in contested(plan, every=every):
-        scores = _scores(renderer, loss, u, groups, candidates, seed, spp, repeats, counted, tick)
+        scores = _scores(renderer, loss, u, groups, candidates, seed, spp, repeats, counted, tick, keep)
         best = min(scores, key=lambda name: scores[name])
         others = ", ".join(f"{name} {score / scores[best]:.3g}" for name, score in scores.items() if name != best)
         time = "renders" if counted else "time"
@@ -154,6 +164,7 @@ def _scores(
     repeats: int,
     counted: bool,
     tick: Callable[[], None],
+    keep: Keep,
 ) -> dict[str, float]:
     """Squared error x seconds of each candidate. The reference is the mean of the differences among them, whose own
     noise is taken off the others' errors. Random directions are no reference: where there are no other differences,
@@ -161,13 +172,18 @@ def _scores(
     names = {group.name for group in groups}
     gradients: dict[str, Tensor] = {}
     seconds: dict[str, float] = {}
+
+    def timed(estimator: str, number: int) -> Json:
+        begun, noise = time.perf_counter(), seeds.stream(seed, "plan", number)
+        gradient = estimated(renderer, loss, u, estimator, names, noise, spp)
+        return {"seconds": time.perf_counter() - begun, "gradient": _packed(gradient, groups)}
+
     for estimator in candidates:
         found, times = [], []
         for number in range(repeats):
-            begun = time.perf_counter()
-            noise = seeds.stream(seed, "plan", number)
-            found.append(estimated(renderer, loss, u, estimator, names, noise, spp))
-            times.append(time.perf_counter() - begun)
+            one = keep(f"{groups[0].name} by {estimator} {number}", partial(timed, estimator, number))
+            found.append(_unpacked(one["gradient"], groups, u))
+            times.append(one["seconds"])
             tick()
         cost = 1.0 + only(renderer.plan, names, estimator).renders
         cost += ADJOINT_RENDERS if estimator in BY_ADJOINT else 0.0
@@ -215,13 +231,13 @@ def cosines(
     repeats: int = REPEATS,
     controls: Collection[str] | None = None,
     tick: Callable[[int], None] = lambda samples: None,
-    keep: Keep = lambda name, measure: measure(),
+    keep: Keep = measured_now,
 ) -> Iterator[CosineRow]:
     """Measure, control by control, the cosine of working gradients with the converged one at the same step.
 
     Sample counts are tried in their order until one reaches the goal at a step; then the next step follows. With
     `controls` only these are measured. `tick` is called after each gradient with the samples a pixel that it took;
-    `cosine_samples` bounds their sum. `keep` is asked for the rows of each control and step, by a name.
+    `cosine_samples` bounds their sum. `keep` is asked for each gradient, by a name.
     """
     base = renderer.plan
     for control in dict.fromkeys(group.control for group in base.groups):
@@ -238,8 +254,7 @@ def cosines(
             if plan in tried:  # no step can be wider
                 continue
             tried.append(plan)
-            measure = partial(_cosines_at, renderer, plan, loss, u, control, factor, seed, counts, repeats, tick)
-            for row in keep(f"{control} x {factor:g}", measure):
+            for row in _cosines_at(renderer, plan, loss, u, factor, seed, counts, repeats, tick, keep):
                 reached = reached or row.status == "ok"
                 yield row
 
@@ -256,58 +271,80 @@ def _cosines_at(
     plan: GradientPlan,
     loss: Loss,
     u: Tensor,
-    control: str,
     factor: float,
     seed: int,
     counts: Sequence[int],
     repeats: int,
     tick: Callable[[int], None],
-) -> list[CosineRow]:
-    """The rows of one control at one step; the renderer has this plan meanwhile."""
-    before = renderer.plan
-    renderer.plan = plan
+    keep: Keep,
+) -> Iterator[CosineRow]:
+    """The rows of the one control that a plan differentiates, at its step."""
+    groups = [one for one in plan.groups if one.estimator != "none"]
+    control = groups[0].control
+    place = f"{control} x {factor:g}"
+
+    def gradient(stream: str, number: int, spp: int) -> Tensor:
+        before, renderer.plan = renderer.plan, plan
+        try:
+            return renderer.gradient(loss, u, seeds.stream(seed, stream, number), spp)[1]
+        finally:
+            renderer.plan = before
+
+    def witness(spp: int, number: int) -> str:
+        return _packed(gradient("converged", number, spp), groups)
 
     def converged(spp: int) -> tuple[Tensor, float]:
         found = []
         for k in range(WITNESSES):
-            found.append(renderer.gradient(loss, u, seeds.stream(seed, "converged", k), spp)[1])
+            kept = keep(f"{place} converged {spp} {k}", partial(witness, spp, k))
+            found.append(_unpacked(kept, groups, u))
             tick(spp)
         agreements = torch.tensor([_cosine(*pair) for pair in itertools.combinations(found, 2)])
         return torch.stack(found).mean(dim=0), float(agreements.min())  # NaN if one is
 
-    try:
-        many = CONVERGED
-        truth, agreement = converged(many)
-        found = []
-        for spp in counts:
-            if many == CONVERGED and (agreement < GOAL or spp > CONVERGED):
-                many = AGAIN * CONVERGED
-                truth, agreement = converged(many)
-            values, times = [], []
-            for number in range(repeats):
-                begun = time.perf_counter()
-                gradient = renderer.gradient(loss, u, seeds.stream(seed, "working", number), spp)[1]
-                times.append(time.perf_counter() - begun)
-                values.append(_cosine(gradient, truth))
-                tick(spp)
-            mean = statistics.fmean(values)
-            found.append(
-                CosineRow(
-                    denoise=renderer.formation.denoiser,
-                    control=control,
-                    factor=factor,
-                    spp=spp,
-                    cosine=mean,
-                    converged=agreement,
-                    seconds=statistics.median(times),
-                    status=status_of(mean, agreement),
-                )
-            )
-            if mean >= GOAL:
-                break
-        return found
-    finally:
-        renderer.plan = before
+    def working(spp: int, number: int) -> Json:
+        begun = time.perf_counter()
+        found = gradient("working", number, spp)
+        return {"seconds": time.perf_counter() - begun, "cosine": _cosine(found, truth)}
+
+    many = CONVERGED
+    truth, agreement = converged(many)
+    for spp in counts:
+        if many == CONVERGED and (agreement < GOAL or spp > CONVERGED):
+            many = AGAIN * CONVERGED
+            truth, agreement = converged(many)
+        tried = []
+        for number in range(repeats):
+            tried.append(keep(f"{place} {spp} {number}", partial(working, spp, number)))
+            tick(spp)
+        mean = statistics.fmean(one["cosine"] for one in tried)
+        yield CosineRow(
+            denoise=renderer.formation.denoiser,
+            control=control,
+            factor=factor,
+            spp=spp,
+            cosine=mean,
+            converged=agreement,
+            seconds=statistics.median(one["seconds"] for one in tried),
+            status=status_of(mean, agreement),
+        )
+        if mean >= GOAL:
+            break
+
+
+def _packed(gradient: Tensor, groups: Sequence[Group]) -> str:
+    """The numbers of some groups as text: float32 in base 64."""
+    part = torch.cat([gradient[one.coordinates] for one in groups])
+    return base64.b64encode(part.to(torch.float32).numpy().tobytes()).decode("ascii")
+
+
+def _unpacked(text: str, groups: Sequence[Group], u: Tensor) -> Tensor:
+    """The gradient (d,) that `_packed` packed; zero elsewhere."""
+    part = torch.frombuffer(bytearray(base64.b64decode(text)), dtype=torch.float32)
+    gradient = torch.zeros_like(u)
+    for one, values in zip(groups, part.split([one.size for one in groups]), strict=True):
+        gradient[one.coordinates] = values
+    return gradient
 
 
 def _cosine(one: Tensor, other: Tensor) -> float:

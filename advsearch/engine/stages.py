@@ -38,6 +38,7 @@ from advsearch.engine.planning import cosine_samples, cosines, measured_plan, pl
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.transport import Transport, reason_against
+from advsearch.interrupts import interruptible
 from advsearch.report.wording import count
 from advsearch.scene.transport.renderer import TransportTooLargeError
 from advsearch.tasks import Judgement
@@ -86,16 +87,17 @@ class Attack:
         if self.budget.smallest:
             scaled(self.problem.domain, 1.0)  # refuses what has no budget before anything is rendered
         try:
-            self.plan()
-            if self.worth_attacking():
-                self.collect_transport()
-                if self.budget.smallest:
-                    find_smallest(self)
-                else:
-                    self.search()
-                self.verify()
-            if self.budget.average:
-                self.average()
+            with interruptible():
+                self.plan()
+                if self.worth_attacking():
+                    self.collect_transport()
+                    if self.budget.smallest:
+                        find_smallest(self)
+                    else:
+                        self.search()
+                    self.verify()
+                if self.budget.average:
+                    self.average()
         except KeyboardInterrupt:
             self.findings.interrupted = True
         self.stages.end()

@@ -21,6 +21,7 @@ from advsearch.engine.measuring import Results
 from advsearch.engine.planning import cosine_samples, cosines
 from advsearch.errors import InputError
 from advsearch.files import Json
+from advsearch.interrupts import INTERRUPTS
 from advsearch.progress import NullProgress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed
@@ -56,6 +57,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(planning, function.__name__, partial(function, counts=(2,), factors=(1.0, 3.0)))
     monkeypatch.setattr("advsearch.engine.planning.CONVERGED", 2)
     monkeypatch.setattr("advsearch.engine.planning.AGAIN", 2)
+    monkeypatch.setattr(INTERRUPTS, "count", 0)
     monkeypatch.setattr(planning, "measured_gains", lambda *_, **__: gains())
     length = PathLength(depth=3, full=6, cuts=[], configurations=1, reason="few")
     monkeypatch.setattr(planning, "bounces_of", lambda *_, **__: length)
@@ -94,7 +96,8 @@ class Stop(NullProgress):
 
     def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
         if self.at and self.at in name:
-            raise KeyboardInterrupt
+            INTERRUPTS.count += 1
+            raise RuntimeError("what Dr.Jit makes of a KeyboardInterrupt")
 
 
 def test_a_plan_that_is_stopped_anywhere_goes_on_to_the_same_result(
@@ -115,6 +118,7 @@ def test_a_plan_that_is_stopped_anywhere_goes_on_to_the_same_result(
             assert stopped.not_measured == LEFT and before == 1
             assert "not measured, it was stopped:\n  step and samples of camera\n" in answer(stopped)
             assert listed(tmp_path)[0].state == "stopped"
+    INTERRUPTS.count = 0
     assert main(["resume", str(folder), "--json", "--quiet"]) == 0
     resumed = PlanResult.of(json.loads(capsys.readouterr().out))
     assert timeless(resumed) == timeless(whole) == timeless(kept(folder)) and finished(folder)
@@ -125,24 +129,24 @@ def test_a_plan_that_is_stopped_anywhere_goes_on_to_the_same_result(
 def test_seconds_end_a_plan_and_may_be_changed_before_it_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder, asked = tmp_path / "run", []
+    folder, sittings = tmp_path / "run", list[Results]()
+
+    def results(memory: Any, seconds: float | None) -> Results:
+        sittings.append(Results(memory, seconds))
+        return sittings[-1]
+
+    monkeypatch.setattr(planning, "Results", results)
     cut = plan_from_config(PlanConfig(**SMALL, seconds=1e-9, run=str(folder)))
-    assert cut.ending == "out of time" and not cut.cosines and cut.not_measured == LEFT
-    assert "not measured, the time was up:\n  step and samples of camera\n" in answer(cut)
-    written = (folder / "run.yaml").read_text("utf-8")
-    (folder / "run.yaml").write_text(written.replace("seconds: 1.0e-09", "seconds: 3600.0"), "utf-8")
-
-    def stored(memory: Any, seconds: float | None) -> Results:
-        asked.append(seconds)
-        return Results(memory, 1e-9)
-
-    monkeypatch.setattr(planning, "Results", stored)
-    assert main(["resume", str(folder), "--quiet"]) == 0
-    assert asked == [3600.0] and len(kept(folder).cosines) == 1  # a sitting always gets on
-    assert [one.variance_x_seconds for one in kept(folder).groups] == [one.variance_x_seconds for one in cut.groups]
+    assert cut.ending == "out of time" and not cut.cosines and cut.not_measured == ["ways to differentiate", *LEFT]
+    assert "not measured, the time was up:\n  ways to differentiate\n" in answer(cut)
+    assert main(["resume", str(folder), "--quiet"]) == 0  # one gradient is taken, whatever the time
     assert f"Go on with: advsearch resume {folder}\n" in capsys.readouterr().out
-    (folder / "run.yaml").write_text(written.replace("seed: 0", "seed: 1"), "utf-8")
-    assert main(["resume", str(folder)]) == 2
+    assert [one.made for one in sittings] == [1, 1]
+    assert main(["resume", str(folder), "seconds=3600", "--quiet"]) == 0
+    assert kept(folder).ending == "done" and kept(folder).command_line == cut.command_line.replace("1e-09", "3600")
+    other = tmp_path / "other"
+    plan_from_config(PlanConfig(**SMALL, seconds=1e-9, run=str(other)))
+    assert main(["resume", str(other), "seed=1"]) == 2
     assert "seed was 0 and is 1 now" in capsys.readouterr().err
 
 
@@ -169,7 +173,7 @@ def test_a_run_that_goes_on_is_not_removed_when_that_fails(tmp_path: Path) -> No
     folder = tmp_path / "run"
     with RunDirectory.create_for(PlanConfig(**SMALL, run=str(folder))):
         pass  # a kill before anything was measured
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(RuntimeError):
         plan_from_config(PlanConfig(**SMALL), progress=Stop(stage="loading"), resumed=folder)
     assert (folder / "run.yaml").is_file()
     with pytest.raises(InputError), RunDirectory.create_for(PlanConfig(**SMALL, run=str(tmp_path / "new"))):

@@ -29,6 +29,7 @@ from advsearch.attacks import (
 )
 from advsearch.attacks.candidates import Candidate, admit, best, contenders
 from advsearch.errors import InputError
+from advsearch.interrupts import INTERRUPTS
 
 DOMAIN = Domain(torch.full((3,), 0.5), (Block(3, "linf", 0.2),))
 
@@ -411,11 +412,18 @@ def test_non_finite_gradient_elements_become_zero_and_are_counted() -> None:
 # ---- interrupts
 
 
-def interrupt_at(number: int) -> Callable[..., Evaluation]:
+@pytest.fixture(autouse=True)
+def no_interrupts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of one test are not the next one's."""
+    monkeypatch.setattr(INTERRUPTS, "count", 0)
+
+
+def interrupt_at(number: int, error: type[BaseException] = KeyboardInterrupt) -> Callable[..., Evaluation]:
     def value(u: Tensor, index: int) -> float:
         calls.append(index)
         if len(calls) == number:
-            raise KeyboardInterrupt
+            INTERRUPTS.count += 1
+            raise error
         return float(u[0] - 0.5)
 
     calls: list[int] = []
@@ -430,6 +438,12 @@ def test_an_interrupt_keeps_the_best_so_far(number: int, expected: float) -> Non
     assert result.ending is Ending.INTERRUPTED
     assert torch.equal(result.best_u, at(expected))
     assert result.renders == number - 1
+
+
+def test_what_native_code_makes_of_an_interrupt_is_one() -> None:
+    """Dr.Jit and Mitsuba make a RuntimeError of a KeyboardInterrupt that strikes in a callback of theirs."""
+    result = search(interrupt_at(3, RuntimeError), DOMAIN, Script((at(-0.1), at(0.1), at(0.15))), steps=3, seed=0)
+    assert result.ending is Ending.INTERRUPTED and torch.equal(result.best_u, at(0.1))
 
 
 def test_an_interrupt_in_the_callback_keeps_that_very_step() -> None:

@@ -78,6 +78,7 @@ def test_the_first_plan_takes_what_is_preferred_and_obeys_force() -> None:
     ("forced", "message"),
     [
         ({"pose": "magic"}, "unknown estimator for pose 'magic'"),
+        ({"*": "magic"}, "unknown estimator 'magic'"),
         ({"poze": "secant"}, "unknown control in `estimators` 'poze'"),
         ({"pose.yaw": "adjoint"}, "`estimators` pose.yaw=adjoint: not valid there; expected one of secant, material"),
     ],

@@ -25,6 +25,7 @@ from advsearch.engine.sweeps.points import Picks, Points
 from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.engine.sweeps.worst import check_worst
+from advsearch.interrupts import interruptible
 from advsearch.progress import Progress
 from advsearch.report.notebook import sweep_html
 from advsearch.report.studies import sweep_figure
@@ -141,15 +142,16 @@ class Sweep:
         for text in self.job.said:
             self.stages.progress.message(text)
         try:
-            self._open(min(first, self.total - 1) // self.models // self.per_scene)
-            hint = f"{self.total} answers, pictures of {count(self.samples, 'sample')} a pixel; `resolution`, `spp`"
-            hint += " or fewer points shorten it"
-            self.stages.begin("sweep", "rendering and classifying", self.total, hint=hint)
-            self.stages.progress.advance(first)
-            self._go_through(first, tally)
-            worst = self._claimed(tally)
-            if worst is not None:
-                worst = worst.model_copy(update={"verified": self._verified(worst)})
+            with interruptible():
+                self._open(min(first, self.total - 1) // self.models // self.per_scene)
+                hint = f"{self.total} answers, pictures of {count(self.samples, 'sample')} a pixel; `resolution`, `spp`"
+                hint += " or fewer points shorten it"
+                self.stages.begin("sweep", "rendering and classifying", self.total, hint=hint)
+                self.stages.progress.advance(first)
+                self._go_through(first, tally)
+                worst = self._claimed(tally)
+                if worst is not None:
+                    worst = worst.model_copy(update={"verified": self._verified(worst)})
         except KeyboardInterrupt:
             ending = INTERRUPTED
             if self.run is not None and self.run.store.count(KIND) != tally.seen:

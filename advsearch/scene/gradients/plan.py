@@ -162,7 +162,8 @@ def first_plan(
     forced = dict(forced or {})
     for name, estimator in forced.items():
         if estimator not in ESTIMATORS:
-            raise UnknownNameError(f"estimator for {name}", estimator, ESTIMATORS)
+            what = "estimator" if name == "*" else f"estimator for {name}"
+            raise UnknownNameError(what, estimator, ESTIMATORS)
     names = {key for group in groups for key in (group.name, group.control)}
     for name in forced:
         if name != "*" and name not in names:
