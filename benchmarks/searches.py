@@ -5,6 +5,7 @@
                                   [--spp N]
                                   [--object FILE --environment FILE --model FILE --labels FILE --label NAME]
     python benchmarks/searches.py --texture [--seeds 10]
+    python benchmarks/searches.py --transport [--seeds 10] [--renders 40] [--epsilon E] [--resolution 128]
 
 The first prints, for each space and policy, the median over seeds of the verified margin (the mean of fresh trials at a
 high sample count, in logits; above 0 the model is wrong), how far `auto` is below the best single policy, and which
@@ -14,6 +15,9 @@ render with; the trials always have 64 samples.
 
 The second compares the renders that gradient search needs with those of the best policy without gradients: the margin
 that `pgd` reaches within a tenth of the renders, and the margins of the others with all of them.
+
+The third compares texture searches that render with those by a matrix of light transport: quartiles of the verified
+margin, and of the processor's seconds that a search takes, making the matrix and ranking included.
 """
 
 from __future__ import annotations
@@ -21,7 +25,9 @@ from __future__ import annotations
 import argparse
 import statistics
 import sys
+import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -31,6 +37,7 @@ from advsearch.api.attack import problem_from_config
 from advsearch.attacks import make_policy, search
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
+from advsearch.engine.transport import Transport
 
 TRIALS, TRIAL_SPP = 12, 64
 BLIND = ("random", "nes")
@@ -54,9 +61,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--resolution", type=int, default=64)
     parser.add_argument("--spp", type=int)
     parser.add_argument("--texture", action="store_true")
+    parser.add_argument("--transport", action="store_true")
+    parser.add_argument("--epsilon", type=float)
     args = parser.parse_args(argv)
     threads.configure(None)
-    (_texture if args.texture else _spaces)(args)
+    (_texture if args.texture else _transport if args.transport else _spaces)(args)
     return 0
 
 
@@ -67,7 +76,7 @@ def _problem(args: argparse.Namespace, control: str) -> Problem:
         model=args.model,
         labels=args.labels,
         label=args.label,
-        controls={control: {}},
+        controls={control: {} if args.epsilon is None else {"epsilon": args.epsilon}},
         resolution=args.resolution,
         spp=args.spp,
         measure="no",
@@ -124,6 +133,32 @@ def _texture(args: argparse.Namespace) -> None:
         values = [_answer(problem, policy, renders, seed) for seed in range(args.seeds)]
         median = statistics.median(values)
         print(f"| {policy} | {renders} | {median:.2f} | {min(values):.2f} | {max(values):.2f} |", flush=True)
+
+
+def _transport(args: argparse.Namespace) -> None:
+    problem = _problem(args, "texture")
+    print("| pictures are | verified margin: lowest, quartiles, highest | processor's seconds, quartiles |")
+    print("| --- | --- | --- |")
+    for name in ("rendered", "predicted"):
+        margins, seconds = [], []
+        for seed in range(args.seeds + 1):
+            problem.seed = seeds.stream(7, "searches", seed)
+            begun = time.process_time()
+            transport = Transport(problem, args.renders)
+            predicted = name == "predicted"
+            found = search(
+                transport.evaluator("search") if predicted else problem.evaluator("search"),
+                replace(problem.domain, exact=predicted),
+                make_policy("auto"),
+                steps=args.renders,
+                seed=seeds.stream(seed, "auto"),
+            )
+            if seed:  # the first one compiles the renderer's code
+                seconds.append(time.process_time() - begun)
+                margins.append(_verified(problem, found.best_u))
+        inner = " ".join(f"{value:.2f}" for value in statistics.quantiles(margins, n=4, method="inclusive"))
+        took = " ".join(f"{value:.2f}" for value in statistics.quantiles(seconds, n=4, method="inclusive"))
+        print(f"| {name} | {min(margins):.2f}, {inner}, {max(margins):.2f} | {took} |", flush=True)
 
 
 if __name__ == "__main__":

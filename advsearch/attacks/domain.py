@@ -106,6 +106,8 @@ class Domain:
             for each number with central differences.
         partial_gradients: whether `evaluate` understands `gradient="free"`, the part of the gradient that costs
             nothing.
+        exact: whether evaluations are free of noise: equal configurations have equal objectives and gradients, as where
+            a matrix predicts the pictures (docs/transport.md).
         first: (d,) where a policy should begin, if not at the start; it moves no ball. For wrappers that begin
             several times.
         lower, upper: (d,) float32 bounds; those of an l-infinity ball are cut into them already.
@@ -119,6 +121,7 @@ class Domain:
     blocks: tuple[Block, ...]
     gradient_cost: int = 0
     partial_gradients: bool = False
+    exact: bool = False
     first: Tensor | None = None
     lower: Tensor = field(init=False, repr=False)
     upper: Tensor = field(init=False, repr=False)

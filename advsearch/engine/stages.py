@@ -235,9 +235,10 @@ class Attack:
             self.stages.progress.advance(record.renders - before, best=record.best)
             before = record.renders
 
+        domain = self.problem.domain if domain is None else domain
         found = run_search(
             self._evaluator(kind, frames),
-            self.problem.domain if domain is None else domain,
+            domain if self.findings.transport is None else replace(domain, exact=True),
             policy,
             steps=steps,
             seed=seed,

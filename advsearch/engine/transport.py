@@ -25,8 +25,9 @@ WORTH = 16
 """Evaluations from which a search pays for the matrix, which costs as much as some 6 rendered ones with gradients
 (`benchmarks/transport.py`)."""
 EVERY = 20
-BOUND = 1.0
-"""Levels of 255, root mean square over the picture."""
+BOUND = 2.0
+"""Levels of 255, root mean square over the picture. On the bundled mug a matrix made anew at 1.7 levels, half way
+through 40 evaluations, moved the verified margin by 0.1 of 28 logits, for as long as all of them take."""
 CHECK_SPP = 64
 """Samples a pixel of the traced pictures of a comparison."""
 Tick = Callable[[int], None]

@@ -42,6 +42,9 @@ into the ascent. One by differences never is: half a number for each, and the su
 REACH = 0.1
 """Length of the ascent's whole step in a box, as a share of half the diagonal: the screen has been everywhere else."""
 
+MOMENTUM = 0.75
+"""Weight of past gradients where none has noise and all point the same way; with noise PGD's own is better."""
+
 CURIOSITY = 2.0
 """How many standard deviations of the surrogate a candidate gets on top of its mean. One does as well without noise;
 with a noise as large as all differences it settles too soon on a lucky point."""
@@ -118,7 +121,7 @@ class AutoState:
 class Auto(Policy[AutoState]):
     """What to use first; it has no options.
 
-    - Norm balls alone (a texture): `PGD`, bit for bit.
+    - Norm balls alone (a texture): `PGD`, bit for bit; with more momentum where evaluations have no noise.
     - Box coordinates alone (poses, cameras, lights, choices): the start and scrambled Sobol points take half of the
       renders. Then a Gaussian process is fitted to all that was seen, and the next point is the candidate with the
       largest mean plus `CURIOSITY` standard deviations (GP-UCB, Srinivas et al. 2010), among moves of the best points,
@@ -140,7 +143,7 @@ class Auto(Policy[AutoState]):
         points = torch.empty(0, box.count)
         plan = make_plan(domain, box, steps)
         if box.count == 0:
-            return AutoState(domain, box, plan, 0, points, points, ascent=PGD().start(domain, generator, steps))
+            return AutoState(domain, box, plan, 0, points, points, ascent=_pgd(domain).start(domain, generator, steps))
         seed = draw_seed(generator)
         with one_thread():
             screen = box.screen(seed, max(0, plan.screen - 1))
@@ -152,7 +155,7 @@ class Auto(Policy[AutoState]):
             with one_thread():
                 state = _begin_ascent(state)
         if state.ascent is not None:
-            steps, _ = PGD().propose(state.ascent, n)
+            steps, _ = _pgd(state.domain).propose(state.ascent, n)
             if steps:
                 proposal, state = _climb(state, steps[0])
                 return (proposal,), state
@@ -169,7 +172,7 @@ class Auto(Policy[AutoState]):
         state = replace(state, spent=state.spent + sum(evaluation.cost for _, evaluation in evaluated))
         if state.climbing and state.ascent is not None:
             ((u, evaluation),) = evaluated
-            ascent = PGD().update(state.ascent, evaluated)
+            ascent = _pgd(state.domain).update(state.ascent, evaluated)
             if state.trial is not None and evaluation.objective < state.trial.objective:
                 u = state.domain.project(state.box.put(ascent.u, state.trial.x))
                 ascent = replace(ascent, u=u, counts=ascent.counts + Counts(rejected=1))
@@ -179,7 +182,7 @@ class Auto(Policy[AutoState]):
         return replace(state, points=points, values=values)
 
     def counts(self, state: AutoState) -> Counts:
-        return NO_COUNTS if state.ascent is None else PGD().counts(state.ascent)
+        return NO_COUNTS if state.ascent is None else _pgd(state.domain).counts(state.ascent)
 
 
 def make_plan(domain: Domain, box: Coordinates, steps: int) -> Plan:
@@ -248,6 +251,11 @@ def _surrogate(state: AutoState) -> tuple[Surrogate, AutoState]:
 # ---- the ascent -----------------------------------------------------------------------------------------------------
 
 
+def _pgd(domain: Domain) -> PGD:
+    """What climbs in a domain."""
+    return PGD(momentum=MOMENTUM) if domain.exact else PGD()
+
+
 def _begin_ascent(state: AutoState) -> AutoState:
     """Let PGD go on from the best of the points seen so far, with small steps in the box."""
     x = state.box.take(state.domain.begin)
@@ -258,7 +266,7 @@ def _begin_ascent(state: AutoState) -> AutoState:
         replace(block, reach=REACH * block.radius) if block.norm == "box" else block for block in state.domain.blocks
     )
     domain = replace(state.domain, blocks=blocks)
-    ascent = PGD().start(domain, seeded(state.seed, 0), max(1, state.plan.steps - state.spent))
+    ascent = _pgd(domain).start(domain, seeded(state.seed, 0), max(1, state.plan.steps - state.spent))
     return replace(state, ascent=replace(ascent, u=domain.project(state.box.put(domain.begin, x))))
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain
-from advsearch.attacks.policies.base import Counts
+from advsearch.attacks.policies.base import NO_COUNTS, Counts
 
 CLIP = 3.0
 """What exceeds the median so many times is out of the usual."""
@@ -33,12 +33,15 @@ def clipped(domain: Domain, gradient: Tensor, lengths: tuple[float, ...]) -> tup
       l-infinity ball, where the step follows the signs, so that this changes how gradients are averaged and no single
       step; `CLIP_L2` in an l2 ball.
     - A gradient that is longer than `CLIP` times the median of the last `MEMORY` is shortened to that.
+    - In a domain that is `exact` nothing is an outlier.
 
     Args:
         domain: whose blocks count.
         gradient: (d,) float32, finite.
         lengths: of the gradients before, the latest last.
     """
+    if domain.exact:
+        return gradient, lengths, NO_COUNTS
     out, cut, shortened = gradient, False, False
     for block, part in domain.parts():
         if block.norm != "box" and block.size >= FEWEST:

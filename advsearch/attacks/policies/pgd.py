@@ -1,4 +1,4 @@
-"""Projected gradient ascent with momentum and a step size that halves when the objective stalls."""
+"""Projected gradient ascent with momentum and a step size that halves when the objective stalls, or falls in a line."""
 
 from __future__ import annotations
 
@@ -24,6 +24,18 @@ FEWEST = 3
 IMPROVING = 0.75
 """Fraction of a window's steps that must improve the objective for the step size to be kept (Auto-PGD's rho)."""
 
+SLOWEST = 0.05
+"""What is left of the step size at the end of a search without noise, as a fraction of the first."""
+
+FEWEST_EXACT = 5
+"""The same as `FEWEST` without noise, where all windows have the shortest length."""
+
+GAIN = 1e-3
+"""Without noise, what a window must add to the best of the one before, as a fraction of what the search has gained."""
+
+ENOUGH = 3
+"""Windows in a row that add less, after which there is nothing to gain."""
+
 PATIENCE = 5
 """Evaluations in a row without any gradient after which there is nothing to follow."""
 
@@ -46,7 +58,7 @@ class Window:
         values: objectives since the last one.
         before: the objective just before `values`; NaN at the start.
         improved: how many of `values` exceed their predecessor.
-        best: best objective at the last checkpoint.
+        best: best objective at the last checkpoint; without noise, of the window before it.
         halved: whether the step size was halved there.
     """
 
@@ -91,8 +103,10 @@ class PGDState:
         steps: evaluations that the renders suffice for.
         u: (d,) what to propose next.
         direction: (d,) accumulated gradient.
-        step_size: in units of each block's radius.
+        first: the objective at the start; NaN before it is known.
+        step_size: in units of each block's radius, before it falls.
         flat: evaluations in a row whose gradient was zero.
+        idle: windows in a row that added nothing; counted without noise only.
         count: evaluations so far.
         lengths: of the latest gradients, as `clipped` wants them.
         counts: outliers cut and steps taken back so far.
@@ -106,10 +120,19 @@ class PGDState:
     step_size: float
     peak: Peak | None
     window: Window
+    first: float = math.nan
     flat: int = 0
+    idle: int = 0
     count: int = 0
     lengths: tuple[float, ...] = ()
     counts: Counts = NO_COUNTS
+
+    @property
+    def pace(self) -> float:
+        """The step size now, in units of each block's radius: without noise it falls in a line over the steps."""
+        if not self.domain.exact:
+            return self.step_size
+        return self.step_size * max(SLOWEST, 1.0 - self.count / self.steps)
 
 
 @dataclass(frozen=True)
@@ -129,6 +152,11 @@ class PGD(Policy[PGDState]):
     Hein 2020, section 3.1; see `Window.stalled`). There we depart from Auto-PGD: it always goes on from the best
     configuration after halving; a noisy best is often only a lucky one, so we go back only if the last window lags
     behind it by two of the window's standard deviations.
+
+    In a domain without noise (`Domain.exact`) no gradient is clipped, and the step size falls in a line over the
+    planned steps, which came farther than Auto-PGD's rule at every budget that was tried (docs/policies/pgd.md). It is
+    halved besides after a window that added less than `GAIN` of what the search has gained; after `ENOUGH` of these in
+    a row there is nothing more to propose.
 
     An evaluation with the objective -inf sends the search back to its best configuration, which is evaluated again
     and left with half the step size. A gradient of zero leaves the accumulated one in charge; if that is zero too, the
@@ -163,13 +191,14 @@ class PGD(Policy[PGDState]):
         seed = draw_seed(generator)
         u = domain.sample(seeded(seed, 0))[0] if self.random_start else domain.begin
         steps = max(1, steps // (1 + domain.gradient_cost))
-        window = Window(max(FEWEST, round(FIRST_WINDOW * steps)))
+        fewest, share = (FEWEST_EXACT, SHORTEST) if domain.exact else (FEWEST, FIRST_WINDOW)
+        window = Window(max(fewest, round(share * steps)))
         return PGDState(domain, steps, seed, u, torch.zeros_like(u), self.step_size, None, window)
 
     def propose(self, state: PGDState, n: int) -> tuple[tuple[Proposal, ...], PGDState]:
-        if state.flat >= PATIENCE:
+        if state.flat >= PATIENCE or state.idle >= ENOUGH:
             return (), state
-        return (Proposal(state.u, gradient=True, step_size=state.step_size),), state
+        return (Proposal(state.u, gradient=True, step_size=state.pace),), state
 
     def update(self, state: PGDState, evaluated: Evaluated) -> PGDState:
         ((u, evaluation),) = evaluated
@@ -183,10 +212,12 @@ class PGD(Policy[PGDState]):
         state = _accumulate(state, gradient, self.momentum)
         if state.peak is None or evaluation.objective > state.peak.objective:
             state = replace(state, peak=Peak(evaluation.objective, u, state.direction))
+        if math.isnan(state.first):
+            state = replace(state, first=evaluation.objective)
         state = replace(state, window=state.window.add(evaluation.objective))
         if len(state.window.values) < state.window.length:
             return _step(state, u, state.direction)
-        return _checkpoint(state, u)
+        return _slower(state, u) if state.domain.exact else _checkpoint(state, u)
 
     def counts(self, state: PGDState) -> Counts:
         return state.counts
@@ -227,10 +258,23 @@ def _checkpoint(state: PGDState, u: Tensor) -> PGDState:
     return _step(state, u, direction)
 
 
+def _slower(state: PGDState, u: Tensor) -> PGDState:
+    """Without noise: halve the step size where the window added nothing to the one before.
+
+    Windows are compared and not the best of all, which may stem from another matrix of light transport.
+    """
+    window = state.window
+    best = max(window.values)
+    idle = best - window.best <= GAIN * (best - state.first)
+    step_size = state.step_size / 2 if idle else state.step_size
+    state = replace(state, step_size=step_size, idle=state.idle + 1 if idle else 0)
+    return _step(replace(state, window=Window(window.length, best=best)), u, state.direction)
+
+
 def _step(state: PGDState, u: Tensor, direction: Tensor) -> PGDState:
     """Move from u along the direction, or at random where there is none."""
     uphill = direction
     if not bool(direction.any()):
         uphill = torch.randn(u.numel(), generator=seeded(state.seed, state.count))
-    move = torch.add(u, state.domain.steepest(u, uphill), alpha=state.step_size)
+    move = torch.add(u, state.domain.steepest(u, uphill), alpha=state.pace)
     return replace(state, u=state.domain.project(move), direction=direction)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -90,6 +90,13 @@ def test_norm_balls_alone_are_pgd_bit_for_bit(blocks: tuple[Block, ...], seed: i
     assert first.asked == second.asked
     assert torch.equal(ours.best_u, theirs.best_u)
     assert [r.step_size for r in ours.history] == [r.step_size for r in theirs.history]
+
+
+def test_without_noise_it_is_pgd_with_more_momentum() -> None:
+    domain = replace(domain_of((BALL,)), exact=True)
+    _, first = played(domain, Auto(), 25)
+    _, second = played(domain, PGD(momentum=0.75), 25)
+    assert torch.equal(torch.stack(first.seen), torch.stack(second.seen))
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 7, 40])

@@ -233,6 +233,46 @@ def test_pgd_halves_its_step_when_the_objective_stalls_and_not_before() -> None:
     assert search(evaluate, climbing, PGD(), steps=STEPS, seed=0).history[-1].step_size == PGD().step_size
 
 
+def test_without_noise_the_step_of_pgd_falls_in_a_line_and_nothing_is_clipped() -> None:
+    """A gradient of which one number is a thousand times the others, and an objective that always gains."""
+    slope = torch.ones(20)
+    slope[0] = 1000.0
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+        return Evaluation(float(index), slope, False)
+
+    domain = Domain(torch.full((20,), 0.5), (Block(20, "linf", 0.1),), exact=True)
+    result = search(evaluate, domain, PGD(step_size=0.4), steps=STEPS, seed=0, candidates=0)
+    sizes = [record.step_size for record in result.history]
+    assert sizes[:3] == pytest.approx([0.4, 0.4 * (1 - 1 / STEPS), 0.4 * (1 - 2 / STEPS)])
+    assert sizes[-1] == pytest.approx(0.4 * 0.05)
+    assert result.counts.cut == 0
+    noisy = search(evaluate, replace(domain, exact=False), PGD(), steps=STEPS, seed=0, candidates=0)
+    assert noisy.counts.cut > 0
+
+
+@pytest.mark.parametrize("norm", NORMS)
+@pytest.mark.parametrize("kind", ["linear", "peak outside"])
+def test_without_noise_pgd_stops_at_the_optimum(kind: str, norm: str) -> None:
+    """It ends by itself, long before the budget does, where more and shorter steps gain nothing."""
+    problem = make_problem(kind, norm, 30, seed=1)
+    domain = replace(problem.domain, exact=True)
+    result = search(problem.evaluator(), domain, PGD(), steps=1000, seed=0, candidates=0)
+    assert result.ending is Ending.FOUND and result.stopped is Ending.STALLED
+    assert len(result.history) < 400
+    assert problem.value(result.best_u) >= problem.optimum / RATIO
+
+
+def test_without_noise_pgd_goes_on_while_it_gains_a_little() -> None:
+    """Slower and slower, but by more than a thousandth of all in every window."""
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+        return Evaluation(float(index) ** 0.5, torch.ones(2), False)
+
+    domain = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.1),), exact=True)
+    assert len(search(evaluate, domain, PGD(), steps=300, seed=0, candidates=0).history) == 300
+
+
 def test_pgd_goes_back_to_its_best_when_it_has_fallen_behind() -> None:
     """A peak that only the first steps see; then the gradient leads away from it, downhill."""
 
