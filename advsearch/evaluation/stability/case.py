@@ -106,7 +106,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Group:
+class CaseGroup:
     """Cases about one thing, in the order in which they run.
 
     Attributes:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from advsearch.engine.gradients import smooth_loss
-from advsearch.evaluation.stability.case import Check, Group, Outcome, holds
+from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome, holds
 from advsearch.evaluation.stability.scene import (
     BARE,
     SPP,
@@ -38,7 +38,7 @@ SAME_PICTURE = 2e-3
 """Mean difference of two pictures that should be one: an 8-bit level is 4e-3."""
 FAR = 1e4
 
-GROUP = Group("geometry")
+GROUP = CaseGroup("geometry")
 _SCENE = "counted and set to zero where they arise (Renderer.non_finite); none is expected"
 _IMPORT = "the import removes faces without area and says so; the renderer never hits one"
 _NORMAL = "the import brings every object to size 1 at the origin, in 64-bit numbers"

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from advsearch.engine.gradients import smooth_loss
-from advsearch.evaluation.stability.case import Check, Group, Outcome, holds
+from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome, holds
 from advsearch.evaluation.stability.scene import ERROR, REFERENCE_SPP, SPP, Controls, examine, small
 from advsearch.scene import library
 from advsearch.scene.description import describe
@@ -19,7 +19,7 @@ from advsearch.scene.mitsuba_backend.parts import Translation, translation
 from advsearch.scene.parts import ScenePart
 from advsearch.scene.renderer import Renderer
 
-GROUP = Group("materials")
+GROUP = CaseGroup("materials")
 _SCENE = "counted and set to zero where they arise (Renderer.non_finite); none is expected"
 _MOVED = "values are rendered inside the range in which the adjoint is right (metallic at most 0.999)"
 

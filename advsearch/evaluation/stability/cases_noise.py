@@ -23,7 +23,7 @@ from torch import Tensor
 
 from advsearch.attacks import Block, Domain, make_policy, search
 from advsearch.engine.gradients import probes, reference, smooth_loss
-from advsearch.evaluation.stability.case import Check, Group, Outcome, holds
+from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome, holds
 from advsearch.evaluation.stability.scene import REFERENCE_SPP, Controls, compared, examine, small
 from advsearch.evaluation.stability.search import Toy
 
@@ -37,7 +37,7 @@ TAIL = 1.5
 Estimator = Callable[[Tensor], Tensor]
 """From samples (..., n, d) to their centre (..., d)."""
 
-GROUP = Group("noise")
+GROUP = CaseGroup("noise")
 _RULE = (
     "outliers are clipped: elements at 3 medians in an l-infinity ball and 10 in an l2 ball, the whole gradient at 3 "
     "medians of the latest lengths"

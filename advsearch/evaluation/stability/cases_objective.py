@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from advsearch.attacks import POLICIES, Ending, make_policy, search, verify
 from advsearch.attacks.objectives import OBJECTIVE_KINDS
-from advsearch.evaluation.stability.case import Check, Group, Outcome, holds
+from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome, holds
 from advsearch.evaluation.stability.search import Toy, numbers, quadratic
 from advsearch.files import JsonObject
 from advsearch.models.model import Model
@@ -30,7 +30,7 @@ WITH_OPTIONS: dict[str, JsonObject] = {
 }
 FORMS = {name: kind.plain for name, kind in OBJECTIVE_KINDS.items() if kind.plain is not None}
 
-GROUP = Group("objective")
+GROUP = CaseGroup("objective")
 _NAN = "an objective that is not finite counts as -inf, its gradient as zero; three in a row end the search"
 _LOGITS = "objectives are written for it: no overflow, shared gradients, tangents where a slope would be lost"
 _FLAT = "a zero gradient gives a random step; the fifth in a row ends the search as 'stalled'"

@@ -22,7 +22,7 @@ from advsearch.attacks import Block, Domain, make_policy, search
 from advsearch.attacks.policies.base import one_thread
 from advsearch.attacks.projections import project_l2_box
 from advsearch.engine.gradients import smooth_loss
-from advsearch.evaluation.stability.case import Check, Group, Outcome, holds
+from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome, holds
 from advsearch.evaluation.stability.scene import SIZE, Controls, small
 from advsearch.evaluation.stability.search import Toy
 from advsearch.models import load_model
@@ -41,7 +41,7 @@ BISECTIONS = 24
 TEXTURE: Controls = {"texture": {"resolution": 16}}
 SHIFT: Controls = {"pose": {"x": [-0.3, 0.3]}}
 
-GROUP = Group("precision")
+GROUP = CaseGroup("precision")
 
 
 @GROUP.case(

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from advsearch.attacks import PGD, Adam, Auto, Policy, search
 from advsearch.errors import InputError
-from advsearch.evaluation.stability.case import Check, Group, Outcome, holds
+from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome, holds
 from advsearch.evaluation.stability.scene import Controls, Evaluator, domain_of, examine, small
 from advsearch.scene.assets import EnvironmentAsset, Floats
 from advsearch.scene.environments import import_environment
@@ -24,7 +24,7 @@ PLATEAU_STEPS = 40
 """Evaluations in which a search has to be off a plateau."""
 POLICIES: tuple[Policy[Any], ...] = (PGD(), Adam(), Auto())
 
-GROUP = Group("radiometric")
+GROUP = CaseGroup("radiometric")
 _SCENE = "counted and set to zero where they arise (Renderer.non_finite); none is expected"
 _FLAT = "a zero gradient gives a random step; the fifth in a row ends the search as 'stalled'"
 _REFUSED = "import_environment counts the texels that are not light and refuses the map"

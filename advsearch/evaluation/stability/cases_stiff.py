@@ -17,7 +17,7 @@ from advsearch.attacks import PGD, Policy, SearchResult, make_policy, search
 from advsearch.controls.base import Parameter
 from advsearch.controls.values import Range, read, to_unit, to_value
 from advsearch.engine.gradients import smooth_loss
-from advsearch.evaluation.stability.case import Check, Group, Outcome
+from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome
 from advsearch.evaluation.stability.scene import SHARPNESS, Controls, Evaluator, domain_of, examine, small
 from advsearch.evaluation.stability.search import Toy, Value, condition_number, hessian, numbers, quadratic, valley
 from advsearch.scene.renderer import Renderer
@@ -34,7 +34,7 @@ SAME = 1e-5
 SLOWER = 1.5
 """Factor by which a rate may depend on the scale."""
 
-GROUP = Group("stiff")
+GROUP = CaseGroup("stiff")
 _BOX = "controls map their units to the unit box; policies know nothing else"
 _BLOCKS = "a step has the length of each block's own radius (Domain.steepest); adam divides by each number's own scale"
 
