@@ -32,7 +32,7 @@ from advsearch.engine.budget import verification_ladder  # noqa: E402
 from advsearch.engine.loading import PictureSettings, as_controls, framed, load_scene  # noqa: E402
 from advsearch.engine.sweeps import swept_scene  # noqa: E402
 from advsearch.engine.sweeps.axes import read_axes  # noqa: E402
-from advsearch.engine.sweeps.job import Job, Place  # noqa: E402
+from advsearch.engine.sweeps.job import Job, NamedScene  # noqa: E402
 from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 from advsearch.progress import NullProgress  # noqa: E402
@@ -141,7 +141,7 @@ def resident() -> int:
 def job_of(config: SweepConfig, model) -> Job:  # type: ignore[no-untyped-def]
     drawn = as_controls(config.controls)
     axes = read_axes(config.grid, drawn)
-    place = Place("mug", "studio", load_scene("mug", "studio"))
+    place = NamedScene("mug", "studio", load_scene("mug", "studio"))
     task = Classification().on(model)
     return Job(
         object="mug",

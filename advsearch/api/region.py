@@ -13,7 +13,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.attacks import make_policy
-from advsearch.attacks.region import ATTEMPTS, MOST_PROBED, Region, grow
+from advsearch.attacks.region import ATTEMPTS, MOST_PROBED, GrownBox, grow
 from advsearch.config import AttackConfig, RegionConfig
 from advsearch.engine.budget import RenderBudget, verification_ladder
 from advsearch.engine.memory import ANSWER, Memory
@@ -244,7 +244,7 @@ def _verdict(attack: Attack, centre: Tensor) -> bool:
     return verdict
 
 
-def _box(problem: Problem, found: Region, at: Any, varied: Varied) -> list[BoxSide]:
+def _box(problem: Problem, found: GrownBox, at: Any, varied: Varied) -> list[BoxSide]:
     """The range of every parameter of the box in its unit."""
     ends = [problem.describe(at(values)) for values in (found.low, found.high, found.centre)]
     rows = []

@@ -16,7 +16,7 @@ from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scen
 from advsearch.engine.naming import different, load_models, options_of, scene_settings
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.axes import read_axes
-from advsearch.engine.sweeps.job import Job, Place, check_scenes
+from advsearch.engine.sweeps.job import Job, NamedScene, check_scenes
 from advsearch.engine.sweeps.loop import SweepResult, carry_out
 from advsearch.errors import InputError
 from advsearch.models import Model
@@ -149,13 +149,13 @@ def _model_name(model: AnyModel) -> str:
     return str(getattr(model, "name", None) or type(model).__name__)
 
 
-def _place(scene: Scene) -> Place:
+def _place(scene: Scene) -> NamedScene:
     described = scene.description
     object_name = described.object_name
-    return Place(object_name, described.environment_name, scene)
+    return NamedScene(object_name, described.environment_name, scene)
 
 
-def _described(places: Sequence[Place]) -> dict[str, Any]:
+def _described(places: Sequence[NamedScene]) -> dict[str, Any]:
     """Settings that say what loaded scenes are."""
     first = places[0].scene.description
     given = {name: value for name, value in first.values.items() if name in first.given and value is not None}
@@ -173,7 +173,7 @@ def _job_of(config: SweepConfig) -> Job:
 
 
 def _job(
-    config: SweepConfig, places: Sequence[Place], models: Sequence[AnyModel], task: AnyTask, controls: Controls
+    config: SweepConfig, places: Sequence[NamedScene], models: Sequence[AnyModel], task: AnyTask, controls: Controls
 ) -> Job:
     shared = RunSettings(texture_resolution=config.texture_resolution)
     shared.check(config.controls)
@@ -220,7 +220,7 @@ def _job(
     )
 
 
-def _places(config: SweepConfig) -> tuple[Place, ...]:
+def _places(config: SweepConfig) -> tuple[NamedScene, ...]:
     """Every object under every environment; each is loaded once."""
     given = scene_settings(config.set_, config.exposure)
     objects, environments = different(config.objects, "object"), different(config.environments, "environment")
@@ -230,7 +230,7 @@ def _places(config: SweepConfig) -> tuple[Place, ...]:
         lights[name] = load_scene(firsts[objects[0]].description.object, name).description.environment
     asked = {light: (lights[light] or NO_MAP) if config.environment else None for light in environments}
     return tuple(
-        Place(name, light, load_scene(firsts[name].description.object, asked[light], settings=given))
+        NamedScene(name, light, load_scene(firsts[name].description.object, asked[light], settings=given))
         for name in objects
         for light in environments
     )

@@ -22,7 +22,7 @@ Same = Callable[[Tensor, int], bool]
 
 
 @dataclass(frozen=True, eq=False)
-class Region:
+class GrownBox:
     """A box in which the answer stays the same.
 
     Attributes:
@@ -66,7 +66,7 @@ def grow(
     seed: int,
     samples: int = 200,
     on_check: Callable[[], None] = lambda: None,
-) -> Region:
+) -> GrownBox:
     """Grow a box around the centre, then check it with samples that nothing was fitted to.
 
     Each face in turn tries to move out by a share of what is left to the bound (1/2 at first, halved at every level at
@@ -105,7 +105,7 @@ def grow(
             break
         for point in wrong:
             _cut(low, high, centre, point)
-    return Region(centre, low, high, samples - len(wrong), samples, judge.count)
+    return GrownBox(centre, low, high, samples - len(wrong), samples, judge.count)
 
 
 class _Judge:

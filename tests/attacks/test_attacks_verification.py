@@ -23,7 +23,7 @@ from advsearch.attacks import (
     search,
     verify,
 )
-from advsearch.attacks.region import Region
+from advsearch.attacks.region import GrownBox
 from advsearch.attacks.verification import EASIER, LEAST_RATE, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.config import FEWEST_SAMPLES, FEWEST_TRIALS
 from advsearch.errors import InputError
@@ -222,7 +222,7 @@ def test_conditions_under_which_the_clean_scene_is_seldom_right_leave_too_few_tr
 def test_the_fewest_samples_of_a_region_follow_from_the_confidence_of_its_interval() -> None:
     low, high = torch.zeros(1), torch.ones(1)
     for samples in (FEWEST_SAMPLES - 1, FEWEST_SAMPLES):
-        region = Region(low, low, high, samples, samples, samples)
+        region = GrownBox(low, low, high, samples, samples, samples)
         assert (region.interval[0] >= LEAST_RATE) == (samples == FEWEST_SAMPLES)
 
 

@@ -31,7 +31,7 @@ from advsearch.evaluation.precision.fits import (
 from advsearch.evaluation.precision.gradient import parts_of
 from advsearch.evaluation.precision.image import COUNTS, variants
 from advsearch.evaluation.precision.machine import machine
-from advsearch.evaluation.precision.objective import Mark, PolicyCurve, curve_of, marks_at, missing, sooner
+from advsearch.evaluation.precision.objective import PolicyCurve, SearchMark, curve_of, marks_at, missing, sooner
 from advsearch.evaluation.precision.points import (
     WARM_UP,
     MeasuredSetting,
@@ -451,7 +451,7 @@ def test_marks_are_powers_of_two_and_the_end() -> None:
 
 
 def test_a_curve_is_medians_and_quartiles_at_common_marks() -> None:
-    searches = [[Mark(1, 1.0 + k, float(k)), Mark(2, 2.0, 2.0 * k)] for k in range(5)]
+    searches = [[SearchMark(1, 1.0 + k, float(k)), SearchMark(2, 2.0, 2.0 * k)] for k in range(5)]
     found = curve_of("random", [*searches, searches[0][:1]])
     assert found.renders == (1,) and found.repeats == 6
     found = curve_of("random", searches)

@@ -22,7 +22,7 @@ from advsearch.tasks.base import Truth
 
 
 @dataclass(frozen=True)
-class Place:
+class NamedScene:
     """One of the scenes.
 
     Attributes:
@@ -75,7 +75,7 @@ class Job:
     label: str | None
     pictures: PictureSettings
     spp: int
-    places: tuple[Place, ...]
+    places: tuple[NamedScene, ...]
     models: tuple[Model, ...]
     tasks: tuple[Task, ...]
     controls: tuple[Control, ...]
@@ -93,7 +93,7 @@ class Job:
         """(height, width) of the pictures for each model."""
         return tuple(map(self.pictures.size, self.models))
 
-    def space(self, place: Place, size: tuple[int, int]) -> Space:
+    def space(self, place: NamedScene, size: tuple[int, int]) -> Space:
         """The controls, those of the grid as choices, bound to a scene.
 
         Raises:
@@ -107,7 +107,7 @@ class Job:
         """The configurations of a space."""
         return Points(space, domain_of(space.controls), self.axes, self.samples, self.sampler, self.pictures.seed)
 
-    def truth(self, place: Place, model: int, values: Mapping[str, Value], look: Looked | None = None) -> Truth:
+    def truth(self, place: NamedScene, model: int, values: Mapping[str, Value], look: Looked | None = None) -> Truth:
         """What is true of a configuration, as the task of a model needs it.
 
         Args:
@@ -118,10 +118,10 @@ class Job:
         """
         return self.tasks[model].truth(self._facts(place, values, look))
 
-    def _facts(self, place: Place, values: Mapping[str, Value], look: Looked | None = None) -> Facts:
+    def _facts(self, place: NamedScene, values: Mapping[str, Value], look: Looked | None = None) -> Facts:
         return facts_of(place.scene, place.object, self.label, lambda: values, look)
 
-    def check_truths(self, place: Place) -> None:
+    def check_truths(self, place: NamedScene) -> None:
         """Refuse a scene of which a task cannot say what is right.
 
         Raises:
@@ -131,7 +131,7 @@ class Job:
             check_truth(task, model, place.scene, self._facts(place, {}), self.pictures)
 
 
-def check_scenes(places: Sequence[Place], controls: Sequence[Control], axes: Sequence[Axis]) -> None:
+def check_scenes(places: Sequence[NamedScene], controls: Sequence[Control], axes: Sequence[Axis]) -> None:
     """Refuse to vary what the scenes were asked to have.
 
     Raises:
@@ -188,7 +188,7 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
     return first, tuple(drawn)
 
 
-def _check_draws(place: Place, space: Space) -> None:
+def _check_draws(place: NamedScene, space: Space) -> None:
     """Refuse to draw what the scene was asked to have."""
     for group in space.groups:
         if group.setting in place.scene.description.given - {ENVIRONMENT}:

@@ -21,7 +21,7 @@ Verified = Callable[[Tensor], float]
 
 
 @dataclass(frozen=True)
-class Mark:
+class SearchMark:
     """How far one search had come.
 
     Attributes:
@@ -87,7 +87,7 @@ class ObjectiveBench:
         """One setting a policy."""
         return [MeasuredSetting("objective", name, spp, 1.0) for name in self._policies]
 
-    def measure(self, setting: MeasuredSetting, seed: int) -> tuple[list[Mark], float]:
+    def measure(self, setting: MeasuredSetting, seed: int) -> tuple[list[SearchMark], float]:
         """Run one search; its marks, verified, and the seconds of search and verification together."""
         begun = time.perf_counter()
         held = self._search(setting.series, seed)
@@ -97,7 +97,7 @@ class ObjectiveBench:
             key = u.numpy().tobytes()
             if key not in objectives:
                 objectives[key] = self._verified(u)
-            marks.append(Mark(renders, seconds, objectives[key]))
+            marks.append(SearchMark(renders, seconds, objectives[key]))
         return marks, time.perf_counter() - begun
 
     def _search(self, policy: str, seed: int) -> list[tuple[int, float, Tensor]]:
@@ -132,7 +132,7 @@ class ObjectiveBench:
         return held
 
 
-def curve_of(policy: str, searches: Sequence[Sequence[Mark]]) -> PolicyCurve:
+def curve_of(policy: str, searches: Sequence[Sequence[SearchMark]]) -> PolicyCurve:
     """Return medians and quartiles over searches, at the marks that all of them have reached."""
     common = min((len(marks) for marks in searches), default=0)
     columns = [[marks[number] for marks in searches] for number in range(common)]
