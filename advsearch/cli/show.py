@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.files import JsonValue
 
 if TYPE_CHECKING:
+    from advsearch.controls import Choice, Parameter
     from advsearch.runs.listing import Listed
 
 HELP = "show what a run found, the parameters of a control, or the options of a policy or a task"
@@ -91,18 +93,20 @@ def _show_control(name: str, as_json: bool) -> int:
     with at_work(as_json=True, quiet=False):
         from advsearch.cli.list import first_line
         from advsearch.controls import CONTROLS
+        from advsearch.runs.results.base import plain
 
     if name not in CONTROLS:
         raise UnknownNameError("control", name, CONTROLS)
     control = CONTROLS[name]
-    parameters, choices = ([facts(one) for one in getattr(control, part, ())] for part in ("parameters", "choices"))
+    parameters, choices = control.parameters, control.choices
     if as_json:
-        output.print_json({"schema": 1, "control": name, "parameters": parameters, "choices": choices})
+        output.print_json({"schema": 1, "control": name, "parameters": plain(parameters), "choices": plain(choices)})
         return 0
     print(f"{name}: {first_line(control)}")
-    for heading, declared in (("parameters, searched or fixed", parameters), ("settings, chosen", choices)):
-        if declared:
-            print(f"\n{heading}:\n{_table([_short(one) for one in declared])}")
+    if parameters:
+        print(f"\nparameters, searched or fixed:\n{_table([_of_parameter(one) for one in parameters])}")
+    if choices:
+        print(f"\nsettings, chosen:\n{_table([_of_choice(one) for one in choices])}")
     return 0
 
 
@@ -120,75 +124,53 @@ def _show_options(kind: str, name: str, as_json: bool) -> int:
     if name not in registry:
         raise UnknownNameError(kind, name, registry)
     entry = registry[name]
-    declared = [
-        {"name": option, "type": type_of(one), "default": plain(getattr(default_of(one), "name", default_of(one)))}
-        for option, one in declared_options(entry).items()
-    ]
+    options = {option: (type_of(one), default_of(one)) for option, one in declared_options(entry).items()}
+    defaults = {option: plain(getattr(default, "name", default)) for option, (_, default) in options.items()}
     if as_json:
+        declared = [{"name": one, "type": options[one][0], "default": defaults[one]} for one in options]
         output.print_json({"schema": 1, kind: name, "options": declared})
         return 0
     print(f"{name}: {first_line(entry)}\n")
-    print(
-        f"options, as in --{kind} '{name}={{OPTION: VALUE}}':\n{_table(declared)}" if declared else "It has no options."
-    )
+    rows = [{"name": one, "type": options[one][0], "default": _cell(defaults[one])} for one in options]
+    print(f"options, as in --{kind} '{name}={{OPTION: VALUE}}':\n{_table(rows)}" if rows else "It has no options.")
     return 0
 
 
-def _short(declared: Mapping[str, Any]) -> dict[str, Any]:
-    """What a person wants to read of a parameter, in few columns; a setting as it is."""
-    if "run_setting" in declared:
-        return _short_choice(declared)
-    if "estimators" not in declared:
-        return dict(declared)
-    one = declared
-    count = " x ".join("any" if side is None else str(side) for side in one["shape"])
-    ways = "none" if one["options"] else ", ".join(one["estimators"])
+def _of_parameter(one: Parameter) -> dict[str, str]:
+    """What a person wants to read of a parameter, in few columns."""
+    count = " x ".join("any" if side is None else str(side) for side in one.shape)
+    low, high = one.search or (0.0, 0.0)
+    searched = f"{low:g} to {high:g}" + (", log" if one.log else "")
     return {
-        "name": one["name"],
-        "unit": one["unit"] + (f" ({count})" if count else ""),
-        "allowed": ", ".join(one["options"]) or f"{one['low']:g} to {one['high']:g}",
-        "searched": "if asked" if one["search"] is None else "all" if one["options"] else _range(one),
-        "default": one["default"],
-        "periodic": one["periodic"],
-        "moves outlines": one["moves_silhouettes"],
-        "derivative": ways,
-        "description": one["description"],
+        "name": one.name,
+        "unit": one.unit + (f" ({count})" if count else ""),
+        "allowed": ", ".join(one.options) or f"{one.low:g} to {one.high:g}",
+        "searched": "if asked" if one.search is None else "all" if one.options else searched,
+        "default": _cell(one.default),
+        "periodic": _cell(one.periodic),
+        "moves outlines": _cell(one.moves_silhouettes),
+        "derivative": "none" if one.options else ", ".join(one.estimators),
+        "description": one.description,
     }
 
 
-def _short_choice(one: Mapping[str, Any]) -> dict[str, Any]:
-    low, high = one["whole"] or (None, None)
-    allowed = ", ".join(one["options"]) or (f"{low} to {high}" if one["whole"] else "")
-    allowed = allowed or (f"over 0 to {one['most']:g}" if one["most"] else "")
-    return {name: allowed if name == "allowed" else one[name] for name in ("name", "allowed", "default", "description")}
+def _of_choice(one: Choice) -> dict[str, str]:
+    """The same of a setting."""
+    allowed = ", ".join(one.options)
+    if one.whole:
+        allowed = f"{one.whole[0]} to {one.whole[1]}"
+    elif one.most:
+        allowed = f"over 0 to {one.most:g}"
+    return {"name": one.name, "allowed": allowed, "default": _cell(one.default), "description": one.description}
 
 
-def _range(one: Mapping[str, Any]) -> str:
-    low, high = one["search"]
-    return f"{low:g} to {high:g}" + (", log" if one["log"] else "")
+def _table(declared: Sequence[Mapping[str, str]]) -> str:
+    """Return what was declared as a table."""
+    rows = [list(one.values()) for one in declared]
+    return output.columns([list(declared[0]), *rows])
 
 
-def facts(parameter: Any) -> dict[str, Any]:
-    """Return what a control declares of one of its parameters as JSON values.
-
-    Args:
-        parameter: a dataclass or a mapping.
-    """
-    from advsearch.runs.results.base import plain
-
-    return dict(plain(parameter))
-
-
-def _table(declared: Sequence[Mapping[str, Any]]) -> str:
-    """Return what was declared as a table, the description last."""
-    heads = sorted(dict.fromkeys(head for one in declared for head in one), key="description".__eq__)
-    rows = [[_cell(one.get(head)) for head in heads] for one in declared]
-    return output.columns([[head.replace("_", " ") for head in heads], *rows])
-
-
-def _cell(value: Any) -> str:
+def _cell(value: JsonValue) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, list):
-        return "[" + ", ".join("any" if one is None else _cell(one) for one in value) + "]"
     return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)

@@ -18,7 +18,7 @@ from advsearch.described import Value
 from advsearch.engine.answers import Described, Looked
 from advsearch.engine.domains import domain_of
 from advsearch.models import Model
-from advsearch.runs.results.plan import PlannedGradient
+from advsearch.runs.results.plan import GroupDerivative, PlannedGradient
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import GradientPlan
@@ -176,10 +176,11 @@ class Problem:
 
     def plan_summary(self, plan: GradientPlan) -> PlannedGradient:
         """Return what a result holds of a plan: what is stored of it, and each step in its parameter's unit."""
-        stored = plan.to_dict()
+        stored, groups = plan.to_dict(), []
         for group, row in zip(plan.groups, stored["groups"], strict=True):
-            row["step_in_unit"], row["unit"] = self._in_unit(group) if group.step_reason else (None, "")
-        return PlannedGradient.of(stored)
+            step, unit = self._in_unit(group) if group.step_reason else (None, "")
+            groups.append(GroupDerivative(**row, step_in_unit=step, unit=unit))
+        return PlannedGradient(renders_per_gradient=plan.renders, spp=plan.spp, groups=groups)
 
     def _in_unit(self, group: Group) -> tuple[float | None, str]:
         """The step of one number in the middle of its range, and its unit; None of what has no number of its own."""

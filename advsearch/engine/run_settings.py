@@ -10,7 +10,9 @@ from advsearch.controls import CONTROLS, Choice, Control, gathered, names_of
 from advsearch.controls.values import is_number
 from advsearch.engine.loading import Controls, as_controls, settings_of
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.files import Json
+
+Asked = Mapping[str, Mapping[str, object]]
+"""Controls as they are asked for: their names, each with its settings."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ class RunSettings:
         named = settings_of(controls)
         return as_controls({asked: {**self._taken(asked, given), **given} for asked, given in named.items()})
 
-    def _taken(self, asked: str, given: Mapping[str, object]) -> Json:
+    def _taken(self, asked: str, given: Mapping[str, object]) -> dict[str, object]:
         """What one control takes, by the names of its own settings."""
         _, name = names_of(asked, given)
         taken = {one.name: self._value(one.run_setting, name) for one in _choices(asked, given) if one.run_setting}
@@ -71,7 +73,7 @@ class RunSettings:
             kept[setting] = value if takes(asked, given, setting) else None
         return RunSettings(**kept)
 
-    def check(self, searched: Mapping[str, Json], drawn: Mapping[str, Json] | None = None) -> None:
+    def check(self, searched: Asked, drawn: Asked | None = None) -> None:
         """Refuse a setting that none of the controls takes.
 
         Args:

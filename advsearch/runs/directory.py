@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, UnknownNameError
-from advsearch.files import Json, open_regular
+from advsearch.files import JsonObject, open_regular
 from advsearch.runs import images, lock, replay, store, summary
 from advsearch.runs.files import PART, replacing, storage_errors, write_text
 from advsearch.yaml_text import LARGEST
@@ -187,7 +187,7 @@ class RunDirectory:
                 f"start again with advsearch run {self.path / CONFIG}"
             )
 
-    def _begun_with(self) -> Json:
+    def _begun_with(self) -> JsonObject:
         """What the store notes of the settings; empty of a run that is older than that note."""
         try:
             noted = json.loads(self.store.note(BEGUN_WITH) or "{}")

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from advsearch.errors import AdvsearchError
-from advsearch.files import Json
 from advsearch.runs import lock, replay, store, summary
 from advsearch.runs.directory import CONFIG, is_run
 from advsearch.runs.results.base import Result
@@ -60,7 +59,7 @@ def finished(path: Path) -> bool:
 
 def described(path: Path) -> Listed:
     """Return the run in a folder; what cannot be read is shown as far as it can."""
-    config: Json = {}
+    config: dict[str, object] = {}
     result: Result | None = None
     kinds: dict[str, int] = {}
     with suppress(AdvsearchError):

@@ -13,7 +13,6 @@ import sys
 import time
 import types
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +33,13 @@ from advsearch.cli.main import COMMANDS, main
 from advsearch.cli.output import columns
 from advsearch.cli.progress import BarProgress, LineProgress, watching
 from advsearch.config import AttackConfig, GapConfig, RegionConfig, SweepConfig
+from advsearch.controls.base import Choice
 from advsearch.described import Value
 from advsearch.errors import InputError, StorageError
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
+from advsearch.scene.parameters import Parameter
 from advsearch.settings import Config, settings
 
 HEAVY = ("torch", "mitsuba", "drjit", "numpy", "scipy", "pydantic", "rich", "yaml", "PIL", "trimesh")
@@ -685,20 +686,14 @@ def registries(monkeypatch: pytest.MonkeyPatch) -> None:
         More.
         """
 
-    @dataclass
-    class Parameter:
-        name: str
-        unit: str
-        range: tuple[float, float]
-        periodic: bool
-
     class Camera:
         """Orbit around the object."""
 
         parameters = (
-            Parameter("azimuth", "degrees", (0.0, 360.0), True),
-            Parameter("distance", "sizes", (1.0, 9.5), False),
+            Parameter("azimuth", (), "degrees", -720.0, 720.0, 40.0, "Around.", periodic=True, search=(0.0, 360.0)),
+            Parameter("lens", (3,), "name", 0.0, 1.0, "own", "Which.", options=("own", "wide"), estimators=()),
         )
+        choices = (Choice("steps", 5, "How many.", whole=(1, 9)),)
 
     def put(name: str, **attributes: Any) -> None:
         module = types.ModuleType(name)
@@ -737,15 +732,19 @@ def test_the_listed_models_can_be_loaded_by_that_name() -> None:
 def test_show_control(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["show", "control", "camera", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["choices"] == []
-    assert found["parameters"][0] == {"name": "azimuth", "unit": "degrees", "range": [0.0, 360.0], "periodic": True}
+    assert found["parameters"][0]["search"] == [0.0, 360.0] and found["parameters"][1]["options"] == ["own", "wide"]
+    assert found["choices"][0]["whole"] == [1, 9] and found["choices"][0]["run_setting"] == ""
     assert main(["show", "control", "camera"]) == 0
     assert capsys.readouterr().out == (
         "camera: Orbit around the object.\n\n"
         "parameters, searched or fixed:\n"
-        "  name       unit      range      periodic\n"
-        "  azimuth    degrees   [0, 360]   yes\n"
-        "  distance   sizes     [1, 9.5]   no\n"
+        "  name      unit       allowed       searched   default   periodic   moves outlines   "
+        "derivative    description\n"
+        "  azimuth   degrees    -720 to 720   0 to 360   40        yes        no               differences   Around.\n"
+        "  lens      name (3)   own, wide     if asked   own       no         no               none          Which.\n"
+        "\nsettings, chosen:\n"
+        "  name    allowed   default   description\n"
+        "  steps   1 to 9    5         How many.\n"
     )
     assert main(["show", "control", "camra"]) == 2
     assert "unknown control 'camra'. Did you mean 'camera'?" in capsys.readouterr().err

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -106,7 +107,7 @@ def made(outcome: Outcome | Exception, name: str = "made") -> Case:
 
 def test_a_row_has_what_the_design_lists() -> None:
     outcome = Outcome((Check("a", 1.0, most=2.0), Check("b", 5.0, most=2.0)), True, 0.25, "stalled", {"c": 3.0})
-    row = run_case(made(outcome)).to_dict()
+    row: Any = run_case(made(outcome)).to_dict()
     wanted = {"case": "made", "control": "pose", "finite": True, "relative_error": 0.25, "ending": "stalled"}
     assert {**row, **wanted} == row
     assert (row["status"], row["rule"], row["decides"]) == (FELL_SHORT, "a rule", "b: 5 (expected at most 2)")
@@ -195,7 +196,8 @@ def test_a_stopped_suite_goes_on_with_the_case_that_it_was_at(
     assert main(["resume", "short", "--quiet"]) == 3
     last = kept("short")
     assert (last.ending, last.not_run) == ("done", [])
-    assert [{**row, "seconds": 0.0} for row in last.to_dict()["rows"]] == [{**row, "seconds": 0.0} for row in whole]
+    again: Any = last.to_dict()
+    assert [{**row, "seconds": 0.0} for row in again["rows"]] == [{**row, "seconds": 0.0} for row in whole]
     capsys.readouterr()
     assert main(["runs", "--json"]) == 0
     listed = {one["name"]: one for one in json.loads(capsys.readouterr().out)["runs"]}

@@ -22,7 +22,7 @@ from advsearch.engine.record import Stages
 from advsearch.engine.rows import judgement_of, trial_row
 from advsearch.engine.sweeps.job import Job, check_all
 from advsearch.engine.sweeps.points import Picks, Points
-from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally
+from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally, rate
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.engine.sweeps.worst import check_worst
 from advsearch.interrupts import interruptible
@@ -307,7 +307,11 @@ class Sweep:
             ending=ending,
             image_formation=Formation.of(next(iter(view.renderers.values())).formation) if view else None,
             planned=self.total,
-            **tally.counted(),
+            **vars(rate(tally.correct, tally.seen)),
+            not_finite=tally.not_finite,
+            answers=tally.frequent(),
+            axes=tally.table(),
+            cells=tally.map(),
             worst=worst,
             grid={axis.name: len(axis.values) for axis in job.axes},
             samples=job.samples,

@@ -11,8 +11,7 @@ from advsearch.attacks import clopper_pearson
 from advsearch.engine.sweeps.axes import Axis
 from advsearch.engine.sweeps.cells import Cells
 from advsearch.engine.sweeps.points import Drawn, Picks
-from advsearch.files import Json
-from advsearch.runs.results.sweep import AxisRow
+from advsearch.runs.results.sweep import AxisRow, CountedAnswers, SweepMap
 from advsearch.tasks import Judgement
 
 FINISHED, INTERRUPTED = "finished", "interrupted"
@@ -51,20 +50,20 @@ class Count:
     def rows(self) -> list[AxisRow]:
         """Return the table of this axis; values without configurations so far are left out."""
         return [
-            AxisRow(axis=self.name, unit=self.unit, value=value, **rate(correct, seen))
+            AxisRow(axis=self.name, unit=self.unit, value=value, **vars(rate(correct, seen)))
             for value, seen, correct in zip(self.values, self.seen, self.correct, strict=True)
             if seen
         ]
 
 
-def rate(correct: int, seen: int) -> Json:
-    """Return count, accuracy and its 95 % Clopper-Pearson interval; null where nothing was seen."""
-    return {
-        "configurations": seen,
-        "correct": correct,
-        "accuracy": correct / seen if seen else None,
-        "interval": clopper_pearson(correct, seen) if seen else None,
-    }
+def rate(correct: int, seen: int) -> CountedAnswers:
+    """Return count, accuracy and its 95 % Clopper-Pearson interval; None where nothing was seen."""
+    return CountedAnswers(
+        configurations=seen,
+        correct=correct,
+        accuracy=correct / seen if seen else None,
+        interval=clopper_pearson(correct, seen) if seen else None,
+    )
 
 
 class Tally:
@@ -132,12 +131,10 @@ class Tally:
         counts = [*self._outer, *self._grid, *self._drawn]
         return [row for count in counts if len(count.values) > 1 for row in count.rows()]
 
-    def counted(self) -> Json:
-        """Return the fields of the summary that are counted."""
-        return {
-            **rate(self.correct, self.seen),
-            "not_finite": self.not_finite,
-            "answers": dict(sorted(self.answers.most_common(MOST_ANSWERS), key=lambda one: (-one[1], one[0]))),
-            "axes": self.table(),
-            "cells": self._cells.drawn(),
-        }
+    def frequent(self) -> dict[str, int]:
+        """Return how often each of the most frequent wrong answers was given, the most frequent first."""
+        return dict(sorted(self.answers.most_common(MOST_ANSWERS), key=lambda one: (-one[1], one[0])))
+
+    def map(self) -> SweepMap | None:
+        """Return what was counted over two axes, where there are as many."""
+        return self._cells.drawn()

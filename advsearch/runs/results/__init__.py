@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from advsearch.files import Json
+from advsearch.files import JsonObject
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.check import CheckResult
@@ -26,7 +26,7 @@ KEPT: tuple[type[Result], ...] = (
 """The results that a run keeps in `summary.json`."""
 
 
-def kind_of(values: Json) -> type[Result] | None:
+def kind_of(values: JsonObject) -> type[Result] | None:
     """Return the result that the values of a `summary.json` are of; None if there is none of that command."""
     if values.get("command") == CurveResult.command and "parts" in values:
         return CurveResult

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, JsonValue
 
-from advsearch.files import Json
+from advsearch.files import JsonObject
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -57,9 +57,9 @@ class Fields(BaseModel):
         """Return the fields with the values that the attributes, or the keys, of something have."""
         return cls.model_validate(source)
 
-    def to_dict(self) -> Json:
+    def to_dict(self) -> JsonObject:
         """Return the fields as JSON values; NaN and infinity are None."""
-        values: Json = plain(self.model_dump(exclude_defaults=True))
+        values: JsonObject = plain(self.model_dump(exclude_defaults=True))
         return values
 
 
@@ -68,7 +68,7 @@ class Result(Fields):
 
     command: ClassVar[str]
 
-    def to_dict(self) -> Json:
+    def to_dict(self) -> JsonObject:
         """Return `schema`, `command` and the fields as JSON values; NaN and infinity are None."""
         return {"schema": SCHEMA, "command": self.command, **super().to_dict()}
 
@@ -94,7 +94,7 @@ class RunResult(Result):
     seed: int = Field(description="the root seed")
     command_line: str = Field(description="the command that asks the same again")
 
-    def to_dict(self) -> Json:
+    def to_dict(self) -> JsonObject:
         """Return the fields as JSON values, what a reader looks for first in front."""
         values = super().to_dict()
         for name in END:

@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypedDict
 
 import torch
 from torch import Tensor
 
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.files import Json
 from advsearch.scene.gradients.differences import DIRECTIONS as DIRECTIONS
 from advsearch.scene.gradients.group import BY_DIFFERENCES as BY_DIFFERENCES
 from advsearch.scene.gradients.group import Group
@@ -53,6 +53,28 @@ the 2 to 5 % of a range that a search goes at a time has another sign as often a
 SEARCH_SHARE = 0.4
 """Share of the picture that such a step moves the fastest outline over at most: of an endless range, 3 % would move all
 things out of sight."""
+
+
+class StoredGroup(TypedDict):
+    """What a run stores of one group of coordinates; see `Group`."""
+
+    control: str
+    parameter: str
+    size: int
+    estimator: str
+    valid: list[str]
+    step: float
+    step_reason: str
+    reason: str
+    variance_x_seconds: dict[str, float]
+
+
+class StoredPlan(TypedDict):
+    """What a run stores of a plan; see `GradientPlan`."""
+
+    renders_per_gradient: int
+    spp: int | None
+    groups: list[StoredGroup]
 
 
 @dataclass(frozen=True)
@@ -103,7 +125,7 @@ class GradientPlan:
         """Return the plan with steps over which outlines move by a pixel: for smooth losses, which bend over more."""
         return replace(self, groups=tuple(replace(one, step=one.pixel) for one in self.groups))
 
-    def restored(self, stored: Json) -> GradientPlan:
+    def restored(self, stored: StoredPlan) -> GradientPlan:
         """Return the plan with the choices that `to_dict` has stored of a plan for the same space."""
         chosen = {f"{one['control']}.{one['parameter']}": one for one in stored["groups"]}
         groups = tuple(
@@ -118,7 +140,7 @@ class GradientPlan:
         )
         return replace(self, groups=groups, spp=stored["spp"])
 
-    def to_dict(self) -> Json:
+    def to_dict(self) -> StoredPlan:
         """Return what a run stores of the plan."""
         return {
             "renders_per_gradient": self.renders,
