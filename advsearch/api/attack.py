@@ -372,14 +372,14 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
 def _policy(job: _Job, problem: Problem) -> Policy[Any]:
     """The policy. Where conditions vary, every gradient is one of others, so `auto` follows a longer mean of them."""
     if not isinstance(job.policy, str):
-        return _with_derivatives(job.policy, job.config)
+        return with_derivatives(job.policy, job.config)
     balls = all(block.norm != "box" for block in problem.domain.blocks)
     if job.policy == "auto" and problem.conditions is not None and balls:
         return make_policy("pgd", **OVER_CONDITIONS)
-    return _with_derivatives(make_policy(job.policy, **_policy_options(job.config)), job.config)
+    return with_derivatives(make_policy(job.policy, **_policy_options(job.config)), job.config)
 
 
-def _with_derivatives(policy: Policy[Any], config: AttackConfig) -> Policy[Any]:
+def with_derivatives(policy: Policy[Any], config: AttackConfig) -> Policy[Any]:
     """Refuse settings of derivatives beside a policy that takes none; return the policy."""
     given = "estimators" if config.estimators else "measure" if config.measure == "full" else None
     if given and not policy.uses_gradient:

@@ -80,7 +80,7 @@ def check_from_config(
     """
     progress, begun = progress or NullProgress(), time.perf_counter()
     progress.stage(LOADING)
-    parts = _parts(config)
+    parts = parts_of(config)
     with RunDirectory.of(config, resumed) as run:
         results, measured = Results(Memory(run), config.seconds), 0
 
@@ -131,7 +131,7 @@ class CheckedPart:
         return f"check {self.number}"
 
 
-def _parts(config: CheckConfig) -> list[CheckedPart]:
+def parts_of(config: CheckConfig) -> list[CheckedPart]:
     asked = [(one, loss) for one in _configurations(config) for loss in config.losses]
     return [CheckedPart(number, one, loss) for number, (one, loss) in enumerate(asked, start=1)]
 

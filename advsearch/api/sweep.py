@@ -130,7 +130,7 @@ def sweep_from_config(
         check_free(config.run, overwrite=config.overwrite)
     progress = progress or NullProgress()
     progress.stage(LOADING)
-    return _kept(config, _job_of(config), progress, resumed)
+    return _kept(config, job_of(config), progress, resumed)
 
 
 # ---- from names to things -------------------------------------------------------------------------------------------
@@ -167,7 +167,7 @@ def _described(places: Sequence[NamedScene]) -> dict[str, Any]:
     }
 
 
-def _job_of(config: SweepConfig) -> Job:
+def job_of(config: SweepConfig) -> Job:
     """Find and load everything that a configuration names."""
     return _job(config, _places(config), config.models, config.task, config.controls)
 

@@ -109,7 +109,7 @@ def test_a_summary_never_forgets_what_an_earlier_one_had(
             results.get(f"{part.key} {number}", row.to_dict)
             yield row
 
-    monkeypatch.setattr(checking, "_parts", lambda *_: both)
+    monkeypatch.setattr(checking, "parts_of", lambda *_: both)
     monkeypatch.setattr(checking, "_linear", measured)
     write = RunDirectory.write_summary
 
@@ -160,6 +160,6 @@ def test_a_finished_part_is_not_even_loaded(whole: CheckResult, monkeypatch: pyt
 
 
 def test_all_goes_through_every_control_on_three_scenes() -> None:
-    parts = checking._parts(CheckConfig(all=True))
+    parts = checking.parts_of(CheckConfig(all=True))
     assert [part.number for part in parts] == list(range(1, len(parts) + 1))
     assert {part.config.object for part in parts} == {"mug", "bowl", "bottle"} and len(parts) > 80

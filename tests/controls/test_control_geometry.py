@@ -64,7 +64,7 @@ def test_no_configuration_breaks_the_mesh(name: str, epsilon: float, form: str) 
     places = torch.from_numpy(solid.places)
     before = face_normals(places, solid.faces)
     for u in wild(len(control.start)):
-        offsets = control._offsets(u)
+        offsets = control.offsets(u)
         assert float(offsets.norm(dim=1).max()) < epsilon
         assert float((before * face_normals(places + offsets, solid.faces)).sum(dim=1).min()) > 0.0
         said = control.describe(u)
@@ -87,7 +87,7 @@ def test_both_sides_of_a_wall_move_together(scene: SceneDescription) -> None:
     thin = torch.from_numpy(solid.walls[gaps < 0.05])
     assert len(thin) > 500
     for u in wild(len(control.start)):
-        offsets = control._offsets(u)
+        offsets = control.offsets(u)
         apart = (offsets[thin[:, 0]] - offsets[thin[:, 1]]).norm(dim=1).max()
         assert float(apart) < 0.1 * float(offsets.norm(dim=1).max()) + 1e-9 or float(apart) < 0.004
 

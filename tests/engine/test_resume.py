@@ -280,11 +280,11 @@ def test_a_kill_before_the_results_had_tables_leaves_a_folder_that_a_run_can_tak
     folder = tmp_path / "run"
     folder.mkdir()
     with closing(sqlite3.connect(folder / "results.sqlite")) as made:
-        store._make(made)
+        made.execute(f"PRAGMA application_id = {store.APPLICATION_ID}")
     with RunDirectory.create(folder) as run:
         run.write_config(configuration())
     with closing(sqlite3.connect(tmp_path / "results.sqlite")) as made:
-        store._make(made)
+        made.execute(f"PRAGMA application_id = {store.APPLICATION_ID}")
         made.execute("CREATE TABLE others (text)")
     folder.joinpath("run.yaml").unlink()
     (tmp_path / "results.sqlite").replace(folder / "results.sqlite")

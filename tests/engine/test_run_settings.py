@@ -9,9 +9,9 @@ import pytest
 import advsearch
 from advsearch.api import attack as attacking
 from advsearch.api import render as rendering
-from advsearch.api.attack import _with_derivatives
+from advsearch.api.attack import with_derivatives
 from advsearch.api.gap import gap_from_config
-from advsearch.api.sweep import _job_of
+from advsearch.api.sweep import job_of
 from advsearch.attacks import make_policy
 from advsearch.cli.flags import with_flags
 from advsearch.cli.main import main
@@ -108,7 +108,7 @@ def test_what_varies_by_chance_takes_all_but_the_budget(monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize("asked", ["texture", "texture:label", {"label": {"kind": "texture"}}])
 def test_a_sweep_and_a_render_give_every_texture_its_resolution(asked: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    job = _job_of(SweepConfig(object="mug", controls=asked, texture_resolution=16))
+    job = job_of(SweepConfig(object="mug", controls=asked, texture_resolution=16))
     assert [one.resolution for one in job.controls if isinstance(one, TextureControl)] == [16]
 
     def rendered(scene: Any, model: Any, *, controls: Any, **more: Any) -> None:
@@ -244,8 +244,8 @@ def test_an_instance_says_its_own(setting: str) -> None:
 def test_settings_of_derivatives_are_refused_beside_a_policy_that_takes_none(given: dict[str, Any]) -> None:
     config = AttackConfig(object="mug", policy="random", **given)
     with pytest.raises(InputError, match="policy random takes no derivatives; leave one of the two out"):
-        _with_derivatives(make_policy("random"), config)
-    assert _with_derivatives(make_policy("pgd"), config).name == "pgd"
+        with_derivatives(make_policy("random"), config)
+    assert with_derivatives(make_policy("pgd"), config).name == "pgd"
 
 
 def test_a_region_has_no_samples_of_a_search(capsys: pytest.CaptureFixture[str]) -> None:

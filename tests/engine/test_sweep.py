@@ -26,7 +26,7 @@ from samples import sweep as swept
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.api.sweep import _job_of, sweep_from_config
+from advsearch.api.sweep import job_of, sweep_from_config
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.draws import NET, Draws, Seeds
 from advsearch.attacks.product import Product, batches
@@ -699,7 +699,7 @@ def test_resume_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_any_configuration_can_be_the_first() -> None:
     config = SweepConfig(object="mug", controls={"pose": {}}, samples=100_000_000, resolution=32, trials=0)
-    sweep = Sweep(_job_of(config), None, NullProgress())
+    sweep = Sweep(job_of(config), None, NullProgress())
     FakeRenderer.stops_at = 8
     late = sweep.carry_out(first=99_999_992)
     assert [row.step for row in late.rows()] == list(range(99_999_992, 100_000_000))
@@ -843,7 +843,7 @@ def test_every_example_of_the_documentation_is_a_sweep(words: list[str], monkeyp
     asked: list[SweepConfig] = []
     monkeypatch.setattr(QuestionCommand, "carry_out", lambda self, config, **rest: kept(asked, config, 0))
     assert main(words[1:]) == 0
-    job = _job_of(asked[0])
+    job = job_of(asked[0])
     assert Sweep(job, None, NullProgress()).total > 1
 
 

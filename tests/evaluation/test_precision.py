@@ -44,7 +44,7 @@ from advsearch.evaluation.precision.points import (
     reference_through,
     typical_seconds,
 )
-from advsearch.evaluation.precision.report import Section, _rounding
+from advsearch.evaluation.precision.report import Section, rounding
 from advsearch.evaluation.precision.rounds import LEAST, TimeBudget, gather, in_rounds, part_samples
 from advsearch.report.diagrams import precision_figures
 from advsearch.runs.results.precision import PrecisionResult, Recommended
@@ -425,8 +425,8 @@ def test_every_count_that_is_measured_is_one_that_its_sampler_takes() -> None:
 
 def test_a_gradient_is_recommended_in_counts_of_the_runs_sampler() -> None:
     section = Section("multijitter")
-    assert _rounding(section, "gradient")("adjoint", 39) == 42 and _rounding(section, "image")("ldsampler", 39) == 64
-    assert _rounding(Section("independent"), "gradient")("adjoint", 39) == 39
+    assert rounding(section, "gradient")("adjoint", 39) == 42 and rounding(section, "image")("ldsampler", 39) == 64
+    assert rounding(Section("independent"), "gradient")("adjoint", 39) == 39
 
 
 def test_parts_of_a_control_with_other_estimators_have_names_of_their_own() -> None:

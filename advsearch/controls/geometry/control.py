@@ -166,14 +166,14 @@ class BoundGeometry(BoundControl):
         self.start = torch.full((shaper.group.size,), 0.5)
 
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
-        return {OFFSETS: self._offsets(u).index_select(0, self._index).float()}
+        return {OFFSETS: self.offsets(u).index_select(0, self._index).float()}
 
-    def _offsets(self, u: Tensor) -> Tensor:
+    def offsets(self, u: Tensor) -> Tensor:
         """Displacement of each place, (P, 3) float64."""
         return self._limits.held(self._shaper.field(u))
 
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        offsets = self._offsets(u.detach())
+        offsets = self.offsets(u.detach())
         lengths = offsets.norm(dim=1)
         return {
             f"{self.name}.largest": {"value": float(lengths.max()), "unit": "object sizes"},

@@ -182,7 +182,7 @@ def _recommended(section: Section, goal: float) -> list[Recommended]:
         asked.setdefault((line[0], line[1], measure, family), {})[line] = points
     found = []
     for (quantity, control, measure, family), lines in asked.items():
-        round_up = _rounding(section, quantity)
+        round_up = rounding(section, quantity)
         one = recommend(lines, goal, round_up)
         if one is None:
             one = Recommended(quantity=quantity, control=control or None, measure=measure, among=None, estimator=None)
@@ -193,7 +193,7 @@ def _recommended(section: Section, goal: float) -> list[Recommended]:
     return found
 
 
-def _rounding(section: Section, quantity: str) -> RoundUp:
+def rounding(section: Section, quantity: str) -> RoundUp:
     """A line of the picture is named after its sampler; one of a gradient has that of the run."""
     return lambda series, samples: next_count(
         section.sampler if quantity == "gradient" else series.removesuffix(OIDN), samples

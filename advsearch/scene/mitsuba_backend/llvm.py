@@ -102,7 +102,7 @@ def examine(path: Path, *, name_hint: Path | None = None) -> LibraryFile:
     """
     if problem := _unreadable(path):
         return LibraryFile(path, (), problem)
-    version = version_in(path) or (version_in(name_hint) if name_hint else ()) or _ask(str(path))
+    version = version_in(path) or (version_in(name_hint) if name_hint else ()) or asked_version(str(path))
     return LibraryFile(path, version, refusal(version))
 
 
@@ -134,7 +134,7 @@ def ensure_llvm() -> LLVM:
             lists what was found and the command that installs a good one.
     """
     given = os.environ.get(VARIABLE, "")
-    chosen = _given(given) if given else _newest(find())
+    chosen = _given(given) if given else newest(find())
     os.environ[VARIABLE] = str(chosen.path)
     return chosen
 
@@ -157,7 +157,7 @@ def install_command(os_release: str | None = None, platform: str = sys.platform)
         return commands["conda"]
     if platform == "darwin":
         return commands["Homebrew"]
-    release = _read_os_release() if os_release is None else os_release
+    release = read_os_release() if os_release is None else os_release
     ids = " ".join(re.findall(r'^ID(?:_LIKE)?="?([^"\n]*)', release, re.MULTILINE)).split()
     if "ubuntu" in ids and re.search(r'^VERSION_ID="?(1\d|2[0-3])\.', release, re.MULTILINE):
         return commands["conda"]  # its own packages end with LLVM 15
@@ -186,11 +186,11 @@ def _given(value: str) -> LLVM:
 
 def _bare(name: str) -> LibraryFile:
     """A library name without a folder is looked up by the dynamic loader; only the library itself knows its version."""
-    version = _ask(name)
+    version = asked_version(name)
     return LibraryFile(Path(name), version, refusal(version))
 
 
-def _newest(candidates: list[LibraryFile]) -> LLVM:
+def newest(candidates: list[LibraryFile]) -> LLVM:
     """The first usable candidate that can be loaded."""
     refused = [str(c) for c in candidates if c.refused]
     for candidate in candidates:
@@ -242,7 +242,7 @@ def _unreadable(path: Path) -> str:
             head = file.read(20)
     except OSError as error:
         return f"it cannot be read: {error.strerror}"
-    own = _own_elf_header()
+    own = own_elf_header()
     if not own:
         return ""
     if head[:4] != b"\x7fELF" or len(head) < 20:
@@ -251,7 +251,7 @@ def _unreadable(path: Path) -> str:
 
 
 @functools.cache
-def _own_elf_header() -> bytes:
+def own_elf_header() -> bytes:
     """The first bytes of this interpreter's own file: word size, byte order, processor; empty if it is not ELF."""
     try:
         with open(sys.executable, "rb") as file:
@@ -261,7 +261,7 @@ def _own_elf_header() -> bytes:
     return head if head[:4] == b"\x7fELF" else b""
 
 
-def _ask(library: str) -> Version:
+def asked_version(library: str) -> Version:
     """Load a library in another process, which a bad one may take down, and ask for its version; () if it has none."""
     command = [sys.executable, "-c", _PROBE, library]
     try:
@@ -271,7 +271,7 @@ def _ask(library: str) -> Version:
         return ()
 
 
-def _read_os_release() -> str:
+def read_os_release() -> str:
     try:
         return Path("/etc/os-release").read_text(encoding="utf-8")
     except OSError:

@@ -18,7 +18,7 @@ UBUNTU = 'ID=ubuntu\nID_LIKE=debian\nVERSION_ID="24.04"\n'
 UBUNTU_22 = 'ID=ubuntu\nID_LIKE=debian\nVERSION_ID="22.04"\n'
 FEDORA = "ID=fedora\nVERSION_ID=42\n"
 
-linux_only = pytest.mark.skipif(not llvm._own_elf_header(), reason="libraries are not ELF files here")
+linux_only = pytest.mark.skipif(not llvm.own_elf_header(), reason="libraries are not ELF files here")
 
 
 @pytest.fixture(autouse=True)
@@ -35,7 +35,7 @@ def library(root: Path, path: str, content: bytes | None = None) -> Path:
     """Make a file that looks like a library for this interpreter."""
     file = root / path
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(llvm._own_elf_header() if content is None else content)
+    file.write_bytes(llvm.own_elf_header() if content is None else content)
     return file
 
 
@@ -94,7 +94,7 @@ def test_other_libraries_of_llvm_are_not_taken_for_it(tmp_path: Path) -> None:
     [
         (b"", "not a shared library"),
         (b"INPUT(libLLVM-19.so)\n", "not a shared library"),
-        (llvm._own_elf_header()[:18] + b"\x28\x00", "another processor"),
+        (llvm.own_elf_header()[:18] + b"\x28\x00", "another processor"),
     ],
 )
 def test_a_file_that_is_no_library_for_this_machine_is_refused(tmp_path: Path, content: bytes, reason: str) -> None:
@@ -108,18 +108,18 @@ def test_a_usable_name_on_a_broken_file_is_passed_over(tmp_path: Path) -> None:
     """The header is right and the rest is missing: the loader says so, and the next candidate is taken."""
     library(tmp_path, "usr/lib/libLLVM.so.99.1")
     with pytest.raises(EnvironmentSetupError, match=r"libLLVM\.so\.99\.1 \(cannot be loaded: .*Install one with"):
-        llvm._newest(llvm.find(tmp_path, {}))
+        llvm.newest(llvm.find(tmp_path, {}))
 
 
 def test_message_without_any_usable_file_lists_what_is_there_and_what_to_type(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     old = library(tmp_path, "usr/lib/x86_64-linux-gnu/libLLVM-15.so.1")
-    monkeypatch.setattr(llvm, "_read_os_release", lambda: DEBIAN)
+    monkeypatch.setattr(llvm, "read_os_release", lambda: DEBIAN)
     monkeypatch.setattr(os, "geteuid", lambda: 1000, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
     with pytest.raises(EnvironmentSetupError) as caught:
-        llvm._newest(llvm.find(tmp_path, {}))
+        llvm.newest(llvm.find(tmp_path, {}))
     message = str(caught.value)
     assert f"{old} (15: it aborts the process" in message
     assert "sudo apt-get install libllvm19" in message
@@ -190,7 +190,7 @@ def test_a_file_without_a_version_in_its_name_is_asked_for_it(tmp_path: Path) ->
 def test_this_machine_has_a_usable_one_and_it_tells_the_version_of_its_name() -> None:
     chosen = llvm.ensure_llvm()
     assert chosen.version[0] >= llvm.MINIMUM
-    assert llvm._ask(str(chosen.path))[: len(chosen.version)] == chosen.version
+    assert llvm.asked_version(str(chosen.path))[: len(chosen.version)] == chosen.version
 
 
 def test_command_prints_the_choice_or_fails_with_the_message(tmp_path: Path) -> None:
