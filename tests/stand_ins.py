@@ -142,3 +142,18 @@ def rows(folder: Path) -> list[tuple[Any, ...]]:
             )
             for r in run.store.rows()
         ]
+
+
+class Impatient(NullProgress):
+    """Presses Ctrl-C after so many evaluations of the search."""
+
+    def __init__(self, after: int) -> None:
+        self._left, self._searching = after, False
+
+    def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
+        self._searching = name.startswith("searching with")
+
+    def advance(self, n: int = 1, **info: float | str) -> None:
+        self._left -= self._searching
+        if self._searching and self._left == 0:
+            raise KeyboardInterrupt

@@ -21,7 +21,6 @@ from advsearch.engine.pictures import write_artifacts, write_pictures
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.rows import verified_rate
-from advsearch.engine.transport import Transport
 from advsearch.errors import InputError
 from advsearch.report.notebook import attack_html
 from advsearch.report.page import write_report
@@ -32,6 +31,7 @@ from advsearch.runs.results.attack import (
     AnswerDistribution,
     AttackSummary,
     AverageCase,
+    BankOfConditions,
     BaselineSearch,
     CleanAnswer,
     ControlGroup,
@@ -284,10 +284,11 @@ def _transport(findings: Findings) -> LinearTransport:
         return LinearTransport(used=False, reason=findings.rendered_because or "nothing was searched")
     return LinearTransport(
         used=True,
-        entries=transport.start.entries,
-        bytes=transport.start.bytes,
+        conditions=None if transport.conditions is None else BankOfConditions.of(transport.conditions),
+        entries=transport.size()[0],
+        bytes=transport.size()[1],
         seconds=transport.seconds,
-        renewed=sum(len(found) for found in transport.renewals.values()),
+        renewed=transport.renewed,
         error=PredictionError.of(transport.deviations[-1]) if transport.deviations else None,
     )
 
@@ -295,9 +296,10 @@ def _transport(findings: Findings) -> LinearTransport:
 def _renders(findings: Findings, problem: Problem) -> dict[str, int]:
     """How many pictures each part took, and how many were predicted instead."""
     search, baseline, transport = findings.search, findings.baseline, findings.transport
-    products = [len(one.history) if one and transport else 0 for one in (search, baseline)]
+    products = [len(one.history) * problem.draws if one and transport else 0 for one in (search, baseline)]
+    traced = transport.traced if transport else 0
     return {
-        "search": (search.renders * problem.draws if search else 0) - products[0] + _traced(transport),
+        "search": (search.renders * problem.draws if search else 0) - products[0] + traced,
         "gradient": search.gradients if search and not transport else 0,
         "baseline": (baseline.renders * problem.draws if baseline else 0) - products[1],
         "verification": findings.verification_renders + len(findings.first_look),
@@ -366,13 +368,6 @@ def _verified(verification: Verification | None) -> VerifiedRate | None:
     if verification is None:
         return None
     return verified_rate(verification.adversarial, verification.adversarial_trials)
-
-
-def _traced(transport: Transport | None) -> int:
-    """Pictures that were traced for matrices and comparisons."""
-    if transport is None:
-        return 0
-    return 1 + sum(len(found) for found in transport.renewals.values()) + 2 * len(transport.deviations)
 
 
 def _remarks(findings: Findings, problem: Problem) -> list[str]:

@@ -213,7 +213,7 @@ class Problem:
             found = [self.evaluated(self.whole(u, d), d, index, gradient, samples, None) for d in draws]
             if on_image is not None and on_image.wants(index):
                 on_image.tell(index, self.picture(u, noise, self.spp, drawn=False))
-            return self._mean(found, u)
+            return self.mean(found, u)
 
         return evaluate
 
@@ -260,8 +260,51 @@ class Problem:
         )
         return evaluation, output
 
-    def _mean(self, found: Sequence[tuple[Evaluation, Output]], u: Tensor) -> Evaluation:
-        """The mean over conditions. Its cost is counted in evaluations, each of which takes a picture a draw."""
+    def judged(
+        self, render: Callable[[Tensor], Tensor], wholes: Sequence[Tensor], u: Tensor, gradient: Wanted
+    ) -> tuple[list[tuple[Evaluation, Output]], Tensor | None]:
+        """Ask the model about several pictures at once.
+
+        Args:
+            render: from u to the pictures (N, H, W, 3), with a graph.
+            wholes: the configuration of the whole space of each.
+            u: (d,) of the searched controls.
+            gradient: whether the derivative is wanted.
+
+        Returns:
+            An evaluation without derivative and the model's output for each picture, and the derivative (d,) of the sum
+            of their objectives.
+        """
+        at = u.detach().clone().requires_grad_(bool(gradient))
+        with torch.set_grad_enabled(bool(gradient)):
+            pictures = render(at)
+            outputs = self.model(pictures)
+            each = [outputs[number : number + 1] for number in range(len(wholes))]
+            truths = [self.truth(whole) for whole in wholes]
+            if self.task.varies:
+                of_each = zip(each, pictures.split(1), truths, strict=True)
+                values = torch.cat([self.objective(output, picture, truth) for output, picture, truth in of_each])
+            else:
+                values = self.objective(outputs, pictures, truths[0])
+            derivative = torch.autograd.grad(values.sum(), at)[0] if values.requires_grad else None
+        with torch.no_grad():
+            said = [self.task.judge(output, truth)[0] for output, truth in zip(each, truths, strict=True)]
+        evaluations = [
+            Evaluation(float(value), None, judgement.success, judgement=judgement)
+            for value, judgement in zip(values.detach(), said, strict=True)
+        ]
+        if gradient and derivative is None:
+            derivative = torch.zeros_like(u)
+        return list(zip(evaluations, each, strict=True)), derivative
+
+    def mean(self, found: Sequence[tuple[Evaluation, Output]], u: Tensor, gradient: Tensor | None = None) -> Evaluation:
+        """The mean over conditions. Its cost is counted in evaluations, each of which takes a picture a draw.
+
+        Args:
+            found: evaluations under each, and the model's outputs.
+            u: (d,) of the searched controls.
+            gradient: of the mean, where the evaluations have none.
+        """
         each, count = [one for one, _ in found], len(found)
         gradients = [one.gradient[: u.numel()] for one in each if one.gradient is not None]
         if self.task.varies:  # each condition has a truth of its own
@@ -272,7 +315,7 @@ class Problem:
                 judgement = self.task.judge(output, self.truth())[0]
         return Evaluation(
             objective=sum(one.objective for one in each) / count,
-            gradient=torch.stack(gradients).mean(dim=0) if gradients else None,
+            gradient=torch.stack(gradients).mean(dim=0) if gradients else gradient,
             success=sum(one.success for one in each) >= OVER_CONDITIONS.share(count),
             non_finite=sum(one.non_finite for one in each),
             cost=max(one.cost for one in each),

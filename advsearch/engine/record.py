@@ -14,7 +14,7 @@ from advsearch.attacks.smallest import Bracket
 from advsearch.engine.memory import Memory
 from advsearch.engine.problem import Problem
 from advsearch.engine.rows import judged, trial_row
-from advsearch.engine.transport import Transport
+from advsearch.engine.transport import Predictor
 from advsearch.progress import Progress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
@@ -59,7 +59,7 @@ class Findings:
     smallest: Bracket | None = None
     frames: list[Any] = field(default_factory=list)
     interrupted: bool = False
-    transport: Transport | None = None
+    transport: Predictor | None = None
     rendered_because: str = ""
     verification_renders: int = 0
 

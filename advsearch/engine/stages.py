@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -30,6 +31,7 @@ from advsearch.attacks import search as run_search
 from advsearch.attacks import verify as run_verify
 from advsearch.attacks.sample_count import most_samples
 from advsearch.attacks.smallest import ATTEMPTS, MOST_CHECKS, ROUNDS, confirmed, scaled, smallest
+from advsearch.engine.bank import Bank
 from advsearch.engine.bounces import WORTH, bounces_of, most_pictures
 from advsearch.engine.budget import Preparation, RenderBudget
 from advsearch.engine.gradients import inside
@@ -264,13 +266,11 @@ class Attack:
         findings.rendered_because = reason_against(problem, steps, self.preparation.specialise) or ""
         if findings.rendered_because:
             return
-        stored = self.memory.note(TRANSPORT) or {}
-        findings.transport = Transport(
-            problem,
-            steps,
-            renewals=stored,
-            keep=lambda renewals: self.memory.set_note(TRANSPORT, renewals),
-        )
+        stored, keep = self.memory.note(TRANSPORT), partial(self.memory.set_note, TRANSPORT)
+        if problem.conditions is None:
+            findings.transport = Transport(problem, steps, renewals=stored or {}, keep=keep)
+        else:
+            findings.transport = Bank(problem, steps, grown=stored or [], keep=keep)
         hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"
         self.stages.begin("transport", "collecting light transport", findings.transport.samples, hint=hint)
         try:

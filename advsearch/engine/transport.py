@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -47,15 +48,83 @@ class Deviation:
     logits: float
 
 
+@dataclass(frozen=True)
+class Conditions:
+    """The conditions that matrices were made for.
+
+    Attributes:
+        made: how many.
+        dropped: how many of them made room for newer ones.
+        grown: comparisons after which there had to be more.
+        gap: by how much the objective was larger under them than under unseen ones, at the last comparison.
+    """
+
+    made: int
+    dropped: int
+    grown: int
+    gap: float | None
+
+
 def reason_against(problem: Problem, steps: int, specialise: bool) -> str | None:
     """Why a search renders instead of predicting, in words; None if it predicts."""
     if not specialise:
         return "nothing is left out"
-    if problem.conditions is not None:
-        return "conditions vary by chance"
     if steps < WORTH:
         return f"a matrix pays from {WORTH} evaluations on"
-    return why_not(problem.renderer)
+    return why_not(problem.renderer, _varying(problem))
+
+
+def _varying(problem: Problem) -> list[str]:
+    """The controls that vary by chance."""
+    return [] if problem.conditions is None else [one.name for one in problem.space.controls[problem.searched :]]
+
+
+class Predictor(ABC):
+    """What predicts the pictures of a run's searches.
+
+    Attributes:
+        deviations: what the comparisons with traced pictures found, in order.
+        seconds: spent on making matrices and on comparing.
+    """
+
+    deviations: list[Deviation]
+    seconds: float
+
+    @property
+    @abstractmethod
+    def samples(self) -> int:
+        """Samples a pixel that are traced before the search can begin."""
+
+    @abstractmethod
+    def prepare(self, tick: Tick = lambda samples: None) -> None:
+        """Make the matrices at the start of the search; told of samples a pixel as they are traced."""
+
+    @abstractmethod
+    def passed(self, kind: str, index: int, u: Tensor) -> None:
+        """Remember an evaluation that was read back."""
+
+    @abstractmethod
+    def evaluator(self, kind: str, on_image: OnImage | None = None) -> Evaluate:
+        """Return the evaluation of configurations of one search."""
+
+    @abstractmethod
+    def size(self) -> tuple[int, int]:
+        """Entries of the matrices, for one colour channel, and bytes."""
+
+    @property
+    @abstractmethod
+    def traced(self) -> int:
+        """Pictures that were traced for matrices and comparisons."""
+
+    @property
+    def renewed(self) -> int | None:
+        """How often the matrix was made anew; None where none is."""
+        return None
+
+    @property
+    def conditions(self) -> Conditions | None:
+        """What there is to say of conditions; None where nothing varies."""
+        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +143,8 @@ class Linearised:
 
 
 @dataclass
-class Transport:
-    """The matrices of a run's searches.
+class Transport(Predictor):
+    """The matrices of a run's searches where nothing varies by chance.
 
     Attributes:
         problem: what is searched.
@@ -98,11 +167,20 @@ class Transport:
 
     @property
     def samples(self) -> int:
-        """Samples a pixel that making the matrices takes."""
         return samples_to_collect(self.problem.renderer)
 
+    def size(self) -> tuple[int, int]:
+        return self.start.entries, self.start.bytes
+
+    @property
+    def renewed(self) -> int:
+        return sum(len(found) for found in self.renewals.values())
+
+    @property
+    def traced(self) -> int:
+        return 1 + self.renewed + 2 * len(self.deviations)
+
     def prepare(self, tick: Tick = lambda samples: None) -> None:
-        """Make the matrices at the start of the search; told of samples a pixel as they are traced."""
         self._start = self._made(self.problem.domain.start, "start", 0, tick)
 
     @property
@@ -118,12 +196,10 @@ class Transport:
         return self._start
 
     def passed(self, kind: str, index: int, u: Tensor) -> None:
-        """Remember an evaluation that was read back: it may be one at which the matrix was made anew."""
         if index in self.renewals.get(kind, ()):
             self._present[kind] = Linearised(u.detach().clone(), index)
 
     def evaluator(self, kind: str, on_image: OnImage | None = None) -> Evaluate:
-        """Return the evaluation of configurations of one search."""
         traced = self.problem.evaluator(kind, on_image)
 
         def evaluate(u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
@@ -163,12 +239,18 @@ class Transport:
     def deviation(self, linear: LinearRenderer, at: Tensor, u: Tensor, index: int) -> Deviation:
         """Compare what a prediction says of the change since its matrix was made at `at` with what two traced pictures
         do."""
-        begun, problem = time.perf_counter(), self.problem
-        seed = seeds.stream(problem.seed, "transport check", index)
-        with torch.no_grad():
-            before, after = (problem.renderer(one, seed=seed, spp=CHECK_SPP) for one in (at, u))
-            predicted = linear(u)
-            off = float((((predicted - linear(at)) - (after - before)) ** 2).mean())
-            logits = float(problem.loss(predicted) - problem.loss(after))
+        begun = time.perf_counter()
+        found = deviation_of(self.problem, linear, at, u, seeds.stream(self.problem.seed, "transport check", index))
         self.seconds += time.perf_counter() - begun
-        return Deviation(255.0 * math.sqrt(off), logits)
+        return found
+
+
+def deviation_of(problem: Problem, linear: LinearRenderer, at: Tensor, u: Tensor, seed: int) -> Deviation:
+    """Compare what a prediction says of the change from one configuration of the whole space to another with what two
+    traced pictures with one seed do."""
+    with torch.no_grad():
+        before, after = (problem.renderer(one, seed=seed, spp=CHECK_SPP) for one in (at, u))
+        predicted = linear(u)
+        off = float((((predicted - linear(at)) - (after - before)) ** 2).mean())
+        logits = float(problem.loss(predicted) - problem.loss(after))
+    return Deviation(255.0 * math.sqrt(off), logits)

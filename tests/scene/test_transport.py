@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from stand_ins import rows
+from stand_ins import Impatient, rows
 from torch import Tensor
 
 import advsearch
 from advsearch.engine import transport as searching
-from advsearch.progress import NullProgress
 from advsearch.scene.mitsuba_backend.transport import Vertices
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport import renderer as linear
@@ -161,21 +160,6 @@ def test_a_search_says_what_predicted_its_pictures(monkeypatch: pytest.MonkeyPat
     assert kept["transport"]["renewed"] == 2
 
 
-class Impatient(NullProgress):
-    """Presses Ctrl-C after so many evaluations of the search."""
-
-    def __init__(self, after: int) -> None:
-        self._left, self._searching = after, False
-
-    def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
-        self._searching = name.startswith("searching with")
-
-    def advance(self, n: int = 1, **info: float | str) -> None:
-        self._left -= self._searching
-        if self._searching and self._left == 0:
-            raise KeyboardInterrupt
-
-
 def test_a_search_that_goes_on_ends_with_the_same_rows(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Though what is read back is not predicted again: the matrix was made anew once before the interrupt."""
     monkeypatch.setattr(searching, "EVERY", 6)
@@ -193,7 +177,6 @@ def test_a_search_that_goes_on_ends_with_the_same_rows(monkeypatch: pytest.Monke
     [
         ({}, "pays from 16"),
         ({"specialise": False}, "nothing is left out"),
-        ({"over": ["light"]}, "by chance"),
     ],
 )
 def test_a_search_that_renders_says_why(options: dict[str, object], reason: str) -> None:

@@ -138,11 +138,21 @@ class PredictionError(Fields):
     logits: Number = Field(description="of the objective")
 
 
+class BankOfConditions(Fields):
+    """The conditions that matrices were made for."""
+
+    made: int = Field(description="how many")
+    dropped: int = Field(description="of them made room for newer ones")
+    grown: int = Field(description="comparisons with unseen conditions after which there had to be more")
+    gap: float | None = Field(description="objective under them over that under unseen ones, at the last comparison")
+
+
 class LinearTransport(Fields):
     """The matrix that predicted the pictures of the searches."""
 
     used: bool
     reason: str | None = Field(default=None, description="why every picture was rendered")
+    conditions: BankOfConditions | None = Field(default=None, description="with `over`")
     entries: int | None = Field(default=None, description="of the matrix")
     bytes: int | None = Field(default=None, description="of its memory")
     seconds: float | None = Field(default=None, description="that it and the comparisons took")

@@ -27,8 +27,27 @@ Ints = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.float32]
 Smooth = Callable[[Tensor], Tensor]
 """From a noisy picture (H, W, 3) to one without noise."""
+MOST_MEANS = 6e4
+"""Multiples of its mean up to which a picture is kept; any exposure has clipped them long before."""
 COARSE = 8
 """Side of the cells of later vertices, in texels."""
+
+
+class Halves:
+    """A picture in 16 bits a number, in multiples of its mean, so that it may be as bright as it likes.
+
+    Args:
+        picture: any shape.
+    """
+
+    def __init__(self, picture: Tensor) -> None:
+        mean = float(picture.abs().mean()) if picture.numel() else 0.0
+        self._scale = mean if 0.0 < mean < float("inf") else 1.0
+        self._values = (picture / self._scale).clamp(-MOST_MEANS, MOST_MEANS).half()
+
+    def __call__(self) -> Tensor:
+        """The picture, float32."""
+        return self._values.float() * self._scale
 
 
 class ColouredRows:
@@ -43,6 +62,7 @@ class ColouredRows:
         self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
         self._kept: tuple[npt.NDArray[np.float16], npt.NDArray[np.int32], npt.NDArray[np.int32]] | None = None
         self._colours: Floats = np.zeros((rows, 3), dtype=np.float32)
+        self._kept_colours = Halves(torch.zeros(0))
 
     @property
     def entries(self) -> int:
@@ -51,7 +71,7 @@ class ColouredRows:
     @property
     def bytes(self) -> int:
         """Memory when it is finished: a share and its column an entry, a beginning and a colour a row."""
-        return 6 * self.entries + (4 + 12) * self._shape[0]
+        return 6 * self.entries + (4 + 6) * self._shape[0]
 
     def add(self, rows: Ints, columns: Ints, shares: Floats, weights: Floats) -> None:
         """Add entries.
@@ -77,18 +97,22 @@ class ColouredRows:
         shares = self._sum.data * np.repeat(factors, np.diff(self._sum.indptr))
         self._kept = shares.astype(np.float16), self._sum.indices, self._sum.indptr
         self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
-        if smooth is not None:
-            self._colours = smooth(torch.from_numpy(self._colours).reshape(*picture, 3)).reshape(-1, 3).numpy()
+        colours = torch.from_numpy(self._colours).reshape(*picture, 3)
+        self._kept_colours = Halves(colours if smooth is None else smooth(colours))
+        self._colours = np.zeros((0, 3), dtype=np.float32)
 
     def times(self, values: Floats) -> Floats:
         """Return the matrix times (columns, 3): (rows, 3)."""
-        found: Floats = (self._shares() @ values) * self._colours
+        found: Floats = (self._shares() @ values) * self._coloured()
         return found
 
     def transposed_times(self, values: Floats) -> Floats:
         """Return the transpose times (rows, 3): (columns, 3)."""
-        found: Floats = self._shares().T @ (values * self._colours)
+        found: Floats = self._shares().T @ (values * self._coloured())
         return found
+
+    def _coloured(self) -> Floats:
+        return self._kept_colours().reshape(-1, 3).numpy()
 
     def _shares(self) -> scipy.sparse.csr_matrix:
         assert self._kept is not None, "finish it first"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 
 import torch
@@ -15,7 +15,7 @@ from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.mitsuba_backend.transport import Paths, mean_of
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.matrix import TextureTransport
+from advsearch.scene.transport.matrix import Halves, TextureTransport
 
 SPP = 128
 """Samples a pixel of the paths whose vertices become the matrix and which make the base picture; what noise the
@@ -47,6 +47,7 @@ class LinearRenderer(Renderer):
         spp: samples a pixel.
         quick: take the noise out of the rows of the matrix as it was taken out of the base picture, which they
             resemble, and not by the denoiser.
+        names: the inputs that get a matrix; None for all base colours that the space sets.
 
     Attributes:
         products: pictures it has made.
@@ -66,6 +67,7 @@ class LinearRenderer(Renderer):
         *,
         spp: int = SPP,
         quick: bool = False,
+        names: Collection[str] | None = None,
     ) -> None:
         vars(self).update(vars(copy.copy(renderer)))
         self.products = 0
@@ -73,14 +75,14 @@ class LinearRenderer(Renderer):
             inputs = self._assembled(u)
             self._applied = {name: value for name, value in inputs.items() if name in ON_PICTURE}
             traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
-            linear = [name for name in traced if name in linear_inputs(renderer)]
+            linear = [name for name in traced if name in (linear_inputs(renderer) if names is None else names)]
             self.there = {name: traced[name].clone() for name in linear}
             self.transports = {
                 name: TextureTransport(self.formation.resolution, (value.shape[0], value.shape[1]))
                 for name, value in self.there.items()
             }
             seen = self._traced(traced, seed, tick, spp)
-            self._base = self._finished(seen, quick).half()
+            self._base = Halves(self._finished(seen, quick))
 
     @property
     def entries(self) -> int:
@@ -89,8 +91,9 @@ class LinearRenderer(Renderer):
 
     @property
     def bytes(self) -> int:
-        """Memory of all matrices."""
-        return sum(one.bytes for one in self.transports.values())
+        """Memory of all matrices and of the base picture, 16 bits a number."""
+        height, width = self.formation.resolution
+        return sum(one.bytes for one in self.transports.values()) + 8 * height * width
 
     @property
     def _hide(self) -> bool:
@@ -116,7 +119,7 @@ class LinearRenderer(Renderer):
         return mean_of(found)
 
     def _finished(self, seen: Paths, quick: bool) -> Tensor:
-        """Take the noise out of the matrices and the base picture, and return that, times the gain."""
+        """Take the noise out of the matrices and the base picture, and return that, with coverage if hidden."""
         radiance = self._finite(seen.radiance - seen.background if self._hide else seen.radiance)
         clean = radiance
         if self.formation.denoiser == "oidn":
@@ -129,11 +132,10 @@ class LinearRenderer(Renderer):
 
         for transport in self.transports.values():
             transport.finish(smooth if self.formation.denoiser == "oidn" else None)
-        shown = torch.cat([clean, seen.coverage], dim=-1) if self._hide else clean
-        return shown
+        return torch.cat([clean, seen.coverage], dim=-1) if self._hide else clean
 
     def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
-        base = self._base.float()
+        base = self._base()
         radiance = base[..., :3]
         for name, transport in self.transports.items():
             radiance = radiance + transport(inputs[name] - self.there[name])
@@ -157,21 +159,26 @@ def linear_inputs(renderer: Renderer) -> frozenset[str]:
     return frozenset(name for name in renderer.scene.names if name.endswith(LINEAR))
 
 
-def why_not(renderer: Renderer) -> str | None:
-    """Why pictures of a renderer's space cannot be predicted by a matrix, in words; None if they can."""
+def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
+    """Why pictures of a renderer's space cannot be predicted by a matrix, in words; None if they can.
+
+    Args:
+        varying: names of controls that stand still for each matrix, whatever they change.
+    """
     plan, linear = renderer.plan, linear_inputs(renderer)
     if renderer.scene.volumetric:
         return "there is haze"
     if renderer.formation.denoiser != "oidn":
         return "noise is part of the picture without the denoiser"
-    for group in plan.groups:
+    searched = [group for group in plan.groups if group.control not in varying]
+    for group in searched:
         if "forced" in group.reason and group.estimator not in ("none", "image"):
             return f"the estimator of {group.name} is forced"
         if group.estimator == "image":
             continue
         if group.estimator != "adjoint" or not renderer.routes.get(group.name, frozenset()) <= linear:
             return f"{group.name} changes more than a base colour"
-    if not any(renderer.routes.get(group.name) for group in plan.groups):
+    if not any(renderer.routes.get(group.name) for group in searched):
         return "nothing that is searched needs a render to be differentiated"
     return None
 

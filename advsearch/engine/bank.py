@@ -1,0 +1,267 @@
+"""Searches over base colours under conditions that vary by chance, by a matrix of light transport for each of many.
+
+Evaluations draw conditions from the bank. It begins with few. Every `EVERY` evaluations the present configuration is
+traced under conditions that no matrix was made for: while these are clearly better for the model than those in the
+bank, the bank grows by `GROWTH` of what each evaluation draws, and what is new is looked at at once. The oldest
+matrices make room where there is no memory. All of that follows from the seed and from the comparisons after which the
+bank grew, so that a run that goes on makes the same matrices again.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.attacks import Evaluate, Evaluation
+from advsearch.attacks.domain import Domain, centre_of_option
+from advsearch.attacks.draws import Draws
+from advsearch.attacks.evaluation import Wanted
+from advsearch.engine.problem import OnImage, Problem
+from advsearch.engine.transport import Conditions, Deviation, Predictor, Tick, deviation_of
+from advsearch.files import scaled
+from advsearch.scene.transport.renderer import MOST_BYTES, LinearRenderer, linear_inputs
+
+FIRST = 8
+"""Conditions in the bank at first, in what an evaluation draws."""
+GROWTH = 8
+"""An evaluation adds a condition for so many that it draws, while the bank grows."""
+EVERY = 50
+UNSEEN = 16
+"""Conditions that a comparison traces, and as many of the bank that it predicts."""
+SURE = 1.0
+"""Standard errors by which unseen conditions have to be better for the model."""
+SPP = 8
+"""Samples a pixel of the paths of a condition: many conditions with some noise teach more than few without."""
+TOGETHER = 16
+"""Pictures that the model is asked about at once."""
+SOBOL_MOST = 64
+"""Numbers of a condition up to which they are stratified."""
+
+
+def stratified(domain: Domain, number: int, seed: int) -> Tensor:
+    """The condition with this number: as likely as any other, and as far from the ones before as may be."""
+    sizes = sum(block.size for block, _ in domain.parts())
+    if sizes > SOBOL_MOST or any(block.norm == "l2" for block, _ in domain.parts()):
+        generator = torch.Generator().manual_seed(seeds.stream(seed, "bank condition", number))
+        return domain.sample(generator)[0]
+    noise = torch.from_numpy(Draws(sizes, "sobol", seed, "bank conditions").points(number, 1)[0]).float()
+    for block, part in domain.parts():
+        if block.options:
+            noise[part] = centre_of_option(noise[part], block.options)
+    return domain.project(torch.lerp(domain.lower, domain.upper, noise))
+
+
+@dataclass(frozen=True, eq=False)
+class Condition:
+    """A matrix, and the numbers of the conditions that it was made for.
+
+    Attributes:
+        alone: whether base colours under it depend on what is searched alone.
+    """
+
+    number: int
+    numbers: Tensor
+    renderer: LinearRenderer
+    alone: bool
+
+
+@dataclass
+class Bank(Predictor):
+    """The matrices of a run whose searches look at conditions that vary by chance.
+
+    Attributes:
+        problem: what is searched.
+        steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
+        grown: the comparisons, by index of the evaluation, after which the bank grew; may be filled before a search
+            that goes on.
+        keep: told of `grown` whenever there is another one.
+        gaps: by how much the objective was larger in the bank than under unseen conditions, by comparison.
+    """
+
+    problem: Problem
+    steps: int
+    grown: list[int] = field(default_factory=list)
+    keep: Callable[[list[int]], None] = lambda grown: None
+    deviations: list[Deviation] = field(default_factory=list)
+    gaps: list[float] = field(default_factory=list)
+    seconds: float = 0.0
+    _held: list[Condition] = field(default_factory=list)
+    _places: dict[int, Tensor] = field(default_factory=dict)
+    _there: dict[str, Tensor] = field(default_factory=dict)
+    _still: LinearRenderer | None = None
+    _made: int = 0
+    _bytes: int = 0
+    _last: int = 0
+    _dropped: int = 0
+
+    # ---- what a predictor says --------------------------------------------------------------------------------------
+
+    @property
+    def samples(self) -> int:
+        return FIRST * self.problem.draws * SPP
+
+    @property
+    def conditions(self) -> Conditions:
+        gap = self.gaps[-1] if self.gaps else None
+        return Conditions(self._wanted(self._last), self._dropped, len(self.grown), gap)
+
+    @property
+    def traced(self) -> int:
+        return self._made + (UNSEEN + 2) * len(self.gaps)
+
+    def size(self) -> tuple[int, int]:
+        return sum(one.renderer.entries for one in self._held), self._bytes
+
+    def prepare(self, tick: Tick = lambda samples: None) -> None:
+        self._fill(0, tick)
+
+    def passed(self, kind: str, index: int, u: Tensor) -> None:
+        if kind == "search" and index < self.steps:
+            self._last = index
+            if index in self.grown:
+                self._places[index] = u.detach().clone()
+
+    def evaluator(self, kind: str, on_image: OnImage | None = None) -> Evaluate:
+        traced = self.problem.evaluator(kind, on_image)
+
+        def evaluate(u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
+            if index >= self.steps:
+                return traced(u, index=index, gradient=gradient, samples=samples)
+            if kind == "search":
+                self._last = index
+                if index and index % EVERY == 0:
+                    self._compare(u, index)
+            self._fill(self._last)
+            if on_image is not None and on_image.wants(index):
+                on_image.tell(index, self._picture(u))
+            return self._evaluated(self._drawn(kind, index), u, gradient)
+
+        return evaluate
+
+    # ---- evaluations ------------------------------------------------------------------------------------------------
+
+    def _drawn(self, kind: str, index: int) -> list[Condition]:
+        """The conditions that an evaluation looks at: what is new, and a random choice of the rest."""
+        count = min(self.problem.draws, len(self._held))
+        before = self._wanted(index - 1 if kind == "search" else self._last)
+        new = [one for one in self._held if one.number >= before][:count]
+        rest = [one for one in self._held if one.number < before]
+        generator = torch.Generator().manual_seed(seeds.stream(self.problem.seed, f"bank {kind}", index))
+        order = torch.randperm(len(rest), generator=generator).tolist()
+        return new + [rest[number] for number in order[: count - len(new)]]
+
+    def _evaluated(self, chosen: Sequence[Condition], u: Tensor, gradient: Wanted) -> Evaluation:
+        found, total = [], None
+        for begin in range(0, len(chosen), TOGETHER):
+            some = chosen[begin : begin + TOGETHER]
+            wholes = [torch.cat([u, one.numbers]) for one in some]
+            each, derivative = self.problem.judged(partial(self._pictures, some), wholes, u, gradient)
+            found += each
+            if derivative is not None:
+                total = derivative if total is None else total + derivative
+        return self.problem.mean(found, u, None if total is None else total / len(chosen))
+
+    def _pictures(self, chosen: Sequence[Condition], u: Tensor) -> Tensor:
+        """Predicted pictures (N, H, W, 3) of u under conditions, with a graph."""
+        alone = self.problem.searched_space.inputs(u)
+        return torch.stack([self._shown(one, u, alone) for one in chosen])
+
+    def _shown(self, one: Condition, u: Tensor, alone: dict[str, Tensor]) -> Tensor:
+        whole = torch.cat([u, one.numbers])
+        if not one.alone:
+            return one.renderer(whole)
+        return one.renderer.shown({name: alone[name] for name in one.renderer.there}, whole)
+
+    def _picture(self, u: Tensor) -> Tensor:
+        """The picture of u under the conditions that the scene comes with."""
+        if self._still is None:
+            seed = seeds.stream(self.problem.seed, "bank still")
+            self._still = self._collected(self.problem.domain.start, None, seed)
+        with torch.no_grad():
+            return self._still(self.problem.whole(u))
+
+    # ---- the bank ---------------------------------------------------------------------------------------------------
+
+    def _wanted(self, index: int) -> int:
+        """How many conditions have been collected by the evaluation with this index."""
+        steps = sum(min(max(index - begin + 1, 0), EVERY) for begin in self.grown)
+        return FIRST * self.problem.draws + steps * self.problem.draws // GROWTH
+
+    def _place(self, number: int) -> Tensor:
+        """The configuration at which the matrix of a condition is made."""
+        begun = [begin for begin in self.grown if self._wanted(begin - 1) <= number]
+        return self._places[begun[-1]] if begun else self.problem.domain.start
+
+    def _fill(self, index: int, tick: Tick = lambda samples: None) -> None:
+        """Make the matrices that there should be by an evaluation, newest last, as far as memory lasts."""
+        wanted, begun = self._wanted(index), time.perf_counter()
+        first = self._held[-1].number + 1 if self._held else 0
+        for number in range(first, wanted):
+            self._held.append(self._condition(number))
+            self._bytes += self._held[-1].renderer.bytes
+            tick(SPP)
+            while len(self._held) > 1 and self._bytes > scaled(MOST_BYTES):
+                self._bytes -= self._held.pop(0).renderer.bytes
+                self._dropped += 1
+        if first < wanted:
+            self.seconds += time.perf_counter() - begun
+
+    def _condition(self, number: int) -> Condition:
+        problem, u = self.problem, self._place(number)
+        assert problem.conditions is not None
+        numbers = stratified(problem.conditions, number, seeds.stream(problem.seed, "bank"))
+        made = self._collected(u, numbers, seeds.stream(problem.seed, "bank matrix", number))
+        with torch.no_grad():
+            own = problem.searched_space.inputs(u)
+        alone = all(name in own and torch.equal(own[name], there) for name, there in made.there.items())
+        for name, there in made.there.items():
+            if name in self._there and torch.equal(self._there[name], there):
+                made.there[name] = self._there[name]
+        self._there = dict(made.there)
+        return Condition(number, numbers, made, alone)
+
+    def _collected(self, u: Tensor, numbers: Tensor | None, seed: int) -> LinearRenderer:
+        problem = self.problem
+        whole = problem.whole(u) if numbers is None else torch.cat([u, numbers])
+        names = {name for group in problem.plan.groups for name in self._reached(group.name, group.control)}
+        self._made += 1
+        with problem.renderer.scene.shorter(problem.search_depth):
+            return LinearRenderer(problem.renderer, whole, seed, spp=SPP, quick=True, names=names)
+
+    def _reached(self, group: str, control: str) -> frozenset[str]:
+        """The base colours that a group of searched coordinates changes."""
+        if control not in {one.name for one in self.problem.searched_space.controls}:
+            return frozenset()
+        return self.problem.renderer.routes.get(group, frozenset()) & linear_inputs(self.problem.renderer)
+
+    def _compare(self, u: Tensor, index: int) -> None:
+        """Look at unseen conditions, and let the bank grow while they are clearly better for the model."""
+        if index in self.grown:
+            return
+        problem, begun = self.problem, time.perf_counter()
+        noise = seeds.stream(problem.seed, "bank check", index)
+        draws = [seeds.stream(noise, "draw", number) for number in range(UNSEEN)]
+        unseen = [problem.evaluated(problem.whole(u, draw), draw, index, False, 1, None)[0].objective for draw in draws]
+        generator = torch.Generator().manual_seed(noise)
+        order = torch.randperm(len(self._held), generator=generator).tolist()[:UNSEEN]
+        chosen = [self._held[number] for number in order]
+        wholes = [torch.cat([u, one.numbers]) for one in chosen]
+        found, _ = problem.judged(partial(self._pictures, chosen), wholes, u, False)
+        seen = [one.objective for one, _ in found]
+        self.gaps.append(statistics.fmean(seen) - statistics.fmean(unseen))
+        error = math.sqrt(sum(statistics.pvariance(some) / len(some) for some in (seen, unseen)))
+        at = torch.cat([self._place(chosen[0].number), chosen[0].numbers])
+        self.deviations.append(deviation_of(problem, chosen[0].renderer, at, wholes[0], noise))
+        if self.gaps[-1] > SURE * error:
+            self._places[index] = u.detach().clone()
+            self.grown.append(index)
+            self.keep(self.grown)
+        self.seconds += time.perf_counter() - begun

@@ -1,0 +1,115 @@
+"""Searches under conditions that vary by chance, by a matrix for each condition of a bank."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from stand_ins import Impatient, rows
+
+import advsearch
+from advsearch.attacks.domain import Block, Domain
+from advsearch.engine import bank, transport
+from advsearch.engine.bank import Bank, stratified
+
+SMALL: dict[str, Any] = {
+    "resolution": 48,
+    "controls": {"texture": {"resolution": 8}},
+    "over": ["camera", "environment"],
+    "draws": 2,
+    "steps": 18,
+    "trials": 6,
+    "verify_spp": 8,
+    "baseline": False,
+    "deterministic": True,
+}
+
+
+def test_conditions_are_stratified_and_numbered() -> None:
+    """Sixteen of them: of each number, one in each sixteenth of its range; the same in any order. A choice has its
+    middle, and a ball of a norm is drawn from."""
+    box = Domain(torch.full((3,), 0.5), (Block(2, low=0.2, high=0.6), Block(1)))
+    drawn = torch.stack([stratified(box, number, seed=3) for number in range(16)])
+    shares = (drawn - box.lower) / (box.upper - box.lower)
+    assert all(sorted((shares[:, one] * 16).floor().tolist()) == list(range(16)) for one in range(3))
+    assert torch.equal(stratified(box, 7, seed=3), drawn[7])
+    assert not torch.equal(stratified(box, 7, seed=4), drawn[7])
+    choice = Domain(torch.tensor([0.25]), (Block(1, options=2),))
+    assert {float(stratified(choice, number, seed=0)) for number in range(8)} == {0.25, 0.75}
+    ball = Domain(torch.full((4,), 0.5), (Block(4, norm="l2", epsilon=0.1),))
+    assert ball.contains(stratified(ball, 5, seed=0)) and stratified(ball, 5, seed=0).ne(0.5).any()
+
+
+@pytest.fixture
+def growing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It compares every six evaluations, and grows after each comparison."""
+    monkeypatch.setattr(bank, "EVERY", 6)
+    monkeypatch.setattr(bank, "UNSEEN", 2)
+    monkeypatch.setattr(bank, "SURE", -1e9)
+    monkeypatch.setattr(bank, "FIRST", 3)
+    monkeypatch.setattr(bank, "GROWTH", 4)
+    monkeypatch.setattr(transport, "CHECK_SPP", 8)
+
+
+@pytest.mark.usefixtures("growing")
+def test_a_search_says_what_its_bank_was() -> None:
+    """Six conditions; after the comparisons at 6 and 12 another one every second evaluation: three and three."""
+    found = advsearch.attack("mug", **{**SMALL, "baseline": True})
+    told, renders = found.summary.transport, found.summary.renders
+    assert told is not None and told.used and told.conditions is not None and told.error is not None
+    assert (told.conditions.made, told.conditions.dropped, told.conditions.grown) == (12, 0, 2)
+    assert told.entries and told.bytes and told.seconds and told.conditions.gap is not None
+    assert renders["products"] == 2 * 18 * 2 and renders["gradient"] == 0
+
+
+@pytest.mark.usefixtures("growing")
+def test_a_search_that_goes_on_ends_with_the_same_rows(tmp_path: Path) -> None:
+    advsearch.attack("mug", run=tmp_path / "whole", **SMALL)
+    stopped = advsearch.attack("mug", run=tmp_path / "parts", progress=Impatient(14), **SMALL)
+    assert stopped.summary.ending == "interrupted"
+    advsearch.attack("mug", run=tmp_path / "parts", resume=True, **SMALL)
+    assert rows(tmp_path / "parts") == rows(tmp_path / "whole")
+
+
+@pytest.mark.usefixtures("growing")
+def test_the_oldest_conditions_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where there is memory for two or three, the newest are kept and nothing fails."""
+    monkeypatch.setattr(bank, "MOST_BYTES", 150_000)
+    kept: list[list[int]] = []
+    drawn = Bank._drawn
+
+    def watched(self: Bank, kind: str, index: int) -> Any:
+        kept.append([one.number for one in self._held])
+        return drawn(self, kind, index)
+
+    monkeypatch.setattr(Bank, "_drawn", watched)
+    told = advsearch.attack("mug", **SMALL).summary.transport
+    assert told is not None and told.conditions is not None and told.bytes is not None
+    assert told.conditions.dropped == 12 - len(kept[-1]) and told.bytes <= 150_000
+    assert kept[-1] == list(range(12 - len(kept[-1]), 12))
+
+
+def test_its_pictures_are_those_that_are_traced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Under each condition, but for noise and what a matrix leaves out; and the derivative is the mean one."""
+    seen: list[Bank] = []
+    monkeypatch.setattr(Bank, "prepare", lambda self, tick: seen.append(self))
+    monkeypatch.setattr(bank, "FIRST", 2)
+    monkeypatch.setattr(bank, "SPP", 64)
+    advsearch.attack("mug", **{**SMALL, "steps": 16, "epsilon": 0.3})
+    made, problem = seen[0], seen[0].problem
+    made._fill(0)
+    generator = torch.Generator().manual_seed(1)
+    u = problem.domain.sample(generator)[0]
+    with torch.no_grad():
+        before, after = (made._pictures(made._held, at) for at in (problem.domain.start, u))
+        for one, change in zip(made._held, after - before, strict=True):
+            wholes = (torch.cat([at, one.numbers]) for at in (problem.domain.start, u))
+            first, second = (problem.renderer(whole, seed=1, spp=64) for whole in wholes)
+            assert float((change - second + first).square().mean()) < 0.1 * float((second - first).square().mean())
+    whole, parts = (made._evaluated(some, u, True).gradient for some in (made._held, made._held[:1]))
+    other = made._evaluated(made._held[1:], u, True).gradient
+    assert whole is not None and parts is not None and other is not None
+    alone = len(made._held) - 1
+    torch.testing.assert_close(whole, (parts + other * alone) / (alone + 1), rtol=1e-4, atol=1e-8)
