@@ -14,10 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from advsearch.api.attack import attack as attack
+    from advsearch.api.check import check as check
     from advsearch.api.gap import gap as gap
+    from advsearch.api.plan import plan as plan
+    from advsearch.api.precision import precision as precision
     from advsearch.api.region import region as region
     from advsearch.api.render import Rendering as Rendering
     from advsearch.api.render import render as render
+    from advsearch.api.stability import stability as stability
     from advsearch.api.sweep import sweep as sweep
     from advsearch.engine.loading import Scene as Scene
     from advsearch.engine.loading import load_scene as load_scene
@@ -35,11 +39,15 @@ _HOMES = {
     "Scene": "advsearch.engine.loading",
     "SweepResult": "advsearch.engine.sweeps.loop",
     "attack": "advsearch.api.attack",
+    "check": "advsearch.api.check",
     "gap": "advsearch.api.gap",
     "load_model": "advsearch.models",
     "load_scene": "advsearch.engine.loading",
+    "plan": "advsearch.api.plan",
+    "precision": "advsearch.api.precision",
     "region": "advsearch.api.region",
     "render": "advsearch.api.render",
+    "stability": "advsearch.api.stability",
     "sweep": "advsearch.api.sweep",
 }
 """The public names, and the module of each."""

@@ -261,6 +261,19 @@ class Setting:
     form: Form
     switched: str
 
+    @property
+    def text(self) -> str:
+        """What it is, its values with range and unit, and its default."""
+        unit = f", in {self.unit}" if self.unit else ""
+        default = self.otherwise if self.default is None else _default(self.default)
+        return f"{self.description}: {self.expects}{unit}" + (f" (default: {default})" if default else "")
+
+
+def _default(value: object) -> str:
+    if isinstance(value, dict):
+        return ",".join(value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
 
 def settings(config: type[Config]) -> tuple[Setting, ...]:
     """Return every setting of a configuration, in the order in which they are shown."""

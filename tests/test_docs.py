@@ -456,9 +456,7 @@ def test_every_yaml_example_is_a_configuration(page: Path, tmp_path: Path) -> No
 
 def parameters(call: str) -> set[str]:
     """Return the keywords that a function of `advsearch` takes."""
-    options: dict[str, type[SceneConfig]] = {"attack": AttackConfig, "sweep": SweepConfig}
-    own = set(inspect.signature(getattr(advsearch, call)).parameters)
-    return own | set(options[call].model_fields) if call in options else own
+    return set(inspect.signature(getattr(advsearch, call)).parameters)
 
 
 @every_page

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from advsearch import seeds
+from advsearch.api.keywords import AttackKeywords, asks
 from advsearch.attacks import Objective, Policy, get_objective, make_policy
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
 from advsearch.config import AttackConfig, SceneConfig
@@ -24,7 +25,7 @@ from advsearch.engine.answers import check_truth, facts_of
 from advsearch.engine.budget import Preparation, RenderBudget, verification_ladder
 from advsearch.engine.loading import Controls, PictureSettings, Scene, framed, load_scene, make_renderer, settings_of
 from advsearch.engine.memory import Memory
-from advsearch.engine.naming import load_models, options_of, scene_settings
+from advsearch.engine.naming import load_models, scene_settings
 from advsearch.engine.outcome import AttackResult, Question, summarise
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
@@ -42,6 +43,9 @@ from advsearch.scene.mitsuba_backend.samplers import next_count
 from advsearch.scene.renderer import Renderer
 from advsearch.tasks import AnyTask, Task, make_task
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
 OVER_CONDITIONS = {"momentum": 0.9, "step_size": 0.2}
 """Options of `pgd` where conditions vary."""
 
@@ -52,10 +56,7 @@ CLEAN_SPP = 64
 """Samples a pixel of the clean picture that an objective compares features with."""
 
 
-_OWN_ARGUMENTS = ("model", "task", "controls", "over", "objective", "policy", "run")
-"""Arguments of `attack` that may be more than a file can say."""
-
-
+@asks(AttackConfig, AttackKeywords)
 def attack(
     scene: Scene | str | Path,
     model: Model | nn.Module | str | Path = "reference",
@@ -68,39 +69,12 @@ def attack(
     run: str | Path | None = None,
     resume: bool = False,
     progress: Progress | None = None,
-    environment: str | Path | None = None,
-    up: Literal["y", "z"] | None = None,
-    set: Mapping[str, float | str | Sequence[float]] | None = None,
-    exposure: float | None = None,
-    resolution: int | str | tuple[int, int] | None = None,
-    labels: str | Path | None = None,
-    label: str | int | Sequence[str] | None = None,
-    texture_resolution: int | None = None,
-    spp: int | Literal["auto"] | None = None,
-    denoise: Literal["oidn", "none"] = "oidn",
-    pixel_sampler: Literal["independent", "multijitter"] = "multijitter",
-    seed: int = 0,
-    threads: int | None = None,
-    deterministic: bool = False,
-    overwrite: bool = False,
-    epsilon: float | Mapping[str, float] | None = None,
-    norm: Literal["linf", "l2"] | None = None,
-    estimators: str | Mapping[str, str] | None = None,
-    measure: Literal["no", "quick", "full"] = "quick",
-    steps: int = 40,
-    seconds: float | None = None,
-    step_size: float | None = None,
-    target: str | int | Sequence[str] | None = None,
-    minimise: bool = False,
-    smallest: bool = False,
-    draws: int = 4,
-    average: int = 0,
-    specialise: bool = True,
-    baseline: bool = True,
-    verify_spp: int | None = None,
-    trials: int | None = None,
+    **settings: Unpack[AttackKeywords],
 ) -> AttackResult:
     """Search for the worst configuration of a scene, verify it, and return everything that is known about it.
+
+    All other arguments are the settings of `advsearch attack`; `environment`, `up`, `set` and `exposure` belong to a
+    scene that is named here, not to one that is loaded.
 
     Args:
         scene: from `load_scene`, or what that takes.
@@ -118,13 +92,10 @@ def attack(
             was.
         progress: told how far it is.
 
-    All other arguments are the settings of the command line by the same names (docs/command-line.md). `environment`,
-    `up`, `set` and `exposure` belong to a scene that is named here, not to one that is loaded.
-
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
-    options = options_of(locals(), AttackConfig, without=_OWN_ARGUMENTS)
+    options = {name: value for name, value in settings.items() if value is not None}
     scene = _scene(scene, options)
     described = {
         "object": scene.description.object_name,
@@ -192,15 +163,15 @@ def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> t
 
 def _scene(scene: Scene | str | Path, options: Mapping[str, Any]) -> Scene:
     """The scene as it was given, or the one that a name and the options describe."""
-    told = {"set": options.get("set", options.get("set_")), **{one: options.get(one) for one in ("environment", "up")}}
+    told = {"set": options.get("set"), **{one: options.get(one) for one in ("environment", "up")}}
     told["exposure"] = options.get("exposure")
     if isinstance(scene, Scene):
         clash = [name for name, value in told.items() if value is not None]
         if clash:
             raise InputError(f"{', '.join(clash)}: belongs to the scene, which is given already; give it to load_scene")
         return scene
-    settings = scene_settings(told["set"], told["exposure"])
-    return load_scene(scene, told["environment"], up=told["up"], settings=settings)
+    given = scene_settings(told["set"], told["exposure"])
+    return load_scene(scene, told["environment"], up=told["up"], settings=given)
 
 
 def _set_by(scene: Scene, options: Mapping[str, Any]) -> dict[str, float]:

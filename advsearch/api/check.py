@@ -7,10 +7,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
+from advsearch.api.keywords import CheckKeywords, asks, configured
 from advsearch.config import CheckConfig
 from advsearch.controls import CONTROLS
 from advsearch.engine.gradients import (
@@ -50,6 +51,10 @@ from advsearch.scene.description import DEFAULT_ENVIRONMENT
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import STEP_RANGE
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
 SCENES = (("mug", "studio"), ("bowl", "kitchen"), ("bottle", "noon"))
 """Bundled scenes that `check --all` goes through."""
 RAW_SPP = 16
@@ -65,6 +70,30 @@ REPEATS, AGAIN = 6, 8
 IN_SAMPLES = "counted in samples a pixel; `resolution` or fewer controls shorten it, `seconds` ends it"
 IN_PARAMETERS = "one for each parameter; `resolution` or fewer controls shorten it, `seconds` ends it"
 """What whoever waits is told of the long stages."""
+
+
+@asks(CheckConfig, CheckKeywords)
+def check(
+    object: str | Path = "mug",
+    model: str | Path = "reference",
+    *,
+    progress: Progress | None = None,
+    **settings: Unpack[CheckKeywords],
+) -> CheckResult:
+    """Compare the gradient of every parameter of a scene with differences (docs/gradients.md).
+
+    All other arguments are the settings of `advsearch check`. The run is kept, in `run` or under runs/.
+
+    Args:
+        object: the name of an object, or a file of one.
+        model: the network under test, as `advsearch check` takes it.
+        progress: told how far it is.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    config = configured(CheckConfig, object=object, model=model, **settings)
+    return check_from_config(config, progress=progress)
 
 
 def check_from_config(

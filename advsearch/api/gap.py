@@ -7,16 +7,17 @@ the part at which it was stopped.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from advsearch.api.attack import attack_once
+from advsearch.api.keywords import GapKeywords, asks, configured
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.config import AttackConfig, GapConfig
 from advsearch.engine.answers import one_label_for_several
-from advsearch.engine.naming import Named, different, load_models, options_of
+from advsearch.engine.naming import different, load_models
 from advsearch.engine.run_settings import RunSettings
 from advsearch.files import Json
 from advsearch.progress import NullProgress, Progress
@@ -31,58 +32,32 @@ from advsearch.runs.summary import attack_of
 from advsearch.scene.library import list_objects, load_object
 from advsearch.tasks import make_task
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
+
+@asks(GapConfig, GapKeywords)
 def gap(
     object: str | Path,
     model: str | Path = "reference",
     *,
-    environment: str | Path | None = None,
-    up: Literal["y", "z"] | None = None,
-    set: Mapping[str, float | str | Sequence[float]] | None = None,
-    exposure: float = 0.0,
-    resolution: int | str | tuple[int, int] | None = None,
-    labels: str | Path | None = None,
-    label: str | int | Sequence[str] | None = None,
-    task: str | Mapping[str, object] = "classification",
-    controls: Named = "texture",
-    texture_resolution: int | None = None,
-    spp: int | Literal["auto"] | None = None,
-    denoise: Literal["oidn", "none"] = "oidn",
-    pixel_sampler: Literal["independent", "multijitter"] = "multijitter",
-    seed: int = 0,
-    threads: int | None = None,
-    deterministic: bool = False,
-    run: str | Path | None = None,
-    overwrite: bool = False,
-    epsilon: float | Mapping[str, float] | None = None,
-    norm: Literal["linf", "l2"] | None = None,
-    estimators: str | Mapping[str, str] | None = None,
-    measure: Literal["no", "quick", "full"] = "quick",
-    policy: str | Mapping[str, object] = "auto",
-    steps: int = 40,
-    seconds: float | None = None,
-    step_size: float | None = None,
-    objective: str | None = None,
-    target: str | int | Sequence[str] | None = None,
-    minimise: bool = False,
-    smallest: bool = False,
-    over: Named = (),
-    draws: int = 4,
-    average: int = 200,
-    specialise: bool = True,
-    baseline: bool = True,
-    verify_spp: int | None = None,
-    trials: int | None = None,
     progress: Progress | None = None,
+    **settings: Unpack[GapKeywords],
 ) -> GapResult:
     """Compare the worst configuration with the average, for each object and each control (docs/questions.md).
 
-    The arguments are the settings of `advsearch gap` by the same names. The run is kept, in `run` or under runs/.
+    All other arguments are the settings of `advsearch gap`. The run is kept, in `run` or under runs/.
+
+    Args:
+        object: names of objects, or files of them, separated by commas.
+        model: the network under test, as `advsearch gap` takes it.
+        progress: told how far it is.
 
     Raises:
-        InputError: anything that the caller can put right.
+        InputError: anything that the caller can put right; nothing is written then.
     """
-    return gap_from_config(GapConfig(**options_of(locals(), GapConfig, ())), progress=progress)
+    config = configured(GapConfig, object=object, model=model, **settings)
+    return gap_from_config(config, progress=progress)
 
 
 def curve_from_config(

@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
+from advsearch.api.keywords import PlanKeywords, asks, configured
 from advsearch.config import PlanConfig
 from advsearch.engine.bounces import bounces_of, most_pictures
 from advsearch.engine.gradients import inside
@@ -32,7 +33,35 @@ from advsearch.runs.results.plan import (
 )
 from advsearch.scene.gradients.plan import BY_DIFFERENCES
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
 PlannedRow = CosineRow | PathLength | GainRow | TexelRow
+
+
+@asks(PlanConfig, PlanKeywords)
+def plan(
+    object: str | Path = "mug",
+    model: str | Path = "reference",
+    *,
+    progress: Progress | None = None,
+    **settings: Unpack[PlanKeywords],
+) -> PlanResult:
+    """Choose how every derivative of a search is obtained and what is left out, by measurement (docs/gradients.md).
+
+    All other arguments are the settings of `advsearch plan`. The run is kept, in `run` or under runs/.
+
+    Args:
+        object: the name of an object, or a file of one.
+        model: the network under test, as `advsearch plan` takes it.
+        progress: told how far it is.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    config = configured(PlanConfig, object=object, model=model, **settings)
+    return plan_from_config(config, progress=progress)
 
 
 def plan_from_config(

@@ -7,13 +7,14 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
+from advsearch.api.keywords import PrecisionKeywords, asks, configured
 from advsearch.attacks import Policy, make_policy
 from advsearch.config import PrecisionConfig
 from advsearch.engine.gradients import Loss, inside, smooth_loss
@@ -39,6 +40,10 @@ from advsearch.runs.results.precision import PrecisionResult
 from advsearch.runs.summary import to_json
 from advsearch.settings import split_names
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
 SHARES = {"image": 0.45, "gradient": 0.3, "objective": 0.25}
 """Of the time, by quantity; what one doesn't use is the others'."""
 REFERENCE_SHARE = 0.35
@@ -49,6 +54,30 @@ count, and at most."""
 VERIFY_SPP, VERIFY_RENDERS = 64, 4
 """Samples a pixel, and fresh renders, that verify what a search held."""
 NUMBERS, FIGURE = "precision.json", "precision"
+
+
+@asks(PrecisionConfig, PrecisionKeywords)
+def precision(
+    object: str | Path = "mug",
+    model: str | Path = "reference",
+    *,
+    progress: Progress | None = None,
+    **settings: Unpack[PrecisionKeywords],
+) -> PrecisionResult:
+    """Measure error against run time of a scene, its gradients and searches over it (docs/precision.md).
+
+    All other arguments are the settings of `advsearch precision`. The run is kept, in `run` or under runs/.
+
+    Args:
+        object: the name of an object, or a file of one.
+        model: the network under test, as `advsearch precision` takes it.
+        progress: told how far it is.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    config = configured(PrecisionConfig, object=object, model=model, **settings)
+    return precision_from_config(config, progress=progress)
 
 
 def precision_from_config(

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
+from advsearch.api.keywords import RegionKeywords, asks, configured
 from advsearch.attacks import make_policy
 from advsearch.attacks.region import ATTEMPTS, MOST_PROBED, GrownBox, grow
 from advsearch.config import AttackConfig, RegionConfig
 from advsearch.engine.budget import RenderBudget, verification_ladder
 from advsearch.engine.memory import ANSWER, Memory
-from advsearch.engine.naming import Named, options_of
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.stages import Attack
@@ -32,6 +32,10 @@ from advsearch.runs.results.base import INTERRUPTED, CleanScene, Formation, Move
 from advsearch.runs.results.region import AxisRange, BoxSide, MarginMap, RegionResult
 from advsearch.runs.store import NAME, Store
 from advsearch.settings import split_names
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
 
 MOST = 8
 """A box is grown in at most so many parameters."""
@@ -53,43 +57,28 @@ class Varied:
     places: Tensor
 
 
+@asks(RegionConfig, RegionKeywords)
 def region(
     object: str | Path,
     model: str | Path = "reference",
     *,
-    environment: str | Path | None = None,
-    up: Literal["y", "z"] | None = None,
-    set: Mapping[str, float | str | Sequence[float]] | None = None,
-    exposure: float = 0.0,
-    resolution: int | str | tuple[int, int] | None = None,
-    labels: str | Path | None = None,
-    label: str | int | Sequence[str] | None = None,
-    task: str | Mapping[str, object] = "classification",
-    controls: Named = "texture",
-    texture_resolution: int | None = None,
-    spp: int | Literal["auto"] | None = None,
-    denoise: Literal["oidn", "none"] = "oidn",
-    pixel_sampler: Literal["independent", "multijitter"] = "multijitter",
-    seed: int = 0,
-    threads: int | None = None,
-    deterministic: bool = False,
-    run: str | Path | None = None,
-    overwrite: bool = False,
-    around: str | None = None,
-    vary: str | None = None,
-    samples: int = 200,
-    map: int = 0,
-    verify_spp: int | None = None,
     progress: Progress | None = None,
+    **settings: Unpack[RegionKeywords],
 ) -> RegionResult:
     """Grow the box around a configuration in which the verdict stays what it is (docs/questions.md).
 
-    The arguments are the settings of `advsearch region` by the same names. The run is kept, in `run` or under runs/.
+    All other arguments are the settings of `advsearch region`. The run is kept, in `run` or under runs/.
+
+    Args:
+        object: the name of an object, or a file of one.
+        model: the network under test, as `advsearch region` takes it.
+        progress: told how far it is.
 
     Raises:
-        InputError: anything that the caller can put right.
+        InputError: anything that the caller can put right; nothing is written then.
     """
-    return region_from_config(RegionConfig(**options_of(locals(), RegionConfig, ())), progress=progress)
+    config = configured(RegionConfig, object=object, model=model, **settings)
+    return region_from_config(config, progress=progress)
 
 
 def region_from_config(

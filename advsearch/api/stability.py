@@ -5,7 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from advsearch.api.keywords import StabilityKeywords, asks, configured
 from advsearch.config import StabilityConfig
 from advsearch.engine.measuring import Results, kept_rows
 from advsearch.engine.memory import Memory
@@ -13,6 +15,24 @@ from advsearch.evaluation.stability.suite import chosen, run_cases
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.stability import CaseRow, StabilityResult
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
+@asks(StabilityConfig, StabilityKeywords)
+def stability(*, progress: Progress | None = None, **settings: Unpack[StabilityKeywords]) -> StabilityResult:
+    """Try extreme scenes, objectives and arithmetic, and say whether each of them holds (docs/stability.md).
+
+    All other arguments are the settings of `advsearch stability`. The run is kept, in `run` or under runs/.
+
+    Args:
+        progress: told how far it is.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    return stability_from_config(configured(StabilityConfig, **settings), progress=progress)
 
 
 def stability_from_config(

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from torch import nn
 
 from advsearch.api.attack import LOADING
+from advsearch.api.keywords import SweepKeywords, asks
 from advsearch.config import SweepConfig
 from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.budget import verification_ladder
 from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, settings_of
-from advsearch.engine.naming import different, load_models, options_of, scene_settings
+from advsearch.engine.naming import different, load_models, scene_settings
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.axes import read_axes
 from advsearch.engine.sweeps.job import Job, NamedScene, check_scenes
@@ -29,6 +30,9 @@ from advsearch.scene.mitsuba_backend.samplers import next_count
 from advsearch.settings import split_names
 from advsearch.tasks import AnyTask, Task, make_task
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
 SAMPLES = 100
 """Draws where there is no grid and nothing is said."""
 
@@ -36,6 +40,7 @@ AnyScene = Scene | str | Path
 AnyModel = Model | nn.Module | str | Path
 
 
+@asks(SweepConfig, SweepKeywords)
 def sweep(
     scene: AnyScene | Sequence[AnyScene],
     model: AnyModel | Sequence[AnyModel] = "reference",
@@ -46,29 +51,12 @@ def sweep(
     controls: Controls = (),
     run: str | Path | None = None,
     progress: Progress | None = None,
-    environment: str | Path | Sequence[str] | None = None,
-    up: Literal["y", "z"] | None = None,
-    set: Mapping[str, float | str | Sequence[float]] | None = None,
-    exposure: float | None = None,
-    resolution: int | str | tuple[int, int] | None = None,
-    labels: str | Path | None = None,
-    label: str | int | Sequence[str] | None = None,
-    texture_resolution: int | None = None,
-    spp: int | None = None,
-    denoise: Literal["oidn", "none"] = "oidn",
-    pixel_sampler: Literal["independent", "multijitter"] = "multijitter",
-    seed: int = 0,
-    threads: int | None = None,
-    deterministic: bool = False,
-    overwrite: bool = False,
-    sampler: Literal["sobol", "random"] = "sobol",
-    batch: int = 16,
-    trials: int = 20,
-    verify_spp: int | None = None,
+    **settings: Unpack[SweepKeywords],
 ) -> SweepResult:
     """Render every configuration of a grid, and draws by chance, and say how often the model is right.
 
-    With `run` naming a sweep of the same settings that was stopped, it goes on where that was stopped.
+    With `run` naming a sweep of the same settings that was stopped, it goes on where that was stopped. All other
+    arguments are the settings of `advsearch sweep`.
 
     Args:
         scene: from `load_scene`, or what that takes; or several.
@@ -80,12 +68,10 @@ def sweep(
         run: folder to keep the run in; None keeps it in memory, which then grows with every configuration.
         progress: told how far it is.
 
-    All other arguments are the settings of the command line by the same names (docs/command-line.md).
-
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
-    options = options_of(locals(), SweepConfig, without=("model", "task", "controls", "grid", "samples", "run"))
+    options = {name: value for name, value in settings.items() if value is not None}
     scenes = _several(scene)
     networks = _several(model)
     names = [split_names(one) if isinstance(one, str) else (str(one),) for one in scenes if not isinstance(one, Scene)]

@@ -85,12 +85,8 @@ def with_flags(message: str) -> str:
 
 
 def help_text(setting: Setting) -> str:
-    """Return what the help says of a setting: what it is, its values with range and unit, and its default."""
-    if setting.form == "switch":
-        return setting.switched or setting.description
-    unit = f", in {setting.unit}" if setting.unit else ""
-    default = setting.otherwise if setting.default is None else _default(setting.default)
-    text = f"{setting.description}: {setting.expects}{unit}" + (f" (default: {default})" if default else "")
+    """Return what the help says of a setting; of a switch, what its flag does."""
+    text = setting.switched or setting.description if setting.form == "switch" else setting.text
     return text.replace("%", "%%")
 
 
@@ -135,9 +131,3 @@ def _controls(given: Sequence[str], flag: str) -> Json:
 
 READERS = {"assignments": _assignments, "choices": _choices, "axes": _axes, "controls": _controls}
 """What reads the flags of each form that is not left to the configuration."""
-
-
-def _default(value: Any) -> str:
-    if isinstance(value, dict):
-        return ",".join(value)
-    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from advsearch import threads
@@ -11,11 +11,7 @@ from advsearch.controls import CONTROLS
 from advsearch.errors import InputError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.loading import named_code
-from advsearch.settings import Config
 from advsearch.tasks import Task
-
-Named = str | Sequence[str] | Mapping[str, Mapping[str, object] | None]
-"""Controls by name; a mapping gives each name its settings."""
 
 
 def scene_settings(fixed: Mapping[str, Any] | None, exposure: float | None) -> dict[str, Any]:
@@ -78,16 +74,3 @@ def different(names: Sequence[str], setting: str) -> Sequence[str]:
             f"{setting}: expected different names, got {','.join(names)!r}; leave {', '.join(twice[:1])} out"
         )
     return names
-
-
-def options_of(arguments: Mapping[str, Any], config: type[Config], without: Collection[str]) -> dict[str, Any]:
-    """Return the arguments of a Python call that are settings of a configuration; None is one that was not given.
-
-    Args:
-        arguments: by name.
-        config: whose settings.
-        without: names that mean something else in the call than in a file.
-    """
-    names = {"set", *config.model_fields}
-    given = {name: value for name, value in arguments.items() if value is not None}
-    return {name: value for name, value in given.items() if name in names and name not in without}

@@ -2,48 +2,56 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import sys
 import types
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import pytest
 import torch
 from torch import Tensor, nn
 
 import advsearch
-from advsearch.config import AttackConfig, GapConfig, RegionConfig, SceneConfig, SweepConfig
+from advsearch.config import CONFIGS
 from advsearch.errors import InputError
-
-BY_SCENE = {"environment", "up", "set", "exposure"}
-"""Settings that a loaded scene has already, so that they have no default of their own."""
+from advsearch.settings import settings
 
 
 def test_dir_lists_the_public_names() -> None:
     assert set(dir(advsearch)) == {*advsearch.__all__, "__version__"}
 
 
-QUESTIONS = [
-    (advsearch.attack, AttackConfig),
-    (advsearch.sweep, SweepConfig),
-    (advsearch.gap, GapConfig),
-    (advsearch.region, RegionConfig),
-]
+QUESTIONS = ("attack", "sweep", "gap", "region", "plan", "check", "precision", "stability")
 
 
-@pytest.mark.parametrize(("function", "config"), QUESTIONS)
-def test_signatures_have_every_setting_with_its_default(function: Any, config: type[SceneConfig]) -> None:
+@pytest.mark.parametrize("name", QUESTIONS)
+def test_signatures_have_every_setting_as_it_is_declared(name: str) -> None:
+    function, declared = getattr(advsearch, name), settings(CONFIGS[name])
     parameters = inspect.signature(function).parameters
     assert not [one for one in parameters.values() if one.kind is one.VAR_KEYWORD]
-    names = {"set" if name == "set_" else name for name in config.model_fields} - {"object"}
-    assert names <= set(parameters) and set(parameters) - names <= {"scene", "object", "resume", "progress"}
-    for name in names - BY_SCENE - {"model", "controls", "over", "grid"}:
-        default = config.model_fields[name].get_default(call_default_factory=True)
-        assert parameters[name].default == (default or None if isinstance(default, dict) else default), name
-    if "scene" in parameters:
-        assert all(parameters[name].default is None for name in BY_SCENE)
+    names = {one.field.removesuffix("_"): one for one in declared if not one.required}
+    assert set(names) <= set(parameters)
+    assert set(parameters) - set(names) <= {"scene", "object", "model", "grid", "resume", "progress"}
+    written = vars(importlib.import_module("advsearch.api.keywords"))[f"{name.capitalize()}Keywords"]
+    inner = inspect.signature(function.__wrapped__).parameters
+    assert set(get_type_hints(written)) == set(names) - set(inner)
+    for key, one in names.items():
+        if key not in inner:
+            assert parameters[key].default == one.default, key
+            assert f"{key}: {one.description}"[:60] in " ".join(function.__doc__.split()), key
     assert all(one.annotation is not inspect.Parameter.empty for one in parameters.values())
+
+
+def test_editors_and_type_checkers_know_every_setting() -> None:
+    """Each comment would be one too many, and mypy would say so, if a keyword had no type."""
+    with pytest.raises(InputError, match=r"^steps: expected a whole number from 1 to 1000000, got many"):
+        advsearch.gap("mug", steps="many")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"^loss: expected linear, model or both, got square"):
+        advsearch.check(loss="square")  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"stability\(\) got an unexpected keyword argument 'object'"):
+        advsearch.stability(object="mug")  # type: ignore[call-arg]
 
 
 def test_an_argument_that_there_is_not_is_python_s_own_error() -> None:

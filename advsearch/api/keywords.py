@@ -1,0 +1,209 @@
+"""The settings of each question as keywords: what Python callers may write for them.
+
+A setting is declared in `advsearch/config/`: its default, its range, what it is. Here stands only what may be written
+for it in Python, which is more than the text of a file, for editors and type checkers (PEP 692). Signatures and
+docstrings are made from both (`asks`).
+"""
+
+from __future__ import annotations
+
+import inspect
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from pathlib import Path
+from typing import Any, Literal, TypedDict, TypeVar
+
+from advsearch.settings import Config, settings
+
+Names = str | Sequence[str]
+"""Names in a list, or in a text with commas between them."""
+NamedControls = str | Sequence[str] | Mapping[str, Mapping[str, object] | None]
+"""NamedControls by name; a mapping gives each name its settings."""
+Named = str | Mapping[str, object]
+"""A name, or a mapping with a `name` and options."""
+
+
+class RunKeywords(TypedDict, total=False):
+    """Where a run is kept."""
+
+    run: str | Path | None
+    overwrite: bool
+
+
+class PictureKeywords(TypedDict, total=False):
+    """Scene, pictures and machine, of every question that renders."""
+
+    environment: Path | Names | None
+    up: Literal["y", "z"] | None
+    set: Mapping[str, float | str | Sequence[float]] | None
+    exposure: float | None
+    resolution: int | str | tuple[int, int] | None
+    labels: str | Path | None
+    label: int | Names | None
+    texture_resolution: int | None
+    denoise: Literal["oidn", "none"]
+    pixel_sampler: Literal["independent", "multijitter"]
+    seed: int
+    threads: int | None
+    deterministic: bool
+
+
+class NamedKeywords(RunKeywords, total=False):
+    """What a question takes by name."""
+
+    task: Named
+    controls: NamedControls
+
+
+class DerivativeKeywords(PictureKeywords, total=False):
+    """Of every question that differentiates a scene."""
+
+    spp: int | Literal["auto"] | None
+    epsilon: float | Mapping[str, float] | None
+    norm: Literal["linf", "l2"] | None
+    estimators: str | Mapping[str, str]
+    specialise: bool
+
+
+class SearchKeywords(DerivativeKeywords, total=False):
+    """Of every search."""
+
+    measure: Literal["no", "quick", "full"]
+    steps: int
+    seconds: float | None
+    step_size: float | None
+    target: int | Names | None
+    minimise: bool
+    draws: int
+    average: int
+    baseline: bool
+    verify_spp: int | None
+    trials: int | None
+
+
+class AttackKeywords(SearchKeywords, total=False):
+    """Of `attack`."""
+
+    smallest: bool
+    overwrite: bool
+
+
+class SweepKeywords(PictureKeywords, total=False):
+    """Of `sweep`."""
+
+    spp: int | None
+    sampler: Literal["sobol", "random"]
+    batch: int
+    trials: int
+    verify_spp: int | None
+    overwrite: bool
+
+
+class GapKeywords(SearchKeywords, NamedKeywords, total=False):
+    """Of `gap`."""
+
+    objective: str | None
+    policy: Named
+    over: NamedControls
+
+
+class RegionKeywords(PictureKeywords, NamedKeywords, total=False):
+    """Of `region`."""
+
+    around: str | None
+    vary: Names | None
+    samples: int
+    map: int
+    verify_spp: int | None
+
+
+class PlanKeywords(DerivativeKeywords, NamedKeywords, total=False):
+    """Of `plan`."""
+
+    objective: str | None
+    seconds: float | None
+
+
+class CheckKeywords(PlanKeywords, total=False):
+    """Of `check`."""
+
+    all: bool
+    loss: Literal["linear", "model", "both"]
+
+
+class PrecisionKeywords(DerivativeKeywords, NamedKeywords, total=False):
+    """Of `precision`."""
+
+    objective: str | None
+    quantities: Names
+    seconds: float
+    error: float
+    rounds: int
+    samplers: Names
+    depths: str | Sequence[int]
+    loss: Literal["linear", "model"]
+    policies: Names
+    steps: int
+    repeats: int
+    out: str | Path | None
+
+
+class StabilityKeywords(RunKeywords, total=False):
+    """Of `stability`."""
+
+    case: Names | None
+    group: Names | None
+    seconds: float | None
+
+
+ONLY_BY_NAME = inspect.Parameter.KEYWORD_ONLY
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+Made = TypeVar("Made", bound=Config)
+
+
+def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Function]:
+    """Give a function that takes settings as `**settings` the signature and the docstring that they come to.
+
+    Every setting becomes a keyword with the default that it is declared with, and a line among the arguments. One that
+    the function has of its own stays as it is there.
+
+    Args:
+        config: declares the settings.
+        keywords: says what may be written for them.
+    """
+    hints = {name: hint.__forward_arg__ for name, hint in keywords.__annotations__.items()}
+
+    def decorate(function: Function) -> Function:
+        own = inspect.signature(function)
+        plain = [one for one in own.parameters.values() if one.kind is not one.VAR_KEYWORD]
+        added, lines = [], []
+        for one in settings(config):
+            name = one.field.removesuffix("_")
+            if name in own.parameters or one.required:
+                continue
+            added.append(inspect.Parameter(name, ONLY_BY_NAME, default=one.default, annotation=hints[name]))
+            lines.append(textwrap.fill(f"{name}: {one.text}", 110, subsequent_indent="    "))
+        signature = own.replace(parameters=[*plain, *added])
+
+        @wraps(function)
+        def asked(*args: Any, **given: Any) -> Any:
+            try:
+                signature.bind(*args, **given)
+            except TypeError as error:
+                raise TypeError(f"{function.__name__}() {error}") from None
+            return function(*args, **given)
+
+        text = inspect.cleandoc(function.__doc__ or "")
+        listed = textwrap.indent("\n".join(lines), "    ")
+        asked.__doc__ = text.replace("\n\nRaises:", f"\n{listed}\n\nRaises:", 1)
+        asked.__signature__ = signature  # type: ignore[attr-defined]
+        return asked  # type: ignore[return-value]
+
+    return decorate
+
+
+def configured(config: type[Made], **given: object) -> Made:
+    """Return a configuration of settings as Python has them; None is one that was not given."""
+    return config(**{name: value for name, value in given.items() if value is not None})
