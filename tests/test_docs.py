@@ -265,11 +265,6 @@ def test_every_control_and_policy_with_options_has_a_made_part() -> None:
         assert set(marked) == {name for known, name in made if known == page}
 
 
-def default_of(function: Any, name: str) -> Any:
-    """Return the default of a parameter."""
-    return inspect.signature(function).parameters[name].default
-
-
 MADE_BY_HAND = [
     ("design.md", f"**First look**: {stages.FIRST_LOOK} renders of the clean scene"),
     ("design.md", f"That makes `steps` + {planned_renders(0)} renders"),
@@ -283,7 +278,7 @@ MADE_BY_HAND = [
     ("questions.md", {8: "Eight renders of the best configurations"}[planned_renders(0)]),
     ("questions.md", f"**Verified** by {TRIALS} fresh renders"),
     ("questions.md", f"until they are within {100 * (smallest.RATIO - 1):.0f} % of each other"),
-    ("questions.md", {12: "or twelve searches are done"}[default_of(smallest.smallest, "rounds")]),
+    ("questions.md", {12: "or twelve searches are done"}[smallest.ROUNDS]),
     ("questions.md", f"What counts on the way is {TRIALS} trials"),
     ("questions.md", f"**Verified** on {TRIALS_OVER} conditions"),
     (
@@ -292,8 +287,8 @@ MADE_BY_HAND = [
     ),
     ("questions.md", f"needs {verification.PASS_PERCENT_OVER} % of those that count"),
     ("questions.md", {8: "in one to eight parameters"}[mapping.MOST]),
-    ("questions.md", {8: "as long as eight random pictures"}[default_of(region.grow, "probes")]),
-    ("questions.md", {4: "with other seeds, up to four times"}[default_of(region.grow, "attempts")]),
+    ("questions.md", {8: "as long as eight random pictures"}[region.PROBES]),
+    ("questions.md", {4: "with other seeds, up to four times"}[region.ATTEMPTS]),
     ("questions.md", f"First {mapping.AT_CENTRE} trials of the centre"),
     ("questions.md", f"Then {RegionConfig.model_fields['samples'].default} fresh samples"),
     ("questions.md", f"at most {100 * (1 - clopper_pearson(200, 200)[0]):.1f} % of the box has another verdict"),
