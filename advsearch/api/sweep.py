@@ -215,11 +215,12 @@ def _places(config: SweepConfig) -> tuple[NamedScene, ...]:
     for name in environments[1:]:
         lights[name] = load_scene(firsts[objects[0]].description.object, name).description.environment
     asked = {light: (lights[light] or NO_MAP) if config.environment else None for light in environments}
-    return tuple(
-        NamedScene(name, light, load_scene(firsts[name].description.object, asked[light], settings=given))
-        for name in objects
-        for light in environments
-    )
+
+    def lit(name: str, light: str) -> Scene:
+        first = firsts[name]
+        return first.under(load_scene(first.description.object, asked[light], settings=given))
+
+    return tuple(NamedScene(name, light, lit(name, light)) for name in objects for light in environments)
 
 
 def _models(models: Sequence[AnyModel], config: SweepConfig, task: Task) -> tuple[tuple[Model, ...], list[str]]:

@@ -65,6 +65,14 @@ class Scene:
         space = make_space(as_controls(controls), description)
         return make_renderer(description, space, resolution, denoise, seed, estimators, sampler=sampler)
 
+    def under(self, other: Scene) -> Scene:
+        """Return another scene of the same object with what stands around it here."""
+        own = self.description
+        if not own.parts:
+            return other
+        values = {**other.description.values, "ground.size": own.values["ground.size"]}
+        return Scene(replace(other.description, parts=own.parts, cameras=own.cameras, values=values))
+
     def __repr__(self) -> str:
         described = self.description
         names = sorted(described.given & described.values.keys())

@@ -18,7 +18,8 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.parts import BallLamp, MeshPart, PointLamp, ScenePart
+from advsearch.scene.importing.scenes import ImportedScene, import_scene, split_node
+from advsearch.scene.parts import BallLamp, MeshPart, PlacedCamera, PointLamp, ScenePart
 
 Doubles = npt.NDArray[np.float64]
 
@@ -35,19 +36,6 @@ NO_MAP = "none"
 """What the environment of a scene without a map is called."""
 OWN_MAP = "own"
 """What the scene's own environment is called where another may be chosen."""
-
-
-@dataclass(frozen=True, eq=False)
-class PlacedCamera:
-    """A camera with a pose of its own.
-
-    Attributes:
-        to_world: (4, 4) its pose: it looks along its own +z with +y up and +x to the left.
-        fov: field of view along the larger side of the picture, degrees.
-    """
-
-    to_world: Doubles
-    fov: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +189,8 @@ def describe(
     """Find and read an object and an environment, bundled or from a file.
 
     Args:
-        object_spec: a bundled name, a path to a mesh, or an asset.
+        object_spec: a bundled name, a path to a mesh, an asset, or "scene.glb#chair": a node of a glTF scene, the rest
+            of which stays around it, without the ground plane, and without a map if it has lamps of its own.
         environment_spec: a bundled name, a path to an .hdr or .exr file, an asset, `NO_MAP` for no map at all, or None
             for the default.
         given: settings to fix, by name.
@@ -211,12 +200,30 @@ def describe(
         InputError: a name is unknown, a file cannot be used, or a setting is out of range.
     """
     values = settings.resolve(given or {})
-    lit_by = environment_spec or DEFAULT_ENVIRONMENT
-    scene = SceneDescription(
-        _object(object_spec, up), _environment(lit_by), values, _spec(object_spec), _spec(lit_by), up
-    )
+    file, node = split_node(object_spec) if isinstance(object_spec, str) else (object_spec, None)
+    around = ImportedScene(_object(object_spec, up)) if node is None else _scene(Path(str(file)), node, up)
+    lit = any(isinstance(part, PointLamp) for part in around.surroundings)
+    lit_by = environment_spec or (NO_MAP if lit else DEFAULT_ENVIRONMENT)
+    if node is not None and "ground.size" not in (given or {}):
+        values = {**values, "ground.size": 0.0}
     asked = () if environment_spec is None else (ENVIRONMENT,)
-    return replace(scene, given=frozenset((*(given or {}), *asked)))
+    return SceneDescription(
+        around.object,
+        _environment(lit_by),
+        values,
+        _spec(object_spec),
+        _spec(lit_by),
+        up,
+        given=frozenset((*(given or {}), *asked)),
+        parts=around.surroundings,
+        cameras=around.cameras,
+    )
+
+
+def _scene(path: Path, node: str, up: str | None) -> ImportedScene:
+    if up is not None:
+        raise InputError("up: glTF files have y up; leave `up` out")
+    return import_scene(path, node)
 
 
 def _spec(spec: str | Path | ObjectAsset | EnvironmentAsset) -> str:

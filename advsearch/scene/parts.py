@@ -1,4 +1,5 @@
-"""What may be in a scene beside its environment map, as data: meshes, lamps, haze, each under a name.
+"""What may be in a scene beside its environment map, as data: meshes, lamps, haze, each under a name. And
+cameras.
 
 A part says what it is and which scene inputs it takes, torch tensors under names of ours; `mitsuba_backend` translates
 it. A part of another kind is a subclass, with a translation registered in `mitsuba_backend.parts.translation`.
@@ -105,6 +106,19 @@ class BallLamp(ScenePart):
         """As of a point; the irradiance of a uniform ball is `pi L r^2 / d^2` (see the `light` control)."""
         intensity = tuple(math.pi * self.radius**2 * one for one in self.radiance)
         return PointLamp(self.name, position=self.place, intensity=intensity).lighting(place)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedCamera:
+    """A camera with a pose of its own.
+
+    Attributes:
+        to_world: (4, 4) its pose: it looks along its own +z with +y up and +x to the left.
+        fov: field of view along the larger side of the picture, degrees.
+    """
+
+    to_world: Doubles
+    fov: float
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,10 +9,10 @@ import torch
 
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.description import ORBIT_CAMERA, PlacedCamera, describe
+from advsearch.scene.description import ORBIT_CAMERA, describe
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
-from advsearch.scene.parts import BallLamp, PointLamp
+from advsearch.scene.parts import BallLamp, PlacedCamera, PointLamp
 
 
 def picture(scene: Scene, controls: str | dict[str, dict[str, object]] = "pose") -> torch.Tensor:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -29,6 +30,9 @@ DEEPEST_TREE = 500
 
 MOST_VALUES = 1_000_000
 """Lists, objects and values in a header; each takes hundreds of bytes of memory, and may take two of the file."""
+
+NODE = "node "
+"""Before the number of a node in its name, in the header that is written."""
 
 T = TypeVar("T")
 List = Annotated[list[T], FailFast()]
@@ -89,18 +93,62 @@ class MeshEntry(_Entry):
     name: str | None = None
 
 
+class _LightUse(_Entry):
+    light: Index
+
+
+class _NodeExtensions(_Entry):
+    punctual: _LightUse | None = Field(default=None, alias="KHR_lights_punctual")
+
+
 class Node(_Entry):
     children: List[Index] = []
     mesh: Index | None = None
+    camera: Index | None = None
+    extensions: _NodeExtensions | None = None
     matrix: Annotated[list[float], Field(min_length=16, max_length=16)] | None = None
     translation: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
     rotation: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
     scale: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
     name: str | None = None
 
+    @property
+    def lamp(self) -> int | None:
+        """Number of the light that the node carries."""
+        carried = self.extensions.punctual if self.extensions else None
+        return None if carried is None else carried.light
+
 
 class SceneEntry(_Entry):
     nodes: List[Index] = []
+
+
+class Perspective(_Entry):
+    yfov: Annotated[float, Field(gt=0.0, lt=3.1416)]
+    aspectRatio: Annotated[float, Field(gt=0.0)] | None = None
+
+
+class CameraEntry(_Entry):
+    type: Literal["perspective", "orthographic"]
+    perspective: Perspective | None = None
+    name: str | None = None
+
+
+class Light(_Entry):
+    """A light of KHR_lights_punctual: `intensity` in candela, of a directional one in lux."""
+
+    type: Literal["point", "spot", "directional"]
+    color: Annotated[list[float], Field(min_length=3, max_length=3)] = [1.0, 1.0, 1.0]
+    intensity: Annotated[float, Field(ge=0.0)] = 1.0
+    name: str | None = None
+
+
+class _Lights(_Entry):
+    lights: List[Light] = []
+
+
+class _Extensions(_Entry):
+    punctual: _Lights | None = Field(default=None, alias="KHR_lights_punctual")
 
 
 class TextureUse(_Entry):
@@ -131,6 +179,10 @@ class _MaterialExtensions(_Entry):
 class MaterialEntry(_Entry):
     pbrMetallicRoughness: MetallicRoughness | None = None
     name: str | None = None
+    normalTexture: TextureUse | None = None
+    emissiveTexture: TextureUse | None = None
+    emissiveFactor: list[float] = []
+    alphaMode: str = "OPAQUE"
     extensions: _MaterialExtensions | None = None
 
     def plain(self) -> MaterialEntry:
@@ -185,8 +237,22 @@ class Header(_Entry):
     materials: List[MaterialEntry] = []
     textures: List[Texture] = []
     images: List[Image] = []
+    cameras: List[CameraEntry] = []
+    extensions: _Extensions | None = None
     extensionsUsed: List[str] = []
     extensionsRequired: List[str] = []
+
+    @property
+    def lights(self) -> list[Light]:
+        """The lights that nodes may carry."""
+        found = self.extensions.punctual if self.extensions else None
+        return [] if found is None else found.lights
+
+    def label(self, index: int) -> str:
+        """Return what a node is called: by its name, its mesh's, or its number."""
+        node = self.nodes[index]
+        mesh = None if node.mesh is None else self.meshes[node.mesh].name
+        return node.name or mesh or f"node {index}"
 
 
 def read_header(path: Path, data: bytes) -> Header:
@@ -225,6 +291,12 @@ def rewritten(path: Path, data: bytes, header: Header) -> bytes:
         update={
             "materials": [material.plain() for material in header.materials],
             "textures": [texture.plain() for texture in header.textures],
+            "nodes": [
+                node.model_copy(update={"name": f"{NODE}{index}", "camera": None, "extensions": None})
+                for index, node in enumerate(header.nodes)
+            ],
+            "cameras": [],
+            "extensions": None,
             "extensionsRequired": [],
             "extensionsUsed": [],
         }
@@ -245,6 +317,18 @@ def base_color_image(header: Header, material: MaterialEntry) -> str | None:
     source = header.textures[surface.baseColorTexture.index].plain().source
     uri = None if source is None else header.images[source].uri
     return "(embedded)" if uri is None or uri.startswith("data:") else uri
+
+
+def not_carried_over(header: Header) -> Iterator[str]:
+    """Yield what materials have that is not read, each with how many of them, as the beginning of a sentence."""
+    counts = {
+        "the normal maps": sum(one.normalTexture is not None for one in header.materials),
+        "the glow": sum(bool(one.emissiveTexture or any(one.emissiveFactor)) for one in header.materials),
+        "the transparency": sum(one.alphaMode != "OPAQUE" for one in header.materials),
+    }
+    for what, count in counts.items():
+        if count:
+            yield f"{what} of {count} material{'s' if count > 1 else ''} {'are' if what.endswith('maps') else 'is'}"
 
 
 def _json_chunk(path: Path, data: bytes) -> bytes:
@@ -349,6 +433,8 @@ def _check_tree(path: Path, header: Header) -> None:
     pieces, drawn = 0, 0
     for node in header.nodes:
         _check_index(path, "meshes", node.mesh, header.meshes)
+        _check_index(path, "cameras", node.camera, header.cameras)
+        _check_index(path, "lights", node.lamp, header.lights)
         if node.mesh is not None:
             pieces, drawn = pieces + len(header.meshes[node.mesh].primitives), drawn + triangles[node.mesh]
         for child in node.children:

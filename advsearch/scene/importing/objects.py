@@ -56,15 +56,30 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
     if up not in (None, "y", "z"):
         raise InputError(f"up axis: expected 'y' or 'z', got {up!r}")
     file = Path(path)
-    data = read_bytes(file, "object", SUFFIXES)
-    parts, notes = read_parts(file, data)
+    parts, notes = read_parts(file, read_bytes(file, "object", SUFFIXES))
+    return object_of(parts, notes, file, safe_name(file), up)
+
+
+def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str, up: str | None) -> ObjectAsset:
+    """Return the object that some parts of a file make up; see `import_object`.
+
+    Args:
+        parts: at least one.
+        notes: warnings about them so far.
+        file: where they are from.
+        name: of the object.
+        up: the axis that points up in the file; None for what the format or else the shape says.
+
+    Raises:
+        InputError: the geometry has NaN, infinite, or coincident vertices only.
+    """
     soup, axis = _upright(parts, file, up)
     soup, repairs = repaired(soup, str(file))
     surfaces = [part.surface for part in parts]
     soup, base_color, bakes = textured(soup, surfaces)
     material, blends = _material(soup, surfaces)
     return ObjectAsset(
-        name=safe_name(file),
+        name=name,
         mesh=normalised(assemble(soup)),
         base_color=base_color,
         material=material,

@@ -47,6 +47,7 @@ class ImportedPart:
         colors: (F, 3, 3) float64 display-referred sRGB of each corner, which multiply the base colour in linear light;
             None when the file gives none.
         surface: the part's material.
+        node: number of its node in a glTF file; -1 in others.
     """
 
     vertices: Array
@@ -55,6 +56,7 @@ class ImportedPart:
     uvs: Array | None
     colors: Array | None
     surface: ImportedSurface
+    node: int = -1
 
 
 @contextlib.contextmanager
@@ -90,12 +92,12 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     header = gltf.read_header(path, data) if path.suffix.lower() in GLTF else None
     readable = checked(path, data) if header is None else gltf.rewritten(path, data, header)
     found = _parse(path, readable, references)
-    meshes = [(mesh, matrix) for mesh, matrix in found if isinstance(mesh, trimesh.Trimesh) and len(mesh.faces)]
-    if any(np.shape(mesh.vertices)[1:] != (3,) for mesh, _ in meshes):
+    meshes = [one for one in found if isinstance(one[0], trimesh.Trimesh) and len(one[0].faces)]
+    if any(np.shape(mesh.vertices)[1:] != (3,) for mesh, _, _ in meshes):
         raise damaged(path, "vertices with 3 coordinates", "another number")
-    if any(mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices) for mesh, _ in meshes):
+    if any(mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices) for mesh, _, _ in meshes):
         raise damaged(path, "faces of its own vertices", "a face that refers to a vertex that is not there")
-    check_faces(path, sum(len(mesh.faces) for mesh, _ in meshes))
+    check_faces(path, sum(len(mesh.faces) for mesh, _, _ in meshes))
     if not meshes:
         got = "points or lines only" if found else "none"
         raise FileFormatError(f"{path}: expected a mesh with faces, got {got}; export triangles")
@@ -106,16 +108,16 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     materials = len(references.materials) if header is None else len(header.materials)
     reader = SurfaceReader(path.name, named, references.refused, materials)
     parts = []
-    for mesh, matrix in meshes:
+    for mesh, matrix, node in meshes:
         part = _part(mesh, reader.surface(mesh.visual), linear=path.suffix.lower() in GLTF)
         if _has_face_uvs(path, data):  # trimesh has shuffled the vertices, but not what belongs to them
             part = replace(part, normals=None, colors=None)
-        parts.append(_placed(part, matrix))
+        parts.append(replace(_placed(part, matrix), node=node))
     return parts, notes + reader.notes
 
 
-def _parse(path: Path, data: bytes, references: References) -> list[tuple[Any, Array]]:
-    """Run trimesh's parser; return what it found with the transforms (4, 4), always in the same order."""
+def _parse(path: Path, data: bytes, references: References) -> list[tuple[Any, Array, int]]:
+    """Run trimesh's parser; return what it found with transforms (4, 4) and nodes, always in the same order."""
     kind = path.suffix.lower().lstrip(".")
     options: dict[str, bool] = {"process": False}
     if kind == "ply":  # with fix_texture, vertices are shuffled and their normals are not
@@ -125,9 +127,10 @@ def _parse(path: Path, data: bytes, references: References) -> list[tuple[Any, A
         found = []
         for node in scene.graph.nodes_geometry:
             matrix, name = scene.graph.get(node)
-            found.append((str(name), np.asarray(matrix, dtype=np.float64)))
-        found.sort(key=lambda item: (item[0], item[1].tobytes()))  # the names of nodes can be random
-        return [(scene.geometry[name], matrix) for name, matrix in found]
+            number = re.match(rf"{gltf.NODE}(\d+)", str(node))
+            found.append((str(name), np.asarray(matrix, dtype=np.float64), int(number[1]) if number else -1))
+        found.sort(key=lambda item: (item[0], item[1].tobytes(), item[2]))  # the names of nodes can be random
+        return [(scene.geometry[name], matrix, number) for name, matrix, number in found]
     except MemoryError:
         raise
     except Exception as error:
@@ -162,6 +165,8 @@ def _file_notes(path: Path, data: bytes, header: gltf.Header | None, references:
             )
     if header is not None and "KHR_texture_transform" in header.extensionsUsed:
         notes.append(f"{path.name} moves its textures with KHR_texture_transform, which is not applied")
+    if header is not None:
+        notes.extend(f"{path.name}: {what} left out" for what in gltf.not_carried_over(header))
     return notes
 
 

@@ -1,0 +1,256 @@
+"""Scenes from glTF files: ``--object scene.glb#chair`` takes one node as the object and the rest as its surroundings.
+
+Lengths are in object sizes, so everything is moved and scaled with the object: its largest extent is 1, it stands on
+z = 0, and z is up.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.assets import ObjectAsset
+from advsearch.scene.importing import gltf
+from advsearch.scene.importing.files import read_bytes, safe_name, shown
+from advsearch.scene.importing.geometry import FLAT
+from advsearch.scene.importing.objects import object_of
+from advsearch.scene.importing.parts import GLTF, ImportedPart, read_parts
+from advsearch.scene.parts import MeshPart, PlacedCamera, PointLamp, ScenePart
+
+Doubles = npt.NDArray[np.float64]
+
+UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""From y up to z up."""
+BEHIND = np.diag([-1.0, 1.0, -1.0])
+"""Cameras of glTF look along -z with +x to the right; ours along +z with +x to the left."""
+LUMENS = 683.0
+"""Lumens of a watt, as exporters of glTF count: the eye's at 555 nm."""
+FAR = 1000.0
+"""Distance of a directional light, in object sizes."""
+MOST_SURROUNDINGS = 200
+"""Meshes and lamps around an object."""
+TAKEN = frozenset(("object", "environment", "ground", "camera"))
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedScene:
+    """What a file holds.
+
+    Attributes:
+        object: the node that was asked for, with all that hangs on it.
+        surroundings: meshes and lamps beside it.
+        cameras: by name.
+    """
+
+    object: ObjectAsset
+    surroundings: tuple[ScenePart, ...] = ()
+    cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)
+
+
+def split_node(spec: str) -> tuple[str, str | None]:
+    """Return the file and the node of ``scene.glb#chair``; None where no node is named."""
+    found = re.fullmatch(rf"(.+({'|'.join(map(re.escape, GLTF))}))#(.*)", spec, re.IGNORECASE | re.DOTALL)
+    return (found[1], found[3]) if found and not Path(spec).exists() else (spec, None)
+
+
+def import_scene(path: Path, node: str) -> ImportedScene:
+    """Read a scene from a .glb or .gltf file.
+
+    The object is repaired, normalised and textured as `import_object` does it; so is every other node with a mesh,
+    which stays in its place beside it. Point and spot lights of KHR_lights_punctual become lamps without a cone,
+    directional ones distant lamps; perspective cameras are kept by name. What is not carried over is among the
+    object's warnings.
+
+    Args:
+        path: of the file.
+        node: name of the object's node, or of its mesh where the node has none; "node 3" is the one with that number.
+
+    Raises:
+        UnknownNameError: no node of that name has a mesh, or one below it.
+        FileFormatError: as for `import_object`.
+        InputError: as for `import_object`; several nodes have the name; or there is too much beside the object.
+    """
+    data = read_bytes(path, "scene", GLTF)
+    header = gltf.read_header(path, data)
+    parts, notes = read_parts(path, data)
+    poses = dict(_poses(header))
+    chosen = _below(header, _named(path, header, node, {part.node for part in parts}))
+    own = [part for part in parts if part.node in chosen]
+    others = sorted({part.node for part in parts} - chosen)
+    lamps = [index for index in poses if header.nodes[index].lamp is not None]
+    if len(others) + len(lamps) > MOST_SURROUNDINGS:
+        raise InputError(
+            f"{path}: expected at most {MOST_SURROUNDINGS} meshes and lights beside the object, got "
+            f"{len(others) + len(lamps)}; join some of them in the file"
+        )
+    frame, names = _frame(own), _Names()
+    surroundings: list[ScenePart] = []
+    for number in others:
+        group = [part for part in parts if part.node == number]
+        name, place = names.free(header.label(number)), _frame(group)
+        made = object_of(group, [], path, name, "y")
+        notes.extend(made.warnings)
+        matrix = np.eye(4)
+        matrix[:3, :3] *= place.size / frame.size
+        matrix[:3, 3] = frame.inside(place.origin)
+        surroundings.append(MeshPart(name, made.mesh, matrix, made.base_color, made.material))
+    for index in lamps:
+        light = header.lights[header.nodes[index].lamp or 0]
+        surroundings.append(_lamp(names.free(light.name or header.label(index)), light, poses[index], frame))
+    cameras = {
+        names.free(header.cameras[camera].name or header.label(index)): _camera(header.cameras[camera], pose, frame)
+        for index, pose in poses.items()
+        if (camera := header.nodes[index].camera) is not None and header.cameras[camera].perspective is not None
+    }
+    notes.extend(_changed(path, header))
+    return ImportedScene(
+        object_of(own, notes, path, f"{safe_name(path)}-{clean(node)}", "y"), tuple(surroundings), cameras
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """How something lies in the file, z up: its own coordinates times `size`, plus `origin` (3,)."""
+
+    size: float
+    origin: Doubles
+
+    def inside(self, places: Doubles) -> Doubles:
+        """Return places (..., 3) of the file, z up, in its own coordinates."""
+        return np.asarray((places - self.origin) / self.size)
+
+
+def _frame(parts: Sequence[ImportedPart]) -> Frame:
+    """The frame in which the parts have a largest extent of 1, stand on z = 0 and are centred in x and y."""
+    corners = []
+    for part in parts:
+        triangles = part.vertices[part.faces]
+        area = np.linalg.norm(np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]), axis=1)
+        extent = float(np.ptp(triangles.reshape(-1, 3), axis=0).max())
+        corners.append(triangles[area > FLAT * extent**2].reshape(-1, 3))
+    places = np.concatenate(corners) @ UPRIGHT.T
+    if not np.isfinite(places).all() or not len(places) or not np.ptp(places, axis=0).max() > 0.0:
+        return Frame(1.0, np.zeros(3))  # refused with a reason when it is repaired
+    low, high = places.min(axis=0), places.max(axis=0)
+    return Frame(float((high - low).max()), np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]))
+
+
+class _Names:
+    """Gives names that are free, and that a setting may have."""
+
+    def __init__(self) -> None:
+        self._taken = set(TAKEN)
+
+    def free(self, wanted: str) -> str:
+        """Return the name, or the first free one with a number behind it."""
+        base = clean(wanted)
+        name = next(
+            one
+            for number in itertools.count(1)
+            if (one := base if number == 1 else f"{base}-{number}") not in self._taken
+        )
+        self._taken.add(name)
+        return name
+
+
+def clean(name: str) -> str:
+    """Return a name of letters, digits, dashes and underscores, 60 at most."""
+    return re.sub(r"[^\w-]+", "-", name).strip("-")[:60] or "part"
+
+
+def _named(path: Path, header: gltf.Header, name: str, with_mesh: set[int]) -> int:
+    """The number of the node of that name which has a mesh, or one below it."""
+    labels = {index: header.label(index) for index in range(len(header.nodes)) if _below(header, index) & with_mesh}
+    found = [index for index, label in labels.items() if name in (label, f"node {index}")]
+    if not found:
+        raise UnknownNameError(f"node of {path.name}", name, list(dict.fromkeys(labels.values())))
+    if len(found) > 1:
+        numbers = ", ".join(f"{path.name}#node {index}" for index in found[:10])
+        raise InputError(f"{path}: {len(found)} nodes are called {shown(name)}; say which: {numbers}")
+    return found[0]
+
+
+def _below(header: gltf.Header, index: int) -> set[int]:
+    """A node and all that hangs on it."""
+    found, level = {index}, [index]
+    while level:
+        level = [child for one in level for child in header.nodes[one].children]
+        found.update(level)
+    return found
+
+
+def _poses(header: gltf.Header) -> Iterator[tuple[int, Doubles]]:
+    """Yield the nodes of the file's scene with their poses (4, 4) in it."""
+    children = {child for node in header.nodes for child in node.children}
+    roots = [index for index in range(len(header.nodes)) if index not in children]
+    if header.scenes:
+        roots = list(header.scenes[header.scene or 0].nodes)
+    level = [(index, np.eye(4)) for index in roots]
+    while level:
+        index, above = level.pop()
+        pose = above @ _matrix(header.nodes[index])
+        yield index, pose
+        level.extend((child, pose) for child in header.nodes[index].children)
+
+
+def _matrix(node: gltf.Node) -> Doubles:
+    """The transform (4, 4) of one node."""
+    if node.matrix is not None:
+        return np.asarray(np.array(node.matrix, dtype=np.float64).reshape(4, 4).T)
+    matrix = np.eye(4)
+    x, y, z, w = np.array(node.rotation or [0.0, 0.0, 0.0, 1.0]) / max(
+        float(np.linalg.norm(node.rotation or 1.0)), 1e-12
+    )
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    matrix[:3, :3] = turn * np.array(node.scale or [1.0, 1.0, 1.0])
+    matrix[:3, 3] = node.translation or [0.0, 0.0, 0.0]
+    return matrix
+
+
+def _lamp(name: str, light: gltf.Light, pose: Doubles, frame: Frame) -> PointLamp:
+    """A light at its place; light falls off with the square of the distance in object sizes as it does in the file."""
+    power = np.array(light.color) * light.intensity / LUMENS
+    if light.type == "directional":
+        way = UPRIGHT @ pose[:3, 2]  # it shines along its -z
+        place, power = FAR * way / max(float(np.linalg.norm(way)), 1e-12), power * FAR**2
+    else:
+        place, power = frame.inside(UPRIGHT @ pose[:3, 3]), power / frame.size**2
+    x, y, z = map(float, place)
+    red, green, blue = map(float, power)
+    return PointLamp(name, dark=not power.any(), position=(x, y, z), intensity=(red, green, blue))
+
+
+def _camera(camera: gltf.CameraEntry, pose: Doubles, frame: Frame) -> PlacedCamera:
+    assert camera.perspective is not None
+    turn = UPRIGHT @ pose[:3, :3] @ BEHIND
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn / np.maximum(np.linalg.norm(turn, axis=0), 1e-12)
+    matrix[:3, 3] = frame.inside(UPRIGHT @ pose[:3, 3])
+    larger = max(camera.perspective.aspectRatio or 1.0, 1.0)
+    return PlacedCamera(matrix, math.degrees(2.0 * math.atan(math.tan(camera.perspective.yfov / 2.0) * larger)))
+
+
+def _changed(path: Path, header: gltf.Header) -> Iterator[str]:
+    """Yield sentences about lights and cameras that are not what they are in the file."""
+    kinds = [light.type for light in header.lights]
+    if "spot" in kinds:
+        yield f"{path.name}: {kinds.count('spot')} spot lights shine in all directions: their cones are left out"
+    if "directional" in kinds:
+        yield f"{path.name}: {kinds.count('directional')} directional lights are lamps {FAR:g} object sizes away"
+    flat = sum(camera.perspective is None for camera in header.cameras)
+    if flat:
+        yield f"{path.name}: {flat} cameras without perspective are left out"
