@@ -38,6 +38,7 @@ COMMANDS = {
     "plan": "advsearch.cli.plan",
     "stability": "advsearch.cli.stability",
     "precision": "advsearch.cli.precision",
+    "import": "advsearch.cli.import_command",
     "list": "advsearch.cli.list",
     "labels": "advsearch.cli.labels",
     "show": "advsearch.cli.show",

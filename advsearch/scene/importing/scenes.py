@@ -21,7 +21,7 @@ from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.importing import gltf
 from advsearch.scene.importing.files import read_bytes, safe_name, shown
 from advsearch.scene.importing.geometry import FLAT
-from advsearch.scene.importing.objects import object_of
+from advsearch.scene.importing.objects import import_object, object_of
 from advsearch.scene.importing.parts import GLTF, ImportedPart, read_parts
 from advsearch.scene.parts import MeshPart, PlacedCamera, PointLamp, ScenePart
 
@@ -114,6 +114,61 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     return ImportedScene(
         object_of(own, notes, path, f"{safe_name(path)}-{clean(node)}", "y"), tuple(surroundings), cameras
     )
+
+
+@dataclass(frozen=True)
+class NodeContents:
+    """A node with geometry.
+
+    Attributes:
+        name: as `import_scene` takes it.
+        triangles: of its own mesh.
+        size: of its bounding box in the file's axes and units, (3,).
+    """
+
+    name: str
+    triangles: int
+    size: tuple[float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Contents:
+    """What is in a file.
+
+    Attributes:
+        object: everything with geometry, as one object.
+        nodes: of a glTF file, in their order.
+        lights, cameras: names.
+    """
+
+    object: ObjectAsset
+    nodes: tuple[NodeContents, ...] = ()
+    lights: tuple[str, ...] = ()
+    cameras: tuple[str, ...] = ()
+
+
+def contents(path: Path) -> Contents:
+    """Return what is understood of a mesh or scene file.
+
+    Raises:
+        FileFormatError, InputError: as for `import_object`.
+    """
+    whole = import_object(path)
+    if path.suffix.lower() not in GLTF:
+        return Contents(whole)
+    data = read_bytes(path, "scene", GLTF)
+    header = gltf.read_header(path, data)
+    nodes: dict[int, list[ImportedPart]] = {}
+    for part in read_parts(path, data)[0]:
+        nodes.setdefault(part.node, []).append(part)
+    listed = []
+    for index, group in sorted(nodes.items()):
+        places = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in group])
+        x, y, z = map(float, np.ptp(places, axis=0))
+        listed.append(NodeContents(header.label(index), sum(len(part.faces) for part in group), (x, y, z)))
+    lights = tuple(light.name or f"light {index}" for index, light in enumerate(header.lights))
+    cameras = tuple(camera.name or f"camera {index}" for index, camera in enumerate(header.cameras))
+    return Contents(whole, tuple(listed), lights, cameras)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,84 @@
+"""`advsearch import`: what is understood of a mesh or scene file, before anything is searched."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from advsearch.cli import output
+from advsearch.errors import InputError
+
+HELP = "say, and picture, what is understood of a mesh or scene file"
+
+_EXAMPLES = """examples:
+  advsearch import mug.obj
+  advsearch import room.glb --json
+  advsearch import room.glb --out room.png
+"""
+VIEWS, SIDE = 4, 192
+"""Views of the picture, and the side of each in pixels."""
+
+
+def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        "import",
+        help=HELP,
+        description=f"{HELP[0].upper()}{HELP[1:]}. Nothing is written but the picture.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("file", metavar="FILE", help="a .glb, .gltf, .obj, .ply or .stl file")
+    parser.add_argument("--out", metavar="FILE", help="a picture of all that is in it, from four sides (.png)")
+    output.add_flags(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print what was understood."""
+    from advsearch.cli.progress import at_work
+
+    out = None if args.out is None else Path(args.out)
+    if out is not None and out.suffix.lower() != ".png":
+        raise InputError(f"--out: expected the name of a .png file, got {args.out}")
+    with at_work(as_json=True, quiet=False):
+        import advsearch
+        from advsearch.scene.importing.scenes import contents
+
+        found = contents(Path(args.file))
+        if out is not None:
+            scene = advsearch.load_scene(args.file, up=found.object.up.axis if found.object.up else None)
+            advsearch.render(scene, around=VIEWS, resolution=SIDE).save(out)
+    whole = found.object
+    facts = {
+        "triangles": len(whole.mesh.faces),
+        "texture": list(whole.base_color.shape[1::-1]),
+        "up": None if whole.up is None else whole.up.axis,
+    }
+    nodes = [{"name": one.name, "triangles": one.triangles, "size": list(one.size)} for one in found.nodes]
+    if args.json:
+        told = {
+            "file": args.file,
+            **facts,
+            "nodes": nodes,
+            "lights": list(found.lights),
+            "cameras": list(found.cameras),
+        }
+        output.print_json({"schema": 1, "command": "import", **told, "warnings": list(whole.warnings), "out": args.out})
+        return 0
+    width, height = whole.base_color.shape[1], whole.base_color.shape[0]
+    print(f"{args.file}: {facts['triangles']:,} triangles, a texture of {width} x {height}, {facts['up']} up")
+    if nodes:
+        rows = [
+            [one.name, f"{one.triangles:,} triangles", " x ".join(f"{side:.3g}" for side in one.size)]
+            for one in found.nodes
+        ]
+        print(output.columns([["node", "", "size"], *rows]))
+        print(f"One of them as the object, the rest around it: --object '{args.file}#{found.nodes[-1].name}'")
+    for what, names in (("lights", found.lights), ("cameras", found.cameras)):
+        if names:
+            print(f"{what}: {', '.join(names)}")
+    for warning in whole.warnings:
+        print(f"Note: {warning}")
+    return 0

@@ -1,0 +1,190 @@
+"""Scenes from glTF files: one node is the object, the rest stays in its place; lamps, cameras, names."""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from advsearch.cli.main import main
+from advsearch.errors import FileFormatError, InputError, UnknownNameError
+from advsearch.scene.description import describe
+from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.importing.scenes import LUMENS, split_node
+from advsearch.scene.parts import PointLamp
+
+ROUND = {"roughnessFactor": 0.8, "metallicFactor": 0.0}
+
+
+def box(extents: list[float], color: list[int]) -> Any:
+    made = trimesh.creation.box(extents=extents)
+    made.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=[*color, 255], **ROUND))
+    return made
+
+
+def with_header(data: bytes, change: Any) -> bytes:
+    """Return a .glb file with another header."""
+    length = struct.unpack_from("<I", data, 12)[0]
+    header, rest = json.loads(data[20 : 20 + length]), data[20 + length :]
+    change(header)
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
+
+
+def add(header: dict[str, Any], node: dict[str, Any]) -> None:
+    header["nodes"].append(node)
+    header["scenes"][header.get("scene", 0)]["nodes"].append(len(header["nodes"]) - 1)
+
+
+def five_nodes(header: dict[str, Any]) -> None:
+    """Add a lamp and a camera to the floor, the wall and the crate."""
+    lights = [{"type": "point", "intensity": 683.0, "color": [1.0, 0.5, 0.0], "name": "bulb"}]
+    header["extensions"] = {"KHR_lights_punctual": {"lights": lights}}
+    header["cameras"] = [{"type": "perspective", "perspective": {"yfov": 0.8, "aspectRatio": 2.0}, "name": "front"}]
+    add(header, {"translation": [0.0, 5.0, 0.0], "extensions": {"KHR_lights_punctual": {"light": 0}}})
+    add(header, {"translation": [1.0, 1.0, 8.0], "camera": 0})
+
+
+@pytest.fixture(scope="module")
+def data() -> bytes:
+    scene = trimesh.Scene()
+    place = trimesh.transformations.translation_matrix
+    scene.add_geometry(box([10.0, 0.2, 10.0], [180, 180, 180]), "floor", "floor", transform=place([0.0, -0.1, 0.0]))
+    scene.add_geometry(box([10.0, 6.0, 0.2], [150, 80, 50]), "the wall", "wall", transform=place([0.0, 3.0, -5.0]))
+    scene.add_geometry(box([2.0, 2.0, 2.0], [200, 180, 30]), "crate", "crate", transform=place([1.0, 1.0, 0.0]))
+    exported: bytes = scene.export(file_type="glb")
+    return with_header(exported, five_nodes)
+
+
+@pytest.fixture
+def file(data: bytes, tmp_path: Path) -> Path:
+    (tmp_path / "room.glb").write_bytes(data)
+    return tmp_path / "room.glb"
+
+
+def test_a_node_is_the_object_and_the_rest_stays_in_its_place_around_it(file: Path) -> None:
+    scene = describe(f"{file}#crate")
+    assert set(scene.meshes) == {"object", "floor", "the-wall"}
+    assert np.ptp(scene.base_vertices, axis=0) == pytest.approx([1.0, 1.0, 1.0])
+    wall = scene.meshes["the-wall"]
+    corners = wall.mesh.vertices @ wall.to_world[:3, :3].T + wall.to_world[:3, 3]
+    # in the file x -5 to 5, height 0 to 6, depth -5.1 to -4.9; the crate of side 2 stands at (1, 0, 0)
+    assert corners.min(axis=0) == pytest.approx([-3.0, 2.45, 0.0], abs=1e-5)
+    assert corners.max(axis=0) == pytest.approx([2.0, 2.55, 3.0], abs=1e-5)
+    assert scene.number("ground.size") == 0.0
+
+
+def test_a_lamp_lights_as_in_the_file_and_takes_the_place_of_a_map(file: Path) -> None:
+    scene = describe(f"{file}#crate")
+    assert scene.environment is None
+    lamp = scene.lamps["bulb"]
+    assert isinstance(lamp, PointLamp)
+    assert lamp.position == pytest.approx((-0.5, 0.0, 2.5))
+    _, here = lamp.lighting(np.array([-0.5, 0.0, 0.0]))
+    candela = np.array([1.0, 0.5, 0.0]) * 683.0
+    assert here == pytest.approx(candela / LUMENS / 5.0**2)  # five metres below it
+    assert describe(f"{file}#crate", "kitchen").environment_name == "kitchen"
+
+
+def test_a_camera_of_the_file_sees_the_object_where_it_is(file: Path) -> None:
+    scene = describe(f"{file}#crate")
+    camera = scene.cameras["front"]
+    assert camera.fov == pytest.approx(math.degrees(2 * math.atan(2 * math.tan(0.4))))
+    pose = camera_to_world(scene.seen_by("front"))
+    seen = np.linalg.inv(pose) @ np.array([0.0, 0.0, 0.5, 1.0])
+    assert seen[:3] == pytest.approx([0.0, 0.0, 4.0], abs=1e-6)  # eight metres ahead, in the middle
+    right = np.linalg.inv(pose) @ np.array([0.5, 0.0, 0.5, 1.0])
+    assert right[0] < 0.0  # +x is to the left
+
+
+def test_an_object_brings_what_hangs_on_it(data: bytes, tmp_path: Path) -> None:
+    def under(header: dict[str, Any]) -> None:
+        nodes = header["nodes"]
+        number = {node.get("name"): index for index, node in enumerate(nodes)}
+        nodes[number["crate"]]["children"] = [number["the wall"]]
+        for one in (header["scenes"][0]["nodes"], *(node.get("children", []) for node in nodes)):
+            if number["the wall"] in one and one is not nodes[number["crate"]]["children"]:
+                one.remove(number["the wall"])
+
+    file = tmp_path / "room.glb"
+    file.write_bytes(with_header(data, under))
+    scene = describe(f"{file}#crate")
+    assert set(scene.meshes) == {"object", "floor"}
+    assert float(np.ptp(scene.base_vertices, axis=0).max()) == pytest.approx(1.0)
+
+
+def test_names_say_which_node(file: Path, data: bytes) -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown node of room.glb 'crates'. Did you mean 'crate'"):
+        describe(f"{file}#crates")
+
+    def twins(header: dict[str, Any]) -> None:
+        for node in header["nodes"]:
+            if node.get("name") == "floor":
+                node["name"] = "crate"
+
+    file.write_bytes(with_header(data, twins))
+    with pytest.raises(
+        InputError, match=r"2 nodes are called .*crate.*; say which: room.glb#node \d, room.glb#node \d"
+    ):
+        describe(f"{file}#crate")
+    number = next(int(word) for word in "0 1 2 3 4".split() if _is_crate(f"{file}#node {word}"))
+    assert describe(f"{file}#node {number}").object_name == f"{file}#node {number}"
+
+
+def _is_crate(spec: str) -> bool:
+    try:
+        return "crate-2" in describe(spec).meshes or "crate" in describe(spec).meshes
+    except UnknownNameError:
+        return False
+
+
+def test_what_is_not_carried_over_is_named(file: Path, data: bytes) -> None:
+    def more(header: dict[str, Any]) -> None:
+        header["materials"][0] |= {"emissiveFactor": [1, 1, 1], "alphaMode": "BLEND"}
+        header["extensions"]["KHR_lights_punctual"]["lights"][0]["type"] = "spot"
+        header["cameras"].append({"type": "orthographic"})
+
+    file.write_bytes(with_header(data, more))
+    notes = " ".join(describe(f"{file}#crate").notes)
+    for words in ("the glow of 1 material is left out", "the transparency of 1", "1 spot lights", "1 cameras without"):
+        assert words in notes
+
+
+@pytest.mark.parametrize("spec", ["room.obj#crate", "crate#a.png", "room.glb"])
+def test_only_gltf_files_have_nodes(spec: str) -> None:
+    assert split_node(spec) == (spec, None)
+    assert split_node("a/room.GLB#the wall") == ("a/room.GLB", "the wall")
+
+
+def test_wrong_numbers_of_lights_and_cameras_are_damage(file: Path, data: bytes) -> None:
+    for entry in ({"camera": 7}, {"extensions": {"KHR_lights_punctual": {"light": 3}}}):
+        file.write_bytes(with_header(data, lambda header, entry=entry: add(header, entry)))
+        with pytest.raises(FileFormatError, match=r"expected glTF with \d (cameras|lights), as it refers to"):
+            describe(f"{file}#crate")
+
+
+def test_an_attack_on_a_node_is_verified_and_goes_on_from_its_file(file: Path, tmp_path: Path) -> None:
+    small = ["--resolution", "16", "--spp", "1", "--steps", "2", "--trials", "6", "--label", "book", "--json"]
+    run = tmp_path / "run"
+    assert main(["attack", "--object", f"{file}#crate", "--control", "pose,texture", *small, "--run", str(run)]) == 0
+    assert json.loads((run / "summary.json").read_text())["object"] == f"{file}#crate"
+    assert main(["sweep", "--object", f"{file}#crate", "--grid", "pose.yaw=0,90", *small[:4], "--label", "book"]) == 0
+
+
+def test_import_says_what_was_understood(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["import", str(file), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [one["name"] for one in told["nodes"]] == ["floor", "the wall", "crate"]
+    assert [one["triangles"] for one in told["nodes"]] == [12, 12, 12]
+    assert (told["lights"], told["cameras"]) == (["bulb"], ["front"])
+    assert main(["import", str(file)]) == 0
+    assert f"{file}#crate" in capsys.readouterr().out
