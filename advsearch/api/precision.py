@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,8 @@ from advsearch.api.keywords import PrecisionKeywords, asks, configured
 from advsearch.attacks import Policy, make_policy
 from advsearch.config import PrecisionConfig
 from advsearch.engine.gradients import Loss, inside, smooth_loss
+from advsearch.engine.measuring import Results, kept_rows
+from advsearch.engine.memory import Memory
 from advsearch.engine.planning import measured_plan, plan_gradients
 from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
@@ -27,17 +30,17 @@ from advsearch.evaluation.precision.image import REFERENCE_SAMPLER, PictureBench
 from advsearch.evaluation.precision.machine import machine
 from advsearch.evaluation.precision.objective import ObjectiveBench, curve_of
 from advsearch.evaluation.precision.points import MeasuredSetting, Point, Sample, point_of
-from advsearch.evaluation.precision.report import Section, report_of
+from advsearch.evaluation.precision.report import MeasuredLine, Section, report_of
 from advsearch.evaluation.precision.rounds import Rounds, TimeBudget, in_rounds
 from advsearch.files import Json
-from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.diagrams import precision_figures
-from advsearch.runs.directory import RunDirectory, check_free
+from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.precision import PrecisionResult
 from advsearch.runs.summary import to_json
+from advsearch.scene.renderer import Renderer
 from advsearch.settings import split_names
 
 if TYPE_CHECKING:
@@ -85,70 +88,119 @@ def precision_from_config(
 ) -> PrecisionResult:
     """Measure error against run time and write figures and numbers.
 
+    The picture, the gradient of each control and the policies are measured one after the other, each in one sitting, so
+    that their times are beside each other; what is done is kept at once, and a run that was stopped goes on with the
+    next, in the seconds that are left.
+
     Args:
         config: scene, model, controls, what to measure and for how long.
         progress: told how far it is.
-        resumed: refused: times are measured in one sitting.
+        resumed: the folder of a run to go on with.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
-    if resumed is not None:
-        raise InputError(
-            f"{resumed}: times are measured in one sitting, so that there is nothing to go on with; run again"
-        )
     progress = progress or NullProgress()
-    if config.run is not None and config.out is None:
-        check_free(config.run, overwrite=config.overwrite)
+    if config.out is None:
+        with RunDirectory.of(config, resumed) as run:
+            report = _measured(config, run, progress)
+            report = report.model_copy(update={"figures": _write(run.path / "images", report)})
+            run.write_summary(report)
+            return report
+    report, folder = _measured(config, None, progress), Path(config.out).expanduser()
+    report = report.model_copy(update={"figures": _write(folder, report)})
+    write_text(folder / NUMBERS, to_json(report) + "\n")
+    return report
+
+
+def _measured(config: PrecisionConfig, run: RunDirectory | None, progress: Progress) -> PrecisionResult:
+    """Measure, and keep it in an open run, if there is one; no figures."""
     begun = time.perf_counter()
     progress.stage(LOADING, hint=f"then {config.seconds:g} seconds of measurements; `seconds` sets them")
     policies = {name: make_policy(name) for name in split_names(config.policies)}
     problem, said = problem_from_config(config)
     for text in said:
         progress.message(text)
-    job = _Measurement(config, problem, progress, TimeBudget(config.seconds))
     setup = time.perf_counter() - begun
-    wanted = [name for name in ("image", "gradient", "objective") if name in split_names(config.quantities)]
+    wanted = split_names(config.quantities)
     if "gradient" in wanted and not any(group.valid for group in problem.renderer.plan.groups):
         raise InputError(
             f"`controls` {','.join(config.controls)}: has no derivative; leave gradient out of `quantities`"
         )
-    measure: dict[str, Callable[[TimeBudget], None]] = {
-        "image": job.image,
-        "gradient": job.gradient,
-        "objective": lambda share: job.objective(share, policies),
-    }
-    try:
-        with interruptible():
-            for number, name in enumerate(wanted):
-                measure[name](job.budget.share(SHARES[name] / sum(SHARES[one] for one in wanted[number:])))
-    except KeyboardInterrupt:
-        job.section.interrupted = True
-    seconds = {"budget": config.seconds, "setup": setup, "total": time.perf_counter() - begun}
-    report = report_of(_head(config, problem), job.section, config.error, seconds)
-    return _kept(config, report)
+    job, results = _Measurement(config, problem, progress, policies), Results(Memory(run))
+    parts = [one for one in job.parts() if one.quantity in wanted]
+
+    def sections() -> Iterator[Section]:
+        left = config.seconds
+        for number, part in enumerate(parts):
+            share = part.share / math.fsum(one.share for one in parts[number:])
+            stored = results.get(part.name, partial(part.timed, TimeBudget(share * left)))
+            left = max(0.0, left - stored["seconds"])
+            yield Section.of(stored["section"])
+
+    def result(sections: Sequence[Section], ending: str) -> PrecisionResult:
+        whole = Section(config.pixel_sampler)
+        for one in sections:
+            whole.extend(one)
+        seconds = {"budget": config.seconds, "setup": setup, "total": time.perf_counter() - begun}
+        place = {"run": None if run is None else str(run.path), "ending": ending, "seconds": seconds}
+        return report_of({**_head(config, problem), **place}, whole, config.error)
+
+    return kept_rows(run, results, sections(), result)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What is measured in one sitting.
+
+    Attributes:
+        quantity: "image", "gradient" or "objective".
+        name: unlike that of all others.
+        share: of the time.
+        measure: within a budget.
+    """
+
+    quantity: str
+    name: str
+    share: float
+    measure: Callable[[TimeBudget], Section]
+
+    def timed(self, budget: TimeBudget) -> Json:
+        """Measure, and return what came out and the seconds that it took, as JSON values."""
+        begun = time.perf_counter()
+        section = self.measure(budget)
+        return {"section": section.to_dict(), "seconds": time.perf_counter() - begun}
 
 
 @dataclass
 class _Measurement:
-    """What is measured, quantity by quantity, and what came out so far."""
+    """What can be measured, part by part; `section` is that of the part at hand."""
 
     config: PrecisionConfig
     problem: Problem
     progress: Progress
-    budget: TimeBudget
+    policies: Mapping[str, Policy[Any]]
     section: Section = field(init=False)
 
-    def __post_init__(self) -> None:
-        self.section = Section(self.config.pixel_sampler)
+    def parts(self) -> list[_Part]:
+        """Everything, in its order."""
+        renderer, _ = self._differentiated
+        found = parts_of(renderer.plan.groups, linear=self.config.loss == "linear")
+        gradients = [
+            _Part("gradient", f"gradient of {one.name}", SHARES["gradient"] / len(found), partial(self._gradient, one))
+            for one in found
+        ]
+        first = _Part("image", "image", SHARES["image"], self._image)
+        return [first, *gradients, _Part("objective", "objective", SHARES["objective"], self._objective)]
 
     @property
     def seed(self) -> int:
         """Root of the measurements' seeds."""
         return seeds.stream(self.config.seed, "precision")
 
-    def image(self, budget: TimeBudget) -> None:
+    def _image(self, budget: TimeBudget) -> Section:
         """The picture and the model's margin."""
+        self.section = Section(self.config.pixel_sampler)
         renderer, problem = self.problem.renderer, self.problem
         depths = [int(part) for part in split_names(self.config.depths)]
         chosen = variants(
@@ -168,29 +220,34 @@ class _Measurement:
         families = {one.series: one.family for one in chosen}
         found = self._rounds("the picture", bench.settings, bench.measure, budget)
         for measure in ("error", "margin_error"):
-            self._take(found, measure, bench.floor, lambda series: theories[series])
-        self.section.families |= {("image", "", series): family for series, family in families.items()}
+            self._take(found, measure, bench.floor, lambda series: theories[series], families)
+        return self.section
 
-    def gradient(self, budget: TimeBudget) -> None:
-        """Every control's gradient."""
-        config, problem, renderer = self.config, self.problem, self.problem.renderer
-        loss: Loss = problem.loss
-        if config.loss == "linear":
-            renderer = renderer.like(denoiser="none", transfer="linear")
-            renderer.plan = renderer.plan.at_a_pixel()
-            loss = smooth_loss(renderer.formation.resolution, config.seed)
-        u = inside(renderer)
-        exact = renderer.like(renderer.scene.like(sampler=REFERENCE_SAMPLER))
-        parts = parts_of(renderer.plan.groups, linear=config.loss == "linear")
-        for number, part in enumerate(parts):
-            bench = GradientBench(renderer, loss, u, part, exact)
-            self._one_gradient(bench, part, budget.share(1.0 / (len(parts) - number)))
+    @cached_property
+    def _differentiated(self) -> tuple[Renderer, Loss]:
+        """The renderer and the loss whose gradient is measured."""
+        renderer, problem = self.problem.renderer, self.problem
+        if self.config.loss == "model":
+            return renderer, problem.loss
+        renderer = renderer.like(denoiser="none", transfer="linear")
+        renderer.plan = renderer.plan.at_a_pixel()
+        return renderer, smooth_loss(renderer.formation.resolution, self.config.seed)
 
-    def _one_gradient(self, bench: GradientBench, part: GradientPart, budget: TimeBudget) -> None:
+    @cached_property
+    def _exact(self) -> Renderer:
+        """The same with the sampler of references."""
+        renderer, _ = self._differentiated
+        return renderer.like(renderer.scene.like(sampler=REFERENCE_SAMPLER))
+
+    def _gradient(self, part: GradientPart, budget: TimeBudget) -> Section:
+        """The gradient of a part of the space."""
+        self.section = Section(self.config.pixel_sampler)
+        renderer, loss = self._differentiated
+        bench = GradientBench(renderer, loss, inside(renderer), part, self._exact)
         share = budget.share(REFERENCE_SHARE)
         bench.refer(share, self.seed, self._timed(f"gradient of {part.name}: references", share))
         if bench.reference is None:
-            return
+            return self.section
         self.section.refer("gradient", bench.by, part.name, bench.reference, bench.part_spp)
         said = bench.bias(budget, self.seed)
         self.section.warnings += [said] if said else []
@@ -199,6 +256,7 @@ class _Measurement:
         linear, sampler = self.config.loss == "linear", self.config.pixel_sampler
         self._take(found, "error", bench.floor, lambda series: theory_of(series, sampler) if linear else UNKNOWN)
         self._confirm(bench, part, budget)
+        return self.section
 
     def _confirm(self, bench: GradientBench, part: GradientPart, budget: TimeBudget) -> None:
         """Measure the setting that is recommended so far again, with seeds of its own."""
@@ -219,11 +277,13 @@ class _Measurement:
         samples = [Sample(numbers, seconds) for numbers, seconds in found.results.get(setting, [])]
         if len(samples) >= CONFIRM_LEAST:
             floor = bench.floor(setting, "error")
-            self.section.again[setting.line, "error"] = point_of(setting, samples, "error", floor)
+            measured = next(each for each in self.section.lines if each.line == setting.line)
+            measured.again = point_of(setting, samples, "error", floor)
 
-    def objective(self, budget: TimeBudget, policies: Mapping[str, Policy[Any]]) -> None:
+    def _objective(self, budget: TimeBudget) -> Section:
         """The best verified objective of each policy."""
-        problem, config = self.problem, self.config
+        problem, config, policies = self.problem, self.config, self.policies
+        self.section = Section(config.pixel_sampler)
         if any(policy.uses_gradient for policy in policies.values()):
             self.progress.stage("measuring which gradients are best here", plan_gradients(problem.plan))
             at, seed = inside(problem.renderer), seeds.stream(config.seed, "measure")
@@ -253,6 +313,7 @@ class _Measurement:
         self.section.left_out += found.left_out
         for setting, taken in found.results.items():
             self.section.curves.append((setting, curve_of(setting.series, [marks for marks, _ in taken if marks])))
+        return self.section
 
     def _verified(self, u: Tensor) -> float:
         """The mean objective of a configuration over fresh renders, rounded to 8 bits; the same seeds for all."""
@@ -287,6 +348,7 @@ class _Measurement:
         measure: str,
         floor: Callable[[MeasuredSetting, str], float],
         theory: Callable[[str], Theory],
+        families: Mapping[str, str] | None = None,
     ) -> None:
         """Make points of what was measured."""
         lines: dict[tuple[str, str, str], list[Point]] = {}
@@ -295,11 +357,13 @@ class _Measurement:
             point = point_of(setting, samples, measure, floor(setting, measure))
             lines.setdefault(setting.line, []).append(point)
         for line, points in lines.items():
-            self.section.add(line, points, theory(line[2]))
+            points.sort(key=lambda point: point.setting.spp)
+            family = (families or {}).get(line[2], "")
+            self.section.lines.append(MeasuredLine(line, measure, points, theory(line[2]), family))
 
     def _timed(self, name: str, budget: TimeBudget) -> Callable[..., None]:
         """Begin a stage that ends with a budget of seconds, and return what tells how many have passed."""
-        total, done = math.ceil(budget.left), 0
+        total, done = max(1, math.ceil(budget.left)), 0
         self.progress.stage(name, total, hint="counted in seconds; `seconds` sets them", at_most=True)
 
         def tick(**info: float | str) -> None:
@@ -314,7 +378,6 @@ class _Measurement:
 def _head(config: PrecisionConfig, problem: Problem) -> Json:
     """What was asked for, and on what it was measured."""
     return {
-        "run": None,
         "object": config.object,
         "model": problem.model.name,
         "environment": problem.space.environment or config.lit_by,
@@ -326,21 +389,8 @@ def _head(config: PrecisionConfig, problem: Problem) -> Json:
         "spp": problem.spp,
         "seed": config.seed,
         "machine": machine(),
+        "command_line": config.command_line(),
     }
-
-
-def _kept(config: PrecisionConfig, report: PrecisionResult) -> PrecisionResult:
-    """Write the figures and the numbers into `--out` or a run directory, and return the report with their paths."""
-    if config.out is not None:
-        folder = Path(config.out).expanduser()
-        report = report.model_copy(update={"figures": _write(folder, report)})
-        write_text(folder / NUMBERS, to_json(report) + "\n")
-        return report
-    with RunDirectory.create_for(config) as kept:
-        figures = _write(kept.path / "images", report)
-        report = report.model_copy(update={"run": str(kept.path), "figures": figures})
-        kept.write_summary(report)
-    return report
 
 
 def _write(folder: Path, report: PrecisionResult) -> list[str]:

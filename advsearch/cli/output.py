@@ -64,7 +64,7 @@ def finish(result: Result, answer: Callable[[Any], str], *, as_json: bool) -> in
         print_json(result)
     else:
         print(answer(result) + go_on_text(result))
-    stopped = getattr(result, "ending", None) == "interrupted" or getattr(result, "interrupted", False)
+    stopped = getattr(result, "ending", None) == "interrupted"
     return INTERRUPTED if stopped else OK
 
 

@@ -47,6 +47,7 @@ def answer(report: PrecisionResult) -> str:
     lines += ["", "references, with their own errors:", _references(report.references)] if report.references else []
     lines += ["", "recommended:", *(f"  {sentence(one, report.goal)}" for one in report.recommendations)]
     lines += ["", "warnings:", *(f"  {one}" for one in report.warnings)] if report.warnings else []
+    lines += ["", "It was stopped: only a part was measured."] if report.goes_on else []
     lines += ["", "not measured, the time was up:", *_left_out(report.left_out)] if report.left_out else []
     lines += ["", *(f"figure: {path}" for path in report.figures)] if report.figures else []
     return "\n".join(lines)

@@ -80,7 +80,7 @@ class Results:
 
 
 def kept_rows(
-    run: RunDirectory, results: Results, rows: Iterable[Row], result: Callable[[Sequence[Row], str], Answer]
+    run: RunDirectory | None, results: Results, rows: Iterable[Row], result: Callable[[Sequence[Row], str], Answer]
 ) -> Answer:
     """Take rows until they end, the time is up or there is an interrupt, and keep what they come to after each.
 
@@ -88,7 +88,7 @@ def kept_rows(
     measured.
 
     Args:
-        run: open.
+        run: open; None where nothing is kept.
         results: what the rows are made from.
         rows: as they come.
         result: makes the result of the rows so far and of how it ended.
@@ -99,7 +99,7 @@ def kept_rows(
         with interruptible():
             for row in rows:
                 taken.append(row)
-                if results.made:
+                if results.made and run is not None:
                     run.write_summary(result(taken, ending))  # what a kill leaves
             ending = "done"
     except KeyboardInterrupt:
@@ -107,6 +107,8 @@ def kept_rows(
     except OutOfTime:
         ending = OUT_OF_TIME
     answer = result(taken, ending)
+    if run is None:
+        return answer
     if ending == INTERRUPTED and not results.made and (run.path / NAME).is_file():
         before = read_result(run.path)
         return before if isinstance(before, type(answer)) else answer

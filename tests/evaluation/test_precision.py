@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from advsearch.api import precision as measuring
+from advsearch.api.precision import precision_from_config
 from advsearch.cli.main import main
 from advsearch.cli.precision import answer as precision_text
 from advsearch.config import AttackConfig, PrecisionConfig
@@ -44,10 +46,13 @@ from advsearch.evaluation.precision.points import (
     reference_through,
     typical_seconds,
 )
-from advsearch.evaluation.precision.report import Section, rounding
+from advsearch.evaluation.precision.report import MeasuredLine, Section, rounding
 from advsearch.evaluation.precision.rounds import LEAST, TimeBudget, gather, in_rounds, part_samples
+from advsearch.progress import NullProgress
 from advsearch.report.diagrams import precision_figures
-from advsearch.runs.results.precision import PrecisionResult, Recommended
+from advsearch.runs.listing import finished
+from advsearch.runs.results.precision import PrecisionReference, PrecisionResult, Recommended
+from advsearch.runs.summary import read_result
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.mitsuba_backend.samplers import next_count
 
@@ -534,6 +539,62 @@ def test_a_tiny_scene_from_end_to_end(
     assert [Path(path).suffix for path in report["figures"]] == [".png", ".svg"]
     png, svg = (Path(path).read_bytes() for path in report["figures"])
     assert png.startswith(b"\x89PNG") and report["machine"]["cpu"].encode() in svg
+
+
+class Stop(NullProgress):
+    """A watcher that presses Ctrl-C at the stage with a name."""
+
+    def __init__(self, at: str) -> None:
+        self.at = at
+
+    def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
+        if self.at in name:
+            raise KeyboardInterrupt
+
+
+def test_a_part_that_is_measured_is_kept_and_not_measured_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    config = PrecisionConfig(
+        object="mug",
+        controls={"environment.rotation": {}},
+        quantities="image,gradient",
+        samplers="independent",
+        depths="2",
+        resolution=(8, 8),
+        seconds=1.0,
+        rounds=3,
+        threads=1,
+        run=str(folder),
+    )
+    stopped = precision_from_config(config, progress=Stop("gradient of environment: references"))
+    assert stopped.ending == "interrupted" and {one.quantity for one in stopped.points} == {"image"}
+    kept = read_result(folder)
+    assert kept.to_dict() == stopped.to_dict() and not finished(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(measuring, "PictureBench", lambda *_: pytest.fail("measured again"))
+        assert main(["resume", str(folder), "--json", "--quiet"]) == 0
+    report = PrecisionResult.of(json.loads(capsys.readouterr().out))
+    assert report.ending == "done" and finished(folder) and len(report.figures) == 2
+    pictures = [one.to_dict() for one in report.points if one.quantity == "image"]
+    assert pictures == [one.to_dict() for one in stopped.points]
+    assert {one.quantity for one in report.points} == {"image", "gradient"}
+
+
+def test_what_was_measured_is_the_same_after_json() -> None:
+    setting = MeasuredSetting("image", "independent", 4, 4.0)
+    point = point_of(setting, [Sample({"error": 0.1}, 0.5)], "error", 0.01)
+    line = MeasuredLine(setting.line, "error", [point], INDEPENDENT, "raw", point)
+    reference = PrecisionReference(quantity="image", reference="raw", error=math.inf, parts=2, spp=64)
+    curve = PolicyCurve("random", (1, 2), (0.5, 1.0), ((0.1, 0.2, 0.3), (0.2, 0.3, 0.4)), 3)
+    section = Section("independent", [line], [reference], [(setting, curve)], 0.5, (setting,), ["a warning"])
+    again = Section.of(json.loads(json.dumps(section.to_dict())))
+    assert repr(again).replace("nan", "inf") == repr(section).replace("nan", "inf")
+    whole = Section("independent")
+    whole.extend(again)
+    whole.extend(Section("independent"))
+    assert whole.start == 0.5 and whole.lines == again.lines
 
 
 def test_a_report_without_points_has_no_figure() -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+
+from pydantic import TypeAdapter
 
 from advsearch.evaluation.precision.fits import (
     Against,
@@ -24,7 +25,6 @@ from advsearch.runs.results.precision import (
     PrecisionPoint,
     PrecisionReference,
     PrecisionResult,
-    PrecisionSlope,
     Recommended,
 )
 from advsearch.scene.mitsuba_backend.samplers import next_count
@@ -35,39 +35,66 @@ FAMILIES = {"raw": "without denoiser", "oidn": "with denoiser", "depth": "by pat
 
 
 @dataclass
+class MeasuredLine:
+    """What was measured of one line of a diagram, in one measure.
+
+    Attributes:
+        line: quantity, control and series.
+        measure: which error.
+        points: by rising samples.
+        theory: what its slope should be.
+        family: of a line of the image: what it is recommended among.
+        again: the setting that was recommended, from measurements after that.
+    """
+
+    line: Line
+    measure: str
+    points: list[Point]
+    theory: Theory
+    family: str = ""
+    again: Point | None = None
+
+
+@dataclass
 class Section:
-    """What was measured so far.
+    """What was measured: of one part of the work, or of several.
 
     Attributes:
         sampler: of the run's pixels, which gradients are taken with.
-        points: of each line and measure.
-        theories: of each line.
-        families: of each line of the image: what it is recommended among.
-        again: points of settings that were recommended, from measurements after that.
+        lines: of each line and measure.
         references: as the report holds them.
         curves: of each policy.
         start: verified objective before any search.
         left_out: settings that did not fit into the time.
         warnings: sentences.
-        interrupted: whether the user stopped it.
     """
 
     sampler: str
-    points: dict[tuple[Line, str], list[Point]] = field(default_factory=dict)
-    theories: dict[Line, Theory] = field(default_factory=dict)
-    families: dict[Line, str] = field(default_factory=dict)
-    again: dict[tuple[Line, str], Point] = field(default_factory=dict)
+    lines: list[MeasuredLine] = field(default_factory=list)
     references: list[PrecisionReference] = field(default_factory=list)
     curves: list[tuple[MeasuredSetting, PolicyCurve]] = field(default_factory=list)
     start: float = math.nan
     left_out: tuple[MeasuredSetting, ...] = ()
     warnings: list[str] = field(default_factory=list)
-    interrupted: bool = False
 
-    def add(self, line: Line, points: Sequence[Point], theory: Theory) -> None:
-        """Keep the points of one line, all of one measure."""
-        self.points[line, points[0].measure] = sorted(points, key=lambda point: point.setting.spp)
-        self.theories[line] = theory
+    def to_dict(self) -> Json:
+        """Return JSON values, of which `of` makes the same again."""
+        values: Json = TypeAdapter(Section).dump_python(self, mode="json")
+        return values
+
+    @classmethod
+    def of(cls, values: Json) -> Section:
+        """Return what `to_dict` was made of."""
+        return TypeAdapter(cls).validate_python(values)
+
+    def extend(self, more: Section) -> None:
+        """Add what was measured in another part of the work."""
+        self.lines += more.lines
+        self.references += more.references
+        self.curves += more.curves
+        self.start = self.start if math.isnan(more.start) else more.start
+        self.left_out += more.left_out
+        self.warnings += more.warnings
 
     def recommended(self, quantity: str, control: str, goal: float) -> Recommended | None:
         """Return the setting that reaches a goal soonest, by what was measured so far."""
@@ -98,13 +125,15 @@ class Section:
         )
 
 
-def report_of(head: Json, section: Section, goal: float, seconds: Mapping[str, float]) -> PrecisionResult:
+def report_of(head: Json, section: Section, goal: float) -> PrecisionResult:
     """Return the report: what was asked for (`head`), what was measured and what follows from it; no figures yet."""
-    slopes = _slopes(section)
-    for slope in slopes:
-        line = (slope.quantity, slope.control or "", slope.estimator)
-        said = warning_of(slope, section.points[line, slope.measure])
-        section.warnings += [said] if said else []
+    slopes, warnings = [], list(section.warnings)
+    for one in section.lines:
+        for against in AGAINST:
+            slope = fit(one.points, against, one.theory)
+            said = None if slope is None else warning_of(slope, one.points)
+            slopes += [] if slope is None else [slope]
+            warnings += [] if said is None else [said]
     return PrecisionResult(
         **head,
         goal=goal,
@@ -112,10 +141,8 @@ def report_of(head: Json, section: Section, goal: float, seconds: Mapping[str, f
         slopes=slopes,
         references=section.references,
         recommendations=_recommended(section, goal) + _policy(section, goal),
-        warnings=section.warnings + (["interrupted: only a part was measured"] if section.interrupted else []),
+        warnings=warnings,
         left_out=[NotMeasured(**_place(one), reason="did not fit into the time") for one in section.left_out],
-        seconds=dict(seconds),
-        interrupted=section.interrupted,
         figures=[],
     )
 
@@ -123,28 +150,18 @@ def report_of(head: Json, section: Section, goal: float, seconds: Mapping[str, f
 # ---- inside ---------------------------------------------------------------------------------------------------------
 
 
-def _slopes(section: Section) -> list[PrecisionSlope]:
-    found = []
-    for (line, _), points in section.points.items():
-        for against in AGAINST:
-            slope = fit(points, against, section.theories[line])
-            if slope is not None:
-                found.append(slope)
-    return found
-
-
 def _points(section: Section) -> list[PrecisionPoint]:
     """One entry a setting; the margin's error stands beside the picture's."""
     found: dict[tuple[Line, int], Json] = {}
-    for (line, measure), points in section.points.items():
-        for point in points:
-            entry = found.setdefault((line, point.setting.spp), _place(point.setting))
-            own = measure.removesuffix("error")  # "margin_", or nothing
-            entry |= {measure: point.error, f"{own}interval": point.interval, f"{own}known": point.known}
+    for one in section.lines:
+        for point in one.points:
+            entry = found.setdefault((one.line, point.setting.spp), _place(point.setting))
+            own = one.measure.removesuffix("error")  # "margin_", or nothing
+            entry |= {one.measure: point.error, f"{own}interval": point.interval, f"{own}known": point.known}
             entry[f"{own}reference_error"] = point.floor
             entry |= {"seconds": point.seconds, "repeats": point.repeats, **point.more}
-            if line in section.families:
-                entry["family"] = section.families[line]
+            if one.family:
+                entry["family"] = one.family
     return [*map(PrecisionPoint.of, found.values()), *_objective_points(section)]
 
 
@@ -174,21 +191,20 @@ def _place(setting: MeasuredSetting) -> Json:
 
 def _recommended(section: Section, goal: float) -> list[Recommended]:
     """For each thing that can be asked for: the setting that reaches the goal soonest, if any does."""
-    asked: dict[tuple[str, str, str, str], dict[Line, Sequence[Point]]] = {}
-    for (line, measure), points in section.points.items():
-        family = section.families.get(line, "")
-        if measure == "margin_error" and family == "depth":
+    asked: dict[tuple[str, str, str, str], dict[Line, MeasuredLine]] = {}
+    for each in section.lines:
+        if each.measure == "margin_error" and each.family == "depth":
             continue
-        asked.setdefault((line[0], line[1], measure, family), {})[line] = points
+        asked.setdefault((*each.line[:2], each.measure, each.family), {})[each.line] = each
     found = []
     for (quantity, control, measure, family), lines in asked.items():
         round_up = rounding(section, quantity)
-        one = recommend(lines, goal, round_up)
+        one = recommend({line: each.points for line, each in lines.items()}, goal, round_up)
         if one is None:
             one = Recommended(quantity=quantity, control=control or None, measure=measure, among=None, estimator=None)
-        again = section.again.get(((quantity, control, one.estimator or ""), measure))
-        if again is not None:
-            one = confirmed(one, again, round_up)
+        chosen = lines.get((quantity, control, one.estimator or ""))
+        if chosen is not None and chosen.again is not None:
+            one = confirmed(one, chosen.again, round_up)
         found.append(one.model_copy(update={"among": FAMILIES.get(family)}))
     return found
 

@@ -7,7 +7,7 @@ from typing import ClassVar, NamedTuple
 
 from pydantic import Field
 
-from advsearch.runs.results.base import Fields, Formation, Interval, Number, Result
+from advsearch.runs.results.base import Fields, Formation, Interval, Number, RunResult
 
 
 class MeasuredError(NamedTuple):
@@ -121,22 +121,18 @@ class Machine(Fields):
     python: str
 
 
-class PrecisionResult(Result):
-    """Error against run time, and what follows from it."""
+class PrecisionResult(RunResult):
+    """Error against run time, and what follows from it, as far as that is measured."""
 
     command: ClassVar[str] = "precision"
 
-    run: str | None
     object: str
     model: str
-    environment: str
-    controls: list[str]
     image_formation: Formation
     depth: int = Field(description="longest light path in segments")
     loss: str
     objective: str
     spp: int
-    seed: int
     machine: Machine
     goal: float = Field(description="relative error that is wanted")
     points: list[PrecisionPoint]
@@ -145,6 +141,4 @@ class PrecisionResult(Result):
     recommendations: list[Recommended]
     warnings: list[str] = Field(description="sentences that a reader has to know")
     left_out: list[NotMeasured]
-    seconds: dict[str, float]
-    interrupted: bool
     figures: list[str]
