@@ -14,7 +14,7 @@ import advsearch
 from advsearch.controls import make_space
 from advsearch.controls.camera import CameraControl
 from advsearch.controls.occlusion.control import BUNDLED, OPTIONS, OcclusionControl, Placement
-from advsearch.controls.occlusion.occluders import loaded, made
+from advsearch.controls.occlusion.occluders import loaded, made, sphere
 from advsearch.controls.pose import PoseControl
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import SceneDescription, describe
@@ -91,6 +91,15 @@ def test_the_occluders_offered_are_there() -> None:
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         assert float((high - low).max()) == pytest.approx(1.0, abs=1e-5)
         np.testing.assert_allclose(low + high, 0.0, atol=1e-5)
+
+
+def test_the_sphere_is_closed_and_faces_outwards() -> None:
+    mesh = sphere(8, 12)
+    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    normal = np.cross(b - a, c - a)
+    assert len(mesh.faces) == 2 * 7 * 12
+    assert (np.linalg.norm(normal, axis=1) > 0.0).all()
+    assert ((normal * (a + b + c) / 3.0).sum(axis=1) > 0.0).all()
 
 
 @pytest.mark.parametrize("which", ["card", "sphere", "chair"])

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
@@ -19,7 +18,6 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.evaluation.stability import suite
 from advsearch.evaluation.stability.case import holds
 from advsearch.evaluation.stability.cases_noise import clipped_mean, median_of_means
-from advsearch.evaluation.stability.scene import sphere
 from advsearch.evaluation.stability.search import Toy, condition_number, hessian, numbers, quadratic
 from advsearch.evaluation.stability.suite import CASES, FELL_SHORT, GROUPS, OK, Case, Check, Outcome, chosen, run_case
 from advsearch.runs.directory import RunDirectory, find_run
@@ -264,15 +262,6 @@ def test_median_of_means_and_clipping_ignore_one_huge_sample() -> None:
     assert torch.equal(median_of_means(samples), torch.ones(3))
     assert float((clipped_mean(samples) - 1.0).abs().max()) < 0.1
     assert torch.equal(median_of_means(samples.expand(2, 24, 3)), torch.ones(2, 3))
-
-
-def test_the_sphere_is_closed_and_faces_outwards() -> None:
-    mesh = sphere(8, 12)
-    a, b, c = (mesh.vertices[mesh.faces[:, k]].astype(np.float64) for k in range(3))
-    normal = np.cross(b - a, c - a)
-    assert len(mesh.faces) == 2 * 7 * 12
-    assert (np.linalg.norm(normal, axis=1) > 0.0).all()
-    assert ((normal * ((a + b + c) / 3.0 - [0.0, 0.0, 0.5])).sum(axis=1) > 0.0).all()
 
 
 def test_a_toy_counts_its_cost_and_breaks_where_it_is_told_to() -> None:

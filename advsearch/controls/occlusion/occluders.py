@@ -43,7 +43,7 @@ def made(name: str) -> ObjectAsset:
         texels += 0.012 * np.sin(np.arange(64) * math.pi / 2.0)[:, None, None]  # the flutes under the paper
         return ObjectAsset(name, _card(), texels.clip(0.0, 1.0).astype(np.float32), Material(roughness=0.9))
     grey = np.full((4, 4, 3), 0.5, dtype=np.float32)
-    return ObjectAsset(name, _sphere(24, 48), grey, Material(roughness=0.6))
+    return ObjectAsset(name, sphere(24, 48), grey, Material(roughness=0.6))
 
 
 def _card() -> Mesh:
@@ -54,8 +54,8 @@ def _card() -> Mesh:
     return Mesh(vertices, np.array([(0, 1, 2), (0, 2, 3)], dtype=np.uint32), normals, uvs)
 
 
-def _sphere(rows: int, columns: int) -> Mesh:
-    """A sphere of diameter 1 with `rows` bands from pole to pole."""
+def sphere(rows: int, columns: int) -> Mesh:
+    """Return a sphere of diameter 1 around the origin: `rows` bands from pole to pole, 2 (rows - 1) columns faces."""
     v, u = (
         one.ravel() for one in np.meshgrid(np.linspace(0, 1, rows + 1), np.linspace(0, 1, columns + 1), indexing="ij")
     )

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from advsearch.controls.occlusion.occluders import sphere
 from advsearch.engine.gradients import smooth_loss
 from advsearch.evaluation.stability.case import CaseGroup, Check, Outcome, holds
 from advsearch.evaluation.stability.scene import (
@@ -23,10 +24,9 @@ from advsearch.evaluation.stability.scene import (
     examine,
     mesh_of,
     small,
-    sphere,
     thing,
 )
-from advsearch.scene.assets import Mesh
+from advsearch.scene.assets import Mesh, normalised
 from advsearch.scene.importing.objects import import_object
 
 QUAD = [[0.0, -0.5, 0.0], [0.0, 0.5, 0.0], [0.0, 0.5, 1.0], [0.0, -0.5, 1.0]]
@@ -113,9 +113,9 @@ def one_triangle() -> Outcome:
 )
 def million() -> Outcome:
     """A sphere of a million triangles: painted, and moved once each way."""
-    fine = sphere(501, 1000)
+    fine, rough = (normalised(sphere(*counts)) for counts in ((501, 1000), (64, 128)))
     found = examine(small(thing(fine), {"texture": {"resolution": 8}}), evaluations=2)
-    coarse, renderer = (small(thing(one), {"pose": {"x": [-0.3, 0.3]}}) for one in (sphere(64, 128), fine))
+    coarse, renderer = (small(thing(one), {"pose": {"x": [-0.3, 0.3]}}) for one in (rough, fine))
     _, slope = renderer.gradient(smooth_loss(renderer.formation.resolution), renderer.start, 0, SPP)
     with torch.no_grad():
         apart = float((renderer(renderer.start, 0, 64) - coarse(coarse.start, 0, 64)).abs().mean())

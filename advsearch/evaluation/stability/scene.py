@@ -92,26 +92,6 @@ def mesh_of(vertices: Sequence[Sequence[float]], faces: Sequence[Sequence[int]])
     return Mesh(points, np.asarray(faces, np.uint32), facing.astype(np.float32), uvs.astype(np.float32))
 
 
-def sphere(rows: int, columns: int) -> Mesh:
-    """Return a sphere of diameter 1 on z = 0 with 2 * (rows - 1) * columns triangles."""
-    polar = np.linspace(0.0, np.pi, rows + 1)[:, None]
-    around = np.linspace(0.0, 2.0 * np.pi, columns + 1)[None, :]
-    unit = np.stack(
-        np.broadcast_arrays(np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)), axis=-1
-    ).reshape(-1, 3)
-    u, v = np.broadcast_arrays(around / (2.0 * np.pi), 1.0 - polar / np.pi)
-    corner = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).reshape(-1)
-    below = corner + columns + 1
-    upper = np.stack([corner, below, corner + 1], axis=1)[columns:]
-    lower = np.stack([corner + 1, below, below + 1], axis=1)[:-columns]
-    return Mesh(
-        (0.5 * unit + np.array([0.0, 0.0, 0.5])).astype(np.float32),
-        np.concatenate([upper, lower]).astype(np.uint32),
-        unit.astype(np.float32),
-        np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float32),
-    )
-
-
 def thing(mesh: Mesh) -> ObjectAsset:
     """Return an object with a checked texture around a display-referred grey."""
     checks = np.indices((4, 4)).sum(axis=0) % 2
