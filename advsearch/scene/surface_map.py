@@ -121,6 +121,26 @@ def rasterised(mesh: Mesh, resolution: int) -> Charts:
     return Charts(mesh, face_map[tuple(nearest)], weight_map[tuple(nearest)], covered, distance)
 
 
+def looked_up(texels: Floats, x: npt.NDArray[np.floating], y: npt.NDArray[np.floating]) -> Floats:
+    """Look a repeating texture up with bilinear interpolation of its values.
+
+    Args:
+        texels: (H, W, C) float32.
+        x, y: (...) column and row, any number of textures away; integers are texel centres.
+
+    Returns:
+        (..., C) float32.
+    """
+    height, width = texels.shape[:2]
+    left, top = np.floor(x), np.floor(y)
+    fx, fy = (x - left).astype(np.float32)[..., None], (y - top).astype(np.float32)[..., None]
+    columns = [((left + k) % width).astype(np.int64) for k in (0, 1)]
+    rows = [((top + k) % height).astype(np.int64) for k in (0, 1)]
+    upper = texels[rows[0], columns[0]] * (1 - fx) + texels[rows[0], columns[1]] * fx
+    lower = texels[rows[1], columns[0]] * (1 - fx) + texels[rows[1], columns[1]] * fx
+    return np.asarray(upper * (1 - fy) + lower * fy, dtype=np.float32)
+
+
 class MeshSurface:
     """The faces of a mesh, ready for rays and for neighbourhoods.
 

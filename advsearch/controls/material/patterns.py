@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.scene.assets import Floats, Material, Mesh
-from advsearch.scene.surface_map import texel_positions
+from advsearch.scene.surface_map import looked_up, texel_positions
 
 Doubles = npt.NDArray[np.float64]
 Grid = tuple[Doubles, Doubles]
@@ -384,7 +384,7 @@ def covering(mesh: Mesh, name: str, side: int = SIDE) -> Floats:
     weights /= weights.sum(axis=-1, keepdims=True)
     texels = np.zeros((side, side, 3), dtype=np.float32)
     for axis, (right, up) in enumerate(((1, 2), (0, 2), (0, 1))):
-        seen = _looked_up(tile(name), positions[..., right] * scale, -positions[..., up] * scale)
+        seen = looked_up(tile(name), positions[..., right] * scale, -positions[..., up] * scale)
         texels += weights[..., axis : axis + 1] * seen
     return texels
 
@@ -394,14 +394,3 @@ def _places(mesh: Mesh, side: int) -> tuple[Floats, Floats]:
     """Positions and normals (side, side, 3) behind the texels of a mesh."""
     positions, normals, _ = texel_positions(mesh, side)
     return positions, normals
-
-
-def _looked_up(texels: Floats, x: Floats, y: Floats) -> Floats:
-    """Bilinear lookup in a tile at x to the right and y down, in texels, any number of tiles away."""
-    left, top = np.floor(x), np.floor(y)
-    fx, fy = (x - left)[..., None], (y - top)[..., None]
-    column, row = left.astype(np.int64) % SIDE, top.astype(np.int64) % SIDE
-    right, below = (column + 1) % SIDE, (row + 1) % SIDE
-    upper = texels[row, column] * (1.0 - fx) + texels[row, right] * fx
-    lower = texels[below, column] * (1.0 - fx) + texels[below, right] * fx
-    return np.asarray(upper * (1.0 - fy) + lower * fy, dtype=np.float32)

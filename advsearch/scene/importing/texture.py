@@ -19,7 +19,8 @@ from advsearch.scene.importing.geometry import Array, Soup
 from advsearch.scene.importing.images import TEXTURE_LIMIT
 from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface
 from advsearch.scene.importing.unwrap import unwrapped
-from advsearch.scene.raster import pixels_in
+from advsearch.scene.raster import doubled_areas, pixels_in
+from advsearch.scene.surface_map import looked_up
 
 Floats = npt.NDArray[np.float32]
 
@@ -93,17 +94,11 @@ def _tinted(color: npt.NDArray[np.floating], factor: npt.NDArray[np.floating]) -
 # --- the file's UVs ----------------------------------------
 
 
-def uv_areas(uvs: Array) -> Array:
-    """Return the (F,) signed areas of the faces in UV space, for uvs of shape (F, 3, 2)."""
-    a, b = uvs[:, 1] - uvs[:, 0], uvs[:, 2] - uvs[:, 0]
-    return (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / 2.0
-
-
 def _usable(soup: Soup, uvs: Array) -> bool:
     """Tell whether UVs are known, inside the unit square, not squashed to lines, and use the square."""
     if not np.isfinite(uvs).all() or uvs.min() < -_SLACK or uvs.max() > 1.0 + _SLACK:
         return False
-    flat, surface = np.abs(uv_areas(uvs)), np.linalg.norm(soup.face_vectors(), axis=1)
+    flat, surface = np.abs(doubled_areas(uvs)) / 2.0, np.linalg.norm(soup.face_vectors(), axis=1)
     return bool(surface[flat < 1e-12].sum() <= _SQUASHED * surface.sum() and flat.sum() >= _CRAMPED)
 
 
@@ -133,7 +128,7 @@ def _windowed(uvs: Array, texture: Floats) -> tuple[Array, Floats]:
     low, high = uvs.min(axis=(0, 1)) - texel, uvs.max(axis=(0, 1)) + texel
     size = high - low
     inside = low.min() >= -_SLACK - texel.max() and high.max() <= 1.0 + _SLACK + texel.max()
-    if size.max() > _WINDOW or (inside and np.abs(uv_areas(uvs)).sum() >= _CRAMPED):
+    if size.max() > _WINDOW or (inside and np.abs(doubled_areas(uvs)).sum() / 2.0 >= _CRAMPED):
         return uvs, texture
     width, height = np.clip(np.ceil(size / texel), 1, TEXTURE_LIMIT).astype(int)
     columns = low[0] + (np.arange(width) + 0.5) / width * size[0]
@@ -183,7 +178,7 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Floats
 
 def _baked_size(soup: Soup, surfaces: Sequence[ImportedSurface]) -> int:
     """Return a power of two, `BAKED_SIZE` to `TEXTURE_LIMIT`, that has room for the texels that the object shows."""
-    texels, areas = 0.0, np.nan_to_num(np.abs(uv_areas(soup.uvs)))
+    texels, areas = 0.0, np.nan_to_num(np.abs(doubled_areas(soup.uvs)) / 2.0)
     for number, area in enumerate(np.bincount(soup.part, areas)):
         texture = surfaces[number].texture
         if texture is not None:
@@ -212,11 +207,4 @@ def sampled(texture: Floats, uvs: Array) -> Floats:
     """
     height, width = texture.shape[:2]
     u, v = (uvs % 1.0).T  # first, since a huge number times a width is infinite
-    x, y = u * width - 0.5, (1.0 - v) * height - 0.5
-    left, top = np.floor(x), np.floor(y)
-    fx, fy = (x - left).astype(np.float32)[:, None], (y - top).astype(np.float32)[:, None]
-    columns = [((left + k) % width).astype(np.int64) for k in (0, 1)]
-    rows = [((top + k) % height).astype(np.int64) for k in (0, 1)]
-    upper = texture[rows[0], columns[0]] * (1 - fx) + texture[rows[0], columns[1]] * fx
-    lower = texture[rows[1], columns[0]] * (1 - fx) + texture[rows[1], columns[1]] * fx
-    return np.asarray(upper * (1 - fy) + lower * fy, dtype=np.float32)
+    return looked_up(texture, u * width - 0.5, (1.0 - v) * height - 0.5)
