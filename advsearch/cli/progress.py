@@ -10,9 +10,9 @@ from contextlib import contextmanager, nullcontext
 from typing import TYPE_CHECKING, TextIO
 
 from advsearch.cli.flags import with_flags
-from advsearch.cli.interrupts import LoadingProgress
 from advsearch.cli.output import output_kept_clean
 from advsearch.cli.screen import printable, raw
+from advsearch.interrupts import INTERRUPTS
 from advsearch.progress import NullProgress, Progress
 
 if TYPE_CHECKING:
@@ -28,6 +28,9 @@ LINE_INTERVAL, LINE_SHARE = 5.0, 0.1
 
 MOST_BARS = 5
 """Stages that a terminal shows at once."""
+
+LOADING_STAGES = 2
+"""The first stages of a command: modules are imported, then a scene and a model are loaded, which imports more."""
 
 
 @contextmanager
@@ -52,6 +55,49 @@ def watching(*, quiet: bool = False) -> Iterator[Progress]:
         lines = LineProgress(sys.stderr)
         with _called_every_second(lines.tick):
             yield lines
+
+
+class LoadingProgress:
+    """A watcher that raises an interrupt which came while something was loaded, when that stage ends.
+
+    Modules that are being imported and native code make other errors of an interrupt, or none. After `LOADING_STAGES`
+    all that catches one is ours and answers it.
+
+    Args:
+        progress: is told everything.
+    """
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._begun = 0
+
+    def stage(self, name: str, total: int | None = None, *, hint: str = "", at_most: bool = False) -> None:
+        """See `Progress.stage`.
+
+        Raises:
+            KeyboardInterrupt: one came while something was loaded.
+        """
+        if self._begun <= LOADING_STAGES:
+            INTERRUPTS.check()
+        self._begun += 1
+        self._progress.stage(name, total, hint=hint, at_most=at_most)
+
+    def advance(self, n: int = 1, **info: float | str) -> None:
+        """See `Progress.advance`."""
+        self._progress.advance(n, **info)
+
+    def message(self, text: str) -> None:
+        """See `Progress.message`."""
+        self._progress.message(text)
+
+    def end(self) -> None:
+        """End the work.
+
+        Raises:
+            KeyboardInterrupt: nothing but imports was there, and one came meanwhile.
+        """
+        if self._begun < LOADING_STAGES:
+            INTERRUPTS.check()
 
 
 class LineProgress:

@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     from advsearch.runs.directory import CONFIG, find_run
     from advsearch.runs.listing import finished
 
-    path = find_run(args.run)
+    path, changes = find_run(args.run), changes_in(args.change)
     if not (path / CONFIG).is_file():
         raise InputError(f"{path}: expected a run with its {CONFIG}, got none; it was stopped before it began")
     if finished(path):
@@ -50,4 +50,4 @@ def run(args: argparse.Namespace) -> int:
 
         print(f"advsearch: {path} is done already", file=sys.stderr)
         return show_run(str(path), args.json)
-    return carry_out(command_in(path / CONFIG), path / CONFIG, changes_in(args.change), args, resumed=path)
+    return carry_out(command_in(path / CONFIG), path / CONFIG, changes, args, resumed=path)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from advsearch.cli import output
 from advsearch.errors import InputError
 
+MOST_NAMES = 4
+"""Controls of a run that the table names."""
 HELP = "list the runs in a folder and how each ended"
 
 
@@ -37,8 +40,14 @@ def run(args: argparse.Namespace) -> int:
         return 0
     heads = ["run", "command", "object", "controls", "rows", "state", "answer"]
     rows = [
-        [one.name, one.command, one.object, ",".join(one.controls), str(one.rows), one.state, one.answer]
+        [one.name, one.command, one.object, _several(one.controls), str(one.rows), one.state, one.answer]
         for one in found
     ]
     print(output.columns([heads, *rows]))
     return 0
+
+
+def _several(names: Sequence[str]) -> str:
+    """The first few of some names, and how many more there are."""
+    more = len(names) - MOST_NAMES
+    return ",".join(names) if more <= 1 else f"{','.join(names[:MOST_NAMES])} and {more} more"

@@ -570,6 +570,8 @@ def test_resume_of_a_run_that_is_done_shows_its_answer(
     api()
     assert main(["resume", "done"]) == 0
     assert capsys.readouterr() == (answer(SUMMARY) + "\n", "advsearch: runs/done is done already\n")
+    assert main(["resume", "done", "seconds"]) == 2
+    assert "seconds" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -600,6 +602,14 @@ def test_runs_are_listed(runs: Path, capsys: pytest.CaptureFixture[str]) -> None
         ("done", "found", 80),
         ("killed", "stopped", 2),
     ]
+
+
+def test_a_run_over_many_controls_takes_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    many = {name: {} for name in ("pose", "camera", "texture", "light", "haze", "lens")}
+    with RunDirectory.create_for(AttackConfig(object="mug", controls=many, run=str(tmp_path / "a"))):
+        pass
+    assert main(["runs", str(tmp_path)]) == 0
+    assert "   pose,camera,texture,light and 2 more   " in capsys.readouterr().out
 
 
 def test_a_run_that_was_stopped_says_how_far_it_came_and_how_to_go_on(
