@@ -78,7 +78,7 @@ class StandInProblem:
 
         return evaluate
 
-    def trial(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True) -> Judgement:
+    def trial(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True, keep: object = None) -> Judgement:
         time.sleep(self.pause)
         return judged(self._logits(u, seed))
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 
 from scipy.special import stdtrit
 
@@ -29,7 +29,10 @@ The drift left above the upper rung is smaller than the one that led there, so a
 """
 
 SEEDS = 8
-"""Renders of a configuration at each sample count."""
+"""Renders of a configuration at each sample count, at most."""
+
+LOOKS = 2
+"""How often the renders of a sample count are looked at: after half of them, and after all."""
 
 MarginOf = Callable[[int, int], float]
 """(spp, seed) -> margin in logits of one render."""
@@ -43,7 +46,8 @@ class Rung:
         name: which configuration, e.g. "clean".
         spp: samples per pixel.
         mean: mean margin over the seeds.
-        half_width: of the 95 % interval of the mean (Student's t).
+        half_width: of the interval of the mean (Student's t) that is right in 97.5 % of all cases: after each of two
+            looks, and so in 95 % after both.
         drift: mean here minus mean at the rung below; NaN at the first.
         settled: whether the drift is small enough; see `choose_spp`.
     """
@@ -85,18 +89,21 @@ def choose_spp(
 
     A configuration has settled at a rung with mean margin m when, against the rung below,
 
-        |change of the mean| + 95 % half-width of that change <= drift * |m|.
+        |change of the mean| + half-width of that change <= drift * |m|.
 
     So the change must be *shown* to be small (that it is smaller than its own uncertainty would pass any measurement
     that is noisy enough), and small against the distance to the decision at margin zero. The error still left at the
     upper rung is smaller than the change that led there, since it falls with the sample count. A margin near zero
     never settles: its verdict does depend on the noise, and `converged` says so.
 
+    The rungs are looked at after half of the renders, and once more after all of them if that does not settle it. Each
+    look has intervals of 97.5 %, so that both together are wrong in 5 % of all cases at most (Bonferroni).
+
     Args:
         margins: the configurations, e.g. {"clean": ..., "adversarial": ...}; each renders once per call.
         seed: root seed; every render gets another seed of the stream "sample count".
         ladder: sample counts, rising, at least one. A single one is returned as it is, unmeasured and not converged.
-        seeds: renders per configuration and rung, at least 2.
+        seeds: renders per configuration and rung at most, at least 4.
         drift: see above, in (0, 1).
 
     Raises:
@@ -104,22 +111,27 @@ def choose_spp(
     """
     if not ladder or ladder[0] < 1 or any(b <= a for a, b in pairwise(ladder)):
         raise InputError(f"verify_spp: expected rising sample counts of at least 1, got {list(ladder)}")
-    if seeds < 2 or not 0.0 < drift < 1.0:
-        raise InputError(f"seeds and drift: expected at least 2 and a number in (0, 1), got {seeds} and {drift}")
+    if seeds < 4 or not 0.0 < drift < 1.0:
+        raise InputError(f"seeds and drift: expected at least 4 and a number in (0, 1), got {seeds} and {drift}")
     if len(ladder) == 1:
         return SampleCount(ladder[0], False, (), 0)
-    table: list[Rung] = []
-    below: dict[str, Rung] = {}
-    for level, spp in enumerate(ladder):
-        here = {}
-        for name, margin_of in margins.items():
-            values = [margin_of(spp, stream(seed, "sample count", level * seeds + k)) for k in range(seeds)]
-            here[name] = _rung(name, spp, values, below.get(name), drift)
-        table += here.values()
-        if all(rung.settled for rung in here.values()):
-            return SampleCount(spp, True, tuple(table), len(table) * seeds)
-        below = here
-    return SampleCount(ladder[-1], False, tuple(table), len(table) * seeds)
+    values: dict[tuple[str, int], list[float]] = {(name, level): [] for name in margins for level in range(len(ladder))}
+
+    def rung(name: str, level: int, count: int) -> Rung:
+        """The summary of at least so many renders."""
+        found = values[name, level]
+        for number in range(len(found), count):
+            found.append(margins[name](ladder[level], stream(seed, "sample count", level * seeds + number)))
+        below = _rung(name, ladder[level - 1], values[name, level - 1], None, drift) if level else None
+        return _rung(name, ladder[level], found, below, drift)
+
+    for level, count in product(range(1, len(ladder)), (seeds // LOOKS, seeds)):
+        two = [[rung(name, one, count) for name in margins] for one in (level - 1, level)]
+        settled = all(one.settled for one in two[1])
+        if settled:
+            break
+    reached = [rung(name, one, 0) for one in range(level + 1) for name in margins]
+    return SampleCount(ladder[level], settled, tuple(reached), sum(map(len, values.values())))
 
 
 def most_samples(configurations: int, ladder: Sequence[int] = LADDER, seeds: int = SEEDS) -> int:
@@ -132,7 +144,8 @@ def _rung(name: str, spp: int, values: list[float], below: Rung | None, drift: f
     count = len(values)
     mean = math.fsum(values) / count
     deviation = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / (count - 1))
-    half_width = float(stdtrit(count - 1, (1.0 + CONFIDENCE) / 2.0)) * deviation / math.sqrt(count)
+    tail = (1.0 - CONFIDENCE) / LOOKS / 2.0
+    half_width = float(stdtrit(count - 1, 1.0 - tail)) * deviation / math.sqrt(count)
     if below is None:
         return Rung(name, spp, mean, half_width, math.nan, False)
     change = mean - below.mean

@@ -71,6 +71,10 @@ class Rule:
         """
         return trial.success and (clean.right if self.control else trial.score > clean.score)
 
+    def counted(self, clean: Sequence[Judgement]) -> int:
+        """Return how many trials count, beside these of the clean configuration."""
+        return sum(trial.right for trial in clean) if self.conditional else len(clean)
+
     def already_wrong(self, clean: Trials) -> bool:
         """Whether a clean configuration is no start at all: right in less than half of its trials."""
         return self.control and 2 * clean.successes < clean.trials
@@ -127,7 +131,8 @@ class Verification:
         u: (d,) the configuration verified, projected into its budget again.
         clean: right answers of the control group.
         adversarial: successes, by `Rule.succeeded`.
-        clean_trials, adversarial_trials: every single trial, in the order of their seeds.
+        clean_trials, adversarial_trials: every single trial, in the order of their seeds; of curtailed ones the second
+            group is the shorter.
         renders: renders spent here.
     """
 
@@ -150,10 +155,12 @@ def run_trials(
     trials: int = 20,
     group: str = "adversarial",
     on_trial: OnTrial | None = None,
+    until: Callable[[Sequence[Judgement]], bool] = lambda done: False,
 ) -> tuple[Judgement, ...]:
     """Render and judge one configuration `trials` times, trial k with seed k of the stream "verification".
 
-    Two groups run with the same root seed get the same seeds, trial by trial, which is what a control group needs.
+    Two groups run with the same root seed get the same seeds, trial by trial, which is what a control group needs. They
+    end sooner where `until`, asked after every trial, says so.
 
     Raises:
         InputError: trials or spp under 1.
@@ -162,12 +169,14 @@ def run_trials(
         raise InputError(f"trials: expected at least 1, got {trials}")
     if spp < 1:
         raise InputError(f"verify_spp: expected at least 1, got {spp}")
-    done = []
+    done: list[Judgement] = []
     for number in range(trials):
         trial = render_trial(u, stream(seed, "verification", number), spp)
         done.append(trial)
         if on_trial is not None:
             on_trial(group, number, trial)
+        if until(done):
+            break
     return tuple(done)
 
 
@@ -188,11 +197,17 @@ def verify(
     clean: Sequence[Judgement] | None = None,
     rule: Rule = WORST_CASE,
     on_trial: OnTrial | None = None,
+    curtailed: bool = False,
 ) -> Verification:
     """Check a search's answer in fresh trials against the clean configuration as control group.
 
     See `Rule` for what counts as a success, and for the ending. KeyboardInterrupt passes
     through.
+
+    Curtailed trials end with the first failure that is one more than the rule allows of all of them. The verdict is
+    that of all trials, whatever the rest would have said, and the Clopper-Pearson interval of those that were made
+    still covers the rate as often as it says: it contains the exact interval of that stopping rule, under which an
+    outcome is the better the later it stops (Jennison and Turnbull 1983).
 
     Args:
         render_trial: renders one configuration with one seed, rounds to 8 bits, asks the model and judges.
@@ -206,11 +221,12 @@ def verify(
             (one control group serves the attack and its baseline).
         rule: when the claim counts.
         on_trial: called after every trial.
+        curtailed: see above; for an answer of which only the verdict matters.
 
     Raises:
         InputError: trials or spp under 1, or `clean` has another length.
     """
-    renders = trials if clean is not None else 2 * trials
+    own = clean is None
     if clean is None:
         clean = run_trials(
             render_trial,
@@ -224,14 +240,22 @@ def verify(
     if len(clean) != trials:
         raise InputError(f"clean trials: expected {trials}, as many as `trials`, got {len(clean)}")
     u = domain.project(u)
-    adversarial = run_trials(render_trial, u, spp=spp, seed=seed, trials=trials, on_trial=on_trial)
     control = count_right(clean, spp)
-    successes = sum(map(rule.succeeded, adversarial, clean))
-    counted = max(1, control.successes) if rule.conditional else trials
+    allowed = rule.allowed(rule.counted(clean))
+
+    def lost(done: Sequence[Judgement]) -> bool:
+        beside = clean[: len(done)]
+        return rule.counted(beside) - sum(map(rule.succeeded, done, beside)) > allowed
+
+    never = (lambda done: False) if not curtailed else lost
+    adversarial = run_trials(render_trial, u, spp=spp, seed=seed, trials=trials, on_trial=on_trial, until=never)
+    counted = max(1, rule.counted(clean[: len(adversarial)]))
+    successes = sum(rule.succeeded(trial, beside) for trial, beside in zip(adversarial, clean, strict=False))
     verified = Trials(successes, counted, spp)
     ending = rule.verdict(claim, control, verified)
     reason = (
         f"{ending.explanation} A success in {successes} of {counted} trials, {rule.needed(counted)} are needed; clean "
         f"right in {control.successes} of {trials}."
     )
+    renders = len(adversarial) + (trials if own else 0)
     return Verification(ending, reason, u, control, verified, tuple(clean), adversarial, renders)

@@ -6,14 +6,11 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings
+from advsearch.engine.record import KEPT, Findings
 from advsearch.report.marks import marked
 from advsearch.runs import images
 from advsearch.runs.directory import RunDirectory
 from advsearch.tasks import Mark
-
-VERIFIED = 4
-"""Pictures of the verification that are kept."""
 
 
 def write_pictures(
@@ -41,10 +38,12 @@ def write_pictures(
         save_marked(run, name, seen[name], problem.marks(seen[name], problem.whole(at)))
     run.save_image("difference", images.difference(seen["clean"], seen["adversarial"]))
     checked = findings.verification
-    for number in range(min(VERIFIED, len(checked.adversarial_trials) if checked else 0)):
+    kind = "verification" if findings.beaten is None else "baseline verification"
+    for number in range(min(KEPT, len(checked.adversarial_trials) if checked else 0)):
         assert checked is not None
         seed, name = seeds.stream(problem.seed, "verification", number), f"verification-{number:02d}"
-        picture = problem.picture(checked.u, seed, findings.spp)
+        picture = findings.pictures.get((kind, number))
+        picture = problem.picture(checked.u, seed, findings.spp) if picture is None else picture
         run.save_image(name, picture)
         save_marked(run, name, picture, problem.marks(picture, problem.whole(checked.u, seed)))
     if findings.frames:

@@ -142,9 +142,15 @@ class Problem:
         with torch.no_grad():
             return to_8_bit(self.renderer(self.whole(u, seed if drawn else None), seed=seed, spp=spp))
 
-    def trial(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True) -> Judgement:
-        """Render, round to 8 bits, ask and judge: one trial of a verification; arguments as for `picture`."""
-        return self.judge(self.picture(u, seed, spp, drawn=drawn), self.whole(u, seed if drawn else None))
+    def trial(
+        self, u: Tensor, seed: int, spp: int, *, drawn: bool = True, keep: Callable[[Tensor], None] | None = None
+    ) -> Judgement:
+        """Render, round to 8 bits, ask and judge: one trial of a verification; arguments as for `picture`, and who is
+        told it."""
+        picture = self.picture(u, seed, spp, drawn=drawn)
+        if keep is not None:
+            keep(picture)
+        return self.judge(picture, self.whole(u, seed if drawn else None))
 
     def judge(self, picture: Tensor, whole: Tensor) -> Judgement:
         """Return what the task says of the model's output for a picture (H, W, 3) of the whole space at `whole`."""

@@ -24,6 +24,10 @@ MEASURED = ("centre", "region", "map")
 """Kinds of trials that seek no answer but see what the model says."""
 
 
+KEPT = 4
+"""Pictures of each group of trials that are kept."""
+
+
 @dataclass
 class Findings:
     """What is known so far; whatever is still None or empty was not reached.
@@ -40,6 +44,8 @@ class Findings:
             the run's answer instead.
         average: trials of configurations drawn from the whole space.
         smallest: the least epsilon, where it was asked for.
+        pictures: of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind and number; of a run that goes on
+            only those that it made itself.
         frames: pictures of the search as 8-bit values in [0, 1], for the animation.
         interrupted: somebody pressed Ctrl-C.
         transport: what predicted the pictures of the searches, if anything did.
@@ -57,6 +63,7 @@ class Findings:
     beaten: Verification | None = None
     average: tuple[Judgement, ...] = ()
     smallest: Bracket | None = None
+    pictures: dict[tuple[str, int], Tensor] = field(default_factory=dict)
     frames: list[Any] = field(default_factory=list)
     interrupted: bool = False
     transport: Predictor | None = None

@@ -38,7 +38,7 @@ from advsearch.engine.gradients import inside
 from advsearch.engine.memory import PLAN, TRANSPORT, Frames, Memory
 from advsearch.engine.planning import cosine_samples, cosines, measured_plan, plan_gradients, tuned
 from advsearch.engine.problem import Problem
-from advsearch.engine.record import Findings, Recorder, Stages
+from advsearch.engine.record import KEPT, Findings, Recorder, Stages
 from advsearch.engine.transport import Transport, reason_against
 from advsearch.interrupts import interruptible
 from advsearch.report.wording import count
@@ -289,13 +289,14 @@ class Attack:
         answer = problem.domain.project(found.best_u)
         self.choose_spp({"clean": problem.domain.start, "adversarial": answer})
         groups = 1 + (baseline is not None) + (not self._clean_tried)
-        self._begin_trials("checking the answer with fresh renders", groups * self.budget.trials)
+        self._begin_trials("checking the answer with fresh renders", groups * self.budget.trials, at_most=True)
         self.clean_trials()
         findings.verification = self.verified("verification", found)
         if findings.verification.ending is Ending.ALREADY_WRONG:
             findings.smallest = None  # seen with other samples than before: no change at all flips the answer
         if baseline is not None:
-            findings.baseline_verification = self.verified("baseline verification", baseline)
+            decided = findings.verification.ending is Ending.FOUND
+            findings.baseline_verification = self.verified("baseline verification", baseline, curtailed=decided)
             self._take_the_worse(found, baseline)
 
     def _take_the_worse(self, found: SearchResult, baseline: SearchResult) -> None:
@@ -374,8 +375,8 @@ class Attack:
         """Whether the control group has been through its trials at this sample count."""
         return bool(self.findings.clean) and self._clean_spp == self.findings.spp
 
-    def verified(self, kind: str, found: SearchResult) -> Verification:
-        """Verify one search's answer against the control group."""
+    def verified(self, kind: str, found: SearchResult, *, curtailed: bool = False) -> Verification:
+        """Verify one search's answer against the control group; `curtailed` where only the verdict matters."""
         return run_verify(
             self._trial(kind),
             self.problem.domain,
@@ -387,6 +388,7 @@ class Attack:
             clean=self.findings.clean,
             rule=self.problem.rule,
             on_trial=self._teller(kind, self.problem.domain.project(found.best_u)),
+            curtailed=curtailed,
         )
 
     def _trial(self, kind: str) -> Callable[[Tensor, int, int], Judgement]:
@@ -396,7 +398,12 @@ class Attack:
         def trial(u: Tensor, seed: int, spp: int) -> Judgement:
             nonlocal count
             number, count = count, count + 1
-            return self.memory.trial(kind, number) or self.problem.trial(u, seed, spp)
+            stored = self.memory.trial(kind, number)
+            if stored is not None:
+                return stored
+            if number >= KEPT:
+                return self.problem.trial(u, seed, spp)
+            return self.problem.trial(u, seed, spp, keep=partial(self.findings.pictures.__setitem__, (kind, number)))
 
         return trial
 

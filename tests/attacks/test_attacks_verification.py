@@ -120,7 +120,7 @@ def drifting(limit: float, bias: float, noise: float) -> Callable[[int, int], fl
 
 def test_margins_that_do_not_drift_settle_at_the_second_rung() -> None:
     choice = choose_spp({"clean": drifting(-3.0, 0.0, 0.1), "adversarial": drifting(2.0, 0.0, 0.1)}, seed=0)
-    assert (choice.spp, choice.converged, choice.renders) == (16, True, 32)
+    assert (choice.spp, choice.converged, choice.renders) == (16, True, 16), "the first look is enough"
     assert [(r.name, r.spp) for r in choice.table] == [
         ("clean", 4),
         ("adversarial", 4),
@@ -135,6 +135,22 @@ def test_a_drifting_margin_climbs_until_it_stands(seed: int) -> None:
     choice = choose_spp({"clean": drifting(-3.0, 0, 0.1), "adversarial": drifting(3.0, 4.0, 0.5)}, seed=seed)
     assert choice.spp >= 256
     assert choice.converged
+
+
+def test_what_half_of_the_renders_do_not_settle_all_of_them_may() -> None:
+    """Margins around 2 that scatter by 0.5: too wide an interval for four renders, not for eight."""
+    choice = choose_spp({"adversarial": lambda spp, seed: 2.0 + 0.5 * (-1.0) ** (seed % 2)}, seed=2, ladder=(4, 16, 64))
+    assert (choice.spp, choice.converged, choice.renders) == (16, True, 16)
+
+
+def test_a_drift_beyond_the_bound_passes_in_one_case_of_twenty_at_most() -> None:
+    """Margins whose mean moves by just more than may be: as often as the two looks together are wrong."""
+
+    def moved(spp: int, seed: int) -> float:
+        return 4.0 - 2.05 * (spp == 4) + 0.3 * float(np.random.default_rng(seed).normal())
+
+    passed = sum(choose_spp({"adversarial": moved}, seed=seed, ladder=(4, 16)).converged for seed in range(400))
+    assert passed <= 0.05 * 400
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -306,6 +322,54 @@ def test_both_groups_get_the_same_fresh_seeds_and_the_control_can_be_shared() ->
     assert (shared.renders, shared.ending) == (6, Ending.FOUND)
     with pytest.raises(InputError, match="clean trials: expected 20, as many as `trials`, got 6"):
         verify(render, DOMAIN, WORST, claim=Ending.FOUND, spp=8, seed=5, clean=clean)
+
+
+def scripted(successes: str) -> Callable[[torch.Tensor, int, int], Judgement]:
+    """Trials of an answer that go as they are told, "1" a success; the clean one is right, but where "-" is told."""
+    told = {stream(0, "verification", number): what for number, what in enumerate(successes)}
+
+    def render(u: torch.Tensor, seed: int, spp: int) -> Judgement:
+        clean = torch.equal(u, DOMAIN.start)
+        return judged(1.0 if told[seed] == ("-" if clean else "1") else -1.0)
+
+    return render
+
+
+@pytest.mark.parametrize("rule", [WORST_CASE, OVER_CONDITIONS])
+@pytest.mark.parametrize("seed", range(40))
+def test_curtailed_trials_end_with_the_verdict_of_all(rule: Rule, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    share = rng.choice([0.0, 0.5, 0.85, 0.95])
+    told = "".join(rng.choice(["1", "0", "-"], p=[share, 0.9 * (1 - share), 0.1 * (1 - share)], size=20))
+    whole, short = (
+        verify(scripted(told), DOMAIN, WORST, claim=Ending.FOUND, spp=1, seed=0, rule=rule, curtailed=curtailed)
+        for curtailed in (False, True)
+    )
+    assert short.ending is whole.ending
+    assert short.adversarial_trials == whole.adversarial_trials[: len(short.adversarial_trials)]
+    assert short.renders == 20 + len(short.adversarial_trials)
+    if whole.ending is Ending.FOUND:
+        assert short.adversarial == whole.adversarial, "a success is tried to the end"
+
+
+def test_a_curtailed_answer_that_never_succeeds_is_tried_twice() -> None:
+    found = verify(scripted("0" * 20), DOMAIN, WORST, claim=Ending.BUDGET_SPENT, spp=1, seed=0, curtailed=True)
+    assert (found.adversarial.successes, found.adversarial.trials, found.ending) == (0, 2, Ending.BUDGET_SPENT)
+
+
+@pytest.mark.parametrize(("trials", "rule"), [(20, WORST_CASE), (6, WORST_CASE), (200, OVER_CONDITIONS)])
+def test_the_interval_of_curtailed_trials_covers_as_often_as_it_says(trials: int, rule: Rule) -> None:
+    """Exactly, by the probability of every outcome: the failure too many comes at trial n, or never."""
+    failures = rule.allowed(trials) + 1
+    for rate in np.linspace(0.005, 0.995, 199):
+        covered = 0.0
+        for n in range(failures, trials + 1):
+            low, high = clopper_pearson(n - failures, n)
+            covered += stats.nbinom.pmf(n - failures, failures, 1.0 - rate) * (low <= rate <= high)
+        for k in range(trials - failures + 1, trials + 1):
+            low, high = clopper_pearson(k, trials)
+            covered += stats.binom.pmf(k, trials, rate) * (low <= rate <= high)
+        assert covered >= 0.95 - 1e-9, rate
 
 
 def test_trials_are_reported_as_they_come() -> None:
