@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
@@ -21,6 +21,7 @@ from advsearch.files import JsonObject, read_text
 from advsearch.yaml_text import LARGEST, parse_yaml
 
 if TYPE_CHECKING:
+    from pydantic.fields import FieldInfo
     from typing_extensions import Self
 
 SCHEMA = 1
@@ -65,7 +66,7 @@ def setting(
     default: Any,
     group: str,
     description: str,
-    expects: str,
+    expects: str = "",
     *,
     unit: str = "",
     otherwise: str = "",
@@ -81,7 +82,8 @@ def setting(
         default: the default, a function that makes it, or ... for none.
         group: heading in the help.
         description: what it is.
-        expects: completes "expected ..." in errors, and names the range in the help.
+        expects: completes "expected ..." in errors, and names the range in the help; empty where type and constraints
+            say it.
         unit: of the value.
         otherwise: what a default of None comes to.
         flag: its flag, where that is not its name: "--control".
@@ -92,9 +94,17 @@ def setting(
     """
     notes: JsonObject = {"group": group, "expects": expects, "unit": unit, "otherwise": otherwise, "flag": flag}
     notes |= {"metavar": metavar, "form": form, "switched": switched}
+    declared: Any = {"default": default, "description": description, **notes, **constraints}
     alias = constraints.pop("alias", None)
     make = {"default_factory": default} if callable(default) else {"default": default}
-    return Field(**make, description=description, json_schema_extra=notes, alias=alias, **constraints)
+    extra = {**notes, "declared": declared}
+    return Field(**make, description=description, json_schema_extra=extra, alias=alias, **constraints)
+
+
+def setting_as_in(config: type[Config], field: str, **changes: Any) -> Any:
+    """Return a setting as another command declares it, but for some of the arguments of `setting`."""
+    extra: Any = config.model_fields[field].json_schema_extra
+    return setting(**{**extra["declared"], **changes})
 
 
 class Clash(NamedTuple):
@@ -185,6 +195,23 @@ class Config(BaseModel):
             return cls(**data)
         except SettingsError as error:
             raise SettingsError(error.problems, path) from None
+
+    @classmethod
+    def shared(cls, other: Config) -> dict[str, object]:
+        """Return the settings that this command and another's have from the same class, but for the run's place."""
+        both = next(one for one in cls.__mro__ if issubclass(one, Config) and isinstance(other, one))
+        apart = (*PLACE, *cls.without, *other.without)
+        return {name: getattr(other, name) for name in both.model_fields if name not in apart}
+
+    @classmethod
+    def of(cls, other: Config, **changes: object) -> Self:
+        """Return what another command's configuration describes as one of this, in a place of its own.
+
+        Args:
+            other: gives the settings that are `shared`.
+            **changes: settings that are different.
+        """
+        return cls(**{**cls.shared(other), **changes})
 
     def to_yaml(self) -> str:
         """Return the YAML form; `from_yaml` of it gives an equal configuration."""
@@ -289,7 +316,7 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
                 flag=notes["flag"] or "--" + field.replace("_", "-"),
                 group=notes["group"],
                 description=info.description or "",
-                expects=notes["expects"],
+                expects=notes["expects"] or _expected(info),
                 unit=notes["unit"],
                 default=None if info.is_required() else info.get_default(call_default_factory=True),
                 otherwise=notes["otherwise"],
@@ -300,6 +327,22 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
             )
         )
     return tuple(found)
+
+
+def _expected(info: FieldInfo) -> str:
+    """What type and constraints of a field say of its values."""
+    kinds = [one for one in get_args(info.annotation) or (info.annotation,) if one is not type(None)]
+    if kinds == [bool]:
+        return "true or false"
+    if get_origin(info.annotation) is Literal or get_origin(kinds[0]) is Literal:
+        *first, last = kinds if get_origin(info.annotation) is Literal else get_args(kinds[0])
+        return f"{', '.join(first)} or {last}"
+    limits = {name: getattr(one, name) for one in info.metadata for name in ("ge", "gt", "le") if hasattr(one, name)}
+    number = "a whole number" if kinds == [int] else "a number"
+    most = limits["le"] if kinds == [int] else f"{limits['le']:g}".replace("e+0", "e")
+    if "gt" in limits:
+        return f"{number} greater than {limits['gt']:g} and at most {most}"
+    return f"{number} from {limits['ge']:g} to {most}"
 
 
 def read_yaml(path: str | Path, above: tuple[Path, ...] = ()) -> dict[str, object]:

@@ -2,8 +2,8 @@
 
 Lines of the package and its modules; lines with an untyped answer (`dict[str, Any]`, `Mapping[str, Any]`); class names
 and file names that occur several times; imports that go in a circle; modules that take a run's settings (a parameter
-annotated with a `...Config`); and the classes of ours that a new control has to import or subclass, from the worked
-example of docs/controls/writing.md.
+or a field annotated with a `...Config`); and the classes of ours that a new control has to import or subclass, from
+the worked example of docs/controls/writing.md.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def circles(modules: Modules) -> list[list[str]]:
 
 
 def takes_settings(tree: ast.Module) -> bool:
-    """Whether a function of a module has a parameter that is a command's configuration."""
+    """Whether a function of a module has a parameter, or a class a field, that is a command's configuration."""
     functions = (node for node in ast.walk(tree) if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)))
     notes = (
         arg.annotation
@@ -89,7 +89,14 @@ def takes_settings(tree: ast.Module) -> bool:
         for arg in (*one.args.posonlyargs, *one.args.args, *one.args.kwonlyargs)
         if arg.annotation is not None
     )
-    return any(re.search(r"\b[A-Z]\w*Config\b", ast.unparse(note)) for note in notes)
+    fields = (
+        node.annotation
+        for owner in ast.walk(tree)
+        if isinstance(owner, ast.ClassDef)
+        for node in owner.body
+        if isinstance(node, ast.AnnAssign)
+    )
+    return any(re.search(r"\b[A-Z]\w*Config\b", ast.unparse(note)) for note in (*notes, *fields))
 
 
 def classes_for_a_control(root: Path) -> list[str]:

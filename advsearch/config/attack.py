@@ -11,10 +11,10 @@ from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.named import name_in, read_named
 from advsearch.config.scene import ControlsByName, SceneConfig
 from advsearch.files import JsonObject
-from advsearch.settings import Clash, setting
+from advsearch.settings import Clash, setting, setting_as_in
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
+    pass
 
 TRIALS, TRIALS_OVER = 20, 200
 """Fresh renders that check an answer, and one that holds for many conditions."""
@@ -72,17 +72,15 @@ class AttackConfig(DerivativeConfig):
         ),
     )
 
-    object: str = setting(
-        ...,
-        "scene",
-        "what the model should recognise; several, separated by commas, are attacked one after the other",
-        "the name of an object or a .obj, .ply, .glb, .gltf or .stl file",
+    object: str = setting_as_in(
+        SceneConfig,
+        "object",
+        description="what the model should recognise; several, separated by commas, are attacked one after the other",
     )
     measure: Literal["no", "quick", "full"] = setting(
         "quick",
         "search",
         "measure which valid estimator of a derivative is best on this scene; full chooses step and samples too",
-        "no, quick or full",
     )
     policy: str | dict[str, JsonValue] = setting(
         "auto", "search", "the rule that proposes configurations", "the name of a policy, or NAME={OPTION: VALUE}"
@@ -91,7 +89,6 @@ class AttackConfig(DerivativeConfig):
         40,
         "search",
         "steps of the search, its budget in renders",
-        "a whole number from 1 to 1000000",
         ge=1,
         le=1_000_000,
     )
@@ -99,7 +96,6 @@ class AttackConfig(DerivativeConfig):
         None,
         "search",
         "time after which the search stops; the random one beside it gets as many renders",
-        "a number greater than 0 and at most 1e9",
         otherwise="no limit",
         unit="seconds",
         gt=0.0,
@@ -109,7 +105,6 @@ class AttackConfig(DerivativeConfig):
         None,
         "search",
         "first step of the policy as a share of epsilon",
-        "a number greater than 0 and at most 2",
         otherwise="the policy's own",
         gt=0.0,
         le=2.0,
@@ -121,26 +116,21 @@ class AttackConfig(DerivativeConfig):
         "names of classes or their numbers, separated by commas",
         otherwise="any wrong answer",
     )
-    minimise: bool = setting(False, "search", "make the object easier to recognise, not harder", "true or false")
-    smallest: bool = setting(
-        False, "search", "find the smallest epsilon at which the model is wrong, up to --epsilon", "true or false"
+    minimise: bool = setting(False, "search", "make the object easier to recognise, not harder")
+    smallest: bool = setting(False, "search", "find the smallest epsilon at which the model is wrong, up to --epsilon")
+    over: ControlsByName = setting_as_in(
+        SceneConfig,
+        "controls",
+        default=dict,
+        description="controls that vary by chance: one answer has to hold for all of them",
+        flag="",
+        min_length=None,
     )
-    over: ControlsByName = setting(
-        dict,
-        "search",
-        "controls that vary by chance: one answer has to hold for all of them",
-        "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
-        metavar="NAME",
-        form="controls",
-    )
-    draws: int = setting(
-        4, "search", "conditions that a step of --over looks at", "a whole number from 1 to 1000", ge=1, le=1000
-    )
+    draws: int = setting(4, "search", "conditions that a step of --over looks at", ge=1, le=1000)
     average: int = setting(
         0,
         "search",
         "random configurations of the same space that say how often the model is wrong on average",
-        "a whole number from 0 to 1000000",
         unit="renders",
         ge=0,
         le=1_000_000,
@@ -149,7 +139,6 @@ class AttackConfig(DerivativeConfig):
         True,
         "search",
         "run a random search with as many renders beside it",
-        "true or false",
         flag="--no-baseline",
         switched="without the random search that runs beside the search",
     )
@@ -158,7 +147,6 @@ class AttackConfig(DerivativeConfig):
         None,
         "verification",
         "samples per pixel of the verification",
-        "a whole number from 1 to 65536",
         otherwise="raised until noise moves nothing",
         unit="samples",
         ge=1,
@@ -185,16 +173,6 @@ class AttackConfig(DerivativeConfig):
         steps = {"steps": policy["steps"]} if "steps" in policy else {}
         rest = {option: value for option, value in policy.items() if option != "steps"}
         return {**data, **steps, "policy": read_named(rest, "policy", "auto")}
-
-    @classmethod
-    def of(cls, config: SceneConfig, **other: Any) -> Self:
-        """Return an attack on what another command's configuration describes, in a place of its own.
-
-        Args:
-            config: gives the settings that its command and this one have from the same class.
-            **other: settings that are different.
-        """
-        return cls(**{**cls.shared(config), **other})
 
     @property
     def policy_name(self) -> str:

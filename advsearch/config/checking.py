@@ -10,24 +10,10 @@ from pydantic import field_validator
 
 from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import Clash, Config, check_once, setting, split_names
+from advsearch.settings import Clash, Config, check_once, setting, setting_as_in, split_names
 
 OF_ALL: Mapping[str, object] = {"object": "mug", "environment": None, "controls": {"texture": {}}, "set_": {}}
 """What is as it is unless it is given, and has to be left so with `all`."""
-
-
-def _sitting() -> Any:
-    """The time of one sitting of a measurement that can go on."""
-    return setting(
-        None,
-        "check",
-        "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
-        "a number greater than 0 and at most 1e9",
-        otherwise="no limit",
-        unit="seconds",
-        gt=0.0,
-        le=1e9,
-    )
 
 
 class CheckConfig(DerivativeConfig):
@@ -50,14 +36,22 @@ class CheckConfig(DerivativeConfig):
         ),
     )
 
-    all: bool = setting(False, "check", "every control, on three bundled scenes; takes hours", "true or false")
+    all: bool = setting(False, "check", "every control, on three bundled scenes; takes hours")
     loss: Literal["linear", "model", "both"] = setting(
         "both",
         "check",
         "what is differentiated: a smooth linear loss of the raw picture, the model's own, or both in turn",
-        "linear, model or both",
     )
-    seconds: float | None = _sitting()
+    seconds: float | None = setting(
+        None,
+        "check",
+        "time after which no measurement is begun any more; `advsearch resume` goes on for as long again",
+        otherwise="no limit",
+        unit="seconds",
+        gt=0.0,
+        le=1e9,
+    )
+    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-check-NNN")
 
     @property
     def title(self) -> tuple[str, ...]:
@@ -76,7 +70,8 @@ class PlanConfig(DerivativeConfig):
     command: ClassVar[str] = "plan"
     free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "seconds")
 
-    seconds: float | None = _sitting()
+    seconds: float | None = setting_as_in(CheckConfig, "seconds")
+    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-plan-NNN")
 
     @property
     def title(self) -> tuple[str, ...]:
@@ -97,16 +92,9 @@ class StabilityConfig(Config):
     group: str | None = setting(
         None, "check", "groups of cases to try, separated by commas", "names of groups", otherwise="all", form="names"
     )
-    seconds: float | None = _sitting()
-    run: str | None = setting(
-        None,
-        "run",
-        "where the run is kept",
-        "a name (kept in runs/) or the path of a folder",
-        otherwise="runs/stability-NNN",
-        min_length=1,
-    )
-    overwrite: bool = setting(False, "run", "replace a run that is there already", "true or false")
+    seconds: float | None = setting_as_in(CheckConfig, "seconds")
+    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/stability-NNN")
+    overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
     @field_validator("case", "group", "run", mode="before")
     @classmethod

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import field_validator
 
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import Clash, check_once, parse_assignment, setting
+from advsearch.settings import Clash, check_once, parse_assignment, setting, setting_as_in
 
 LARGEST_EPSILON = 1e6
 """No control has a distance of that size; far above it, its square is none in float32."""
@@ -26,12 +26,7 @@ class DerivativeConfig(SceneConfig):
         ),
     )
 
-    object: str = setting(
-        "mug",
-        "scene",
-        "what the model should recognise",
-        "the name of an object or a .obj, .ply, .glb, .gltf or .stl file",
-    )
+    object: str = setting_as_in(SceneConfig, "object", default="mug")
     epsilon: float | dict[str, float] | tuple[float, ...] | None = setting(
         None,
         "search",
@@ -41,7 +36,7 @@ class DerivativeConfig(SceneConfig):
         otherwise="the control's own",
     )
     norm: Literal["linf", "l2"] | None = setting(
-        None, "search", "how that distance is measured", "linf or l2", otherwise="the control's own"
+        None, "search", "how that distance is measured", otherwise="the control's own"
     )
     estimators: dict[str, str] = setting(
         dict,
@@ -60,7 +55,6 @@ class DerivativeConfig(SceneConfig):
         True,
         "search",
         "leave out what the scene and the search don't need",
-        "true or false",
         flag="--no-specialise",
         switched="compute what the scene and the search don't need too; `advsearch plan` shows what that is",
     )

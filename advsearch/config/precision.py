@@ -8,7 +8,8 @@ from typing import Any, ClassVar, Literal
 from pydantic import field_validator
 
 from advsearch.config.derivative import DerivativeConfig
-from advsearch.settings import Clash, check_once, setting, split_names
+from advsearch.config.scene import SceneConfig
+from advsearch.settings import Clash, check_once, setting, setting_as_in, split_names
 
 QUANTITIES = ("image", "gradient", "objective")
 SAMPLERS = ("independent", "stratified", "multijitter", "orthogonal", "ldsampler")
@@ -49,7 +50,6 @@ class PrecisionConfig(DerivativeConfig):
         120.0,
         "search",
         "time that all measurements may take",
-        "a number greater than 0 and at most 1e9",
         unit="seconds",
         gt=0.0,
         le=1e9,
@@ -58,13 +58,10 @@ class PrecisionConfig(DerivativeConfig):
         0.05,
         "search",
         "relative error that the recommended settings should have",
-        "a number greater than 0 and at most 1",
         gt=0.0,
         le=1.0,
     )
-    rounds: int = setting(
-        8, "search", "measurements of every setting, at most", "a whole number from 3 to 1000", ge=3, le=1000
-    )
+    rounds: int = setting(8, "search", "measurements of every setting, at most", ge=3, le=1000)
     samplers: str = setting(
         "independent,stratified,multijitter,orthogonal,ldsampler",
         "search",
@@ -82,17 +79,13 @@ class PrecisionConfig(DerivativeConfig):
         "linear",
         "search",
         "whose gradient is measured: a smooth linear loss of the raw picture, or the model's in its image formation",
-        "linear or model",
     )
     policies: str = setting(
         "auto,random", "search", "policies that are compared, separated by commas", "names of policies"
     )
-    steps: int = setting(
-        32, "search", "renders of each search of a policy", "a whole number from 2 to 100000", ge=2, le=100_000
-    )
-    repeats: int = setting(
-        5, "search", "searches of each policy, with other seeds", "a whole number from 1 to 1000", ge=1, le=1000
-    )
+    steps: int = setting(32, "search", "renders of each search of a policy", ge=2, le=100_000)
+    repeats: int = setting(5, "search", "searches of each policy, with other seeds", ge=1, le=1000)
+    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-precision-NNN")
     out: str | None = setting(
         None,
         "run",

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
-from advsearch.settings import setting
+from advsearch.settings import setting, setting_as_in
 
 FEWEST_SAMPLES = 8
 """With fewer, not even a box without exceptions has one verdict in more than half of it, at the confidence of
@@ -20,15 +20,7 @@ class GapConfig(AttackConfig):
     several: ClassVar[tuple[str, ...]] = ("object",)
     without: ClassVar[tuple[str, ...]] = ("smallest",)
 
-    average: int = setting(
-        200,
-        "search",
-        "random configurations of the same space that say how often the model is wrong on average",
-        "a whole number from 1 to 1000000",
-        unit="renders",
-        ge=1,
-        le=1_000_000,
-    )
+    average: int = setting_as_in(AttackConfig, "average", default=200, ge=1)
 
 
 class RegionConfig(SceneConfig):
@@ -55,7 +47,6 @@ class RegionConfig(SceneConfig):
         200,
         "region",
         "fresh samples that check the box",
-        f"a whole number from {FEWEST_SAMPLES} to 1000000",
         unit="renders",
         ge=FEWEST_SAMPLES,
         le=1_000_000,
@@ -64,18 +55,8 @@ class RegionConfig(SceneConfig):
         0,
         "region",
         "side of the map of the margin, where there are two parameters; 0 for none",
-        "a whole number from 0 to 512",
         unit="points",
         ge=0,
         le=512,
     )
-    verify_spp: int | None = setting(
-        None,
-        "region",
-        "samples per pixel",
-        "a whole number from 1 to 65536",
-        otherwise="raised until noise moves nothing",
-        unit="samples",
-        ge=1,
-        le=65536,
-    )
+    verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", group="region", description="samples per pixel")

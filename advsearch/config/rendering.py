@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 from pydantic import field_validator
 
-from advsearch.config.scene import CONTROLS, ControlsByName, SceneConfig
-from advsearch.settings import setting
+from advsearch.config.scene import ControlsByName, SceneConfig
+from advsearch.settings import setting, setting_as_in
 
 PICTURE_SPP = 64
 """Samples a pixel of a picture that is made to be looked at."""
@@ -22,18 +22,19 @@ class RenderConfig(SceneConfig):
     command: ClassVar[str] = "render"
     without: ClassVar[tuple[str, ...]] = ("label", "run", "overwrite")
 
-    controls: ControlsByName = setting(
-        dict,
-        "picture",
-        "what differs from the scene, separated by commas; a range stays where a search would start",
-        "names of controls, or NAME={PARAMETER: VALUE}",
-        **CONTROLS,
+    controls: ControlsByName = setting_as_in(
+        SceneConfig,
+        "controls",
+        default=dict,
+        group="picture",
+        description="what differs from the scene, separated by commas; a range stays where a search would start",
+        expects="names of controls, or NAME={PARAMETER: VALUE}",
+        min_length=None,
     )
     around: int | None = setting(
         None,
         "picture",
         "one sheet of so many views, from azimuths all around the object",
-        "a whole number from 2 to 64",
         otherwise="one view",
         unit="views",
         ge=2,
@@ -43,7 +44,6 @@ class RenderConfig(SceneConfig):
         PICTURE_SPP,
         "picture",
         "samples per pixel",
-        "a whole number from 1 to 65536",
         unit="samples",
         ge=1,
         le=65536,

@@ -10,8 +10,7 @@ from pydantic import JsonValue, field_validator, model_validator
 
 from advsearch.config.named import name_in, read_named
 from advsearch.errors import InputError
-from advsearch.files import Json
-from advsearch.settings import PLACE, Clash, Config, check_once, number_or_text, setting, split_names
+from advsearch.settings import Clash, Config, check_once, number_or_text, setting, split_names
 
 DEFAULT_ENVIRONMENT = "studio"
 """What lights a scene of which nothing is said: `scene.description.DEFAULT_ENVIRONMENT`, which a test holds this to."""
@@ -70,7 +69,6 @@ class SceneConfig(Config):
         None,
         "scene",
         "axis of an imported object that points up",
-        "y or z",
         otherwise="as the format says, or else the axis along which it stands best",
     )
     set_: dict[str, float | str | tuple[float, ...]] = setting(
@@ -83,9 +81,7 @@ class SceneConfig(Config):
         metavar="PARAMETER=VALUE",
         form="assignments",
     )
-    exposure: float = setting(
-        0.0, "scene", "brightness of the picture", "a number from -10 to 10", unit="stops", ge=-10.0, le=10.0
-    )
+    exposure: float = setting(0.0, "scene", "brightness of the picture", unit="stops", ge=-10.0, le=10.0)
     resolution: tuple[int, int] | None = setting(
         None,
         "scene",
@@ -136,7 +132,6 @@ class SceneConfig(Config):
         None,
         "search",
         "side of the searched texture",
-        "a whole number from 2 to 4096",
         unit="texels",
         otherwise="chosen from the object's own",
         ge=2,
@@ -151,24 +146,19 @@ class SceneConfig(Config):
         otherwise="8 with the denoiser, 16 without",
         unit="samples",
     )
-    denoise: Literal["oidn", "none"] = setting(
-        "oidn", "search", "denoiser of every render, in search and verification", "oidn or none"
-    )
+    denoise: Literal["oidn", "none"] = setting("oidn", "search", "denoiser of every render, in search and verification")
     pixel_sampler: Literal["independent", "multijitter"] = setting(
         "multijitter",
         "search",
         "how samples are spread over a pixel, in search and verification; independent ones have more noise, but come "
         "in any number: multijitter rounds up to products of two near numbers",
-        "independent or multijitter",
     )
 
     seed: int = setting(
         0, "run", "root of every random stream", "a whole number from 0 to 2**63 - 1", ge=0, le=2**63 - 1
     )
-    threads: int | None = setting(
-        None, "run", "processor threads", "a whole number from 1 to 1024", otherwise="all", ge=1, le=1024
-    )
-    deterministic: bool = setting(False, "run", "the same numbers bit for bit, at some cost in time", "true or false")
+    threads: int | None = setting(None, "run", "processor threads", otherwise="all", ge=1, le=1024)
+    deterministic: bool = setting(False, "run", "the same numbers bit for bit, at some cost in time")
     run: str | None = setting(
         None,
         "run",
@@ -177,7 +167,7 @@ class SceneConfig(Config):
         otherwise="runs/OBJECT-CONTROL-NNN",
         min_length=1,
     )
-    overwrite: bool = setting(False, "run", "replace a run that is there already", "true or false")
+    overwrite: bool = setting(False, "run", "replace a run that is there already")
 
     @model_validator(mode="after")
     def _one_of_each(self) -> SceneConfig:
@@ -187,13 +177,6 @@ class SceneConfig(Config):
             if len(names) > 1 and name not in self.several:
                 raise one_only(name, names)
         return self
-
-    @classmethod
-    def shared(cls, config: SceneConfig) -> Json:
-        """Return the settings that this command and another one's have from the same class, but for the run's place."""
-        both = next(one for one in cls.__mro__ if issubclass(one, SceneConfig) and isinstance(config, one))
-        apart = (*PLACE, *cls.without, *config.without)
-        return {name: getattr(config, name) for name in both.model_fields if name not in apart}
 
     @property
     def title(self) -> tuple[str, ...]:

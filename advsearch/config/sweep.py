@@ -8,9 +8,9 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator
 
-from advsearch.config.attack import FEWEST_TRIALS
-from advsearch.config.scene import CONTROLS, DEFAULT_ENVIRONMENT, ControlsByName, SceneConfig
-from advsearch.settings import Clash, number_or_text, setting, split_names
+from advsearch.config.attack import FEWEST_TRIALS, AttackConfig
+from advsearch.config.scene import ControlsByName, SceneConfig
+from advsearch.settings import Clash, number_or_text, setting, setting_as_in, split_names
 
 Grid = dict[str, object]
 """Values, or numbers of them, by the parameters of the grid."""
@@ -33,25 +33,22 @@ class SweepConfig(SceneConfig):
         ),
     )
 
-    object: str = setting(
-        ...,
-        "scene",
-        "what the model should recognise; several separated by commas",
-        "names of objects or .obj, .ply, .glb, .gltf or .stl files",
+    object: str = setting_as_in(
+        SceneConfig,
+        "object",
+        description="what the model should recognise; several separated by commas",
+        expects="names of objects or .obj, .ply, .glb, .gltf or .stl files",
     )
-    environment: str | None = setting(
-        None,
-        "scene",
-        "what lights it; several separated by commas",
-        "names of environments or .hdr or .exr files",
-        otherwise=DEFAULT_ENVIRONMENT,
+    environment: str | None = setting_as_in(
+        SceneConfig,
+        "environment",
+        description="what lights it; several separated by commas",
+        expects="names of environments or .hdr or .exr files",
     )
-    model: str = setting(
-        "reference",
+    model: str = setting_as_in(
+        SceneConfig,
         "model",
-        "the network under test; several separated by commas are shown the same pictures",
-        "reference, a .pt2, TorchScript or .onnx file, torchvision:NAME, timm:NAME, hf:REPOSITORY, or "
-        "package.module:callable",
+        description="the network under test; several separated by commas are shown the same pictures",
     )
     grid: Grid = setting(
         dict,
@@ -61,41 +58,33 @@ class SweepConfig(SceneConfig):
         metavar="PARAMETER=VALUES",
         form="axes",
     )
-    controls: ControlsByName = setting(
-        dict,
-        "sweep",
-        "what is drawn by chance beside the grid, separated by commas",
-        "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
-        **CONTROLS,
+    controls: ControlsByName = setting_as_in(
+        SceneConfig,
+        "controls",
+        default=dict,
+        group="sweep",
+        description="what is drawn by chance beside the grid, separated by commas",
+        min_length=None,
     )
     samples: int | None = setting(
         None,
         "sweep",
         "draws of the controls at each point of the grid",
-        "a whole number from 1 to 1000000000",
         otherwise="1, or 100 without a grid",
         ge=1,
         le=1_000_000_000,
     )
-    sampler: Literal["sobol", "random"] = setting("sobol", "sweep", "how the draws are made", "sobol or random")
+    sampler: Literal["sobol", "random"] = setting("sobol", "sweep", "how the draws are made")
     batch: int = setting(
         16,
         "sweep",
         "pictures that the model sees at once, and that are stored at once",
-        "a whole number from 1 to 1024",
         unit="pictures",
         ge=1,
         le=1024,
     )
-    spp: int | None = setting(
-        None,
-        "sweep",
-        "samples per pixel of a picture",
-        "a whole number from 1 to 65536",
-        otherwise="8 with the denoiser, 16 without",
-        unit="samples",
-        ge=1,
-        le=65536,
+    spp: int | None = setting_as_in(
+        SceneConfig, "spp", group="sweep", description="samples per pixel of a picture", expects="", ge=1, le=65536
     )
     trials: int = setting(
         20,
@@ -106,24 +95,8 @@ class SweepConfig(SceneConfig):
         ge=0,
         le=100_000,
     )
-    verify_spp: int | None = setting(
-        None,
-        "verification",
-        "samples per pixel of these",
-        "a whole number from 1 to 65536",
-        otherwise="raised until noise moves nothing",
-        unit="samples",
-        ge=1,
-        le=65536,
-    )
-    run: str | None = setting(
-        None,
-        "run",
-        "where the run is kept",
-        "a name (kept in runs/) or the path of a folder",
-        otherwise="runs/OBJECT-sweep-NNN",
-        min_length=1,
-    )
+    verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", description="samples per pixel of these")
+    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-sweep-NNN")
 
     @property
     def title(self) -> tuple[str, ...]:
