@@ -34,6 +34,32 @@ def attack(data: Path, run: Path, case: str) -> dict[str, Any]:
     return summary
 
 
+TASKS = {
+    "texture of a cup": ("mug", "detection", "ssd_mobilenet_v1_coco_300", "cup", ["--objective", "vanish"], "texture"),
+    "patch on a cup": ("mug", "detection", "ssd_mobilenet_v1_coco_300", "cup", ["--objective", "vanish"], "patch"),
+    "texture of a bottle": ("bottle", "segmentation", "deeplabv3_mnv2_dm05_pascal_257", "bottle", [], "texture"),
+    "patch on a bottle": ("bottle", "segmentation", "deeplabv3_mnv2_dm05_pascal_257", "bottle", [], "patch"),
+}
+"""By name: object, task, model, right answer, more flags, control."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", TASKS)
+def test_a_real_detector_and_a_real_segmenter_are_fooled(case: str, real_data: Path, tmp_path: Path) -> None:
+    thing, task, model, label, flags, control = TASKS[case]
+    network = real_data / "models" / model
+    command = [sys.executable, "-m", "advsearch", "attack", "--object", thing, "--task", task, "--label", label, *flags]
+    command += ["--model", f"{network}.pt2", "--labels", f"{network}.labels.json", "--control", control]
+    done = subprocess.run(
+        [*command, "--run", str(tmp_path / "run"), "--json"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    assert summary["ending"] == "found" and summary["clean"]["control"]["correct"] >= 19
+    assert summary["verified"]["successes"] > summary["baseline"]["verified"]["successes"]
+    assert (tmp_path / "run" / "images" / "adversarial-answer.png").is_file()
+
+
 @pytest.mark.parametrize(
     "case", [case if case == "small mug" else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
 )

@@ -17,7 +17,10 @@ TRUE, SAID = (0, 190, 255), (255, 110, 0)
 """Colours of what is true and of what the model says; told apart in any kind of colour vision."""
 SMALLEST = 512
 """Pixels of the longest side at least; smaller pictures are magnified, so that text can be read."""
-TINT = 0.45
+TINT, LETTERS = 0.45, 28
+"""How much of a tint covers a picture; how many letters are as high as its longest side."""
+
+Box = tuple[float, float, float, float]
 
 
 class Shape(Protocol):
@@ -32,7 +35,7 @@ class Shape(Protocol):
         """Whether it is true of the scene, and not what the model says."""
 
     @property
-    def box(self) -> tuple[float, float, float, float] | None:
+    def box(self) -> Box | None:
         """x0, y0, x1, y1 in pixels of the picture."""
 
     @property
@@ -43,8 +46,8 @@ class Shape(Protocol):
 def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:
     """Return a picture with shapes drawn into it, magnified where it is small.
 
-    The box or the outline of what is true is blue; a box of the model is orange, and its mask tinted so. Of boxes, the
-    text stands at the upper left corner, or inside where there is no room above.
+    The box or the outline of what is true is blue; a box of the model is orange, and its mask tinted so. The text of a
+    box stands at its upper left corner, that of the true one at the lower left.
 
     Args:
         picture: (H, W, 3) display-referred sRGB in [0, 1].
@@ -60,9 +63,12 @@ def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:
     for shape in sorted(shapes, key=lambda one: one.true):
         if shape.mask is not None:
             _draw_mask(image, np.asarray(shape.mask, dtype=bool), shape.true)
-    draw, font = ImageDraw.Draw(image), ImageFont.load_default(13)
-    for shape in sorted((one for one in shapes if one.box is not None), key=lambda one: not one.true):
-        _draw_box(draw, shape, factor, size, font)
+    draw, font = ImageDraw.Draw(image), ImageFont.load_default(max(size) // LETTERS)
+    boxes = [(shape, _corners(shape.box, factor, size)) for shape in shapes if shape.box is not None]
+    for shape, ends in boxes:
+        draw.rectangle(ends, outline=_colour(shape), width=2)
+    for shape, ends in boxes:
+        _write(draw, shape, ends, size, font)
     found: Floats = np.asarray(image, dtype=np.float32) / np.float32(255.0)
     return found
 
@@ -80,21 +86,26 @@ def _draw_mask(image: Image.Image, mask: npt.NDArray[np.bool_], true: bool) -> N
     image.paste(colour, (0, 0), Image.fromarray(np.rint(255.0 * strength).astype(np.uint8)))
 
 
-def _draw_box(draw: ImageDraw.ImageDraw, shape: Shape, factor: int, size: tuple[int, int], font: Any) -> None:
-    assert shape.box is not None
-    most = [side - 1 for side in size] * 2
-    x0, y0, x1, y1 = (
-        min(max(round(end * factor) - (place > 1), 0), last)
-        for place, (end, last) in enumerate(zip(shape.box, most, strict=True))
-    )
-    colour = TRUE if shape.true else SAID
-    draw.rectangle((x0, y0, max(x0, x1), max(y0, y1)), outline=colour, width=2)
+def _colour(shape: Shape) -> tuple[int, int, int]:
+    return TRUE if shape.true else SAID
+
+
+def _corners(box: Box, factor: int, size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """The first and the last pixel of a box in a magnified picture, as far as it is inside."""
+    x0, y0, x1, y1 = (round(end * factor) for end in box)
+    left, top = (min(max(start, 0), side - 1) for start, side in zip((x0, y0), size, strict=True))
+    right, bottom = (min(end, side) - 1 for end, side in zip((x1, y1), size, strict=True))
+    return left, top, max(left, right), max(top, bottom)
+
+
+def _write(
+    draw: ImageDraw.ImageDraw, shape: Shape, ends: tuple[int, int, int, int], size: tuple[int, int], font: Any
+) -> None:
+    """Write beside a box: above it, or below where it is true, so that the two do not cover each other."""
     text = f"true: {shape.text}" if shape.true else shape.text
     left, top, right, bottom = draw.textbbox((0, 0), text, font=font)
     wide, high = right - left + 6, bottom - top + 6
-    at: tuple[float, float] = (x0, y0 - high if y0 >= high else y0)
-    if shape.true:  # its text stands below, where that of the model's box does not cover it
-        at = (x0, y1 if y1 + high < size[1] else y1 - high)
-    at = min(at[0], max(size[0] - wide, 0)), at[1]
-    draw.rectangle((at[0], at[1], at[0] + wide, at[1] + high), fill=colour)
-    draw.text((at[0] + 3 - left, at[1] + 3 - top), text, fill=(0, 0, 0), font=font)
+    y = ends[3] if shape.true else ends[1] - high
+    x, y = max(0, min(ends[0], size[0] - wide)), max(0, min(y, size[1] - high))
+    draw.rectangle((x, y, x + wide, y + high), fill=_colour(shape))
+    draw.text((x + 3 - left, y + 3 - top), text, fill=(0, 0, 0), font=font)

@@ -13,7 +13,7 @@ from advsearch import __version__
 from advsearch.report import wording
 from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
 from advsearch.report.markup import Html, element, join
-from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text
+from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, marks_text
 from advsearch.report.style import CSS
 from advsearch.runs import directory, images, store
 from advsearch.runs.files import write_text
@@ -131,7 +131,7 @@ def _pictures(data: RunData) -> Html:
     animation = _figure(data, "images/search.gif", "", "from the first step to the last")
     return join(
         _section("What the model sees", shown),
-        _section("What it answers", answered, "pair", "Blue is true of the scene, orange is the model's answer."),
+        _section("What it answers", answered, "large", marks_text(summary.task)),
         _details("Pictures of the verification", [_figure(data, name, "", _trial(name)) for name in trials], "small"),
         _details("The search as an animation", [animation], "single"),
     )

@@ -12,6 +12,10 @@ _MARGINS = {
     DETECTION: "how far the best right box is under the score that counts, in log-odds; over 0 where none is found",
     SEGMENTATION: "the lead of wrong classes at the pixel that decides, in logits; over 0 where too few are right",
 }
+_MARKS = {
+    DETECTION: "Blue is the true box, orange what the model finds with a score that counts.",
+    SEGMENTATION: "Blue is the true outline, orange the pixels to which the model gives a right class.",
+}
 _WANTED = {
     "mislabel": "makes the model take {} for something else",
     "displace": "makes the model see {} elsewhere",
@@ -57,6 +61,11 @@ def margin_text(task: str) -> str:
     return _MARGINS.get(task, "over 0 where the answer is wrong")
 
 
+def marks_text(task: str) -> str:
+    """Return what is drawn into the pictures of a task's answers, in a sentence."""
+    return _MARKS.get(task, "Blue is true of the scene, orange is the model's answer.")
+
+
 def wanted(objective: str, thing: str) -> str:
     """Return what a search with an objective looks for, as a clause: "makes the model miss this mug"."""
     return _WANTED.get(objective, "makes the model miss {}").format(thing)
@@ -77,7 +86,7 @@ def answer_text(task: str, answer: Said) -> str:
     """Return an answer on one line: ``vase, 91 %``, ``no cup found (best 0.12)``."""
     label, number = cells(task, answer)
     if task == SEGMENTATION and number:
-        return f"accuracy over the object's pixels {percent(answer.probability)}, most answers {label}"
+        return f"accuracy over the object's pixels {percent(answer.probability)}, most often {label}"
     if task == DETECTION and number:
         return f"{label} ({number})"
     return f"{label}, {number}" if number else label
@@ -89,7 +98,7 @@ def calls(task: str, thing: str, label: str) -> str:
         return f"calls {thing} {with_article(label)}"
     if task == DETECTION:
         return _detects("finds", "sees", "takes", thing, label)
-    return f"takes most of {thing} for {label}" if task == SEGMENTATION else f'answers "{label}" for {thing}'
+    return f"takes {thing} for {_stuff(label)}" if task == SEGMENTATION else f'answers "{label}" for {thing}'
 
 
 def calling(task: str, label: str) -> str:
@@ -98,7 +107,11 @@ def calling(task: str, label: str) -> str:
         return f"calling it {with_article(label)}"
     if task == DETECTION:
         return _detects("finding", "seeing", "taking", "it", label)
-    return f"taking most of it for {label}" if task == SEGMENTATION else f'answering "{label}"'
+    return f"taking it for {_stuff(label)}" if task == SEGMENTATION else f'answering "{label}"'
+
+
+def _stuff(label: str) -> str:
+    return label if label == "background" else with_article(label)
 
 
 def _detects(finds: str, sees: str, takes: str, thing: str, label: str) -> str:

@@ -24,6 +24,7 @@ p { margin: 0.5rem 0; max-width: 46rem; }
 .pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(14rem, 44%), 1fr)); gap: 1.25rem 1rem; }
 .pictures.pair { max-width: 40rem; }
 .pictures.single { max-width: 24rem; }
+.pictures.large { grid-template-columns: repeat(auto-fit, minmax(min(22rem, 100%), 1fr)); }
 .pictures.small { grid-template-columns: repeat(auto-fill, minmax(7rem, 1fr)); gap: 0.6rem; }
 figure { margin: 0; }
 figure img { display: block; width: 100%; height: auto; border-radius: 4px; background: var(--track); }

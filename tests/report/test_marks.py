@@ -1,0 +1,104 @@
+"""Boxes and masks drawn into pictures: where they lie, in which colour, and what stands beside them."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+import torch
+
+from advsearch.report.marks import SAID, SMALLEST, TINT, TRUE, marked
+from advsearch.report.phrases import answer_text, calling, calls, cells, margin_text, marks_text, wanted
+from advsearch.tasks import Answer, Mark
+
+
+def where(picture: npt.NDArray[np.float32], colour: tuple[int, int, int]) -> npt.NDArray[np.bool_]:
+    near: npt.NDArray[np.bool_] = np.asarray((np.abs(picture - np.array(colour) / 255) < 1 / 255).all(axis=2))
+    return near
+
+
+GREY = np.full((64, 64, 3), 0.5, dtype=np.float32)
+"""Magnified by 8."""
+
+
+def test_a_box_frames_the_pixels_that_it_says() -> None:
+    drawn = marked(GREY, [Mark("cup", False, box=(16.0, 24.0, 48.0, 56.0))])
+    assert drawn.shape == (SMALLEST, SMALLEST, 3)
+    orange = where(drawn, SAID)
+    assert orange[192:448, [128, 129, 382, 383]].all() and orange[[192, 193, 446, 447], 128:384].all()
+    assert not orange[200:440, 136:376].any() and not orange[450:].any() and not orange[:, 390:].any()
+    assert orange[172:192, 128:140].mean() > 0.5, "its text stands above"
+    assert not where(drawn, TRUE).any()
+
+
+def test_what_is_true_is_written_below_and_both_can_be_seen() -> None:
+    box = (16.0, 24.0, 48.0, 56.0)
+    drawn = marked(GREY, [Mark("cup", True, box=box), Mark("cup 0.76", False, box=box)])
+    blue, orange = where(drawn, TRUE), where(drawn, SAID)
+    assert blue[450:470, 130:180].mean() > 0.3 and orange[172:192, 128:140].mean() > 0.3
+
+
+@pytest.mark.parametrize("box", [(-20.0, -20.0, 90.0, 90.0), (60.0, 60.0, 64.0, 64.0), (5.0, 5.0, 5.0, 5.0)])
+def test_what_reaches_out_of_the_picture_is_cut(box: tuple[float, float, float, float]) -> None:
+    drawn = marked(GREY, [Mark("a very long name of a thing that is there", True, box=box)])
+    assert drawn.shape == (SMALLEST, SMALLEST, 3) and where(drawn, TRUE).any()
+
+
+def test_a_mask_is_tinted_and_the_true_one_outlined() -> None:
+    mask = torch.zeros(32, 32).bool()
+    mask[8:24, 8:24] = True
+    said = marked(GREY, [Mark("mug", False, mask=mask)])
+    tint = (1 - TINT) * 0.5 + TINT * np.array(SAID) / 255
+    assert np.abs(said[140:370, 140:370] - tint).max() < 0.01 and np.abs(said[:120] - 0.5).max() < 0.01
+    blue = where(marked(GREY, [Mark("mug", True, mask=mask)]), TRUE)
+    assert blue[128:384, 128].all() and blue[383, 128:384].all() and not blue[140:370, 140:370].any()
+    assert not blue[:128].any(), "the outline is inside"
+
+
+def test_a_large_picture_keeps_its_size_and_nothing_changes_nothing() -> None:
+    large = np.random.default_rng(0).integers(0, 256, (600, 300, 3)).astype(np.float32) / 255
+    assert np.abs(marked(large, []) - large).max() < 1e-6
+
+
+# ---- the same in words ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("task", "answer", "text"),
+    [
+        ("classification", Answer("vase", 3, 0.913), "vase, 91 %"),
+        ("detection", Answer("cup", 46, 0.762), "cup (score 0.76)"),
+        ("detection", Answer("no cup", None, 0.124), "no cup found (best 0.12)"),
+        ("detection", Answer("cup elsewhere", None, 0.7), "cup elsewhere (score 0.70)"),
+        ("detection", Answer("out of view"), "out of view"),
+        ("segmentation", Answer("background", 0, 0.031),
+         "accuracy over the object's pixels 3 %, most often background"),
+        ("yaw", Answer("30 degrees"), "30 degrees"),
+    ],
+)  # fmt: skip
+def test_an_answer_in_words(task: str, answer: Answer, text: str) -> None:
+    assert answer_text(task, answer) == text
+
+
+@pytest.mark.parametrize(
+    ("task", "label", "does", "doing"),
+    [
+        ("classification", "iron", "calls this mug an iron", "calling it an iron"),
+        ("detection", "no cup", "finds no cup", "finding no cup"),
+        ("detection", "bowl", "takes this mug for a bowl", "taking it for a bowl"),
+        ("detection", "dog elsewhere", "sees a dog where there is none", "seeing a dog where there is none"),
+        ("segmentation", "sofa", "takes this mug for a sofa", "taking it for a sofa"),
+        ("segmentation", "background", "takes this mug for background", "taking it for background"),
+        ("yaw", "30 degrees", 'answers "30 degrees" for this mug', 'answering "30 degrees"'),
+    ],
+)
+def test_what_a_model_does_in_words(task: str, label: str, does: str, doing: str) -> None:
+    assert (calls(task, "this mug", label), calling(task, label)) == (does, doing)
+
+
+def test_margins_and_objectives_in_words() -> None:
+    assert len({margin_text(task) for task in ("classification", "detection", "segmentation", "yaw")}) == 4
+    assert len({marks_text(task) for task in ("detection", "segmentation", "yaw")}) == 3
+    assert wanted("vanish", "this mug") == "makes the model miss this mug"
+    assert wanted("displace", "this mug") == "makes the model see this mug elsewhere"
+    assert cells("detection", Answer("no cup", None, 0.124)) == ["no cup found", "best 0.12"]

@@ -1,0 +1,174 @@
+"""Every command with a detector and with a segmenter: small networks of the colours of the bundled mug, as files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from advsearch.cli.main import main
+from advsearch.runs.images import read_png
+from advsearch.runs.store import Store
+
+SIDE = 32
+MUG, CORNER = [0.12, 0.12, 0.86, 0.86], [0.02, 0.02, 0.2, 0.2]
+
+
+class Finder(nn.Module):
+    """Two boxes, of which the first is about where the mug is: it has a blue band. A cup that lacks it is a bowl."""
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        blue = (x[:, 2] - x[:, 0])[:, 15:21, 8:22].mean(dim=(1, 2))
+        light = x[:, :, :6, :6].mean(dim=(1, 2, 3))
+        cup, dog = 30.0 * (blue - 0.1), 30.0 * (light - 0.6)
+        none = torch.full_like(cup, -4.0)
+        rows = torch.stack([torch.stack([cup, -cup, none], dim=1), torch.stack([none, none, dog], dim=1)], dim=1)
+        return x.new_tensor([[MUG, CORNER]]).expand(x.shape[0], -1, -1), rows.sigmoid()
+
+
+class Painter(nn.Module):
+    """Logits of each pixel: a mug is bright or blue, all else is background; nothing is a dog."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        bright, blue = x.mean(dim=1) - 0.5, x[:, 2] - x[:, 0] - 0.02
+        mug = 20.0 * torch.maximum(bright, blue)
+        return torch.stack([torch.zeros_like(mug), mug, mug - 5.0], dim=1)
+
+
+@pytest.fixture(scope="module", params=["detection", "segmentation"])
+def asked(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """The flags of a task with a model file, at a small size."""
+    folder = tmp_path_factory.mktemp(request.param)
+    network, names, label = {
+        "detection": (Finder(), ["cup", "bowl", "dog"], "cup"),
+        "segmentation": (Painter(), ["background", "mug", "dog"], "mug"),
+    }[request.param]
+    batch = {0: torch.export.Dim("batch", min=1, max=64)}
+    program = torch.export.export(network.eval(), (torch.zeros(2, 3, SIDE, SIDE),), dynamic_shapes=(batch,))
+    torch.export.save(program, folder / "net.pt2")
+    (folder / "labels.json").write_text(json.dumps(names), "utf-8")
+    task = "detection" if request.param == "detection" else "segmentation={accuracy: 0.7}"
+    model = ["--task", task, "--model", str(folder / "net.pt2"), "--labels", str(folder / "labels.json")]
+    return [*model, "--label", label, "--json"]
+
+
+def answer(capsys: pytest.CaptureFixture[str], *command: str) -> dict[str, Any]:
+    """Type a command, and return what it prints."""
+    assert main(list(command)) == 0
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def task_of(asked: list[str]) -> str:
+    return asked[1].partition("=")[0]
+
+
+SHORT = ["--spp", "2", "--verify-spp", "4", "--measure", "no", "--denoise", "none"]
+
+
+def test_a_search_predicts_verifies_and_draws(
+    asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """By a matrix of light transport; rows have the payload, and blue and orange are in the pictures."""
+    run, detects = tmp_path / "run", task_of(asked) == "detection"
+    flags = ["--epsilon", "0.2", "--steps", "16", "--trials", "6", "--spp", "2", "--verify-spp", "4", "--run", str(run)]
+    found = answer(capsys, "attack", "--object", "mug", *asked, *flags)
+    assert found["ending"] == "found" and found["transport"]["used"] and found["clean"]["correct"]
+    assert found["objective"] == ("score" if detects else "pixel_margin")
+    assert set(found["verified"]["labels"]) == ({"bowl"} if detects else {"background"})
+    assert found["adversarial"]["payload"].keys() == ({"box", "found"} if detects else {"accuracy", "iou", "pixels"})
+    with Store(run / "results.sqlite", read_only=True) as store:
+        assert {type(row.payload) for row in store.rows("verification")} == {dict}
+    plain, drawn = (read_png(run / "images" / f"{name}.png") for name in ("adversarial", "adversarial-answer"))
+    assert max(drawn.shape) == 512 and np.array_equal(plain, np.rint(plain * 255) / np.float32(255))
+    blue = (np.abs(drawn - np.array([0, 190, 255]) / 255) < 1 / 255).all(axis=2)
+    assert blue.sum() > 100, "the true box, or the outline of the mask"
+    page = (run / "report.html").read_text("utf-8")
+    assert "What it answers" in page and "trial 00" in page
+    said = "(score" if detects else "accuracy over the object&#x27;s pixels"
+    assert said in page.replace("'", "&#x27;")
+
+
+def test_a_stopped_search_goes_on_with_the_same_words(
+    asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    command = ["attack", "--object", "mug", "--control", "pose", *asked, *SHORT, "--policy", "random", "--steps", "4"]
+    first = answer(capsys, *command, "--trials", "6", "--run", str(tmp_path / "run"))
+    (tmp_path / "run" / "summary.json").unlink()
+    again = answer(capsys, "resume", str(tmp_path / "run"), "--json")
+    for name in ("clean", "adversarial", "verified", "ending"):
+        assert again[name] == first[name]
+
+
+def test_a_sweep_counts_and_keeps_the_worst(
+    asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    swept = answer(
+        capsys, "sweep", "--object", "mug", *asked, "--grid", "pose.yaw=0,180", "--grid", "camera.elevation=25,85",
+        "--denoise", "none", "--spp", "2", "--trials", "6", "--verify-spp", "4", "--run", str(tmp_path / "run"),
+    )  # fmt: skip
+    assert swept["configurations"] == 4 and swept["worst"]["claimed"]["payload"] is not None
+    assert (tmp_path / "run" / "images" / "worst-answer.png").is_file()
+
+
+def test_how_much_worse_than_the_average(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    flags = ["--steps", "3", "--average", "4", "--trials", "6", "--policy", "random", "--run", str(tmp_path / "run")]
+    found = answer(capsys, "gap", "--object", "mug", "--control", "pose", *asked, *SHORT, *flags)
+    assert found["table"][0]["average"]["configurations"] == 4
+
+
+def test_the_region_round_a_verdict(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    flags = ["--vary", "pose.yaw", "--denoise", "none", "--verify-spp", "4", "--samples", "20"]
+    found = answer(
+        capsys, "region", "--object", "mug", "--control", "pose", *asked, *flags, "--run", str(tmp_path / "run")
+    )
+    assert found["verdict"] in ("right", "wrong") and found["box"][0]["name"] == "pose.yaw"
+
+
+def test_the_smallest_change(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    flags = ["--epsilon", "0.3", "--smallest", "--steps", "8", "--trials", "6", "--run", str(tmp_path / "run")]
+    found = answer(capsys, "attack", "--object", "mug", *asked, *SHORT, *flags)
+    assert found["ending"] == "found" and 0.0 < found["smallest"]["epsilon"]["texture"] < 0.3
+
+
+def test_an_answer_that_holds_for_many_conditions(
+    asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Every condition has a true box or mask of its own."""
+    flags = ["--over", "camera={azimuth: [35, 45]}", "--draws", "2", "--steps", "4", "--trials", "8"]
+    found = answer(
+        capsys, "attack", "--object", "mug", "--epsilon", "0.3", *asked, *SHORT, *flags, "--run", str(tmp_path / "run")
+    )
+    assert found["verified"]["trials"] == 8 and found["over"] == ["camera"]
+
+
+def test_a_picture_with_the_answers_beside(
+    asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    flags = [*asked[:6], "--denoise", "none", "--spp", "2", "--json", "--out", str(tmp_path / "mug.png")]
+    found = answer(capsys, "render", "--object", "mug", *flags)
+    first = found["views"][0]["answers"][0]
+    assert first["label"] == ("cup" if task_of(asked) == "detection" else "background") and first["probability"] > 0.5
+
+
+def test_the_first_answers_are_told_where_no_label_fits(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    """A detector's own cup is no mug; a segmenter without names has no mug either."""
+    detects = task_of(asked) == "detection"
+    assert main(["attack", "--object", "mug", *asked[: 6 if detects else 4], *SHORT]) == 2
+    said = capsys.readouterr().err
+    assert f"calls a clean picture of it {'cup' if detects else 'class 0'!r} " in said and "name what is right" in said
+
+
+@pytest.mark.parametrize("asked", ["detection"], indirect=True)
+def test_a_wrong_name_is_sought_by_its_objective(
+    asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    flags = ["--objective", "mislabel", "--epsilon", "0.3", "--steps", "6", "--trials", "6", "--target", "bowl"]
+    found = answer(capsys, "attack", "--object", "mug", *asked, *SHORT, *flags, "--run", str(tmp_path / "run"))
+    assert (found["ending"], found["objective"], found["target"]) == ("found", "mislabel", ["bowl"])
+    assert set(found["verified"]["labels"]) == {"bowl"}
