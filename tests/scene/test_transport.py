@@ -79,11 +79,12 @@ def test_its_derivative_is_that_of_the_adjoint(renderer: Renderer, predicted: li
     assert torch.equal(exact, predicted.gradient(loss, u, seed=4, spp=8)[1]), "nothing of it is by chance"
 
 
-def vertices(rows: Sequence[tuple[int, float, float, float]]) -> Vertices:
-    """Vertices from rows of pixel, u, v and weight."""
+def vertices(rows: Sequence[tuple[int, float, float, float]], sharp: bool = True) -> Vertices:
+    """Vertices from rows of pixel, u, v and weight, that the camera sees or not."""
     table = np.array(rows, dtype=np.float32).reshape(-1, 4)
     weight = torch.from_numpy(table[:, 3:]).expand(-1, 3).contiguous()
-    return Vertices(torch.from_numpy(table[:, 0]).long(), torch.from_numpy(table[:, 1:3]).contiguous(), weight)
+    seen = torch.full((len(table),), sharp)
+    return Vertices(torch.from_numpy(table[:, 0]).long(), torch.from_numpy(table[:, 1:3]).contiguous(), weight, seen)
 
 
 def test_a_lookup_is_bilinear_and_repeats_at_the_border() -> None:
@@ -102,7 +103,7 @@ def test_the_transpose_is_one() -> None:
     places = torch.rand(60, 2, generator=generator)
     rows = [(int(60 * x) % 12, float(x), float(y), float(x - y)) for x, y in places]
     made = TextureTransport((3, 4), (COARSE + 3, 2 * COARSE))
-    made.add([vertices(rows[:30]), vertices(rows[30:])], share=1.0)
+    made.add([vertices(rows[:30]), vertices(rows[30:], sharp=False)], share=1.0)
     made.finish()
     change = torch.randn(COARSE + 3, 2 * COARSE, 3, generator=generator)
     cotangent = torch.randn(3, 4, 3, generator=generator)

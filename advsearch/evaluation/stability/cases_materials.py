@@ -45,6 +45,13 @@ def _glass(part: GlassBall) -> Translation:
     return Translation({part.name: ball})
 
 
+def behind_glass(controls: Controls) -> Renderer:
+    """The mug behind a ball of clear glass, which covers part of it."""
+    camera = camera_to_world(describe("mug"))
+    x, y, z = (float(one) for one in camera[:3, 3] * 0.6 + np.array([0.0, 0.0, 0.2]))
+    return small("mug", controls, parts=[GlassBall("glass", (x, y, z), 0.3)])
+
+
 def surface(searched: dict[str, list[float]], **values: float) -> Outcome:
     """A surface with some numbers at the ends of their range, and the derivative by some of them there."""
     settings = {f"material.{name}": value for name, value in values.items()}
@@ -85,10 +92,8 @@ GROUP.case(
 )
 def clear_glass() -> Outcome:
     """The object behind a ball of clear glass: light bends twice, and a texel still has its gradient."""
-    camera = camera_to_world(describe("mug"))
-    x, y, z = (float(one) for one in camera[:3, 3] * 0.6 + np.array([0.0, 0.0, 0.2]))
     controls: Controls = {"texture": {"resolution": 8}, "environment": {"exposure": [-1.0, 1.0]}}
-    glass = small("mug", controls, parts=[GlassBall("glass", (x, y, z), 0.3)])
+    glass = behind_glass(controls)
     without = small("mug", controls)
     with torch.no_grad():
         moved = float((glass(glass.start, 0, 8) - without(without.start, 0, 8)).abs().mean())

@@ -20,6 +20,7 @@ from advsearch.evaluation.stability import (
     cases_precision,
     cases_radiometric,
     cases_stiff,
+    cases_transport,
 )
 from advsearch.evaluation.stability.case import FELL_SHORT, OK, Case, Check, Outcome
 from advsearch.progress import Progress
@@ -33,6 +34,7 @@ _MODULES = (
     cases_stiff,
     cases_precision,
     cases_noise,
+    cases_transport,
 )
 GROUPS: tuple[str, ...] = tuple(module.GROUP.name for module in _MODULES)
 """Every group, in the order in which they run."""

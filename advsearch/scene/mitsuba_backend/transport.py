@@ -37,11 +37,19 @@ class Vertices:
         pixel: (n,) int64, row by row.
         uv: (n, 2) float32 texture coordinates as Mitsuba has them: row 0 of a base colour lies at v = 0.
         weight: (n, 3) float32, divided by the samples a pixel, so that a pixel's sum is what counts.
+        sharp: (n,) bool: the camera sees it directly, or through mirrors and glass.
     """
 
     pixel: Tensor
     uv: Tensor
     weight: Tensor
+    sharp: Tensor
+
+    def only(self, mask: Tensor) -> Vertices:
+        """Return those that a mask (n,) has."""
+        if bool(mask.all()):
+            return self
+        return Vertices(self.pixel[mask], self.uv[mask], self.weight[mask], self.sharp[mask])
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +116,8 @@ def collect(scene: Any, parameters: Any, key: str, noise: Any, size: tuple[int, 
         parameters.update()
     radiance, vertices = _gathered(steps)
     pictures = [*(radiance + first.shown), *first.others]
-    taking_part = [dr.any(one != 0.0) & dr.all(dr.isfinite(one)) for _, one in vertices]
+    all_of_them = dr.full(mi.Bool, True, height * width * spp)
+    taking_part = [all_of_them & dr.any(one != 0.0) & dr.all(dr.isfinite(one)) for _, one, _ in vertices]
     dr.eval(pictures, vertices, taking_part)
     means = [dr.block_sum(channel, spp) / spp for channel in pictures]
     dr.eval(means)
@@ -116,21 +125,26 @@ def collect(scene: Any, parameters: Any, key: str, noise: Any, size: tuple[int, 
     radiance, coverage, background, albedo, normal = (
         one.contiguous() for one in torch.split(picture, [3, 1, 3, 3, 3], dim=-1)
     )
-    found = [_kept(uv, weight, taken, spp) for (uv, weight), taken in zip(vertices, taking_part, strict=True)]
+    found = [_kept(*vertex, taken, spp) for vertex, taken in zip(vertices, taking_part, strict=True)]
     return Paths(radiance, coverage, background, albedo, normal, found)
 
 
-def _kept(uv: Any, weight: Any, taking_part: Any, spp: int) -> Vertices:
+def _kept(uv: Any, weight: Any, sharp: Any, taking_part: Any, spp: int) -> Vertices:
     """Take the vertices that take part out of all, as tensors."""
     mi = mitsuba()
     import drjit as dr
 
     index: Any = dr.compress(taking_part)
+    if dr.width(index) == 0:
+        none = torch.zeros(0)
+        return Vertices(none.long(), none.reshape(0, 2), none.reshape(0, 3), none.bool())
     uv, weight = dr.gather(mi.Point2f, uv, index), dr.gather(mi.Color3f, weight, index) / spp
-    pixel = index // spp
-    dr.eval(uv, weight, pixel)
+    pixel, sharp = index // spp, dr.gather(mi.Bool, sharp, index)
+    dr.eval(uv, weight, pixel, sharp)
     places = torch.stack([uv.x.torch(), uv.y.torch()], dim=1)
-    return Vertices(pixel.torch().long(), places, torch.stack([one.torch() for one in weight], dim=1))
+    return Vertices(
+        pixel.torch().long(), places, torch.stack([one.torch() for one in weight], dim=1), sharp.torch().bool()
+    )
 
 
 @dataclass
@@ -147,6 +161,7 @@ class _Step:
 
     Attributes:
         through: throughput before it.
+        sharp: no vertex before it scatters light.
         to_light, on: directions to the light that was sampled and of the path; with which of them count.
         arriving: radiance that arrives from the light over the density, weighted.
         value, value_on: the BSDF times the cosine for both.
@@ -157,6 +172,7 @@ class _Step:
     bsdf: Any
     at: Any
     through: Any
+    sharp: Any
     to_light: Any
     lit: Any
     arriving: Any
@@ -189,7 +205,7 @@ def _walk(scene: Any, ray: Any, noise: Any, depth: int) -> tuple[_First, list[_S
 
     context = mi.BSDFContext()
     through = mi.Spectrum(1.0)
-    active = mi.Bool(True)
+    active, sharp = mi.Bool(True), dr.full(mi.Bool, True, dr.width(ray.o))
     last, last_pdf, last_delta = dr.zeros(mi.SurfaceInteraction3f), mi.Float(1.0), mi.Bool(True)
     steps: list[_Step] = []
     first: _First | None = None
@@ -221,6 +237,7 @@ def _walk(scene: Any, ray: Any, noise: Any, depth: int) -> tuple[_First, list[_S
             bsdf=bsdf,
             at=hit,
             through=through,
+            sharp=sharp,
             to_light=to_light,
             lit=lit,
             arriving=arriving,
@@ -235,6 +252,7 @@ def _walk(scene: Any, ray: Any, noise: Any, depth: int) -> tuple[_First, list[_S
         steps.append(made)
         through = through * factor
         active &= going
+        sharp = sharp & delta
         last, last_pdf, last_delta = hit, sampled.pdf, delta
         ray = hit.spawn_ray(hit.to_world(sampled.wo))
     assert first is not None
@@ -253,17 +271,17 @@ def _seen(hit: Any, bsdf: Any, shown: Any) -> _First:
     return _First(shown, [dr.select(covered, mi.Float(1.0), 0.0), *behind, *albedo, *normal])
 
 
-def _gathered(steps: list[_Step]) -> tuple[Any, list[tuple[Any, Any]]]:
-    """Return the radiance that leaves the first vertices, and texture coordinates and weights of all."""
+def _gathered(steps: list[_Step]) -> tuple[Any, list[tuple[Any, Any, Any]]]:
+    """Return the radiance that leaves the first vertices, and texture coordinates, weights and sharpness of all."""
     mi = mitsuba()
     import drjit as dr
 
     beyond = mi.Spectrum(0.0)
-    found: list[tuple[Any, Any]] = []
+    found: list[tuple[Any, Any, Any]] = []
     for one in reversed(steps):
         incoming = one.hit + beyond
         weight = one.through * (one.slope * one.arriving + one.slope_on * incoming)
-        found.append((mi.Point2f(one.at.uv), weight))
+        found.append((mi.Point2f(one.at.uv), weight, one.sharp))
         beyond = one.value * one.arriving + one.factor * incoming
     return dr.select(dr.isfinite(beyond), beyond, 0.0), found[::-1]
 

@@ -4,10 +4,10 @@ Where camera, meshes and lights stand still, the radiance of a pixel is, to firs
 
     radiance = base + J (base colour - base colour there),        J: pixels x texels, one weight a colour channel,
 
-and J is sparse: a pixel sees few texels directly (bilinear lookups of the first vertices of its paths) and many a
-little (light from the object to the object), for which coarse cells of `COARSE` texels a side are enough. What a pixel
-sees of the texels hardly depends on the colour of the light, so that a row of J is kept as shares of texels, which add
-up to one, times a colour.
+and J is sparse: a pixel sees few texels directly, in a mirror or through glass (bilinear lookups), and many a little
+(light from the object to the object), for which coarse cells of `COARSE` texels a side are enough. What a pixel sees of
+the texels hardly depends on the colour of the light, so that a row of J is kept as shares of texels, which add up to
+one, times a colour.
 """
 
 from __future__ import annotations
@@ -82,6 +82,8 @@ class ColouredRows:
             shares: (n, k), how much each of them has of it.
             weights: (n, 3).
         """
+        if not len(rows):
+            return
         begin = np.searchsorted(rows, np.arange(self._shape[0] + 1)) * columns.shape[1]
         values = (shares * np.abs(weights).mean(axis=1, keepdims=True)).ravel()
         more = scipy.sparse.csr_matrix((values, columns.ravel().astype(np.int32), begin.astype(np.int32)), self._shape)
@@ -145,9 +147,9 @@ class TextureTransport:
 
     def add(self, vertices: Sequence[Vertices], share: float) -> None:
         """Add a pass of paths, vertices by their place in the path; it counts as this share of the samples."""
-        self._first.add(*_bilinear(vertices[0], self._texture, share))
-        for one in vertices[1:]:
-            self._later.add(*_nearest(one, self._cells, share))
+        for one in vertices:
+            self._first.add(*_bilinear(one.only(one.sharp), self._texture, share))
+            self._later.add(*_nearest(one.only(~one.sharp), self._cells, share))
 
     def finish(self, smooth: Smooth | None = None) -> None:
         """End the collecting.
