@@ -605,7 +605,7 @@ def test_runs_are_listed(runs: Path, capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_a_run_over_many_controls_takes_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    many = {name: {} for name in ("pose", "camera", "texture", "light", "haze", "lens")}
+    many: dict[str, dict[str, object]] = {name: {} for name in ("pose", "camera", "texture", "light", "haze", "lens")}
     with RunDirectory.create_for(AttackConfig(object="mug", controls=many, run=str(tmp_path / "a"))):
         pass
     assert main(["runs", str(tmp_path)]) == 0

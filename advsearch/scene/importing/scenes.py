@@ -172,7 +172,7 @@ def contents(path: Path) -> Contents:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class FileFrame:
     """How something lies in the file, z up: its own coordinates times `size`, plus `origin` (3,)."""
 
     size: float
@@ -183,7 +183,7 @@ class Frame:
         return np.asarray((places - self.origin) / self.size)
 
 
-def _frame(parts: Sequence[ImportedPart]) -> Frame:
+def _frame(parts: Sequence[ImportedPart]) -> FileFrame:
     """The frame in which the parts have a largest extent of 1, stand on z = 0 and are centred in x and y."""
     corners = []
     for part in parts:
@@ -193,9 +193,9 @@ def _frame(parts: Sequence[ImportedPart]) -> Frame:
         corners.append(triangles[area > FLAT * extent**2].reshape(-1, 3))
     places = np.concatenate(corners) @ UPRIGHT.T
     if not np.isfinite(places).all() or not len(places) or not np.ptp(places, axis=0).max() > 0.0:
-        return Frame(1.0, np.zeros(3))  # refused with a reason when it is repaired
+        return FileFrame(1.0, np.zeros(3))  # refused with a reason when it is repaired
     low, high = places.min(axis=0), places.max(axis=0)
-    return Frame(float((high - low).max()), np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]))
+    return FileFrame(float((high - low).max()), np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, low[2]]))
 
 
 class _Names:
@@ -276,7 +276,7 @@ def _matrix(node: gltf.Node) -> Doubles:
     return matrix
 
 
-def _lamp(name: str, light: gltf.Light, pose: Doubles, frame: Frame) -> PointLamp:
+def _lamp(name: str, light: gltf.Light, pose: Doubles, frame: FileFrame) -> PointLamp:
     """A light at its place; light falls off with the square of the distance in object sizes as it does in the file."""
     power = np.array(light.color) * light.intensity / LUMENS
     if light.type == "directional":
@@ -289,7 +289,7 @@ def _lamp(name: str, light: gltf.Light, pose: Doubles, frame: Frame) -> PointLam
     return PointLamp(name, dark=not power.any(), position=(x, y, z), intensity=(red, green, blue))
 
 
-def _camera(camera: gltf.CameraEntry, pose: Doubles, frame: Frame) -> PlacedCamera:
+def _camera(camera: gltf.CameraEntry, pose: Doubles, frame: FileFrame) -> PlacedCamera:
     assert camera.perspective is not None
     turn = UPRIGHT @ pose[:3, :3] @ BEHIND
     matrix = np.eye(4)
