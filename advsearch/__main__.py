@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 
@@ -10,9 +11,13 @@ def start() -> int:
     """Run the command line and return its exit status."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the process, without a traceback, until `main` begins
 
-    from advsearch.cli.main import main
+    from advsearch.cli.main import INTERRUPTED, main
 
-    return main()
+    status = main()
+    if status == INTERRUPTED:  # one that struck inside Dr.Jit has left it so that the interpreter aborts at its end
+        sys.stderr.flush()
+        os._exit(status)  # standard output is written out, and every file is closed
+    return status
 
 
 if __name__ == "__main__":

@@ -274,6 +274,14 @@ def test_an_interrupt_that_an_import_swallows_is_not_lost(where: dict[str, str],
     assert "swallowed" in done.stdout + done.stderr and done.stderr.endswith("advsearch: interrupted\n")
 
 
+def test_an_interrupted_process_ends_without_the_interpreters_own_end() -> None:
+    """What an interrupt inside native code leaves behind aborts there: status 134 and a dump of threads."""
+    code = "import atexit, os; from advsearch.cli import main; main._status = lambda given: print('answer') or 130; "
+    code += "atexit.register(os.abort); from advsearch.__main__ import start; start()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "answer\n", "")
+
+
 def test_a_reader_that_goes_away_is_no_error() -> None:
     code = "import sys; from advsearch.cli.main import main; sys.stdin.read(); sys.exit(main(['--help']))"
     with subprocess.Popen(
