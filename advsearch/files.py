@@ -18,14 +18,11 @@ from advsearch.errors import FileFormatError, InputError
 FACTOR = "ADVSEARCH_LIMITS"
 """Environment variable with a number that all limits on the size of input are multiplied by."""
 
-Json = dict[str, Any]
-"""What a file or a store holds as a JSON object, before a type has taken it, or once it has been written out."""
-
 JsonValue = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"] | None
 """Whatever JSON can hold."""
 
 JsonObject = dict[str, JsonValue]
-"""A JSON object."""
+"""A JSON object, before a type has taken it or once it has been written out."""
 
 DEPTH = 100
 """Deepest nesting of JSON, in lists and objects."""

@@ -380,7 +380,7 @@ def check_names(config: Config) -> None:
     shared = RunSettings(getattr(config, "epsilon", None), getattr(config, "norm", None), config.texture_resolution)
     shared.check(config.controls, over)
     shared.given_to(config.controls)
-    resolve(config.set_)  # type: ignore[arg-type]
+    resolve(config.set_)
     lights = config.environments if isinstance(config, SweepConfig) else (config.lit_by,)
     for name in config.objects:
         assert name in library.list_objects() or Path(split_node(name)[0]).suffix in objects.SUFFIXES

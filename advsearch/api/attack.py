@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,6 +32,7 @@ from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.stages import Attack
 from advsearch.errors import InputError
+from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.features import features_of
 from advsearch.options import as_setting
@@ -96,7 +97,7 @@ def attack(
         InputError: anything that the caller can put right; nothing is written then.
     """
     options = {name: value for name, value in settings.items() if value is not None}
-    scene = _scene(scene, options)
+    scene = _scene(scene, settings)
     described = {
         "object": scene.description.object_name,
         "environment": scene.description.environment_name,
@@ -107,7 +108,7 @@ def attack(
         "task": as_setting(task) if isinstance(task, Task) else task,
         "objective": getattr(objective, "__name__", "custom") if callable(objective) else objective,
         "policy": policy if isinstance(policy, str) else policy.name,
-        "set": _set_by(scene, options),
+        "set": _set_by(scene, settings.get("exposure")),
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
     searched, drawn = _controls(config, controls, over)
@@ -161,24 +162,24 @@ def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> t
     return problem, [*job.loaded[1], *sentences(problem.space.moved)]
 
 
-def _scene(scene: Scene | str | Path, options: Mapping[str, Any]) -> Scene:
-    """The scene as it was given, or the one that a name and the options describe."""
-    told = {"set": options.get("set"), **{one: options.get(one) for one in ("environment", "up")}}
-    told["exposure"] = options.get("exposure")
+def _scene(scene: Scene | str | Path, settings: AttackKeywords) -> Scene:
+    """The scene as it was given, or the one that a name and the settings describe."""
     if isinstance(scene, Scene):
-        clash = [name for name, value in told.items() if value is not None]
+        clash = [name for name in ("set", "environment", "up", "exposure") if settings.get(name) is not None]
         if clash:
             raise InputError(f"{', '.join(clash)}: belongs to the scene, which is given already; give it to load_scene")
         return scene
-    given = scene_settings(told["set"], told["exposure"])
-    return load_scene(scene, told["environment"], up=told["up"], settings=given)
+    given, lit_by = scene_settings(settings.get("set"), settings.get("exposure")), settings.get("environment")
+    if not (lit_by is None or isinstance(lit_by, (str, Path))):
+        raise one_only("environment", tuple(lit_by))
+    return load_scene(scene, lit_by, up=settings.get("up"), settings=given)
 
 
-def _set_by(scene: Scene, options: Mapping[str, Any]) -> dict[str, float]:
+def _set_by(scene: Scene, exposure: float | None) -> dict[str, float]:
     """The parameters of the scene that were fixed, but for the exposure where an option says it."""
     values, given = scene.description.values, scene.description.given
     fixed = {name: value for name, value in values.items() if name in given and value is not None}
-    if options.get("exposure"):
+    if exposure:
         fixed.pop("camera.exposure", None)
     return fixed
 
@@ -242,7 +243,7 @@ def _model(model: Model | nn.Module | str | Path, config: AttackConfig, task: Ta
     return loaded, said
 
 
-def _policy_options(config: AttackConfig) -> dict[str, Any]:
+def _policy_options(config: AttackConfig) -> JsonObject:
     return config.policy_options | ({} if config.step_size is None else {"step_size": config.step_size})
 
 

@@ -42,10 +42,18 @@ from advsearch.engine.planning import (
 )
 from advsearch.engine.problem import Problem
 from advsearch.engine.run_settings import RunSettings
-from advsearch.files import Json
+from advsearch.files import JsonObject
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.check import WHOLE, CheckedRow, CheckedRows, CheckResult, DerivativeRow, DirectionRow
+from advsearch.runs.results.check import (
+    WHOLE,
+    CheckedPlace,
+    CheckedRow,
+    CheckedRows,
+    CheckResult,
+    DerivativeRow,
+    DirectionRow,
+)
 from advsearch.runs.results.plan import CosineRow
 from advsearch.scene.description import DEFAULT_ENVIRONMENT
 from advsearch.scene.gradients.group import Group
@@ -176,14 +184,15 @@ def _configurations(config: CheckConfig) -> Iterator[CheckConfig]:
                 continue  # a bottle is closed
             if control == "sky" and environment != DEFAULT_ENVIRONMENT:
                 continue  # a sky takes the place of the environment
-            update: Json = {
-                "object": object,
-                "environment": None if environment == DEFAULT_ENVIRONMENT else environment,
-                "controls": {control: {}},
-                "label": None,
-                **vars(shared.alone(control, {})),
-            }
-            yield config.model_copy(update=update)
+            yield config.model_copy(
+                update={
+                    "object": object,
+                    "environment": None if environment == DEFAULT_ENVIRONMENT else environment,
+                    "controls": {control: {}},
+                    "label": None,
+                    **vars(shared.alone(control, {})),
+                }
+            )
 
 
 def _rows_of(part: CheckedPart, parts: int, results: Results, progress: Progress) -> Iterator[CheckedRow]:
@@ -260,7 +269,9 @@ def _model(part: CheckedPart, title: str, results: Results, progress: Progress) 
         table.append(row)
         taken = [group.estimator for group in renderer.plan.groups if group.control == row.control]
         names = ", ".join(dict.fromkeys(taken))
-        yield DirectionRow(**_place(part), **row.model_dump(exclude={"denoise"}), parameter=WHOLE, estimator=names)
+        yield DirectionRow(
+            **vars(_place(part)), **row.model_dump(exclude={"denoise"}), parameter=WHOLE, estimator=names
+        )
     renderer.plan, spp = tuned(renderer.plan, table)
     wider = {group.name: group.step / steps[group.name] for group in renderer.plan.groups if steps[group.name]}
     for one in _rows(
@@ -306,7 +317,7 @@ def _rows(
         references: dict[str, Reference] = {}
         for probe in mine:
 
-            def referred(probe: Probe = probe) -> Json:
+            def referred(probe: Probe = probe) -> JsonObject:
                 # what acts on the picture clips: its mean depends on the noise, so both get the same
                 many = spp if probe.group.estimator == "image" else max(spp, high)
                 return vars(reference(renderer, loss, u, probe, seed=seed, spp=many, repeats=repeats, factors=factors))
@@ -326,7 +337,7 @@ def _rows(
 
                 def estimated(
                     wanted: Sequence[Probe] = wanted, estimator: str = estimator, factor: float = factor
-                ) -> list[Json]:
+                ) -> list[JsonObject]:
                     many = REPEATS if factor == 1.0 else AGAIN  # another try has to be surer
                     found = estimates(
                         renderer, loss, u, estimator, wanted, seed=seed, spp=spp, repeats=many, factor=factor
@@ -373,7 +384,7 @@ def _row(
 ) -> DerivativeRow:
     status, error = verdict(estimate, against, size)
     return DerivativeRow(
-        **_place(part),
+        **vars(_place(part)),
         control=probe.group.control,
         parameter=probe.name.partition(".")[2],
         estimator=estimate.estimator,
@@ -399,5 +410,5 @@ def _sets(found: Sequence[Probe]) -> list[list[Probe]]:
     return list(sets.values())
 
 
-def _place(part: CheckedPart) -> Json:
-    return {"object": part.config.object, "environment": part.config.lit_by, "loss": part.loss}
+def _place(part: CheckedPart) -> CheckedPlace:
+    return CheckedPlace(object=part.config.object, environment=part.config.lit_by, loss=part.loss)

@@ -19,7 +19,6 @@ from advsearch.config import AttackConfig, GapConfig
 from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.naming import different, load_models
 from advsearch.engine.run_settings import RunSettings
-from advsearch.files import Json
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.studies import curve_figure, gap_figure
 from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, default_name, is_run
@@ -27,7 +26,7 @@ from advsearch.runs.files import write_bytes
 from advsearch.runs.listing import finished
 from advsearch.runs.results.attack import AttackSummary, AverageCase
 from advsearch.runs.results.base import INTERRUPTED
-from advsearch.runs.results.gap import CurvePoint, CurveResult, GapResult, GapRow, ObjectRow
+from advsearch.runs.results.gap import CurvePoint, CurveResult, GapResult, GapRow, ObjectRow, StudyResult
 from advsearch.runs.summary import attack_of
 from advsearch.scene.library import list_objects, load_object
 from advsearch.tasks import make_task
@@ -75,31 +74,40 @@ def curve_from_config(
         resumed: folder of the run to go on with.
     """
 
-    def body(parts: _Parts) -> Json:
-        return _curve(config, parts)
+    epsilons: Sequence[float | None] = sorted(config.epsilons) or [None]
 
-    return _study(config, CurveResult, body, progress or NullProgress(), resumed)
+    def result(rows: list[ObjectRow], common: StudyResult) -> CurveResult:
+        curve = [_accuracy(rows, epsilon) for epsilon in epsilons]
+        return CurveResult(**vars(common), epsilons=list(epsilons), table=rows, curve=curve)
+
+    return _study(config, lambda parts: _curve(config, epsilons, parts), result, progress or NullProgress(), resumed)
 
 
 def gap_from_config(config: GapConfig, *, progress: Progress | None = None, resumed: Path | None = None) -> GapResult:
     """The worst case beside the average, over the same space and budget, for each object and each control."""
 
-    def body(parts: _Parts) -> Json:
-        return {"table": _gap(config, parts)}
+    def result(rows: list[GapRow], common: StudyResult) -> GapResult:
+        return GapResult(**vars(common), table=rows)
 
-    return _study(config, GapResult, body, progress or NullProgress(), resumed)
+    return _study(config, lambda parts: _gap(config, parts), result, progress or NullProgress(), resumed)
 
 
 # ---- one study ------------------------------------------------------------------------------------------------------
 
 
 Study = TypeVar("Study", bound=CurveResult | GapResult)
+Rows = TypeVar("Rows")
 
 
 def _study(
-    config: AttackConfig, kind: type[Study], body: Callable[[_Parts], Json], progress: Progress, resumed: Path | None
+    config: AttackConfig,
+    attacks: Callable[[_Parts], Rows],
+    result_of: Callable[[Rows, StudyResult], Study],
+    progress: Progress,
+    resumed: Path | None,
 ) -> Study:
-    """Carry out the attacks of a study in its run; `body` returns what is its own in the result."""
+    """Carry out the attacks of a study in its run; `attacks` returns their rows, `result_of` puts these into a result
+    beside what all studies have in common."""
     begun = time.perf_counter()
     with RunDirectory.of(config, resumed) as run:
         said = _label_for_all(config)
@@ -107,8 +115,8 @@ def _study(
             progress.message(text)
         each = len(config.controls) if isinstance(config, GapConfig) else max(1, len(config.epsilons))
         parts = _Parts(run.path / PARTS, progress, len(config.objects) * each)
-        own = body(parts)
-        result = kind(
+        rows = attacks(parts)
+        common = StudyResult(
             run=str(run.path),
             objects=list(config.objects),
             controls=list(config.controls),
@@ -116,7 +124,6 @@ def _study(
             model=config.model,
             task=config.task_name,
             policy=config.policy_name,
-            **own,
             warnings=[*said, *parts.warnings],
             parts=parts.names,
             ending=INTERRUPTED if parts.interrupted else "done",
@@ -124,6 +131,7 @@ def _study(
             seed=config.seed,
             command_line=config.command_line(),
         )
+        result = result_of(rows, common)
         figure = gap_figure(result) if isinstance(result, GapResult) else curve_figure(result)
         for suffix, data in figure.items():
             write_bytes(run.path / "images" / f"{config.command}.{suffix}", data)
@@ -181,8 +189,7 @@ class _Parts:
 # ---- robust accuracy against epsilon --------------------------------------------------------------------------------
 
 
-def _curve(config: AttackConfig, parts: _Parts) -> Json:
-    epsilons: Sequence[float | None] = sorted(config.epsilons) or [None]
+def _curve(config: AttackConfig, epsilons: Sequence[float | None], parts: _Parts) -> list[ObjectRow]:
     rows = []
     for place, name in enumerate(different(config.objects, "object")):
         row = ObjectRow(object=name, clean=None, flips_at=None)
@@ -198,7 +205,7 @@ def _curve(config: AttackConfig, parts: _Parts) -> Json:
             if row.ending in ("found", "already wrong"):
                 break
         rows.append(row)
-    return {"epsilons": list(epsilons), "table": rows, "curve": [_accuracy(rows, epsilon) for epsilon in epsilons]}
+    return rows
 
 
 def _seen(name: str, summary: AttackSummary, tried: float | None) -> ObjectRow:

@@ -32,13 +32,13 @@ from advsearch.evaluation.precision.objective import ObjectiveBench, curve_of
 from advsearch.evaluation.precision.points import MeasuredSetting, Point, Sample, point_of
 from advsearch.evaluation.precision.report import MeasuredLine, Section, report_of
 from advsearch.evaluation.precision.rounds import Rounds, TimeBudget, in_rounds
-from advsearch.files import Json
+from advsearch.files import JsonObject
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.diagrams import precision_figures
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.results.base import Formation
-from advsearch.runs.results.precision import PrecisionResult
+from advsearch.runs.results.precision import PrecisionResult, PrecisionSubject
 from advsearch.runs.summary import to_json
 from advsearch.scene.renderer import Renderer
 from advsearch.settings import split_names
@@ -143,8 +143,8 @@ def _measured(config: PrecisionConfig, run: RunDirectory | None, progress: Progr
         for one in sections:
             whole.extend(one)
         seconds = {"budget": config.seconds, "setup": setup, "total": time.perf_counter() - begun}
-        place = {"run": None if run is None else str(run.path), "ending": ending, "seconds": seconds}
-        return report_of({**_head(config, problem), **place}, whole, config.error)
+        path = None if run is None else str(run.path)
+        return report_of(_subject(config, problem, path, ending, seconds), whole, config.error)
 
     return kept_rows(run, results, sections(), result)
 
@@ -165,7 +165,7 @@ class _Part:
     share: float
     measure: Callable[[TimeBudget], Section]
 
-    def timed(self, budget: TimeBudget) -> Json:
+    def timed(self, budget: TimeBudget) -> JsonObject:
         """Measure, and return what came out and the seconds that it took, as JSON values."""
         begun = time.perf_counter()
         section = self.measure(budget)
@@ -375,22 +375,27 @@ class _Measurement:
         return tick
 
 
-def _head(config: PrecisionConfig, problem: Problem) -> Json:
+def _subject(
+    config: PrecisionConfig, problem: Problem, run: str | None, ending: str, seconds: dict[str, float]
+) -> PrecisionSubject:
     """What was asked for, and on what it was measured."""
-    return {
-        "object": config.object,
-        "model": problem.model.name,
-        "environment": problem.space.environment or config.lit_by,
-        "controls": list(config.controls),
-        "image_formation": Formation.of(problem.renderer.formation),
-        "depth": problem.renderer.scene.max_depth,
-        "loss": config.loss,
-        "objective": config.objective or problem.task.objective,
-        "spp": problem.spp,
-        "seed": config.seed,
-        "machine": machine(),
-        "command_line": config.command_line(),
-    }
+    return PrecisionSubject(
+        run=run,
+        object=config.object,
+        model=problem.model.name,
+        environment=problem.space.environment or config.lit_by,
+        controls=list(config.controls),
+        ending=ending,
+        image_formation=Formation.of(problem.renderer.formation),
+        depth=problem.renderer.scene.max_depth,
+        loss=config.loss,
+        objective=config.objective or problem.task.objective,
+        spp=problem.spp,
+        machine=machine(),
+        seconds=seconds,
+        seed=config.seed,
+        command_line=config.command_line(),
+    )
 
 
 def _write(folder: Path, report: PrecisionResult) -> list[str]:

@@ -22,14 +22,13 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.stages import Attack
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.files import Json
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.studies import map_figure
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.base import INTERRUPTED, CleanScene, Formation, MovedValue
-from advsearch.runs.results.region import AxisRange, BoxSide, MarginMap, RegionResult
+from advsearch.runs.results.region import AxisRange, BoxSide, GrownRegion, MarginMap, RegionResult
 from advsearch.runs.store import NAME, Store
 from advsearch.settings import split_names
 
@@ -105,7 +104,7 @@ def region_from_config(
             with interruptible():
                 found, ending = _found(attack, config, varied, centre, run), "done"
         except KeyboardInterrupt:
-            found, ending = {}, INTERRUPTED
+            found, ending = GrownRegion(), INTERRUPTED
         stages.end()
         result = RegionResult(
             run=str(run.path),
@@ -115,7 +114,7 @@ def region_from_config(
             task=problem.task.name,
             controls=[bound.name for bound in problem.space.controls],
             ending=ending,
-            **found,
+            **vars(found),
             image_formation=Formation.of(problem.renderer.formation),
             clean=CleanScene(moved=[MovedValue.of(one) for one in problem.space.moved]),
             warnings=said,
@@ -128,7 +127,7 @@ def region_from_config(
         return result
 
 
-def _found(attack: Attack, config: RegionConfig, varied: Varied, centre: Tensor, run: RunDirectory) -> Json:
+def _found(attack: Attack, config: RegionConfig, varied: Varied, centre: Tensor, run: RunDirectory) -> GrownRegion:
     """Look at the centre, grow the box, check it, and draw the map if one was asked for."""
     problem, stages = attack.problem, attack.stages
     attack.choose_spp({"centre": centre})
@@ -159,20 +158,20 @@ def _found(attack: Attack, config: RegionConfig, varied: Varied, centre: Tensor,
     seed = seeds.stream(config.seed, "region")
     found = grow(same, centre[varied.places], seed=seed, samples=config.samples, on_check=on_check)
     box = _box(problem, found, at, varied)
-    return {
-        "verdict": "wrong" if verdict else "right",
-        "box": box,
-        "same": found.same,
-        "samples": found.samples,
-        "rate": found.same / found.samples,
-        "interval": found.interval,
-        "volume": found.volume,
-        "spp": spp,
-        "map": _map(attack, config.map, at, box, run) if config.map else None,
-    }
+    return GrownRegion(
+        verdict="wrong" if verdict else "right",
+        box=box,
+        same=found.same,
+        samples=found.samples,
+        rate=found.same / found.samples,
+        interval=found.interval,
+        volume=found.volume,
+        spp=spp,
+        map=_map(attack, config.map, at, box, run) if config.map else None,
+    )
 
 
-def _budget(around: str) -> Json:
+def _budget(around: str) -> dict[str, object]:
     """How far a run's controls may go, so that its answer lies within."""
     theirs = AttackConfig.from_yaml(find_run(around) / CONFIG)
     return {"epsilon": theirs.epsilon, "norm": theirs.norm}

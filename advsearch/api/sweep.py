@@ -44,7 +44,7 @@ AnyModel = Model | nn.Module | str | Path
 def sweep(
     scene: AnyScene | Sequence[AnyScene],
     model: AnyModel | Sequence[AnyModel] = "reference",
-    grid: Mapping[str, Any] | None = None,
+    grid: Mapping[str, object] | None = None,
     *,
     task: AnyTask = "classification",
     samples: int | None = None,
@@ -77,7 +77,7 @@ def sweep(
     names = [split_names(one) if isinstance(one, str) else (str(one),) for one in scenes if not isinstance(one, Scene)]
     if names and len(names) < len(scenes):
         raise InputError("scene: expected scenes from load_scene or names of objects, got some of each")
-    described: dict[str, Any] = {
+    described: dict[str, object] = {
         "model": ",".join(_model_name(one) for one in networks),
         "task": as_setting(task) if isinstance(task, Task) else task,
         "controls": settings_of(controls),
@@ -141,7 +141,7 @@ def _place(scene: Scene) -> NamedScene:
     return NamedScene(object_name, described.environment_name, scene)
 
 
-def _described(places: Sequence[NamedScene]) -> dict[str, Any]:
+def _described(places: Sequence[NamedScene]) -> dict[str, object]:
     """Settings that say what loaded scenes are."""
     first = places[0].scene.description
     given = {name: value for name, value in first.values.items() if name in first.given and value is not None}

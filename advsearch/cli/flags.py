@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 
 from advsearch.config import CONFIGS, AttackConfig
 from advsearch.errors import InputError
-from advsearch.files import Json
 from advsearch.settings import Config, Setting, check_once, parse_assignment, settings
 
 _NO_SETTINGS = {"code": "--code"}
@@ -90,19 +89,19 @@ def help_text(setting: Setting) -> str:
     return text.replace("%", "%%")
 
 
-def _assignments(given: Sequence[str], flag: str) -> Json:
+def _assignments(given: Sequence[str], flag: str) -> dict[str, object]:
     """Return name to value from ``NAME=VALUE``, each name once."""
     pairs = [parse_assignment(text, flag) for text in given]
     check_once((name for name, _ in pairs), flag)
     return dict(pairs)
 
 
-def _choices(given: Sequence[str], flag: str) -> Json:
+def _choices(given: Sequence[str], flag: str) -> dict[str, object]:
     """Return name to choice from ``NAME=CHOICE`` or a choice for all."""
     return _assignments([text if "=" in text else f"*={text}" for text in given], flag)
 
 
-def _axes(given: Sequence[str], flag: str) -> Json:
+def _axes(given: Sequence[str], flag: str) -> dict[str, object]:
     """Return parameter to values from ``PARAMETER=VALUES``, which YAML would take for numbers to the base of 60.
 
     Raises:
@@ -116,7 +115,7 @@ def _axes(given: Sequence[str], flag: str) -> Json:
     return _assignments(quoted, flag)
 
 
-def _controls(given: Sequence[str], flag: str) -> Json:
+def _controls(given: Sequence[str], flag: str) -> dict[str, object]:
     """Return control to settings from ``texture,pose``, ``texture={resolution: 64}`` and ``pose,texture={...}``."""
     found: list[tuple[str, Any]] = []
     for text in given:

@@ -19,6 +19,7 @@ from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
+from advsearch.scene.settings import Given
 
 Controls = str | Sequence[str | Control] | Mapping[str, Mapping[str, object]]
 """One control or several, by name or instance; a mapping gives each name its settings."""
@@ -116,7 +117,7 @@ def load_scene(
     environment: str | Path | EnvironmentAsset | None = None,
     *,
     up: str | None = None,
-    settings: Mapping[str, float] | None = None,
+    settings: Given | None = None,
 ) -> Scene:
     """Load a scene.
 

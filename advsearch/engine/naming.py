@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from advsearch import threads
@@ -11,10 +11,11 @@ from advsearch.controls import CONTROLS
 from advsearch.errors import InputError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.loading import named_code
+from advsearch.scene.settings import Given
 from advsearch.tasks import Task
 
 
-def scene_settings(fixed: Mapping[str, Any] | None, exposure: float | None) -> dict[str, Any]:
+def scene_settings(fixed: Given | None, exposure: float | None) -> Given:
     """Return the parameters that a scene is loaded with: those of `set`, and the exposure.
 
     Raises:

@@ -15,14 +15,13 @@ import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, TypedDict
 
 import torch
 from torch import Tensor
 
 from advsearch import seeds
 from advsearch.engine.gradients import EXPENSIVE, Loss, estimated, only
-from advsearch.files import Json
 from advsearch.runs.results.check import GradientStatus
 from advsearch.runs.results.plan import CosineRow
 from advsearch.scene.gradients.group import Group
@@ -173,7 +172,7 @@ def _scores(
     gradients: dict[str, Tensor] = {}
     seconds: dict[str, float] = {}
 
-    def timed(estimator: str, number: int) -> Json:
+    def timed(estimator: str, number: int) -> TimedGradient:
         begun, noise = time.perf_counter(), seeds.stream(seed, "plan", number)
         gradient = estimated(renderer, loss, u, estimator, names, noise, spp)
         return {"seconds": time.perf_counter() - begun, "gradient": _packed(gradient, groups)}
@@ -302,7 +301,7 @@ def _cosines_at(
         agreements = torch.tensor([_cosine(*pair) for pair in itertools.combinations(found, 2)])
         return torch.stack(found).mean(dim=0), float(agreements.min())  # NaN if one is
 
-    def working(spp: int, number: int) -> Json:
+    def working(spp: int, number: int) -> TimedCosine:
         begun = time.perf_counter()
         found = gradient("working", number, spp)
         return {"seconds": time.perf_counter() - begun, "cosine": _cosine(found, truth)}
@@ -330,6 +329,20 @@ def _cosines_at(
         )
         if mean >= GOAL:
             break
+
+
+class TimedGradient(TypedDict):
+    """What is stored of one gradient: seconds, and its numbers; see `_packed`."""
+
+    seconds: float
+    gradient: str
+
+
+class TimedCosine(TypedDict):
+    """What is stored of one working gradient: seconds, and its cosine with the converged one."""
+
+    seconds: float
+    cosine: float
 
 
 def _packed(gradient: Tensor, groups: Sequence[Group]) -> str:

@@ -183,7 +183,7 @@ def describe(
     object_spec: str | Path | ObjectAsset,
     environment_spec: str | Path | EnvironmentAsset | None = None,
     *,
-    given: Mapping[str, float] | None = None,
+    given: settings.Given | None = None,
     up: str | None = None,
 ) -> SceneDescription:
     """Find and read an object and an environment, bundled or from a file.

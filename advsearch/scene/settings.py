@@ -6,7 +6,7 @@ A control takes its declarations from here (`POSE`, `CAMERA`, ...) and adds thos
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 from advsearch.errors import InputError, UnknownNameError
@@ -160,7 +160,11 @@ SETTINGS: Mapping[str, Parameter] = {
 """Every setting by `family.parameter`; of no other control's parameters."""
 
 
-def resolve(given: Mapping[str, float]) -> dict[str, float | None]:
+Given = Mapping[str, float | str | Sequence[float]]
+"""Settings as they are asked for, by name; `resolve` refuses what is no number."""
+
+
+def resolve(given: Given) -> dict[str, float | None]:
     """Return every setting's value: what was given, checked, over the defaults; None where the scene works it out.
 
     Raises:

@@ -20,7 +20,6 @@ from advsearch.config import PlanConfig
 from advsearch.engine.measuring import Results
 from advsearch.engine.planning import cosine_samples, cosines
 from advsearch.errors import InputError
-from advsearch.files import Json
 from advsearch.interrupts import INTERRUPTS
 from advsearch.progress import NullProgress
 from advsearch.runs.directory import RunDirectory
@@ -35,7 +34,7 @@ SMALL: dict[str, Any] = {
     "spp": 1,
     "threads": 1,
 }
-FORCED: Json = {**SMALL, "estimators": {"*": "differences"}}
+FORCED: dict[str, Any] = {**SMALL, "estimators": {"*": "differences"}}
 """Which estimator is best depends on the machine's time."""
 LEFT = [
     *("step and samples of camera", "step and samples of environment"),
@@ -63,7 +62,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(planning, "bounces_of", lambda *_, **__: length)
 
 
-def timeless(result: PlanResult) -> Json:
+def timeless(result: PlanResult) -> dict[str, Any]:
     """The result without times, what they decide, and its place."""
 
     def without(value: Any) -> Any:
@@ -71,7 +70,7 @@ def timeless(result: PlanResult) -> Json:
             return {name: without(one) for name, one in value.items() if name not in ("seconds", "run")}
         return [without(one) for one in value] if isinstance(value, list) else value
 
-    kept: Json = without(result.to_dict())
+    kept: dict[str, Any] = without(result.to_dict())
     del kept["denoise"]
     return kept
 
@@ -190,7 +189,7 @@ def test_a_summary_keeps_its_rows_when_reading_them_back_is_interrupted(tmp_path
 
 
 def test_nothing_is_said_of_a_denoiser_that_was_not_measured() -> None:
-    row: Json = {"control": "pose", "factor": 1.0, "spp": 8, "converged": 1.0, "status": "ok"}
+    row: dict[str, Any] = {"control": "pose", "factor": 1.0, "spp": 8, "converged": 1.0, "status": "ok"}
     rows: Sequence[CosineRow] = [CosineRow.of({**row, "denoise": "oidn", "cosine": 0.95, "seconds": 2.0})]
     other = [CosineRow.of({**row, "denoise": "none", "cosine": 0.93, "seconds": 1.0})]
     said: Callable[..., str] = lambda **tables: quieter(tables, "oidn").reason  # noqa: E731

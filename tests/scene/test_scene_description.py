@@ -101,7 +101,7 @@ def test_a_wrong_setting_is_explained() -> None:
     with pytest.raises(InputError, match="got nan"):
         resolve({"pose.x": float("nan")})
     with pytest.raises(InputError, match="expected a number in degrees, got 'left'"):
-        resolve({"pose.yaw": "left"})  # type: ignore[dict-item]
+        resolve({"pose.yaw": "left"})
 
 
 def test_unknown_names_and_a_needless_up_are_explained() -> None:

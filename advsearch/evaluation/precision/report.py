@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from pydantic import TypeAdapter
@@ -19,13 +20,15 @@ from advsearch.evaluation.precision.fits import (
 from advsearch.evaluation.precision.image import OIDN
 from advsearch.evaluation.precision.objective import PolicyCurve, missing, sooner
 from advsearch.evaluation.precision.points import MeasuredSetting, Point, ReferenceValue
-from advsearch.files import Json
+from advsearch.files import JsonObject
 from advsearch.runs.results.precision import (
     NotMeasured,
     PrecisionPoint,
     PrecisionReference,
     PrecisionResult,
+    PrecisionSubject,
     Recommended,
+    SettingPlace,
 )
 from advsearch.scene.mitsuba_backend.samplers import next_count
 
@@ -77,13 +80,13 @@ class Section:
     left_out: tuple[MeasuredSetting, ...] = ()
     warnings: list[str] = field(default_factory=list)
 
-    def to_dict(self) -> Json:
+    def to_dict(self) -> JsonObject:
         """Return JSON values, of which `of` makes the same again."""
-        values: Json = TypeAdapter(Section).dump_python(self, mode="json")
+        values: JsonObject = TypeAdapter(Section).dump_python(self, mode="json")
         return values
 
     @classmethod
-    def of(cls, values: Json) -> Section:
+    def of(cls, values: JsonObject) -> Section:
         """Return what `to_dict` was made of."""
         return TypeAdapter(cls).validate_python(values)
 
@@ -125,8 +128,8 @@ class Section:
         )
 
 
-def report_of(head: Json, section: Section, goal: float) -> PrecisionResult:
-    """Return the report: what was asked for (`head`), what was measured and what follows from it; no figures yet."""
+def report_of(subject: PrecisionSubject, section: Section, goal: float) -> PrecisionResult:
+    """Return the report: what was asked for, what was measured and what follows from it; no figures yet."""
     slopes, warnings = [], list(section.warnings)
     for one in section.lines:
         for against in AGAINST:
@@ -135,14 +138,14 @@ def report_of(head: Json, section: Section, goal: float) -> PrecisionResult:
             slopes += [] if slope is None else [slope]
             warnings += [] if said is None else [said]
     return PrecisionResult(
-        **head,
+        **vars(subject),
         goal=goal,
         points=_points(section),
         slopes=slopes,
         references=section.references,
         recommendations=_recommended(section, goal) + _policy(section, goal),
         warnings=warnings,
-        left_out=[NotMeasured(**_place(one), reason="did not fit into the time") for one in section.left_out],
+        left_out=[NotMeasured(**vars(_place(one)), reason="did not fit into the time") for one in section.left_out],
         figures=[],
     )
 
@@ -152,17 +155,33 @@ def report_of(head: Json, section: Section, goal: float) -> PrecisionResult:
 
 def _points(section: Section) -> list[PrecisionPoint]:
     """One entry a setting; the margin's error stands beside the picture's."""
-    found: dict[tuple[Line, int], Json] = {}
+    found: dict[tuple[Line, int], dict[str, Point]] = {}
+    families = {one.line: one.family for one in section.lines if one.family}
     for one in section.lines:
         for point in one.points:
-            entry = found.setdefault((one.line, point.setting.spp), _place(point.setting))
-            own = one.measure.removesuffix("error")  # "margin_", or nothing
-            entry |= {one.measure: point.error, f"{own}interval": point.interval, f"{own}known": point.known}
-            entry[f"{own}reference_error"] = point.floor
-            entry |= {"seconds": point.seconds, "repeats": point.repeats, **point.more}
-            if one.family:
-                entry["family"] = one.family
-    return [*map(PrecisionPoint.of, found.values()), *_objective_points(section)]
+            found.setdefault((one.line, point.setting.spp), {})[one.measure] = point
+    points = [_together(by_measure, families.get(line)) for (line, _), by_measure in found.items()]
+    return [*points, *_objective_points(section)]
+
+
+def _together(by_measure: Mapping[str, Point], family: str | None) -> PrecisionPoint:
+    """The entry of a setting: its error, and the margin's where that was measured too."""
+    point, margin, last = by_measure["error"], by_measure.get("margin_error"), [*by_measure.values()][-1]
+    return PrecisionPoint(
+        **vars(_place(point.setting)),
+        error=point.error,
+        interval=point.interval,
+        known=point.known,
+        reference_error=point.floor,
+        margin_error=None if margin is None else margin.error,
+        margin_interval=None if margin is None else margin.interval,
+        margin_known=None if margin is None else margin.known,
+        margin_reference_error=None if margin is None else margin.floor,
+        seconds=last.seconds,
+        repeats=last.repeats,
+        cosine=last.more.get("cosine"),
+        family=family,
+    )
 
 
 def _objective_points(section: Section) -> list[PrecisionPoint]:
@@ -173,8 +192,17 @@ def _objective_points(section: Section) -> list[PrecisionPoint]:
         for renders, seconds, (low, middle, high), share in zip(
             curve.renders, curve.seconds, curve.objective, shares, strict=True
         ):
-            place = {**_place(setting), "renders": renders, "seconds": seconds, "repeats": curve.repeats}
-            found.append(PrecisionPoint(**place, error=share, objective=middle, quartiles=(low, high)))
+            found.append(
+                PrecisionPoint(
+                    **vars(_place(setting)),
+                    renders=renders,
+                    seconds=seconds,
+                    repeats=curve.repeats,
+                    error=share,
+                    objective=middle,
+                    quartiles=(low, high),
+                )
+            )
     return found
 
 
@@ -184,9 +212,10 @@ def _best(section: Section) -> float:
     return max((value for value in tops if math.isfinite(value)), default=math.nan)
 
 
-def _place(setting: MeasuredSetting) -> Json:
-    place = {"quantity": setting.quantity, "estimator": setting.series, "spp": setting.spp}
-    return {**place, "control": setting.control or None}
+def _place(setting: MeasuredSetting) -> SettingPlace:
+    return SettingPlace(
+        quantity=setting.quantity, estimator=setting.series, spp=setting.spp, control=setting.control or None
+    )
 
 
 def _recommended(section: Section, goal: float) -> list[Recommended]:

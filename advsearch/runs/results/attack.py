@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, Number, Payload, RunResult
+from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, Number, Payload, SceneResult
 from advsearch.runs.results.plan import PlannedGradient
 
 
@@ -160,14 +160,11 @@ class LinearTransport(Fields):
     error: PredictionError | None = Field(default=None, description="of the last comparison")
 
 
-class AttackSummary(RunResult):
+class AttackSummary(SceneResult):
     """The worst configuration of a scene that was found, how sure that is, and what it cost."""
 
     command: ClassVar[str] = "attack"
 
-    object: str
-    model: str
-    task: str = Field(description="what judges the answers")
     policy: str
     objective: str
     epsilon: float | dict[str, float | None] | None = Field(description="the budget; by control where there are more")

@@ -107,6 +107,14 @@ Payload = Annotated[JsonValue, BeforeValidator(lambda value: plain(value))]
 """What a task keeps of an answer beside its words."""
 
 
+class SceneResult(RunResult):
+    """The answer of a command about one object, one model and one task."""
+
+    object: str
+    model: str
+    task: str = Field(description="what judges the answers")
+
+
 class MovedValue(Fields):
     """A value of the scene that a control leaves out, so that the clean scene has another."""
 

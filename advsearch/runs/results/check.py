@@ -14,12 +14,17 @@ WHOLE = "*"
 """What stands for the parameter in rows about a whole control."""
 
 
-class GradientRow(Fields):
-    """A derivative that was checked."""
+class CheckedPlace(Fields):
+    """Where a derivative was checked, and of what."""
 
     object: str
     environment: str
     loss: str = Field(description="`linear`, or `model`: the model's own")
+
+
+class GradientRow(CheckedPlace):
+    """A derivative that was checked."""
+
     control: str
     parameter: str = Field(description="`*` for a whole control")
     estimator: str

@@ -121,8 +121,8 @@ class Machine(Fields):
     python: str
 
 
-class PrecisionResult(RunResult):
-    """Error against run time, and what follows from it, as far as that is measured."""
+class PrecisionSubject(RunResult):
+    """What was asked for, and on what it was measured."""
 
     command: ClassVar[str] = "precision"
 
@@ -134,6 +134,11 @@ class PrecisionResult(RunResult):
     objective: str
     spp: int
     machine: Machine
+
+
+class PrecisionResult(PrecisionSubject):
+    """Error against run time, and what follows from it, as far as that is measured."""
+
     goal: float = Field(description="relative error that is wanted")
     points: list[PrecisionPoint]
     slopes: list[PrecisionSlope]

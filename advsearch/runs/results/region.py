@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, Number, RunResult, having
+from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, Number, SceneResult, having
 
 
 class AxisRange(Fields):
@@ -31,14 +31,9 @@ class MarginMap(Fields):
     margins: list[list[Number]] = Field(description="logits, in rows of the second parameter from its lowest value")
 
 
-class RegionResult(RunResult):
-    """The box around a configuration in which the verdict stays; only what is known of it if it was interrupted."""
+class GrownRegion(Fields):
+    """What is known of a region; nothing yet if it was interrupted."""
 
-    command: ClassVar[str] = "region"
-
-    object: str
-    model: str
-    task: str = Field(description="what judges the answers")
     verdict: str | None = Field(default=None, description="`right` or `wrong`, at the centre")
     box: list[BoxSide] | None = Field(default=None, description="for each parameter, the range of its values")
     same: int | None = Field(default=None, description="fresh samples of the box that had that verdict")
@@ -50,6 +45,13 @@ class RegionResult(RunResult):
     map: MarginMap | None = Field(
         default=None, description="the margin over two parameters; only where `map` asks for it"
     )
+
+
+class RegionResult(GrownRegion, SceneResult):
+    """The box around a configuration in which the verdict stays."""
+
+    command: ClassVar[str] = "region"
+
     image_formation: Formation
     clean: CleanScene
     warnings: list[str] = Field(description="sentences that a reader has to know")
