@@ -137,3 +137,8 @@ def test_the_gap_is_asked_for_by_name(tmp_path: Path) -> None:
     assert found.table[0].average.configurations == 6
     with pytest.raises(InputError, match=r"^map: expected a whole number from 0 to 512, got 600"):
         advsearch.region("mug", controls="camera", map=600)
+
+
+def test_an_attack_has_one_environment() -> None:
+    with pytest.raises(InputError, match="environment: expected one"):
+        advsearch.attack("mug", environment=["studio", "sunset"])
