@@ -144,7 +144,9 @@ def with_dots(image: Tensor, values: Mapping[str, Tensor]) -> Tensor:
     """
     shades = srgb_to_linear(torch.stack([values["red"], values["green"], values["blue"]], dim=-1))
     light = srgb_to_linear(image)
-    for cover, shade in zip(_covers(image.shape[0], image.shape[1], values), shades, strict=True):
+    for cover, shade in zip(
+        _covers(image.shape[0], image.shape[1], values).to(image.device), shades.to(image.device), strict=True
+    ):
         light = light + cover[..., None] * (shade - light)
     return linear_to_srgb(light)
 

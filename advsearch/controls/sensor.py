@@ -92,7 +92,7 @@ def through_sensor(image: Tensor, values: Mapping[str, Tensor], seed: int = 0) -
     light = light + spread * _normal(height, width, seed).to(light)
     light = light + values["mosaic"] * (demosaiced(light) - light)
     gains = torch.stack([2.0 ** values["red"], torch.ones_like(values["red"]), 2.0 ** values["blue"]])
-    seen = linear_to_srgb((light * gains).clamp(0.0, 1.0))
+    seen = linear_to_srgb((light * gains.to(light.device)).clamp(0.0, 1.0))
     compression = round(float(values["compression"].detach()))
     return coded(seen, 100 - compression).clamp(0.0, 1.0) if compression else seen
 

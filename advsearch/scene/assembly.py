@@ -41,8 +41,10 @@ class MovingMesh:
             to_world: (4, 4) an invertible affine map, or None for the base pose.
             offsets: (V, 3) displacement in mesh coordinates, or None.
         """
-        matrix = self.to_world if to_world is None else to_world
-        vertices, normals = self.vertices, self.normals
+        given = to_world if to_world is not None else offsets
+        device = self.vertices.device if given is None else given.device
+        matrix = self.to_world.to(device) if to_world is None else to_world
+        vertices, normals = self.vertices.to(device), self.normals.to(device)
         if offsets is not None:
             vertices = vertices + offsets
             normals = self._turned(offsets)
@@ -56,16 +58,18 @@ class MovingMesh:
         Area-weighted normals over vertices that share place and normal (so that creases stay creases) are worked out
         for the displaced and for the original mesh; their difference is added to the author's normals.
         """
-        displaced = self._area_normals(self.vertices + offsets)
-        return self.normals + (displaced - self._original_area_normals)
+        device = offsets.device
+        displaced = self._area_normals(self.vertices.to(device) + offsets)
+        return self.normals.to(device) + (displaced - self._original_area_normals.to(device))
 
     def _area_normals(self, vertices: Tensor) -> Tensor:
-        first, second, third = (vertices.index_select(0, self._faces[:, corner]) for corner in range(3))
+        faces, groups = self._faces.to(vertices.device), self._groups.to(vertices.device)
+        first, second, third = (vertices.index_select(0, faces[:, corner]) for corner in range(3))
         normals = torch.linalg.cross(second - first, third - first)
-        summed = torch.zeros(self._group_count, 3).index_add(
-            0, self._groups[self._faces].T.reshape(-1), normals.repeat(3, 1)
+        summed = vertices.new_zeros(self._group_count, 3).index_add(
+            0, groups[faces].T.reshape(-1), normals.repeat(3, 1)
         )
-        found = summed[self._groups]
+        found = summed[groups]
         return found / (found.square().sum(dim=1, keepdim=True) + 1e-24).sqrt()
 
     @cached_property

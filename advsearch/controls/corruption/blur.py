@@ -55,7 +55,7 @@ def defocus_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     (radius,) = at_level(DEFOCUS, level)
     radius = radius * scale(image)
     reach = math.ceil(float(radius.detach()) + 0.5)
-    offsets = torch.arange(-reach, reach + 1, dtype=torch.float32)
+    offsets = torch.arange(-reach, reach + 1, dtype=torch.float32, device=image.device)
     distance = torch.sqrt(offsets[:, None] ** 2 + offsets[None, :] ** 2)
     disc = (radius + 0.5 - distance).clamp(0.0, 1.0)
     return _convolved(image, disc / disc.sum())
@@ -83,7 +83,7 @@ def zoom_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     (largest,) = at_level(ZOOM, level)
     zooms = 1.0 + (largest - 1.0) * torch.linspace(0.0, 1.0, ZOOM_STEPS)
     matrices = torch.diag_embed((1.0 / zooms)[:, None].expand(-1, 2))
-    theta = torch.cat([matrices, torch.zeros(ZOOM_STEPS, 2, 1)], dim=2)
+    theta = torch.cat([matrices, torch.zeros(ZOOM_STEPS, 2, 1)], dim=2).to(image.device)
     height, width = image.shape[:2]
     grid = F.affine_grid(theta, [ZOOM_STEPS, 3, height, width], align_corners=False)
     copies = planes(image).expand(ZOOM_STEPS, -1, -1, -1)

@@ -80,9 +80,9 @@ def coded(image: Tensor, quality: int) -> Tensor:
         image: (H, W, 3) display-referred sRGB in [0, 1].
         quality: 1 to 100, as of libjpeg.
     """
-    levels = (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).numpy()
+    levels = (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
     file = io.BytesIO()
     Image.fromarray(levels).save(file, "JPEG", quality=quality)
     with Image.open(file) as read:
         read_back = torch.from_numpy(np.asarray(read, dtype=np.float32) / 255.0)
-    return image + (read_back - image).detach()
+    return image + (read_back.to(image.device) - image).detach()

@@ -38,13 +38,13 @@ def _uniform(height: int, width: int, seed: int, name: str) -> Tensor:
 def gaussian_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Add normal noise, as of a sensor in the dark."""
     (sigma,) = at_level(GAUSSIAN, level)
-    return image + sigma * _normal(image.shape[0], image.shape[1], seed, "gaussian noise")
+    return image + sigma * _normal(image.shape[0], image.shape[1], seed, "gaussian noise").to(image.device)
 
 
 def speckle_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Add normal noise in proportion to the value."""
     (sigma,) = at_level(SPECKLE, level)
-    return image + image * sigma * _normal(image.shape[0], image.shape[1], seed, "speckle noise")
+    return image + image * sigma * _normal(image.shape[0], image.shape[1], seed, "speckle noise").to(image.device)
 
 
 def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
@@ -54,7 +54,7 @@ def shot_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     of standard deviations from the mean, when the mean or the spread changes a little.
     """
     (photons,) = at_level(SHOT, level)
-    share = _uniform(image.shape[0], image.shape[1], seed, "shot noise")
+    share = _uniform(image.shape[0], image.shape[1], seed, "shot noise").to(image.device)
     with torch.no_grad():
         counted = poisson(image * photons, share) / photons
         away = (counted - image) / torch.sqrt(image / photons + _DARK)
@@ -88,7 +88,7 @@ def impulse_noise(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """
     (lost,) = at_level(IMPULSE, level)
     height, width = image.shape[:2]
-    turn = _uniform(height, width, seed, "impulse noise")
-    extreme = (_uniform(height, width, seed, "impulse value") < 0.5).float()
+    turn = _uniform(height, width, seed, "impulse noise").to(image.device)
+    extreme = (_uniform(height, width, seed, "impulse value") < 0.5).float().to(image.device)
     kept = torch.where(turn < lost.detach(), extreme, image)
     return kept + (lost - lost.detach()) * (extreme - image.detach())

@@ -74,7 +74,7 @@ def picture(stack: Tensor) -> Tensor:
 def blurred(image: Tensor, sigma: Tensor) -> Tensor:
     """Blur an (H, W, C) picture with a Gaussian of () standard deviation in pixels; edges are continued."""
     reach = max(1, math.ceil(4.0 * float(sigma.detach())))
-    offsets = torch.arange(-reach, reach + 1, dtype=torch.float32)
+    offsets = torch.arange(-reach, reach + 1, dtype=torch.float32, device=image.device)
     weights = torch.exp(-0.5 * (offsets / sigma) ** 2)
     weights = weights / weights.sum()
     channels = image.shape[2]
@@ -94,7 +94,7 @@ def streaked(image: Tensor, radius: Tensor, sigma: Tensor, angle: float, step: f
         step: pixels of this picture for a reference pixel.
     """
     count = math.ceil((2.0 * float(radius.detach()) + 1.0) * step)
-    along = torch.arange(count) / step
+    along = torch.arange(count, device=image.device) / step
     weights = torch.exp(-0.5 * (along / sigma) ** 2) * (2.0 * radius + 1.0 - along).clamp(0.0, 1.0)
     weights = weights / weights.sum()
     height, width = image.shape[:2]
@@ -116,8 +116,8 @@ def warped(image: Tensor, shift: Tensor) -> Tensor:
     """
     height, width = image.shape[:2]
     rows, columns = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    where = torch.stack([columns, rows], dim=-1) + shift
-    grid = where * torch.tensor([2.0 / width, 2.0 / height]) - 1.0
+    where = torch.stack([columns, rows], dim=-1).to(image.device) + shift.to(image.device)
+    grid = where * torch.tensor([2.0 / width, 2.0 / height], device=image.device) - 1.0
     return picture(F.grid_sample(planes(image), grid[None], padding_mode="reflection", align_corners=False))
 
 

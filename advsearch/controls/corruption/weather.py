@@ -54,7 +54,7 @@ def fog(image: Tensor, level: Tensor, seed: int) -> Tensor:
     (density,) = at_level(FOG, level)
     drift = between(level, lambda whole: _drift(height, width, seed, FOG_DECAY[whole - 1]))
     brightest = image.max()
-    return (image + density * drift) * brightest / (brightest + density)
+    return (image + density * drift.to(image.device)) * brightest / (brightest + density)
 
 
 @lru_cache(maxsize=8)
@@ -88,7 +88,7 @@ def fractal(side: int, decay: float, source: torch.Generator) -> Tensor:
 def frost(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Lay ice crystals over the picture."""
     keep, ice = at_level(FROST, level)
-    return keep * image + ice * _crystals(image.shape[0], image.shape[1], seed)
+    return keep * image + ice * _crystals(image.shape[0], image.shape[1], seed).to(image.device)
 
 
 @lru_cache(maxsize=4)
@@ -126,8 +126,8 @@ def _line(pen: ImageDraw.ImageDraw, begin: complex, end: complex, shine: float) 
 def snow(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Pale the picture and let streaks of snow fall before it."""
     (keep,) = at_level(SNOW_KEEP, level)
-    layer = between(level, lambda whole: _snowfall(image.shape[0], image.shape[1], seed, whole))
-    grey = (image * torch.tensor(LUMA)).sum(dim=-1, keepdim=True)
+    layer = between(level, lambda whole: _snowfall(image.shape[0], image.shape[1], seed, whole)).to(image.device)
+    grey = (image * image.new_tensor(LUMA)).sum(dim=-1, keepdim=True)
     pale = torch.maximum(image, 1.5 * grey + 0.5)
     return keep * image + (1.0 - keep) * pale + layer + layer.rot90(2)
 

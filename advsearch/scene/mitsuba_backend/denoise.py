@@ -47,4 +47,4 @@ class Denoiser:
         for buffer, image in ((color, radiance), (guide, albedo), (direction, normal)):
             buffer.copy_(image.detach())
         mitsuba_oidn.denoise(color, guide, direction, hdr=True, output=output)
-        return output.clone()
+        return output.to(radiance.device, copy=True)
