@@ -304,12 +304,12 @@ def _default(value: object) -> str:
 
 def settings(config: type[Config]) -> tuple[Setting, ...]:
     """Return every setting of a configuration, in the order in which they are shown."""
-    found = []
+    declared = []
     for field, info in config.model_fields.items():
         if field in config.without:
             continue
         notes: Any = info.json_schema_extra
-        found.append(
+        declared.append(
             Setting(
                 field=field,
                 name=info.alias or field,
@@ -326,7 +326,7 @@ def settings(config: type[Config]) -> tuple[Setting, ...]:
                 switched=notes["switched"],
             )
         )
-    return tuple(found)
+    return tuple(declared)
 
 
 def _expected(info: FieldInfo) -> str:
@@ -423,13 +423,13 @@ def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchErr
     declared = settings(config)
     known = {one.name: one for one in declared} | {one.field: one for one in declared}
     problems: dict[str, str] = {}
-    for found in errors:
-        name = str(found["loc"][0])
+    for error in errors:
+        name = str(error["loc"][0])
         if name not in known:
             return UnknownNameError("setting", name, {one.name for one in declared})
-        got = "nothing" if found["type"] == "missing" else _shown(found["input"])
-        if known[name].form in ("assignments", "controls") and len(found["loc"]) > 1:
-            got = f"{found['loc'][1]}={got}"
+        got = "nothing" if error["type"] == "missing" else _shown(error["input"])
+        if known[name].form in ("assignments", "controls") and len(error["loc"]) > 1:
+            got = f"{error['loc'][1]}={got}"
         problems.setdefault(known[name].name, f"expected {known[name].expects}, got {got}")
     return SettingsError(tuple(problems.items()))
 

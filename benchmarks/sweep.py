@@ -161,7 +161,7 @@ def job_of(config: SweepConfig, model) -> Job:  # type: ignore[no-untyped-def]
         trials=config.trials,
         ladder=verification_ladder(config.pixel_sampler, config.verify_spp),
         command_line=config.command_line(),
-        said=(),
+        warnings=(),
     )
 
 

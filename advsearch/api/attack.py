@@ -239,8 +239,8 @@ def _asked(config: AttackConfig, task: AnyTask, objective: Wanted | None) -> tup
 
 def _model(model: Model | nn.Module | str | Path, config: AttackConfig, task: Task) -> tuple[Model, list[str]]:
     """Load the model; its warnings become sentences of the run."""
-    (loaded,), said = load_models([model], task, labels=config.labels, used_threads=config.used_threads)
-    return loaded, said
+    (loaded,), warnings = load_models([model], task, labels=config.labels, used_threads=config.used_threads)
+    return loaded, warnings
 
 
 def _policy_options(config: AttackConfig) -> JsonObject:
@@ -329,8 +329,8 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
     stages.begin("setup", PREPARING)
     problem = _problem(job)
     own = job.scene.description
-    said = [*own.notes, *job.loaded[1], *sentences(problem.space.moved)]
-    for text in said:
+    warnings = [*own.notes, *job.loaded[1], *sentences(problem.space.moved)]
+    for text in warnings:
         progress.message(text)
     policy = _policy(job, problem)
     with _directory(job, run) as kept:
@@ -338,7 +338,7 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
         recorder, prepared = Recorder(kept, problem, memory), preparation_of(job.config)
         attack = Attack(problem, budget_of(job.config), policy, recorder, memory, stages, prepared)
         findings = attack.carry_out()
-        return summarise(_question(job.config), problem, findings, recorder, stages, said)
+        return summarise(_question(job.config), problem, findings, recorder, stages, warnings)
 
 
 def _policy(job: _Job, problem: Problem) -> Policy[Any]:

@@ -339,10 +339,10 @@ def _rows(
                     wanted: Sequence[Probe] = wanted, estimator: str = estimator, factor: float = factor
                 ) -> list[JsonObject]:
                     many = REPEATS if factor == 1.0 else AGAIN  # another try has to be surer
-                    found = estimates(
+                    measured = estimates(
                         renderer, loss, u, estimator, wanted, seed=seed, spp=spp, repeats=many, factor=factor
                     )
-                    return [vars(one) for one in found]
+                    return [vars(one) for one in measured]
 
                 stored = results.get(_key(part, f"{estimator} x {factor:g}", wanted), estimated)
                 for probe, one in zip(wanted, stored, strict=True):
@@ -367,16 +367,16 @@ def attempts(group: Group) -> list[tuple[str, float]]:
     forced = "forced" in group.reason
     names = [group.estimator] if forced else [one for one in group.valid if one not in EXPENSIVE]
     wide = next((one for one in ("differences", "secant", "forward") if one in names), None)
-    found = [(one, 1.0) for one in names]
+    tries = [(one, 1.0) for one in names]
     if wide is None:
-        return found
+        return tries
     tried = {group.step}
     for factor in FACTORS[1:]:
         step = min(factor * group.step, STEP_RANGE[1])
         if step not in tried:
             tried.add(step)
-            found.append((wide, factor))
-    return found
+            tries.append((wide, factor))
+    return tries
 
 
 def _row(
@@ -402,10 +402,10 @@ def _row(
     )
 
 
-def _sets(found: Sequence[Probe]) -> list[list[Probe]]:
+def _sets(along: Sequence[Probe]) -> list[list[Probe]]:
     """Probes that one gradient answers together: of one control, with the same valid estimators."""
     sets: dict[tuple[str, tuple[str, ...], str], list[Probe]] = {}
-    for probe in found:
+    for probe in along:
         sets.setdefault((probe.group.control, probe.group.valid, probe.group.estimator), []).append(probe)
     return list(sets.values())
 

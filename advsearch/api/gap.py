@@ -110,8 +110,8 @@ def _study(
     beside what all studies have in common."""
     begun = time.perf_counter()
     with RunDirectory.of(config, resumed) as run:
-        said = _label_for_all(config)
-        for text in said:
+        notes = _label_for_all(config)
+        for text in notes:
             progress.message(text)
         each = len(config.controls) if isinstance(config, GapConfig) else max(1, len(config.epsilons))
         parts = _Parts(run.path / PARTS, progress, len(config.objects) * each)
@@ -124,7 +124,7 @@ def _study(
             model=config.model,
             task=config.task_name,
             policy=config.policy_name,
-            warnings=[*said, *parts.warnings],
+            warnings=[*notes, *parts.warnings],
             parts=parts.names,
             ending=INTERRUPTED if parts.interrupted else "done",
             seconds={"total": time.perf_counter() - begun},

@@ -284,13 +284,13 @@ def _limits() -> list[EstimatorLimit]:
 
 def _left_out(problem: Problem, used: set[str]) -> list[str]:
     """What a search with these estimators does not compute, in sentences."""
-    said = []
+    sentences = []
     if not used & {"boundary", "guided", "material"}:
-        said.append("boundary terms: nothing that an adjoint differentiates moves an outline")
+        sentences.append("boundary terms: nothing that an adjoint differentiates moves an outline")
     if not used & {"adjoint", "boundary", "guided", "material"}:
-        said.append("adjoint renders: no coordinate needs one")
+        sentences.append("adjoint renders: no coordinate needs one")
     if not used & BY_DIFFERENCES:
-        said.append("renders for differences: every derivative is an adjoint or of the picture itself")
+        sentences.append("renders for differences: every derivative is an adjoint or of the picture itself")
     if not problem.renderer.scene.volumetric:
-        said.append("the volumetric integrator: there is no medium")
-    return said
+        sentences.append("the volumetric integrator: there is no medium")
+    return sentences

@@ -118,8 +118,8 @@ def _measured(config: PrecisionConfig, run: RunDirectory | None, progress: Progr
     begun = time.perf_counter()
     progress.stage(LOADING, hint=f"then {config.seconds:g} seconds of measurements; `seconds` sets them")
     policies = {name: make_policy(name) for name in split_names(config.policies)}
-    problem, said = problem_from_config(config)
-    for text in said:
+    problem, warnings = problem_from_config(config)
+    for text in warnings:
         progress.message(text)
     setup = time.perf_counter() - begun
     wanted = split_names(config.quantities)
@@ -185,10 +185,12 @@ class _Measurement:
     def parts(self) -> list[_Part]:
         """Everything, in its order."""
         renderer, _ = self._differentiated
-        found = parts_of(renderer.plan.groups, linear=self.config.loss == "linear")
+        divided = parts_of(renderer.plan.groups, linear=self.config.loss == "linear")
         gradients = [
-            _Part("gradient", f"gradient of {one.name}", SHARES["gradient"] / len(found), partial(self._gradient, one))
-            for one in found
+            _Part(
+                "gradient", f"gradient of {one.name}", SHARES["gradient"] / len(divided), partial(self._gradient, one)
+            )
+            for one in divided
         ]
         first = _Part("image", "image", SHARES["image"], self._image)
         return [first, *gradients, _Part("objective", "objective", SHARES["objective"], self._objective)]
@@ -218,9 +220,9 @@ class _Measurement:
             self.section.refer("image", family, "", one, bench.part_spp[family], bench.margins[family])
         theories = {one.series: one.theory for one in chosen}
         families = {one.series: one.family for one in chosen}
-        found = self._rounds("the picture", bench.settings, bench.measure, budget)
+        measured = self._rounds("the picture", bench.settings, bench.measure, budget)
         for measure in ("error", "margin_error"):
-            self._take(found, measure, bench.floor, lambda series: theories[series], families)
+            self._take(measured, measure, bench.floor, lambda series: theories[series], families)
         return self.section
 
     @cached_property
@@ -249,12 +251,12 @@ class _Measurement:
         if bench.reference is None:
             return self.section
         self.section.refer("gradient", bench.by, part.name, bench.reference, bench.part_spp)
-        said = bench.bias(budget, self.seed)
-        self.section.warnings += [said] if said else []
+        remark = bench.bias(budget, self.seed)
+        self.section.warnings += [remark] if remark else []
         share = budget.share(1.0 - CONFIRM_SHARE)
-        found = self._rounds(f"gradient of {part.name}", bench.settings, bench.measure, share)
+        measured = self._rounds(f"gradient of {part.name}", bench.settings, bench.measure, share)
         linear, sampler = self.config.loss == "linear", self.config.pixel_sampler
-        self._take(found, "error", bench.floor, lambda series: theory_of(series, sampler) if linear else UNKNOWN)
+        self._take(measured, "error", bench.floor, lambda series: theory_of(series, sampler) if linear else UNKNOWN)
         self._confirm(bench, part, budget)
         return self.section
 
@@ -266,7 +268,7 @@ class _Measurement:
         like = next(setting for setting in bench.settings if setting.series == one.estimator)
         setting = replace(like, spp=one.spp, cost=like.cost / like.spp * one.spp)
         tick = self._timed(f"gradient of {part.name}: {one.estimator} with {one.spp} samples again", budget)
-        found = in_rounds(
+        measured = in_rounds(
             [setting],
             bench.measure,
             budget,
@@ -274,11 +276,11 @@ class _Measurement:
             seed=seeds.stream(self.seed, "confirm"),
             on_done=lambda _: tick(),
         )
-        samples = [Sample(numbers, seconds) for numbers, seconds in found.results.get(setting, [])]
+        samples = [Sample(numbers, seconds) for numbers, seconds in measured.results.get(setting, [])]
         if len(samples) >= CONFIRM_LEAST:
             floor = bench.floor(setting, "error")
-            measured = next(each for each in self.section.lines if each.line == setting.line)
-            measured.again = point_of(setting, samples, "error", floor)
+            line = next(each for each in self.section.lines if each.line == setting.line)
+            line.again = point_of(setting, samples, "error", floor)
 
     def _objective(self, budget: TimeBudget) -> Section:
         """The best verified objective of each policy."""
@@ -300,7 +302,7 @@ class _Measurement:
         self.section.start = self._verified(problem.domain.start)
         settings = bench.settings(problem.spp)
         tick = self._timed("searching with each policy", budget)
-        found = in_rounds(
+        measured = in_rounds(
             settings,
             bench.measure,
             budget,
@@ -310,8 +312,8 @@ class _Measurement:
             warm_up=0,
             on_done=lambda setting: tick(policy=setting.series),
         )
-        self.section.left_out += found.left_out
-        for setting, taken in found.results.items():
+        self.section.left_out += measured.left_out
+        for setting, taken in measured.results.items():
             self.section.curves.append((setting, curve_of(setting.series, [marks for marks, _ in taken if marks])))
         return self.section
 
@@ -331,7 +333,7 @@ class _Measurement:
         self, name: str, settings: Sequence[MeasuredSetting], measure: Any, budget: TimeBudget
     ) -> Rounds[dict[str, float]]:
         tick = self._timed(f"{name}: measuring every setting in rounds", budget)
-        found: Rounds[dict[str, float]] = in_rounds(
+        measured: Rounds[dict[str, float]] = in_rounds(
             settings,
             measure,
             budget,
@@ -339,12 +341,12 @@ class _Measurement:
             seed=self.seed,
             on_done=lambda setting: tick(now=setting.series, samples=setting.spp),
         )
-        self.section.left_out += found.left_out
-        return found
+        self.section.left_out += measured.left_out
+        return measured
 
     def _take(
         self,
-        found: Rounds[dict[str, float]],
+        measured: Rounds[dict[str, float]],
         measure: str,
         floor: Callable[[MeasuredSetting, str], float],
         theory: Callable[[str], Theory],
@@ -352,7 +354,7 @@ class _Measurement:
     ) -> None:
         """Make points of what was measured."""
         lines: dict[tuple[str, str, str], list[Point]] = {}
-        for setting, taken in found.results.items():
+        for setting, taken in measured.results.items():
             samples = [Sample(numbers, seconds) for numbers, seconds in taken]
             point = point_of(setting, samples, measure, floor(setting, measure))
             lines.setdefault(setting.line, []).append(point)

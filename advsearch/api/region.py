@@ -91,8 +91,8 @@ def region_from_config(
     stages = Stages(progress or NullProgress())
     stages.begin("setup", LOADING)
     budget = {} if config.around is None else _budget(config.around)
-    problem, said = problem_from_config(AttackConfig.of(config, **budget))
-    for text in said:
+    problem, warnings = problem_from_config(AttackConfig.of(config, **budget))
+    for text in warnings:
         stages.progress.message(text)
     varied = _varied(problem, config)
     centre = _centre(problem, config)
@@ -102,9 +102,9 @@ def region_from_config(
         attack = Attack(problem, spent, make_policy("random"), Recorder(run, problem, memory), memory, stages)
         try:
             with interruptible():
-                found, ending = _found(attack, config, varied, centre, run), "done"
+                answer, ending = _answer(attack, config, varied, centre, run), "done"
         except KeyboardInterrupt:
-            found, ending = GrownRegion(), INTERRUPTED
+            answer, ending = GrownRegion(), INTERRUPTED
         stages.end()
         result = RegionResult(
             run=str(run.path),
@@ -114,10 +114,10 @@ def region_from_config(
             task=problem.task.name,
             controls=[bound.name for bound in problem.space.controls],
             ending=ending,
-            **vars(found),
+            **vars(answer),
             image_formation=Formation.of(problem.renderer.formation),
             clean=CleanScene(moved=[MovedValue.of(one) for one in problem.space.moved]),
-            warnings=said,
+            warnings=warnings,
             renders={"verification": attack.findings.verification_renders},
             seconds={**stages.seconds, "total": stages.total},
             seed=config.seed,
@@ -127,7 +127,7 @@ def region_from_config(
         return result
 
 
-def _found(attack: Attack, config: RegionConfig, varied: Varied, centre: Tensor, run: RunDirectory) -> GrownRegion:
+def _answer(attack: Attack, config: RegionConfig, varied: Varied, centre: Tensor, run: RunDirectory) -> GrownRegion:
     """Look at the centre, grow the box, check it, and draw the map if one was asked for."""
     problem, stages = attack.problem, attack.stages
     attack.choose_spp({"centre": centre})
@@ -156,16 +156,16 @@ def _found(attack: Attack, config: RegionConfig, varied: Varied, centre: Tensor,
         return trial.success == verdict
 
     seed = seeds.stream(config.seed, "region")
-    found = grow(same, centre[varied.places], seed=seed, samples=config.samples, on_check=on_check)
-    box = _box(problem, found, at, varied)
+    grown = grow(same, centre[varied.places], seed=seed, samples=config.samples, on_check=on_check)
+    box = _box(problem, grown, at, varied)
     return GrownRegion(
         verdict="wrong" if verdict else "right",
         box=box,
-        same=found.same,
-        samples=found.samples,
-        rate=found.same / found.samples,
-        interval=found.interval,
-        volume=found.volume,
+        same=grown.same,
+        samples=grown.samples,
+        rate=grown.same / grown.samples,
+        interval=grown.interval,
+        volume=grown.volume,
         spp=spp,
         map=_map(attack, config.map, at, box, run) if config.map else None,
     )
@@ -232,16 +232,16 @@ def _verdict(attack: Attack, centre: Tensor) -> bool:
     return verdict
 
 
-def _box(problem: Problem, found: GrownBox, at: Any, varied: Varied) -> list[BoxSide]:
+def _box(problem: Problem, grown: GrownBox, at: Any, varied: Varied) -> list[BoxSide]:
     """The range of every parameter of the box in its unit."""
-    ends = [problem.describe(at(values)) for values in (found.low, found.high, found.centre)]
+    ends = [problem.describe(at(values)) for values in (grown.low, grown.high, grown.centre)]
     rows = []
     for name in varied.names:
         stem, _, number = name.rpartition(".")
         known = name if name in ends[0] else stem
         if known not in ends[0]:  # one of many numbers, which nobody describes
             place = varied.names.index(name)
-            sides = (found.low, found.high, found.centre)
+            sides = (grown.low, grown.high, grown.centre)
             low, high, centre = (float(side[place]) for side in sides)
             rows.append(BoxSide(name=name, unit="of the range", low=low, high=high, centre=centre))
             continue
@@ -251,8 +251,8 @@ def _box(problem: Problem, found: GrownBox, at: Any, varied: Varied) -> list[Box
     return rows
 
 
-def _number(told: Any, number: str) -> float:
-    value = told["value"]
+def _number(described: Any, number: str) -> float:
+    value = described["value"]
     return float(value[int(number)] if number else value)
 
 

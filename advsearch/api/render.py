@@ -36,8 +36,8 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
     given = scene_settings(config.set_, config.exposure)
     scene = load_scene(config.object, config.environment, up=config.up, settings=given)
     task = make_task(config.task)
-    (model,), said = load_models([config.model], task, labels=config.labels, used_threads=config.used_threads)
-    found = render(
+    (model,), notes = load_models([config.model], task, labels=config.labels, used_threads=config.used_threads)
+    rendering = render(
         scene,
         model,
         task=task,
@@ -50,7 +50,7 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
         seed=config.seed,
         progress=progress,
     )
-    warnings = [*found.warnings, *said]
+    warnings = [*rendering.warnings, *notes]
     for text in warnings:
         progress.message(text)
-    return found.result(out, found.save(out), warnings)
+    return rendering.result(out, rendering.save(out), warnings)

@@ -123,10 +123,10 @@ def sweep_from_config(
 
 
 def _several(given: Any) -> list[Any]:
-    found = list(given) if isinstance(given, (list, tuple)) else [given]
-    if not found:
+    listed = list(given) if isinstance(given, (list, tuple)) else [given]
+    if not listed:
         raise InputError("scene and model: expected at least one of each, got an empty list")
-    return found
+    return listed
 
 
 def _model_name(model: AnyModel) -> str:
@@ -178,12 +178,12 @@ def _job(
     samples = config.samples or (SAMPLES if drawn and not axes else 1)
     check_scenes(places, drawn, axes)
     made = make_task(task)
-    networks, said = _models(models, config, made)
+    networks, warnings = _models(models, config, made)
     tasks = tuple(made.on(network) for network in networks)
     own = {place.object: place.scene.description.object.label for place in places}
-    said += one_label_for_several(networks, config.label, own)
+    warnings += one_label_for_several(networks, config.label, own)
     for place in places:
-        said += place.scene.description.notes
+        warnings += place.scene.description.notes
     return Job(
         object=config.object,
         environment=config.lit_by,
@@ -202,7 +202,7 @@ def _job(
         trials=config.trials,
         ladder=verification_ladder(config.pixel_sampler, config.verify_spp),
         command_line=config.command_line(),
-        said=tuple(dict.fromkeys(said)),
+        warnings=tuple(dict.fromkeys(warnings)),
     )
 
 

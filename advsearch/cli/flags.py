@@ -111,21 +111,21 @@ def _axes(given: Sequence[str], flag: str) -> dict[str, object]:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise InputError(f"{flag} {twice[0]}: given twice; write all values in one, separated by commas")
-    quoted = [re.sub(r"=\s*([^\s\"'\[{].*)", lambda found: f'="{found[1]}"', text, count=1) for text in given]
+    quoted = [re.sub(r"=\s*([^\s\"'\[{].*)", lambda match: f'="{match[1]}"', text, count=1) for text in given]
     return _assignments(quoted, flag)
 
 
 def _controls(given: Sequence[str], flag: str) -> dict[str, object]:
     """Return control to settings from ``texture,pose``, ``texture={resolution: 64}`` and ``pose,texture={...}``."""
-    found: list[tuple[str, Any]] = []
+    controls: list[tuple[str, Any]] = []
     for text in given:
         names, equals, settings_text = text.partition("=")
         plain = [name.strip() for name in names.split(",") if name.strip()]
         last = [plain.pop() if plain else ""] if equals else []
-        found += [(name, {}) for name in plain]
-        found += [parse_assignment(f"{name}={settings_text}", flag) for name in last]
-    check_once((name for name, _ in found), flag)
-    return dict(found)
+        controls += [(name, {}) for name in plain]
+        controls += [parse_assignment(f"{name}={settings_text}", flag) for name in last]
+    check_once((name for name, _ in controls), flag)
+    return dict(controls)
 
 
 READERS = {"assignments": _assignments, "choices": _choices, "axes": _axes, "controls": _controls}

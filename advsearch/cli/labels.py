@@ -53,8 +53,8 @@ def run(args: argparse.Namespace) -> int:
     if not indices:
         raise InputError(f"none of the {len(labels)} labels is like {args.word!r}; leave the word out to see all")
     if args.json:
-        found = [{"index": index, "label": labels[index]} for index in indices]
-        output.print_json({"schema": 1, "command": "labels", "word": args.word, "labels": found})
+        listed = [{"index": index, "label": labels[index]} for index in indices]
+        output.print_json({"schema": 1, "command": "labels", "word": args.word, "labels": listed})
     else:
         print(output.columns([[f"#{index}", labels[index]] for index in indices]))
     return 0

@@ -146,7 +146,7 @@ def _left_out(left_out: Sequence[NotMeasured]) -> list[str]:
     for one in left_out:
         name = f"{one.control or one.quantity} by {one.estimator}"
         counts.setdefault(name, []).append(str(one.spp))
-    return [f"  {name}: {', '.join(found)} samples" for name, found in counts.items()]
+    return [f"  {name}: {', '.join(samples)} samples" for name, samples in counts.items()]
 
 
 def _percent(error: MeasuredError) -> str:

@@ -56,14 +56,14 @@ def answer(result: RegionResult) -> str:
     ]
     if result.box is None or result.interval is None:
         return "Stopped before the box was known.\n\n" + output.columns(cost)
-    said = (
+    verdict = (
         f"The model is {result.verdict} in {result.same} of {result.samples} fresh samples of this box: "
         f"with 95 % confidence in at least {100.0 * result.interval[0]:.1f} % of it."
     )
     rows = [["parameter", "from", "to", "centre", "unit"]]
     rows += [[one.name, f"{one.low:.4g}", f"{one.high:.4g}", f"{one.centre:.4g}", one.unit] for one in result.box]
     facts = [["share of the space", percent(result.volume)], *cost]
-    return "\n\n".join([said, output.columns(rows), output.columns(facts)])
+    return "\n\n".join([verdict, output.columns(rows), output.columns(facts)])
 
 
 COMMAND = _Region(

@@ -13,15 +13,15 @@ if TYPE_CHECKING:
 HELP = "render a picture of a scene, and say what the model sees in it"
 
 
-def text(found: RenderResult) -> str:
+def text(result: RenderResult) -> str:
     """Return what was written, and the model's answers view by view."""
-    height, width = found.size
-    lines = [f"{found.out}: {width} x {height} pixels", ""]
-    if len(found.views) == 1:
-        rows = [[one.label, _percent(one)] for one in found.views[0].answers]
-        return "\n".join([*lines, f"Model {found.model} sees", output.columns(rows)])
-    rows = [["azimuth", f"model {found.model} sees"]]
-    for view in found.views:
+    height, width = result.size
+    lines = [f"{result.out}: {width} x {height} pixels", ""]
+    if len(result.views) == 1:
+        rows = [[one.label, _percent(one)] for one in result.views[0].answers]
+        return "\n".join([*lines, f"Model {result.model} sees", output.columns(rows)])
+    rows = [["azimuth", f"model {result.model} sees"]]
+    for view in result.views:
         rows.append([f"{view.azimuth:g}", ", ".join(f"{one.label} {_percent(one)}".strip() for one in view.answers)])
     return "\n".join([*lines, output.columns(rows)])
 

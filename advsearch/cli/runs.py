@@ -31,17 +31,17 @@ def run(args: argparse.Namespace) -> int:
     folder = HOME if args.folder is None else Path(args.folder)
     if args.folder is not None and not os.path.isdir(folder):
         raise InputError(f"{folder}: expected a folder with runs in it, got no such folder")
-    found = listed(folder)
+    runs = listed(folder)
     if args.json:
-        output.print_json({"schema": 1, "command": "runs", "runs": [vars(one) for one in found]})
+        output.print_json({"schema": 1, "command": "runs", "runs": [vars(one) for one in runs]})
         return 0
-    if not found:
+    if not runs:
         print(f"no runs in {folder}/ yet; advsearch attack makes one")
         return 0
     heads = ["run", "command", "object", "controls", "rows", "state", "answer"]
     rows = [
         [one.name, one.command, one.object, _several(one.controls), str(one.rows), one.state, one.answer]
-        for one in found
+        for one in runs
     ]
     print(output.columns([heads, *rows]))
     return 0

@@ -64,21 +64,21 @@ def show_run(name: str, as_json: bool) -> int:
     return 0
 
 
-def _show_unfinished(found: Listed, as_json: bool) -> int:
+def _show_unfinished(run: Listed, as_json: bool) -> int:
     """Say what a run is, how far it has come and how to go on."""
-    go_on = output.go_on_command(found.path) if found.begun and found.state == "stopped" else None
+    go_on = output.go_on_command(run.path) if run.begun and run.state == "stopped" else None
     if as_json:
-        output.print_json({"schema": 1, **vars(found), "run": found.path, "ending": None, "resume": go_on})
+        output.print_json({"schema": 1, **vars(run), "run": run.path, "ending": None, "resume": go_on})
         return 0
-    what = found.command
-    if found.object:
-        what += f" of {found.object}, {' and '.join(found.controls) or 'nothing searched'}"
-    how = {"running": "A process is working on it"}.get(found.state, "It was stopped before its end")
-    kept = ", ".join(f"{count} of {kind}" for kind, count in found.kinds.items())
-    lines = [f"{found.name}: {what}.", f"{how}; evaluations kept so far: {kept or 'none'}."]
+    what = run.command
+    if run.object:
+        what += f" of {run.object}, {' and '.join(run.controls) or 'nothing searched'}"
+    how = {"running": "A process is working on it"}.get(run.state, "It was stopped before its end")
+    kept = ", ".join(f"{count} of {kind}" for kind, count in run.kinds.items())
+    lines = [f"{run.name}: {what}.", f"{how}; evaluations kept so far: {kept or 'none'}."]
     if go_on is not None:
         lines += ["", f"Go on with: {go_on}"]
-    elif found.state == "stopped":
+    elif run.state == "stopped":
         lines += [
             "",
             "It was stopped before its settings were written, so there is nothing to go on with; start again.",

@@ -56,11 +56,11 @@ def load_models(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ModelWarning)
         loaded = tuple(load_model(one, labels=labels, read=task.reader) for one in models)
-    said = [str(one.message) for one in caught if issubclass(one.category, ModelWarning)]
+    sentences = [str(one.message) for one in caught if issubclass(one.category, ModelWarning)]
     for one in caught:
         if not issubclass(one.category, ModelWarning):
             warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
-    return loaded, said
+    return loaded, sentences
 
 
 def different(names: Sequence[str], setting: str) -> Sequence[str]:

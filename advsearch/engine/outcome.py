@@ -134,7 +134,7 @@ class AttackResult:
 
 
 def summarise(
-    asked: Question, problem: Problem, findings: Findings, recorder: Recorder, stages: Stages, said: Sequence[str]
+    asked: Question, problem: Problem, findings: Findings, recorder: Recorder, stages: Stages, warnings: Sequence[str]
 ) -> AttackResult:
     """Put the result together and, if there is a run directory, write its files."""
     search = findings.search
@@ -155,7 +155,7 @@ def summarise(
     space = problem.searched_space
     artifacts = space.artifacts(u)
     run = recorder.run
-    warnings = [*said, *_remarks(findings, problem)]
+    warnings = [*warnings, *_remarks(findings, problem)]
     if run is not None:
         write_pictures(run, problem, findings, linear, {"clean": clean, "adversarial": adversarial}, u)
         write_artifacts(run, artifacts)
@@ -307,14 +307,14 @@ def _renders(findings: Findings, problem: Problem) -> dict[str, int]:
     }
 
 
-def _gradients(found: SearchResult) -> SearchGradients:
+def _gradients(search: SearchResult) -> SearchGradients:
     """What the search saw of its gradients, and what its policy did about them and about steps that failed."""
-    norms = [record.gradient_norm for record in found.history if record.objective == record.objective]
+    norms = [record.gradient_norm for record in search.history if record.objective == record.objective]
     return SearchGradients(
-        count=found.gradients,
-        cosine_with_the_one_before=statistics.median(found.agreement) if found.agreement else None,
+        count=search.gradients,
+        cosine_with_the_one_before=statistics.median(search.agreement) if search.agreement else None,
         zero=sum(norm == 0.0 for norm in norms),
-        **vars(found.counts),
+        **vars(search.counts),
     )
 
 
@@ -346,11 +346,11 @@ def _smallest(bracket: Bracket, problem: Problem) -> SmallestEpsilon:
     )
 
 
-def _distribution(found: Distribution, problem: Problem) -> AnswerDistribution | None:
+def _distribution(distribution: Distribution, problem: Problem) -> AnswerDistribution | None:
     """Mean and spread of a distribution of configurations, where there are few numbers."""
-    if found.mean.numel() > MOST_NUMBERS:
+    if distribution.mean.numel() > MOST_NUMBERS:
         return None
-    return AnswerDistribution(mean=_described(problem, found.mean), deviation=found.deviation.tolist())
+    return AnswerDistribution(mean=_described(problem, distribution.mean), deviation=distribution.deviation.tolist())
 
 
 def _ending(findings: Findings, problem: Problem) -> Ending:
@@ -372,13 +372,15 @@ def _verified(verification: Verification | None) -> VerifiedRate | None:
 
 def _remarks(findings: Findings, problem: Problem) -> list[str]:
     """What a reader has to know beside the numbers."""
-    said = []
+    remarks = []
     count = findings.sample_count
     if count is not None and count.table and not count.converged:
-        said.append(
+        remarks.append(
             f"The margin still moved with the sample count at {count.spp} samples a pixel, the most that was tried: "
             "noise may take part in the verdict."
         )
     if problem.renderer.non_finite:
-        said.append(f"{problem.renderer.non_finite} values of pictures or gradients were not finite and were set to 0.")
-    return said
+        remarks.append(
+            f"{problem.renderer.non_finite} values of pictures or gradients were not finite and were set to 0."
+        )
+    return remarks

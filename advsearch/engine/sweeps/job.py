@@ -66,7 +66,7 @@ class Job:
         trials: fresh renders that check the worst configuration; 0 for none.
         ladder: sample counts that this climbs.
         command_line: the command that asks the same again.
-        said: warnings on the way.
+        warnings: on the way.
     """
 
     object: str
@@ -86,7 +86,7 @@ class Job:
     trials: int
     ladder: Sequence[int]
     command_line: str
-    said: tuple[str, ...]
+    warnings: tuple[str, ...]
 
     @cached_property
     def sizes(self) -> tuple[tuple[int, int], ...]:
@@ -168,21 +168,21 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
     Raises:
         InputError: a scene cannot take a control, or a label does not fit a model.
     """
-    found = []
+    bound = []
     for place in job.places:
         spaces = [job.space(place, size) for size in dict.fromkeys(job.sizes)]
         _check_draws(place, spaces[0])
-        found += [(place, job.points(space)) for space in spaces]
+        bound += [(place, job.points(space)) for space in spaces]
         job.check_truths(place)
-    first = found[0][1]
-    for place, points in found:
+    first = bound[0][1]
+    for place, points in bound:
         if points.drawn_numbers != first.drawn_numbers:
             raise InputError(
                 f"`object` {place.object}: its controls draw other numbers than those of {job.places[0].object}; sweep "
                 "the two by themselves"
             )
     drawn = []
-    for versions in zip(*(points.drawn for _, points in found), strict=True):
+    for versions in zip(*(points.drawn for _, points in bound), strict=True):
         same = all(one.parts == versions[0].parts for one in versions)
         drawn.append(versions[0] if same else replace(versions[0], unit="of its range", parts=_shares()))
     return first, tuple(drawn)

@@ -139,7 +139,7 @@ class Sweep:
         tally = self._counted()
         first = tally.seen if first is None else first
         ending, worst = FINISHED, None
-        for text in self.job.said:
+        for text in self.job.warnings:
             self.stages.progress.message(text)
         try:
             with interruptible():
@@ -324,7 +324,7 @@ class Sweep:
             renders_per_second=self._rendered / swept if self._rendered and swept else None,
             seconds={**seconds, "total": self.stages.total},
             seed=job.pictures.seed,
-            warnings=[*job.said, *self._remarks(tally, checked)],
+            warnings=[*job.warnings, *self._remarks(tally, checked)],
             command_line=job.command_line,
         )
         if self.run is not None:
@@ -335,17 +335,17 @@ class Sweep:
 
     def _remarks(self, tally: Tally, checked: WorstVerified | None) -> list[str]:
         """What a reader has to know beside the numbers."""
-        said = []
+        remarks = []
         if tally.not_finite:
-            said.append(f"{tally.not_finite} answers of the model were not finite; they count as not right.")
+            remarks.append(f"{tally.not_finite} answers of the model were not finite; they count as not right.")
         if self._not_finite:
-            said.append("Some values of pictures were not finite and were set to 0.")
+            remarks.append("Some values of pictures were not finite and were set to 0.")
         if checked and not checked.converged:
-            said.append(
+            remarks.append(
                 f"The worst margin still moved with the sample count at {checked.spp} samples a pixel, the most "
                 "that was tried: noise may take part in it."
             )
-        return said
+        return remarks
 
 
 def carry_out(job: Job, run: RunDirectory | None, progress: Progress, first: int | None = None) -> SweepResult:
