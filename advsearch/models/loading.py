@@ -185,7 +185,9 @@ def _relabelled(
     name = name or model.name
     if labels is None:
         return dataclasses.replace(model, name=name)
-    return dataclasses.replace(model, name=name, labels=fitting_labels(model.classes, labels, origin, name), named=True)
+    if model.read is None:  # the classes of others are counted by their task
+        labels = fitting_labels(model.classes, labels, origin, name)
+    return dataclasses.replace(model, name=name, labels=labels, named=True)
 
 
 def _positive(key: str, value: int | None, default: int) -> int:

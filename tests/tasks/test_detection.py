@@ -309,6 +309,7 @@ def test_a_task_learns_names_size_and_unit_from_its_model() -> None:
     assert unnamed.labels == ("class 0", "class 1", "class 2") and unnamed.unit == "fractions"
     facts = Facts("mug", "#2", look=lambda: torch.ones(4, 4).bool())
     assert unnamed.truth(facts) == Place((2,), (0, 0, 4, 4), (4, 4))
+    assert Detection().on(load_model(replace(model, labels=()), labels=NAMES)).labels == NAMES, "named afterwards"
     with pytest.raises(InputError, match="labels: 2 labels, but model Pixels has 3 classes"):
         Detection().on(replace(model, labels=("a", "b")))
     with pytest.raises(InputError, match=r"loaded for its logits; load it with read=Detection\(\).reader"):
