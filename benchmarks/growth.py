@@ -1,6 +1,6 @@
 """Time and memory of a search step over two thousand steps: neither may grow.
 
-    python benchmarks/growth.py [--steps 2000] [--size 64]
+    python benchmarks/growth.py [--steps 2000] [--size 64] [--transport]
 
 The speed of a machine that others use too drifts by more than what is looked for. So every step is followed by a fixed
 piece of work that has nothing to do with the search (the model on a picture of its own), and the ratio of the two is
@@ -32,6 +32,7 @@ from advsearch.controls import make_space  # noqa: E402
 from advsearch.controls.texture import TextureControl  # noqa: E402
 from advsearch.engine.loading import load_scene, make_renderer  # noqa: E402
 from advsearch.engine.problem import Problem  # noqa: E402
+from advsearch.engine.transport import Transport  # noqa: E402
 from advsearch.models import load_model  # noqa: E402
 from advsearch.tasks import Classification, Facts  # noqa: E402
 
@@ -40,6 +41,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--steps", type=int, default=2000, help="steps of the search (default 2000)")
     parser.add_argument("--size", type=int, default=64, help="side of the picture in pixels (default 64)")
+    parser.add_argument("--transport", action="store_true", help="predict pictures by a matrix of light transport")
     args = parser.parse_args()
     description = load_scene("mug").description
     space = make_space([TextureControl()], description)
@@ -47,7 +49,8 @@ def main() -> None:
     renderer = make_renderer(description, space, args.size, "oidn", 0)
     task = Classification().on(model)
     problem = Problem(renderer, space, model, task, lambda *_: Facts("mug", "mug"), get_objective("margin"), 4, 0)
-    policy, evaluate = make_policy("pgd"), problem.evaluator("search")
+    policy = make_policy("pgd")
+    evaluate = (Transport(problem, args.steps) if args.transport else problem).evaluator("search")
     state = policy.start(problem.domain, torch.Generator().manual_seed(0), args.steps)
     ratios, seconds, memory = [], [], []
     yardstick = torch.rand(16, args.size, args.size, 3)

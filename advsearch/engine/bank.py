@@ -244,7 +244,8 @@ class Bank(Predictor):
 
     def _compare(self, u: Tensor, index: int) -> None:
         """Look at unseen conditions, and let the bank grow while they are clearly better for the model."""
-        if index in self.grown:
+        if index in self.grown:  # in an earlier life, which ended before this evaluation did
+            self._places[index] = u.detach().clone()
             return
         problem, begun = self.problem, time.perf_counter()
         noise = seeds.stream(problem.seed, "bank check", index)

@@ -219,8 +219,9 @@ class Transport(Predictor):
             self.deviations.append(found)
             if found.levels > BOUND:
                 present = self._made(u, kind, index)
-                self.renewals.setdefault(kind, []).append(index)
-                self.keep(self.renewals)
+                if index not in self.renewals.setdefault(kind, []):  # else in an earlier life of the run
+                    self.renewals[kind].append(index)
+                    self.keep(self.renewals)
         self._present[kind], renderer = self._ready(present, kind)
         return renderer
 

@@ -74,6 +74,27 @@ def test_a_search_that_goes_on_ends_with_the_same_rows(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("growing")
+def test_a_run_that_was_killed_between_a_comparison_and_its_evaluation_goes_on(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """That the bank grows is stored by then, and where it grew is what is evaluated next."""
+    fill = Bank._fill
+
+    def killed(self: Bank, index: int, *more: Any) -> None:
+        if index == 6:
+            raise KeyboardInterrupt
+        fill(self, index, *more)
+
+    monkeypatch.setattr(Bank, "_fill", killed)
+    advsearch.attack("mug", run=tmp_path / "a", **SMALL)
+    monkeypatch.setattr(Bank, "_fill", fill)
+    found = advsearch.attack("mug", run=tmp_path / "a", resume=True, **SMALL)
+    assert found.summary.steps == 18
+    assert found.summary.transport is not None and found.summary.transport.conditions is not None
+    assert found.summary.transport.conditions.grown == 2
+
+
+@pytest.mark.usefixtures("growing")
 def test_the_oldest_conditions_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where there is memory for two or three, the newest are kept and nothing fails."""
     monkeypatch.setattr(bank, "MOST_BYTES", 150_000)
