@@ -41,6 +41,10 @@ Passes = Callable[[Tensor, int], bool]
 """(u, check) -> whether a configuration passes the trials; check numbers its seeds."""
 
 
+Likely = Callable[[Tensor], bool]
+"""u -> whether a configuration would probably pass: a guess that costs next to nothing."""
+
+
 @dataclass(frozen=True, eq=False)
 class Bracket:
     """Where the smallest scale lies.
@@ -90,7 +94,7 @@ def shrunk(domain: Domain, u: Tensor, scale: float) -> Tensor:
     return domain.project(domain.start + scale * (u - domain.start))
 
 
-def smallest(search: Search, passes: Passes, domain: Domain) -> Bracket:
+def smallest(search: Search, passes: Passes, domain: Domain, likely: Likely | None = None) -> Bracket:
     """Bracket the smallest scale of the domain's budgets at which a configuration passes.
 
     1. A search in the whole budget. If its answer fails the trials, there is nothing to shrink.
@@ -106,6 +110,7 @@ def smallest(search: Search, passes: Passes, domain: Domain) -> Bracket:
         search: finds the best configuration of a domain.
         passes: verifies one.
         domain: the largest budget.
+        likely: says where 2 begins, and from where it goes on in growing steps; None to bisect from the whole length.
 
     Returns:
         The bracket; not `closed` if the searches did not suffice.
@@ -114,7 +119,7 @@ def smallest(search: Search, passes: Passes, domain: Domain) -> Bracket:
     state = Bracket(0.0, math.inf, None, 1, 1)
     if not passes(u, 0):
         return replace(state, low=1.0)
-    state = _shorten(replace(state, high=1.0, u=u), passes, domain)
+    state = _shorten(replace(state, high=1.0, u=u), passes, domain, likely)
     while state.searches < ROUNDS and state.high > RATIO * state.low and state.high > SMALLEST_SCALE:
         floor = state.high / 2.0 if state.low == 0.0 else math.sqrt(state.low * state.high)
         scale = max(floor, state.high / RATIO if state.high <= RATIO**2 * state.low else floor)
@@ -123,7 +128,8 @@ def smallest(search: Search, passes: Passes, domain: Domain) -> Bracket:
         passed = passes(u, state.checks)
         state = replace(state, searches=state.searches + 1, checks=state.checks + 1)
         if passed:
-            state = _shorten(replace(state, high=scale, u=u, found_by=state.searches - 1), passes, domain)
+            state = replace(state, high=scale, u=u, found_by=state.searches - 1)
+            state = _shorten(state, passes, domain, likely)
         else:
             state = replace(state, low=scale)
     return state
@@ -155,18 +161,37 @@ def confirmed(bracket: Bracket, passes: Passes, domain: Domain, *, times: int = 
     return bracket
 
 
-def _shorten(state: Bracket, passes: Passes, domain: Domain) -> Bracket:
-    """Bisect the length of the configuration until the ends are within `SHORTENED`."""
+def _shorten(state: Bracket, passes: Passes, domain: Domain, likely: Likely | None) -> Bracket:
+    """Bisect the length of the configuration until the ends are within `SHORTENED`.
+
+    With a guess it is tried there first, and then farther and farther from there, but never beyond the middle.
+    """
     if state.u is None:
         raise RuntimeError("there is no configuration to shorten")
-    longest, high, low = state.u, state.high, max(state.low, SMALLEST_SCALE * state.high)
-    best, checks = state.u, state.checks
+    longest, length, low = state.u, state.high, max(state.low, SMALLEST_SCALE * state.high)
+
+    def at(scale: float) -> Tensor:
+        return shrunk(scaled(domain, scale), longest, scale / length)
+
+    best, high, checks = state.u, length, state.checks
+    middle, stride = math.sqrt(high * low), math.inf
+    if likely is not None:
+        middle, stride = _crossing(lambda scale: likely(at(scale)), low, high), SHORTENED
     while high > SHORTENED * low:
-        middle = math.sqrt(high * low)
-        shorter = shrunk(scaled(domain, middle), longest, middle / state.high)
+        shorter = at(middle)
         if passes(shorter, checks):
             best, high = shorter, middle
+            middle = max(math.sqrt(high * low), high / stride)
         else:
             low = middle
-        checks += 1
+            middle = min(math.sqrt(high * low), low * stride)
+        stride, checks = stride * stride, checks + 1
     return replace(state, high=high, u=best, checks=checks)
+
+
+def _crossing(likely: Callable[[float], bool], low: float, high: float) -> float:
+    """Return the shortest length in (low, high) of which a guess says that it passes, to within `SHORTENED`."""
+    while high > SHORTENED * low:
+        middle = math.sqrt(high * low)
+        low, high = (low, middle) if likely(middle) else (middle, high)
+    return math.sqrt(high * low)

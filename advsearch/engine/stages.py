@@ -240,7 +240,7 @@ class Attack:
         domain = self.problem.domain if domain is None else domain
         found = run_search(
             self._evaluator(kind, frames),
-            domain if self.findings.transport is None else replace(domain, exact=True),
+            replace(domain, exact=True) if isinstance(self.findings.transport, Transport) else domain,
             policy,
             steps=steps,
             seed=seed,
@@ -506,7 +506,8 @@ def find_smallest(attack: Attack) -> None:
         return True
 
     times = -(-CONFIRMED // budget.trials)
-    bracket = smallest(found, passes, problem.domain)
+    likely = findings.transport.likely if isinstance(findings.transport, Transport) else None
+    bracket = smallest(found, passes, problem.domain, likely=likely)
     if bracket.u is not None:
         most = ATTEMPTS * times * budget.trials
         attack._begin_trials("checking the smallest change", most, at_most=True)

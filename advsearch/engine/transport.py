@@ -20,6 +20,7 @@ from advsearch import seeds
 from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Wanted
 from advsearch.engine.problem import OnImage, Problem
+from advsearch.scene.formation import to_8_bit
 from advsearch.scene.transport.renderer import LinearRenderer, samples_to_collect, why_not
 
 WORTH = 16
@@ -210,6 +211,11 @@ class Transport(Predictor):
             return self.problem.evaluated(u, noise, index, gradient, samples, on_image, renderer)[0]
 
         return evaluate
+
+    def likely(self, u: Tensor) -> bool:
+        """Whether the picture that is predicted from the start is a success, rounded to 8 bits."""
+        with torch.no_grad():
+            return self.problem.judge(to_8_bit(self.start(u)), u).success
 
     def _compared(self, kind: str, index: int, u: Tensor) -> LinearRenderer:
         """The matrix to predict this evaluation with, compared and made anew where that is due."""

@@ -50,6 +50,33 @@ def test_the_smallest_epsilon_of_a_linear_model_is_within_five_per_cent(
     assert bracket.searches <= 12
 
 
+@pytest.mark.parametrize("off", [1.0, 1.02, 0.9, 1.3, 0.2, 5.0, None])
+def test_a_guess_saves_trials_and_changes_no_bracket(off: float | None) -> None:
+    """A guess that is off by a factor: the bracket holds whatever it says, and a good one needs fewer trials."""
+    domain, weights, bias = linear(30, "linf", 0.3)
+    checks = 0
+
+    def value(u: Tensor) -> float:
+        return float((u - domain.start) @ weights) + bias
+
+    def passes(u: Tensor, _: int) -> bool:
+        nonlocal checks
+        checks += 1
+        return value(u) > 0.0
+
+    def likely(u: Tensor) -> bool:
+        return (value(u) - bias) * (off or 1.0) + bias > 0.0
+
+    def found(inside: Domain, number: int) -> Tensor:
+        return inside.project(inside.start + 100.0 * weights)
+
+    bracket = smallest(found, passes, domain, None if off is None else likely)
+    assert bracket.u is not None and bracket.closed and value(bracket.u) > 0.0
+    assert 0.3 <= bracket.high <= RATIO * 0.3 and bracket.low <= 0.3
+    assert checks == bracket.checks
+    assert checks <= {None: 16, 1.0: 8, 1.02: 10, 0.9: 14, 1.3: 16}.get(off, 22)
+
+
 def test_an_end_that_passed_by_luck_moves_out_until_it_passes_again() -> None:
     domain, weights, bias = linear(5, "linf", 0.5)
 

@@ -149,6 +149,28 @@ def test_a_matrix_that_is_too_large_is_not_made(renderer: Renderer, monkeypatch:
 SMALL = {"resolution": SIZE, "trials": 6, "steps": 18, "verify_spp": 8, "controls": {"texture": {"resolution": 8}}}
 
 
+def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, guesses = 0, 0
+    linearised, likely = linear.LinearRenderer, searching.Transport.likely
+
+    def counted(*given: Any) -> Any:
+        nonlocal made
+        made += 1
+        return linearised(*given)
+
+    def guessed(self: searching.Transport, u: Tensor) -> bool:
+        nonlocal guesses
+        guesses += 1
+        return likely(self, u)
+
+    monkeypatch.setattr(searching, "LinearRenderer", counted)
+    monkeypatch.setattr(searching.Transport, "likely", guessed)
+    monkeypatch.setattr(searching, "BOUND", 100.0)
+    found = advsearch.attack("mug", smallest=True, baseline=False, run=None, **SMALL).summary  # type: ignore[arg-type]
+    assert found.smallest is not None and found.smallest.epsilon is not None and found.smallest.searches > 1
+    assert made == 1 and guesses >= 5
+
+
 def test_a_search_says_what_predicted_its_pictures(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """It compares, makes the matrix anew where that is off, and a run that goes on ends with the same rows."""
     monkeypatch.setattr(searching, "EVERY", 6)
