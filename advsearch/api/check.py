@@ -42,7 +42,6 @@ from advsearch.engine.planning import (
 )
 from advsearch.engine.problem import Problem
 from advsearch.engine.run_settings import RunSettings
-from advsearch.files import JsonObject
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.check import (
@@ -317,13 +316,12 @@ def _rows(
         references: dict[str, Reference] = {}
         for probe in mine:
 
-            def referred(probe: Probe = probe) -> JsonObject:
+            def referred(probe: Probe = probe) -> Reference:
                 # what acts on the picture clips: its mean depends on the noise, so both get the same
                 many = spp if probe.group.estimator == "image" else max(spp, high)
-                return vars(reference(renderer, loss, u, probe, seed=seed, spp=many, repeats=repeats, factors=factors))
+                return reference(renderer, loss, u, probe, seed=seed, spp=many, repeats=repeats, factors=factors)
 
-            kept = results.get(_key(part, "reference", [probe]), referred)
-            references[probe.name] = Reference(**{**kept, "steps": tuple(kept["steps"])})
+            references[probe.name] = results.value(_key(part, "reference", [probe]), Reference, referred)
             progress.advance(1)
         sets = _sets(mine)
         most = sum(len(tried(group[0].group)) for group in sets)
@@ -337,18 +335,17 @@ def _rows(
 
                 def estimated(
                     wanted: Sequence[Probe] = wanted, estimator: str = estimator, factor: float = factor
-                ) -> list[JsonObject]:
+                ) -> list[Estimate]:
                     many = REPEATS if factor == 1.0 else AGAIN  # another try has to be surer
-                    measured = estimates(
+                    return estimates(
                         renderer, loss, u, estimator, wanted, seed=seed, spp=spp, repeats=many, factor=factor
                     )
-                    return [vars(one) for one in measured]
 
-                stored = results.get(_key(part, f"{estimator} x {factor:g}", wanted), estimated)
-                for probe, one in zip(wanted, stored, strict=True):
+                key = _key(part, f"{estimator} x {factor:g}", wanted)
+                for probe, one in zip(wanted, results.value(key, list[Estimate], estimated), strict=True):
                     against = references[probe.name]
                     size = scale_of(against, list(references.values()))
-                    row = _row(part, spp, probe, Estimate(**one), against, size)
+                    row = _row(part, spp, probe, one, against, size)
                     good |= {probe.name} if row.status == "ok" else set()
                     yield row
                 progress.advance(1)

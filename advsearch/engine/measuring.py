@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 
+from pydantic import TypeAdapter
+
 from advsearch.engine.memory import Memory
 from advsearch.interrupts import interruptible
 from advsearch.runs.directory import RunDirectory
@@ -17,6 +19,7 @@ from advsearch.runs.summary import NAME, read_result
 Row = TypeVar("Row")
 Answer = TypeVar("Answer", bound=Result)
 Kind = TypeVar("Kind", bound=Fields)
+Measured = TypeVar("Measured")
 
 
 class OutOfTime(Exception):
@@ -61,6 +64,11 @@ class Results:
         """
         if self.made and time.monotonic() >= self._end:
             raise OutOfTime
+
+    def value(self, key: str, kind: type[Measured], measure: Callable[[], Measured]) -> Measured:
+        """Return what `measure` returns, or what is stored of this kind (a dataclass, or a list of some); as `get`."""
+        adapter = TypeAdapter(kind)
+        return adapter.validate_python(self.get(key, lambda: adapter.dump_python(measure(), mode="json")))
 
     def row(self, key: str, kind: type[Kind], measure: Callable[[], Kind]) -> Kind:
         """Return the fields that `measure` returns, or those of this kind that are stored; otherwise as `get`."""

@@ -11,9 +11,6 @@ from advsearch.controls.values import is_number
 from advsearch.engine.loading import Controls, as_controls, settings_of
 from advsearch.errors import InputError, UnknownNameError
 
-Asked = Mapping[str, Mapping[str, object]]
-"""Controls as they are asked for: their names, each with its settings."""
-
 
 @dataclass(frozen=True)
 class RunSettings:
@@ -73,7 +70,9 @@ class RunSettings:
             kept[setting] = value if takes(asked, given, setting) else None
         return RunSettings(**kept)
 
-    def check(self, searched: Asked, drawn: Asked | None = None) -> None:
+    def check(
+        self, searched: Mapping[str, Mapping[str, object]], drawn: Mapping[str, Mapping[str, object]] | None = None
+    ) -> None:
         """Refuse a setting that none of the controls takes.
 
         Args:
