@@ -266,6 +266,13 @@ def test_nothing_heavy_is_imported_before_it_is_needed(code: str) -> None:
     assert (done.stdout.strip(), done.stderr) == ("[]", "")
 
 
+def test_an_attack_needs_none_of_torchs_compilers() -> None:
+    """They take a second; only files of `torch.export` do."""
+    code = "import sys, advsearch.api.attack, advsearch.models.reference; print('torch._dynamo' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "False\n"
+
+
 # -- what is shipped -------------------------------------------------------------------------------------------------
 
 

@@ -19,8 +19,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from torch.export.pt2_archive import PT2ArchiveWriter
-
 from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.files import JsonObject, JsonValue
@@ -72,6 +70,8 @@ def rewritten(archive: Archive) -> io.BytesIO:
     Raises:
         FileFormatError: it has something in it that a plain network has not; the message says what.
     """
+    from torch.export.pt2_archive import PT2ArchiveWriter  # a second of compilers, which no other model needs
+
     names = {new: old if old in archive else new for new, old in OLD_NAMES.items()}
     program = _checked_program(archive, names[PROGRAM])
     for name in EXAMPLE:
