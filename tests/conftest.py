@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"
 """Meshes, environments and an ImageNet classifier that nobody on this project made; see README. May be absent."""
 MEDIUM = Path(__file__).with_name("medium.txt")
-QUICK, QUICKEST = 0.2, 5.0
+QUICK, QUICKEST = 0.15, 5.0
 """CPU seconds of a quick test, at most; and of the quickest of a file, which is quick all the same."""
 
 
