@@ -27,10 +27,6 @@ CLOSE_LOOKS = 4
 """Then a candidate is rendered so many times more, at most, while it is not clearly worse than the best."""
 
 
-CONTROLS: Any = {"flag": "--control", "metavar": "NAME", "form": "controls"}
-"""How controls are written on a command line."""
-
-
 class SceneConfig(Config):
     """What every command over a scene and a model needs to know.
 
@@ -125,7 +121,9 @@ class SceneConfig(Config):
         "search",
         "what may change, separated by commas",
         "names of controls, or NAME={PARAMETER: VALUE or [LOW, HIGH]}",
-        **CONTROLS,
+        flag="--control",
+        metavar="NAME",
+        form="controls",
         min_length=1,
     )
     texture_resolution: int | None = setting(
