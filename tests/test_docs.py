@@ -24,7 +24,6 @@ from samples import attack
 
 import advsearch
 import advsearch.config
-from advsearch.api import attack as attacking
 from advsearch.api import region as mapping
 from advsearch.attacks import (
     POLICIES,
@@ -282,10 +281,6 @@ MADE_BY_HAND = [
     ("questions.md", {12: "or twelve searches are done"}[smallest.ROUNDS]),
     ("questions.md", f"What counts on the way is {TRIALS} trials"),
     ("questions.md", f"**Verified** on {TRIALS_OVER} conditions"),
-    (
-        "questions.md",
-        "`pgd` with a momentum of {momentum} and a first step of {step_size}".format(**attacking.OVER_CONDITIONS),
-    ),
     ("questions.md", f"needs {verification.PASS_PERCENT_OVER} % of those that count"),
     ("questions.md", {8: "in one to eight parameters"}[mapping.MOST]),
     ("questions.md", {8: "as long as eight random pictures"}[region.PROBES]),

@@ -47,9 +47,6 @@ from advsearch.tasks import AnyTask, Task, make_task
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-OVER_CONDITIONS = {"momentum": 0.9, "step_size": 0.2}
-"""Options of `pgd` where conditions vary."""
-
 LOADING, PREPARING = "loading the scene and the model", "preparing the scene for rendering"
 """What a person who waits is told before the first picture."""
 
@@ -342,12 +339,13 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
 
 
 def _policy(job: _Job, problem: Problem) -> Policy[Any]:
-    """The policy. Where conditions vary, every gradient is one of others, so `auto` follows a longer mean of them."""
+    """The policy. Where a model lets no gradient through, `auto` climbs by differences of whole pictures."""
+    balls = all(block.norm != "box" for block in problem.domain.blocks)
+    name = job.policy if isinstance(job.policy, str) else job.policy.name
+    if name == "auto" and balls and not problem.model.differentiable:
+        return make_policy("nes")
     if not isinstance(job.policy, str):
         return with_derivatives(job.policy, job.config)
-    balls = all(block.norm != "box" for block in problem.domain.blocks)
-    if job.policy == "auto" and problem.conditions is not None and balls:
-        return make_policy("pgd", **OVER_CONDITIONS)
     return with_derivatives(make_policy(job.policy, **_policy_options(job.config)), job.config)
 
 

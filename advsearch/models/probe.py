@@ -181,7 +181,7 @@ def _gradient_reaches(model: Model, images: Tensor, repeatable: bool) -> bool:
     except (RuntimeError, ModelError) as error:
         reaches, why = False, first_line(error)
     if not reaches:
-        _warn(f"no gradient of model {model.name} reaches its image ({why}): use a policy without gradients")
+        _warn(f"no gradient of model {model.name} reaches its image ({why}): use `auto` or a policy without gradients")
     return reaches
 
 

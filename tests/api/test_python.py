@@ -16,6 +16,7 @@ from torch import Tensor, nn
 import advsearch
 from advsearch.config import CONFIGS
 from advsearch.errors import InputError
+from advsearch.models import ModelWarning
 from advsearch.settings import settings
 
 
@@ -142,3 +143,22 @@ def test_the_gap_is_asked_for_by_name(tmp_path: Path) -> None:
 def test_an_attack_has_one_environment() -> None:
     with pytest.raises(InputError, match="environment: expected one"):
         advsearch.attack("mug", environment=["studio", "sunset"])
+
+
+class Rounding(torch.nn.Module):
+    """Answers by the brightness, and lets no gradient through."""
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        mean = images.detach().mean(dim=(1, 2, 3))
+        return torch.stack([mean, 0.5 - mean], dim=1)
+
+
+def test_a_model_without_a_gradient_is_searched_without_one() -> None:
+    with pytest.warns(ModelWarning, match="no gradient .* use `auto`"):
+        model = advsearch.load_model(Rounding(), labels=["light", "dark"], input_size=16)
+    small: dict[str, Any] = {"resolution": 16, "spp": 1, "trials": 6, "baseline": False, "denoise": "none"}
+    controls = {"texture": {"resolution": 4, "epsilon": 1.0}}
+    result = advsearch.attack("mug", model, controls=controls, label="light", steps=24, **small)
+    assert result.search is not None
+    assert result.search.gradients == 0
+    assert len({round(step.objective, 4) for step in result.search.history}) > 5, "it moves"
