@@ -194,9 +194,9 @@ def test_a_message_names_the_argument_in_python_and_the_flag_on_the_command_line
 
 def test_a_bug_keeps_its_traceback_and_ends_with_1() -> None:
     code = (
-        "import sys, test_cli\n"
-        "def attack(config, progress): raise ValueError('a bug')\n"
-        "sys.modules.update(test_cli.stand_ins(attack))\n"
+        "import sys, advsearch.api\n"
+        "def carry_out(config, *, progress, resumed): raise ValueError('a bug')\n"
+        "advsearch.api.carry_out = carry_out\n"
         "from advsearch.cli.main import main; sys.exit(main(['attack', '--object', 'mug', '--json']))"
     )
     done = python(code, cwd=Path(__file__).parent, env={**os.environ, "PYTHONPATH": str(ROOT / "tests")})

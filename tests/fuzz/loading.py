@@ -109,7 +109,7 @@ def warm_up(loaders: Iterable[str]) -> None:
 
         Image.init()
     if {"model", "labels"} & set(loaders):
-        import torch.export
+        import torch.export.pt2_archive  # makes a folder for compiled code
         import torch.jit  # noqa: F401
 
         import advsearch.models
