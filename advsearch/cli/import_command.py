@@ -48,8 +48,7 @@ def run(args: argparse.Namespace) -> int:
 
         found = contents(Path(args.file))
         if out is not None:
-            scene = advsearch.load_scene(args.file, up=found.object.up.axis if found.object.up else None)
-            advsearch.render(scene, around=VIEWS, resolution=SIDE).save(out)
+            advsearch.render(advsearch.load_scene(found.object), around=VIEWS, resolution=SIDE).save(out)
     whole = found.object
     facts = {
         "triangles": len(whole.mesh.faces),

@@ -21,6 +21,7 @@ from advsearch.runs.images import read_png, to_8bit
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.summary import read_result
 from advsearch.scene.assets import Floats, Mesh
+from advsearch.scene.description import NO_MAP
 from advsearch.scene.raster import doubled_areas
 from advsearch.scene.surface_map import rasterised
 
@@ -55,7 +56,7 @@ def printable(run: str | Path, size: float) -> list[Piece]:
     if not isinstance(summary, AttackSummary):
         raise FileFormatError(f"{folder}: expected a run of attack, got one of {summary.command}")
     config = AttackConfig.from_yaml(folder / CONFIG)
-    scene = load_scene(config.object, config.environment, up=config.up)
+    scene = load_scene(config.object, NO_MAP, up=config.up)
     pieces: list[Piece] = []
     for control in as_controls(config.controls):
         picture = folder / ARTIFACTS / f"{control.name}.png"

@@ -21,7 +21,7 @@ from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.importing import gltf
 from advsearch.scene.importing.files import read_bytes, safe_name, shown
 from advsearch.scene.importing.geometry import FLAT
-from advsearch.scene.importing.objects import import_object, object_of
+from advsearch.scene.importing.objects import SUFFIXES, object_of
 from advsearch.scene.importing.parts import GLTF, ImportedPart, read_parts
 from advsearch.scene.parts import MeshPart, PlacedCamera, PointLamp, ScenePart
 
@@ -153,13 +153,14 @@ def contents(path: Path) -> Contents:
     Raises:
         FileFormatError, InputError: as for `import_object`.
     """
-    whole = import_object(path)
+    data = read_bytes(path, "object", SUFFIXES)
+    parts, notes = read_parts(path, data)
+    whole = object_of(parts, notes, path, safe_name(path), None)
     if path.suffix.lower() not in GLTF:
         return Contents(whole)
-    data = read_bytes(path, "scene", GLTF)
     header = gltf.read_header(path, data)
     nodes: dict[int, list[ImportedPart]] = {}
-    for part in read_parts(path, data)[0]:
+    for part in parts:
         nodes.setdefault(part.node, []).append(part)
     listed = []
     for index, group in sorted(nodes.items()):
