@@ -66,13 +66,14 @@ RULES = {
     "tasks": Rule({"models"}, {"torch"}),
     "attacks": Rule({"tasks"}, {"torch", "numpy", "scipy", "cma"}),
     "engine": Rule(
-        {"scene", "bundled", "controls", "models", "tasks", "attacks", "runs", "report", "config", "settings"}
+        {"scene", "bundled", "controls", "models", "tasks", "attacks", "runs", "report", "viewer", "config", "settings"}
     ),
     "evaluation": Rule({"scene", "bundled", "controls", "models", "tasks", "attacks", "engine", "runs", "report"}),
     "runs": Rule(
         {"config", "settings"}, {"numpy", "pydantic", "typing_extensions", "imageio", "OpenEXR", "PIL", "pyarrow"}
     ),
     "report": Rule({"runs", "config", "settings"}, {"numpy", "PIL", "matplotlib"}, HEAVY),
+    "viewer": Rule({"runs", "report", "config", "settings"}, {"numpy", "PIL"}, HEAVY),
     "api": Rule(None),
     "cli": Rule(None),
     "": Rule({"api", "engine", "models"}, set()),

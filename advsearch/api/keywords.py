@@ -95,6 +95,7 @@ class SweepKeywords(PictureKeywords, total=False):
     spp: int | None
     sampler: Literal["sobol", "random"]
     batch: int
+    keep_pictures: Literal["all", "wrong", "none"]
     trials: int
     verify_spp: int | None
     overwrite: bool

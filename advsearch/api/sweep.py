@@ -90,6 +90,8 @@ def sweep(
     else:
         described["object"] = ",".join(name for some in names for name in some)
     config = SweepConfig(**{**described, **options, "run": None if run is None else str(run)})
+    if config.keep_pictures != "none" and config.run is None:
+        raise InputError("keep_pictures: expected `run` beside it, the folder that keeps them; name one")
     progress = progress or NullProgress()
     resumed = _stopped(config)
     if config.run is not None and resumed is None:
@@ -203,6 +205,7 @@ def _job(
         ladder=verification_ladder(config.pixel_sampler, config.verify_spp),
         command_line=config.command_line(),
         warnings=tuple(dict.fromkeys(warnings)),
+        keep_pictures=config.keep_pictures,
     )
 
 

@@ -33,6 +33,8 @@ COMMANDS = {
     "region": "advsearch.cli.region",
     "resume": "advsearch.cli.resume",
     "runs": "advsearch.cli.runs",
+    "dashboard": "advsearch.cli.dashboard",
+    "view": "advsearch.cli.view",
     "export": "advsearch.cli.export",
     "check": "advsearch.cli.check",
     "plan": "advsearch.cli.plan",

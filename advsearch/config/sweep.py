@@ -83,6 +83,9 @@ class SweepConfig(SceneConfig):
         ge=1,
         le=1024,
     )
+    keep_pictures: Literal["all", "wrong", "none"] = setting(
+        "none", "sweep", "answers of which small pictures are kept, to look at"
+    )
     spp: int | None = setting_as_in(
         SceneConfig, "spp", group="sweep", description="samples per pixel of a picture", expects="", ge=1, le=65536
     )

@@ -55,12 +55,13 @@ def sweep_html(summary: SweepSummary) -> str:
     rows = [["axis", "value", "configurations", "right", "accuracy", "95 % interval"]]
     for name in dict.fromkeys(row.axis for row in summary.axes):
         mine = [row for row in summary.axes if row.axis == name]
-        rows += [_axis_row(row) for row in mine] if len(mine) <= MOST_ROWS else []
+        rows += [axis_cells(row) for row in mine] if len(mine) <= MOST_ROWS else []
     drawn = _picture(figure["png"], 2 * SHOWN) if figure else None
     return element("div", element("p", f"{total} ({rate})."), drawn, _table(rows) if len(rows) > 1 else None)
 
 
-def _axis_row(row: AxisRow) -> list[str]:
+def axis_cells(row: AxisRow) -> list[str]:
+    """Return what a table says of a value of an axis: axis, value, configurations, right, accuracy, interval."""
     ends = row.value if isinstance(row.value, (list, tuple)) else [row.value]
     value = " to ".join(f"{end:g}" if isinstance(end, float) else str(end) for end in ends)
     unit = f" {row.unit}" if row.unit not in ("", "name") else ""

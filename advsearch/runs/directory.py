@@ -30,6 +30,9 @@ HOME = Path("runs")
 
 CONFIG = "run.yaml"
 REPORT = "report.html"
+COLUMNS = "columns.bin"
+"""Of a sweep that has ended: its rows as columns of numbers (advsearch/viewer/columns.py)."""
+
 IMAGES = "images"
 ARTIFACTS = "artifacts"
 PARTS = "parts"
@@ -47,6 +50,7 @@ CONTENTS = (
     replay.NAME,
     summary.NAME,
     REPORT,
+    COLUMNS,
     IMAGES,
     ARTIFACTS,
     PARTS,

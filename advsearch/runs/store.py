@@ -177,11 +177,16 @@ class Store:
             ended = time.monotonic()
             self._next_sync = ended + max(SYNC_INTERVAL, (ended - began) / SYNC_SHARE)
 
-    def rows(self, kind: str | None = None) -> Iterator[Row]:
-        """Yield the rows, or those of one kind, in the order in which they were written."""
-        where, given = ("", ()) if kind is None else (" WHERE kind = ?", (kind,))
+    def rows(self, kind: str | None = None, after: int = 0) -> Iterator[Row]:
+        """Yield the rows, or those of one kind, in the order in which they were written.
+
+        Args:
+            kind: of the rows; None for all.
+            after: the id behind which to begin.
+        """
+        where, given = ("id > ?", (after,)) if kind is None else ("id > ? AND kind = ?", (after, kind))
         with _readable(self.path):
-            cursor = self._db.execute(f"SELECT {', '.join(_COLUMNS)} FROM evaluations{where} ORDER BY id", given)
+            cursor = self._db.execute(f"SELECT {', '.join(_COLUMNS)} FROM evaluations WHERE {where} ORDER BY id", given)
         while True:
             with _readable(self.path):
                 values = cursor.fetchone()

@@ -13,7 +13,7 @@ import shlex
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -890,3 +890,21 @@ def test_a_small_sweep_really_rendered_is_repeatable(tmp_path: Path) -> None:
         picture = render(render.start, seed=rows[3].seed or 0, spp=1)
         logits = model()((picture * 255.0).round() / 255.0)
     assert float(logits[0, 1] - logits[0, 0]) == pytest.approx(rows[3].objective, abs=0.2)
+
+
+@pytest.mark.parametrize("keep", ["all", "wrong", "none"])
+def test_pictures_are_kept_as_asked(tmp_path: Path, keep: Literal["all", "wrong", "none"]) -> None:
+    models = [model(0.65, "strict"), model(0.9, "easy")]
+    result = advsearch.sweep(
+        "mug", models, {"pose.yaw": list(range(0, 360, 45))}, trials=0, run=tmp_path / "run", keep_pictures=keep
+    )
+    rows = list(result.rows())
+    wrong = {row.step // 2 for row in rows if not row.correct}
+    assert 0 < len(wrong) < 8
+    files = (tmp_path / "run" / "images" / "rows").glob("*/*.jpg")
+    assert {int(file.stem) for file in files} == {"all": set(range(8)), "wrong": wrong, "none": set()}[keep]
+
+
+def test_pictures_without_a_run_have_no_place() -> None:
+    with pytest.raises(InputError, match=r"keep_pictures.*run"):
+        advsearch.sweep("mug", model(), {"pose.yaw": [0, 90]}, keep_pictures="all")

@@ -67,6 +67,7 @@ class Job:
         ladder: sample counts that this climbs.
         command_line: the command that asks the same again.
         warnings: on the way.
+        keep_pictures: thumbnails that are kept: "all", "wrong" (what any of the models gets wrong) or "none".
     """
 
     object: str
@@ -87,6 +88,7 @@ class Job:
     ladder: Sequence[int]
     command_line: str
     warnings: tuple[str, ...]
+    keep_pictures: Literal["all", "wrong", "none"] = "none"
 
     @cached_property
     def sizes(self) -> tuple[tuple[int, int], ...]:

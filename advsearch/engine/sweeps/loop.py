@@ -9,7 +9,7 @@ that was stopped goes on bit for bit as one that was not.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,8 @@ from advsearch.runs.results.attack import DescribedValue
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.sweep import SweepSummary, WorstClaim, WorstConfiguration, WorstVerified
 from advsearch.tasks import Judgement
+from advsearch.viewer import thumbnails
+from advsearch.viewer.page import write_page
 
 KIND = "sweep"
 """Rows of the sweep; those of the trials are called "verification"."""
@@ -146,6 +148,8 @@ class Sweep:
                 self._open(min(first, self.total - 1) // self.models // self.per_scene)
                 hint = f"{self.total} answers, pictures of {count(self.samples, 'sample')} a pixel; `resolution`, `spp`"
                 hint += " or fewer points shorten it"
+                if self.run is not None and self.job.keep_pictures != "none":
+                    hint += f"; pictures that are kept take {self._pictures_text()}"
                 self.stages.begin("sweep", "rendering and classifying", self.total, hint=hint)
                 self.stages.progress.advance(first)
                 self._go_through(first, tally)
@@ -176,7 +180,7 @@ class Sweep:
         before = view.number * self.per_scene
         picks = self.points.picks(numbers.start, len(numbers), before)
         noise = [self._seeds(before + number) for number in numbers]
-        seen, values = view.look(picks, noise, self.samples)
+        seen, values, pictures = view.look(picks, noise, self.samples)
         seconds = (time.perf_counter() - begun) / (len(numbers) * self.models)
         rows = [
             self._row(before + number, model, noise[k], seen[model][k], values[model][k], seconds)
@@ -186,6 +190,9 @@ class Sweep:
         if self.run is None:
             self._kept += rows
         else:
+            for k, number in enumerate(numbers):
+                if self._is_kept(seen[model][k] for model in range(self.models)):
+                    thumbnails.keep(self.run.path, before + number, pictures[k])
             self.run.record(*rows)
         for k in range(len(numbers)):
             for model in range(self.models):
@@ -196,6 +203,19 @@ class Sweep:
             if self.run is not None:
                 self.run.store.set_note(NOT_FINITE, "yes")
         self._tell(len(rows), tally)
+
+    def _pictures_text(self) -> str:
+        """What the kept pictures take, said beforehand."""
+        height, width = self.job.sizes[0]
+        share = min(1.0, thumbnails.SIDE / max(height, width)) ** 2 * height * width / thumbnails.SIDE**2
+        megabytes = self.total // self.models * thumbnails.BYTES * share / 1e6
+        size = f"{megabytes / 1e3:.1f} GB" if megabytes >= 1e3 else f"{max(megabytes, 0.1):.1f} MB"
+        return f"about {size}" if self.job.keep_pictures == "all" else f"at most about {size}"
+
+    def _is_kept(self, seen: Iterable[Judgement]) -> bool:
+        """Whether the thumbnail of a picture of which the models say this is kept."""
+        asked = self.job.keep_pictures
+        return asked == "all" or (asked == "wrong" and not all(one.right for one in seen))
 
     def _row(
         self, number: int, model: int, seed: int, trial: Judgement, values: dict[str, Value], seconds: float
@@ -331,6 +351,7 @@ class Sweep:
             self.run.write_summary(summary)
             for suffix, data in sweep_figure(summary).items():
                 write_bytes(self.run.path / "images" / f"sweep.{suffix}", data)
+            write_page(self.run.path, summary)
         return SweepResult(summary, None if self.run is None else self.run.path, tuple(self._kept))
 
     def _remarks(self, tally: Tally, checked: WorstVerified | None) -> list[str]:

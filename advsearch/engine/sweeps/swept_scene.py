@@ -52,7 +52,9 @@ class SweptScene:
     def not_finite(self) -> bool:
         return any(renderer.non_finite for renderer in self.renderers.values())
 
-    def look(self, picks: Picks, noise: Sequence[int], spp: int) -> tuple[list[list[Judgement]], list[list[Values]]]:
+    def look(
+        self, picks: Picks, noise: Sequence[int], spp: int
+    ) -> tuple[list[list[Judgement]], list[list[Values]], Tensor]:
         """Render configurations, round to 8 bits, ask and judge.
 
         Args:
@@ -61,7 +63,8 @@ class SweptScene:
             spp: samples a pixel.
 
         Returns:
-            For each model, what it says of each picture; and what is stored of each picture that it was shown.
+            For each model, what it says of each picture; what is stored of each picture that it was shown; and the
+            pictures (n, H, W, 3) that the first model was shown.
         """
         u, pictures, values = {}, {}, {}
         for size, renderer in self.renderers.items():
@@ -70,7 +73,7 @@ class SweptScene:
             values[size] = self.points[size].values(u[size], picks)
         sizes = self._job.sizes
         seen = [self._judged(model, pictures[size], u[size], values[size]) for model, size in enumerate(sizes)]
-        return seen, [values[size] for size in sizes]
+        return seen, [values[size] for size in sizes], pictures[sizes[0]]
 
     def trial(self, number: int, u: Tensor, seed: int, spp: int) -> Judgement:
         """What one model says of one configuration."""

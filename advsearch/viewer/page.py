@@ -1,0 +1,261 @@
+"""The page of one or several sweeps: still pictures and tables that need no script, and the explorer over them.
+
+The same page is a file that needs no other (`write_page`), a page of `advsearch dashboard`, and one of a folder that
+any web server serves: only where its rows and pictures come from differs (`Shown`).
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import json
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from pathlib import Path
+
+from advsearch import __version__
+from advsearch.files import JsonObject
+from advsearch.report import wording
+from advsearch.report.markup import Html, element, join
+from advsearch.report.notebook import axis_cells
+from advsearch.report.phrases import percent
+from advsearch.report.style import CSS
+from advsearch.runs import directory
+from advsearch.runs.files import write_bytes, write_text
+from advsearch.runs.results.sweep import AxisRow, SweepSummary
+from advsearch.runs.summary import read_result
+from advsearch.viewer.columns import Columns, read_columns
+from advsearch.viewer.thumbnails import Kept, kept_pictures
+
+MOST_EMBEDDED = 3_000_000
+"""Bytes of pictures that a page which needs no other file takes along; the worst answers first."""
+
+MOST_ROWS = 200_000
+"""Rows that such a page takes along; more are for `advsearch dashboard`."""
+
+MOST_LISTED = 96
+"""Values of an axis that are listed as a table; of more, none."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Where the page of a run gets what it shows.
+
+    Attributes:
+        name: of the run.
+        rows: columns for a page that needs no other file; else the address they are fetched from; None where they are
+            too many for such a page, which then has the tables only.
+        parts: whether the address gives them in parts (``?after=ID``), as those of a sweep that goes on.
+        pictures: which thumbnails there are; None for none.
+        folder: address of the thumbnails; None puts them into the page.
+    """
+
+    name: str
+    rows: Columns | str | None
+    parts: bool = False
+    pictures: Kept | None = None
+    folder: str | None = None
+
+
+def write_page(run: Path, summary: SweepSummary) -> Path:
+    """Write `report.html` of a sweep that has ended, and its rows as columns, into its folder; return the page's path.
+
+    Raises:
+        FileFormatError: the results are damaged.
+        StorageError: it cannot be written.
+    """
+    columns = read_columns(run)
+    write_bytes(run / directory.COLUMNS, columns.packed(), durable=False)
+    source = Shown(run.name, columns if len(columns.step) <= MOST_ROWS else None, pictures=kept_pictures(run))
+    return write_text(run / directory.REPORT, page([(run, summary)], [source]), durable=False)
+
+
+def page(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[Shown]) -> str:
+    """Return the page as HTML.
+
+    Args:
+        runs: folder and result of each sweep; None where it has none yet.
+        sources: what the explorer of each reads.
+    """
+    script, style = asset("viewer.js"), CSS + asset("viewer.css")
+    connects = any(isinstance(one.rows, str) for one in sources)
+    policy = f"default-src 'none'; script-src '{_digest(script)}'; style-src 'unsafe-inline'; img-src data:"
+    policy += " 'self'; connect-src 'self'" if connects else ""
+    summaries = [(path, summary) for path, summary in runs if summary is not None]
+    title = ", ".join(path.name for path, _ in runs)
+    head = element(
+        "head",
+        element("meta", charset="utf-8"),
+        element("meta", http_equiv="Content-Security-Policy", content=policy + "; base-uri 'none'; form-action 'none'"),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element("meta", name="color-scheme", content="light dark"),
+        element("title", f"{title} - advsearch"),
+        element("style", Html(style)),
+    )
+    described, data = [], []
+    sources = [one for one in sources if one.rows is not None]
+    for number, source in enumerate(sources):
+        described.append(_described(source, number))
+        if isinstance(source.rows, Columns):
+            packed = base64.b64encode(gzip.compress(source.rows.packed(), 6, mtime=0)).decode()
+            data.append(element("script", Html(packed), type="application/octet-stream", id=f"rows-{number}"))
+    main = element(
+        "main",
+        element("div", id="explorer", hidden="hidden") if sources else _too_many(runs),
+        *(_still(path, summary) for path, summary in summaries),
+        *(join(_axes(summary), _cost(path, summary)) for path, summary in summaries),
+    )
+    body = element(
+        "body",
+        _header(runs),
+        main,
+        element("footer", f"advsearch {__version__}, {title}."),
+        element("script", Html(_json(described)), type="application/json", id="runs"),
+        *data,
+        element("script", Html(script)),
+    )
+    return "<!doctype html>\n" + element("html", head, body, lang="en") + "\n"
+
+
+@cache
+def asset(name: str) -> str:
+    """Return a file of the viewer."""
+    return (resources.files("advsearch.viewer") / "static" / name).read_text(encoding="utf-8")
+
+
+def _digest(script: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
+
+def _json(value: object) -> str:
+    """JSON that may stand in a script element, whatever its texts are."""
+    text = json.dumps(value)
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _described(source: Shown, number: int) -> JsonObject:
+    described: JsonObject = {"name": source.name, "parts": source.parts}
+    described["embedded" if isinstance(source.rows, Columns) else "rows"] = (
+        f"rows-{number}" if isinstance(source.rows, Columns) else source.rows
+    )
+    kept = source.pictures
+    if kept is None:
+        return described
+    pictures: JsonObject = {"models": kept.models}
+    if source.folder is not None:
+        pictures |= {"folder": source.folder, "suffix": kept.suffix, "kept": list(kept.numbers) if kept.some else None}
+    elif isinstance(source.rows, Columns):
+        pictures["embedded"] = dict(kept.embedded(source.rows, MOST_EMBEDDED))
+    return {**described, "pictures": pictures}
+
+
+def _header(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
+    lines: list[Html] = []
+    for path, summary in runs:
+        heading = "h1" if len(runs) == 1 else "h2"
+        if summary is None:
+            lines += [element(heading, f"{path.name}: this sweep has not ended yet")]
+            continue
+        what = f"sweep {path.name}; object {summary.object}, environment {summary.environment}, model {summary.model}"
+        lines += [element("p", what, class_="eyebrow"), element(heading, verdict(summary))]
+        remarks = [element("li", text) for text in summary.warnings]
+        lines += [element("ul", *remarks, class_="remarks")] if remarks else []
+    return element("header", element("h1", "Sweeps side by side") if len(runs) > 1 else None, *lines)
+
+
+def _too_many(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
+    names = shlex.join(["advsearch", "dashboard", *(directory.shown(path) for path, _ in runs)])
+    return element("p", f"More than {MOST_ROWS} rows are explored with: ", element("code", names))
+
+
+def verdict(summary: SweepSummary) -> str:
+    """Return what a sweep came to, in one sentence."""
+    if not summary.configurations:
+        return "No configuration was looked at."
+    share = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}"
+    ended = "" if summary.configurations == summary.planned else f" so far, of {summary.planned} planned"
+    return f"Right in {summary.correct} of {summary.configurations} configurations{ended} ({share})."
+
+
+def _still(path: Path, summary: SweepSummary) -> Html:
+    """What a page without a script shows in the explorer's place."""
+    figure = _figure(path / "images" / "sweep.png", f"Accuracy over {_axes_text(summary)}.")
+    worst = _figure(path / "images" / "worst.png", _worst_text(summary))
+    return join(
+        element("div", figure, class_="pictures", data_still="true") if figure else None,
+        element("h2", "The worst configuration") if worst else None,
+        element("div", worst, class_="pictures pair") if worst else None,
+    )
+
+
+def _axes_text(summary: SweepSummary) -> str:
+    names = list(dict.fromkeys(row.axis for row in summary.axes))
+    return " and ".join(names[:2]) or "all configurations"
+
+
+def _worst_text(summary: SweepSummary) -> str:
+    worst = summary.worst
+    if worst is None:
+        return ""
+    where = ", ".join(f"{name} {wording.number_text(one.value)}" for name, one in worst.values.items())
+    told, rate = f"{where}: the model answers {worst.claimed.label}", worst.verified
+    return f"{told}; wrong in {rate.successes} of {rate.trials} fresh renders." if rate else f"{told}."
+
+
+def _figure(file: Path, caption: str) -> Html | None:
+    if not file.is_file():
+        return None
+    address = "data:image/png;base64," + base64.b64encode(file.read_bytes()).decode("ascii")
+    return element("figure", element("img", src=address, alt=caption), element("figcaption", caption))
+
+
+def _axes(summary: SweepSummary) -> Html:
+    """The accuracy of each value of each axis, as tables."""
+    tables = []
+    for name in dict.fromkeys(row.axis for row in summary.axes):
+        mine = [row for row in summary.axes if row.axis == name]
+        if len(mine) <= MOST_LISTED:
+            tables.append(element("details", element("summary", f"Accuracy by {name}"), _table(mine)))
+    return join(element("h2", "In numbers"), *tables) if tables else Html("")
+
+
+def _table(rows: Sequence[AxisRow]) -> Html:
+    heads = ("value", "configurations", "right", "accuracy", "95 % interval")
+    lines = [
+        element("tr", element("th", first, scope="row"), *(element("td", cell) for cell in rest))
+        for _, first, *rest in map(axis_cells, rows)
+    ]
+    head = element("thead", element("tr", *(element("th", text, scope="col") for text in heads)))
+    return element("div", element("table", head, element("tbody", *lines)), class_="scroll")
+
+
+def _cost(path: Path, summary: SweepSummary) -> Html:
+    facts = {
+        "Ending": summary.ending,
+        "Time": wording.seconds_text(summary.seconds["total"]),
+        "Samples a pixel": str(summary.spp),
+        "Image formation": wording.formation_text(summary.image_formation) if summary.image_formation else "",
+        "Seed": str(summary.seed),
+        "Again": shlex.join(["advsearch", "run", f"{summary.run or path}/{directory.CONFIG}"]),
+        "Command": summary.command_line,
+    }
+    lines = [
+        element("tr", element("th", name, scope="row"), element("td", value)) for name, value in facts.items() if value
+    ]
+    return join(element("h2", "Cost and conditions"), element("table", element("tbody", *lines), class_="facts"))
+
+
+def result_of(run: Path) -> SweepSummary | None:
+    """Return the result of the sweep in a folder; None where it has none yet.
+
+    Raises:
+        FileFormatError: it is damaged, or that of another command.
+    """
+    if not (run / "summary.json").is_file():
+        return None
+    found = read_result(run)
+    return found if isinstance(found, SweepSummary) else None

@@ -1,0 +1,341 @@
+"""`advsearch dashboard`: the pages of runs from a small server, on this machine unless asked otherwise.
+
+What it answers: GET and HEAD of the list, of a run's page, of its rows and thumbnails, and nothing else. No part of an
+address becomes a path: runs are looked up by name among those that it was given, pictures by number. A request whose
+`Host` is not this server's is refused, so that a page elsewhere whose name is made to lead here (DNS rebinding) reads
+nothing; so is one that another origin's page sends. Beyond this machine every request needs the token.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import re
+import secrets
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from queue import Queue
+from socket import socket
+from typing import Any
+from urllib.parse import parse_qs, quote, unquote, urlsplit
+
+from advsearch.errors import AdvsearchError, InputError
+from advsearch.files import open_regular
+from advsearch.report.markup import Html, element
+from advsearch.report.style import CSS
+from advsearch.runs import listing, lock
+from advsearch.runs.directory import COLUMNS, HOME, REPORT, is_run
+from advsearch.viewer.columns import read_columns
+from advsearch.viewer.page import Shown, asset, page, result_of
+from advsearch.viewer.thumbnails import kept_pictures, path_of
+
+LOOPBACK = "127.0.0.1"
+
+FIRST_PART, PART = 4_000, 50_000
+"""Rows of a sweep that goes on that are sent at once; reading more takes longer than somebody waits for the first."""
+
+LARGEST = 1 << 30
+"""Most bytes of a sweep's columns."""
+
+WORKERS = 16
+"""Requests that are answered at once; others wait."""
+
+WAITING = 1024
+"""Connections that may wait."""
+
+PATIENCE = 20.0
+"""Seconds after which a connection that sends or takes nothing is closed."""
+
+LONGEST = 4096
+"""Characters of an address."""
+
+COOKIE = "advsearch"
+
+
+class Refused(Exception):
+    """A request that is not answered as asked."""
+
+    def __init__(self, status: HTTPStatus, text: str) -> None:
+        super().__init__(text)
+        self.status = status
+
+
+class Dashboard(HTTPServer):
+    """The server. `serve_forever` answers until `shutdown`.
+
+    Args:
+        runs: folders of runs; empty for those in ``runs/``, looked up anew for each request.
+        host: address to listen at.
+        port: 0 takes a free one.
+
+    Attributes:
+        token: what every request has to bring; None on this machine only.
+
+    Raises:
+        InputError: the address can't be listened at.
+    """
+
+    request_queue_size = WAITING
+    allow_reuse_address = True
+
+    def __init__(self, runs: Sequence[Path], host: str = LOOPBACK, port: int = 0) -> None:
+        self._given = tuple(runs)
+        self.token = None if _is_loopback(host) else secrets.token_urlsafe(24)
+        self._host = host
+        self._waiting: Queue[tuple[socket, Any] | None] = Queue(WAITING)
+        try:
+            super().__init__((host, port), _Handler)
+        except (OSError, OverflowError) as error:
+            raise InputError(f"host and port: cannot listen at {host}:{port}: {error}") from None
+        for _ in range(WORKERS):
+            threading.Thread(target=self._work, daemon=True).start()
+
+    @property
+    def address(self) -> str:
+        """What to open in a browser."""
+        host = self._host if self._host not in ("0.0.0.0", "::") else LOOPBACK
+        host = f"[{host}]" if ":" in host else host
+        return f"http://{host}:{self.server_port}/" + (f"?token={self.token}" if self.token else "")
+
+    def runs(self) -> Mapping[str, Path]:
+        """The runs that are shown, by the name under which they are."""
+        folders = self._given or tuple(path for path in sorted(HOME.glob("*")) if path.is_dir() and is_run(path))
+        names: dict[str, Path] = {}
+        for path in folders:
+            name, number = path.resolve().name, 2
+            while name in names:
+                name, number = f"{path.resolve().name} ({number})", number + 1
+            names[name] = path
+        return names
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Let a worker answer."""
+        self._waiting.put((request, client_address))
+
+    def _work(self) -> None:
+        while (job := self._waiting.get()) is not None:
+            request, client = job
+            try:
+                request.settimeout(PATIENCE)
+                self.finish_request(request, client)
+            except Exception:
+                continue  # whatever one client does, the others are answered
+            finally:
+                self.shutdown_request(request)
+
+    def server_close(self) -> None:
+        """Stop listening and let the workers go."""
+        super().server_close()
+        for _ in range(WORKERS):
+            self._waiting.put(None)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: Dashboard
+    protocol_version = "HTTP/1.0"
+    server_version, sys_version = "advsearch", ""
+
+    def do_GET(self) -> None:
+        self._answer(body=True)
+
+    def do_HEAD(self) -> None:
+        self._answer(body=False)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Say nothing."""
+
+    def _answer(self, *, body: bool) -> None:
+        headers: dict[str, str] = {}
+        try:
+            self._check()
+            kind, data, headers = self._found()
+            status = HTTPStatus.OK
+        except Refused as refused:
+            status, kind, data = refused.status, "text/plain; charset=utf-8", f"{refused}\n".encode()
+        except AdvsearchError as error:
+            status, kind, data = HTTPStatus.INTERNAL_SERVER_ERROR, "text/plain; charset=utf-8", f"{error}\n".encode()
+        except OSError:
+            status, kind, data = HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", b"it is not there any more\n"
+        self.send_response(status)
+        for name, value in {
+            "Content-Type": kind,
+            "Content-Length": str(len(data)),
+            "Cache-Control": "no-store",
+            "X-Content-Type-Options": "nosniff",
+            "X-Frame-Options": "DENY",
+            "Referrer-Policy": "no-referrer",
+            "Cross-Origin-Resource-Policy": "same-origin",
+            **headers,
+        }.items():
+            self.send_header(name, value)
+        self.end_headers()
+        if body:
+            self.wfile.write(data)
+
+    # ---- who may ask -------------------------------------------------------------------------------------------------
+
+    def _check(self) -> None:
+        if len(self.path) > LONGEST:
+            raise Refused(HTTPStatus.REQUEST_URI_TOO_LONG, "the address is too long")
+        host = self.headers.get("Host", "")
+        if not self._is_own(host):
+            raise Refused(HTTPStatus.FORBIDDEN, "this server is not called so; open the address that it printed")
+        origin = self.headers.get("Origin")
+        if origin is not None and origin != f"http://{host}":
+            raise Refused(HTTPStatus.FORBIDDEN, "a page of another origin asks; open the address that was printed")
+        if self.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
+            if self.headers.get("Sec-Fetch-Mode") != "navigate":
+                raise Refused(HTTPStatus.FORBIDDEN, "a page of another site asks")
+        token = self.server.token
+        if token is not None and not any(hmac.compare_digest(token, one) for one in self._tokens()):
+            raise Refused(HTTPStatus.UNAUTHORIZED, "the token is missing; open the address that was printed")
+
+    def _is_own(self, host: str) -> bool:
+        """Whether a request's Host is an address of this server: a name would need a name server to lead here."""
+        name, _, port = host.rpartition(":")
+        if not port.isdecimal() or int(port) != self.server.server_port:
+            return False
+        if self.server.token is None:
+            return name in ("localhost", LOOPBACK, "[::1]")
+        if name in ("localhost", self.server._host):
+            return True
+        try:
+            ipaddress.ip_address(name.removeprefix("[").removesuffix("]"))
+        except ValueError:
+            return False
+        return True
+
+    def _tokens(self) -> list[str]:
+        given = parse_qs(urlsplit(self.path).query).get("token", [])
+        for part in self.headers.get("Cookie", "").split(";"):
+            name, _, value = part.strip().partition("=")
+            if name == f"{COOKIE}-{self.server.server_port}":
+                given.append(value)
+        return [one for one in given if one.isascii()]
+
+    # ---- what is answered --------------------------------------------------------------------------------------------
+
+    def _found(self) -> tuple[str, bytes, dict[str, str]]:
+        if not self.path.startswith("/"):
+            raise Refused(HTTPStatus.BAD_REQUEST, "this server is no proxy")
+        address = urlsplit(self.path)
+        query = parse_qs(address.query)
+        headers = {}
+        if self.server.token and "token" in query:
+            cookie = f"{COOKIE}-{self.server.server_port}={self.server.token}"
+            headers["Set-Cookie"] = f"{cookie}; HttpOnly; SameSite=Strict; Path=/"
+        for pattern, answer in _ROUTES:
+            match = re.fullmatch(pattern, address.path)
+            if match:
+                kind, data = answer(self, query, *map(unquote, match.groups()))
+                return kind, data, headers
+        raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
+
+    def _run(self, name: str) -> Path:
+        found = self.server.runs().get(name)
+        if found is None:
+            raise Refused(HTTPStatus.NOT_FOUND, "there is no such run")
+        return found
+
+    def _list(self, _query: Mapping[str, list[str]]) -> tuple[str, bytes]:
+        return "text/html; charset=utf-8", list_page(self.server.runs()).encode()
+
+    def _page(self, _query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
+        run = self._run(name)
+        if listing.described(run).command == "sweep":
+            return "text/html; charset=utf-8", page([(run, result_of(run))], [_source(name, run)]).encode()
+        report = run / REPORT
+        if report.is_symlink() or not report.is_file():
+            raise Refused(HTTPStatus.NOT_FOUND, f"{name} has no page yet; advsearch show {name} prints what it has")
+        return "text/html; charset=utf-8", report.read_bytes()
+
+    def _compare(self, query: Mapping[str, list[str]]) -> tuple[str, bytes]:
+        names = list(dict.fromkeys(query.get("run", [])))
+        if not names:
+            raise Refused(HTTPStatus.BAD_REQUEST, "choose at least one sweep")
+        runs = [(name, self._run(name)) for name in names]
+        other = [name for name, run in runs if listing.described(run).command != "sweep"]
+        if other:
+            raise Refused(HTTPStatus.BAD_REQUEST, f"only sweeps can be shown side by side; {', '.join(other)} is none")
+        pages = page([(run, result_of(run)) for _, run in runs], [_source(name, run) for name, run in runs])
+        return "text/html; charset=utf-8", pages.encode()
+
+    def _rows(self, query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
+        run = self._run(name)
+        after = query.get("after", ["0"])[0]
+        if not re.fullmatch(r"[0-9]{1,15}", after):
+            raise Refused(HTTPStatus.BAD_REQUEST, "after: expected the id of a row")
+        if after == "0" and (run / COLUMNS).is_file() and listing.finished(run):
+            with open_regular(run / COLUMNS, "columns of a sweep", LARGEST) as file:
+                return "application/octet-stream", file.read()
+        part = PART if int(after) else FIRST_PART
+        running = lock.is_held(run)  # before the rows are read: what comes later is asked for again
+        columns = read_columns(run, int(after), part)
+        more = len(columns.step) == part
+        return "application/octet-stream", replace(columns, more=more, running=running).packed()
+
+    def _picture(self, _query: Mapping[str, list[str]], name: str, number: str) -> tuple[str, bytes]:
+        file = path_of(self._run(name), int(number))
+        if file.is_symlink():
+            raise Refused(HTTPStatus.NOT_FOUND, "there is no such picture")
+        return "image/jpeg", file.read_bytes()
+
+
+Answer = Callable[..., tuple[str, bytes]]
+
+_ROUTES: tuple[tuple[str, Answer], ...] = (
+    ("/", _Handler._list),
+    ("/compare/", _Handler._compare),
+    ("/runs/([^/]+)/", _Handler._page),
+    ("/runs/([^/]+)/rows", _Handler._rows),
+    (r"/runs/([^/]+)/pictures/[0-9]+/([0-9]{1,12})\.jpg", _Handler._picture),
+)
+
+
+def _source(name: str, run: Path) -> Shown:
+    base = f"/runs/{quote(name, safe='')}"
+    return Shown(name, f"{base}/rows", parts=True, pictures=kept_pictures(run), folder=f"{base}/pictures")
+
+
+def list_page(runs: Mapping[str, Path]) -> str:
+    """Return the page that lists runs, by the name under which each is shown."""
+    lines, sweeps = [], 0
+    for name, path in runs.items():
+        one = listing.described(path)
+        sweep = one.command == "sweep"
+        sweeps += sweep
+        what = ", ".join(filter(None, (one.command, one.object, " and ".join(one.controls), one.state, one.answer)))
+        box = element("input", type="checkbox", name="run", value=name, aria_label=f"compare {name}") if sweep else None
+        link = element("a", name, href=f"/runs/{quote(name, safe='')}/")
+        lines.append(element("li", box, " " if box else None, link, element("div", what, class_="soft")))
+    button = element("p", element("button", "Show the chosen sweeps side by side", type="submit"))
+    form = element("form", element("ul", *lines, class_="runs"), button if sweeps > 1 else None, action="/compare/")
+    none = element("p", "No runs here yet: advsearch sweep, or advsearch attack, makes one.")
+    head = element(
+        "head",
+        element("meta", charset="utf-8"),
+        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
+        element(
+            "meta",
+            http_equiv="Content-Security-Policy",
+            content="default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'self'",
+        ),
+        element("meta", name="color-scheme", content="light dark"),
+        element("title", "Runs - advsearch"),
+        element("style", Html(CSS + asset("viewer.css"))),
+    )
+    body = element("body", element("header", element("h1", "Runs")), element("main", form if lines else none))
+    return "<!doctype html>\n" + element("html", head, body, lang="en") + "\n"
+
+
+def _is_loopback(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

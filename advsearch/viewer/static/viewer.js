@@ -1,0 +1,650 @@
+// The explorer of a sweep: two parameters across a map, the others at one value or over all, and the pictures behind a
+// cell. Rows come as columns of numbers (advsearch/viewer/columns.py); everything below is counted from them here.
+"use strict";
+(() => {
+  const MOST_LEVELS = 40; // different numbers of a parameter that are shown one by one; of more, parts of its range
+  const PARTS = 12; // into which a range is cut
+  const SHOWN = 48; // pictures of the gallery at once
+  const FOLLOW = 3000; // milliseconds between two looks at a sweep that goes on
+  const MAP = [[0, 34, 78], [42, 63, 108], [87, 93, 109], [127, 124, 117], [166, 157, 117], [210, 193, 101], [254, 232, 56]];
+  const KINDS = { uint32: Uint32Array, float32: Float32Array, uint16: Uint16Array, uint8: Uint8Array };
+  const UNKNOWN = 2, NO_PROBABILITY = 65535;
+  const OVERALL = "all values", ACROSS = "across", UP = "up", ONE = "one value";
+
+  // ---- elements ----------------------------------------------------------------------------------------------------
+
+  function make(tag, given = {}, ...children) {
+    const element = document.createElement(tag);
+    for (const [name, value] of Object.entries(given)) {
+      if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+      else if (name === "style") for (const [key, text] of Object.entries(value)) element.style.setProperty(key, text);
+      else if (value !== null && value !== undefined && value !== false) element.setAttribute(name, value === true ? "" : value);
+    }
+    element.append(...children.filter((child) => child !== null));
+    return element;
+  }
+
+  function drawn(tag, given = {}, ...children) {
+    const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
+    for (const [name, value] of Object.entries(given)) element.setAttribute(name, value);
+    element.append(...children);
+    return element;
+  }
+
+  function choice(label, options, value, told) {
+    const select = make("select", { onchange: (event) => told(event.target.value) });
+    for (const [name, text] of options) select.append(make("option", { value: name, selected: name === value }, text));
+    return make("label", {}, make("span", {}, label), select);
+  }
+
+  // ---- numbers -----------------------------------------------------------------------------------------------------
+
+  const percent = (share) => (share === null ? "none" : `${Math.abs(share * 100 - Math.round(share * 100)) < 0.05 ? Math.round(share * 100) : (share * 100).toFixed(1)} %`);
+  const short = (value) => (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(4))));
+  const named = (name, unit) => (unit && unit !== "name" ? `${name} [${unit}]` : name);
+
+  const factorials = [0];
+  function logFactorial(n) {
+    if (n > 2000) return n * Math.log(n) - n + 0.5 * Math.log(2 * Math.PI * n) + 1 / (12 * n);
+    for (let k = factorials.length; k <= n; k++) factorials.push(factorials[k - 1] + Math.log(k));
+    return factorials[n];
+  }
+
+  // The regularised incomplete beta function of whole numbers by Lentz's continued fraction (Press et al., Numerical
+  // Recipes, 6.4).
+  function beta(x, a, b) {
+    if (x <= 0 || x >= 1) return x <= 0 ? 0 : 1;
+    if (x > (a + 1) / (a + b + 2)) return 1 - beta(1 - x, b, a);
+    const front = Math.exp(logFactorial(a + b - 1) - logFactorial(a - 1) - logFactorial(b - 1) + a * Math.log(x) + b * Math.log1p(-x)) / a;
+    let c = 1, d = 1 / (1 - ((a + b) * x) / (a + 1)), result = d;
+    for (let m = 1; m < 400; m++) {
+      for (const term of [(m * (b - m) * x) / ((a + 2 * m - 1) * (a + 2 * m)), (-(a + m) * (a + b + m) * x) / ((a + 2 * m) * (a + 2 * m + 1))]) {
+        d = 1 / (1 + term * d);
+        c = 1 + term / c;
+        result *= c * d;
+      }
+      if (Math.abs(c * d - 1) < 1e-12) break;
+    }
+    return front * result;
+  }
+
+  const intervals = new Map();
+  // The interval of Clopper and Pearson (1934) at 95 %.
+  function interval(right, count) {
+    const key = right * 4294967296 + count;
+    if (!intervals.has(key)) {
+      const solve = (low, high, wanted) => {
+        for (let k = 0; k < 40; k++) {
+          const middle = (low + high) / 2;
+          if (wanted(middle)) high = middle; else low = middle;
+        }
+        return (low + high) / 2;
+      };
+      const low = right === 0 ? 0 : solve(0, right / count, (x) => beta(x, right, count - right + 1) > 0.025);
+      const high = right === count ? 1 : solve(right / count, 1, (x) => beta(x, right + 1, count - right) > 0.975);
+      intervals.set(key, [low, high]);
+    }
+    return intervals.get(key);
+  }
+
+  function colour(share) {
+    const place = Math.min(Math.max(share, 0), 1) * (MAP.length - 1);
+    const first = Math.min(Math.floor(place), MAP.length - 2);
+    const mixed = MAP[first].map((low, k) => Math.round(low + (MAP[first + 1][k] - low) * (place - first)));
+    const light = 0.2126 * (mixed[0] / 255) ** 2.2 + 0.7152 * (mixed[1] / 255) ** 2.2 + 0.0722 * (mixed[2] / 255) ** 2.2;
+    return { background: `rgb(${mixed.join(",")})`, color: light > 0.179 ? "#000" : "#fff" };
+  }
+
+  // ---- rows --------------------------------------------------------------------------------------------------------
+
+  function unpacked(buffer) {
+    const size = new DataView(buffer).getUint32(0, true);
+    const head = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, size)));
+    const arrays = {};
+    for (const one of head.columns) arrays[one.name] = new KINDS[one.type](buffer, 4 + size + one.at, head.count);
+    return { head, arrays };
+  }
+
+  // Rows of several sweeps, or of one that goes on, one behind the other.
+  class Table {
+    constructor() {
+      this.count = 0;
+      this.parameters = [];
+      this.answers = [];
+      this.sources = [];
+      this.columns = { step: new Uint32Array(0), margin: new Float32Array(0), answer: new Uint16Array(0), probability: new Uint16Array(0), right: new Uint8Array(0), source: new Uint16Array(0) };
+    }
+
+    add({ head, arrays }, source) {
+      const before = this.count, count = before + head.count;
+      const grown = (array, kind, empty) => {
+        const larger = new kind(count);
+        if (empty !== undefined) larger.fill(empty);
+        if (array) larger.set(array);
+        return larger;
+      };
+      for (const name of ["step", "margin", "probability", "right"]) {
+        this.columns[name] = grown(this.columns[name], this.columns[name].constructor);
+        this.columns[name].set(arrays[name], before);
+      }
+      this.columns.source = grown(this.columns.source, Uint16Array);
+      this.columns.source.fill(source, before);
+      this.columns.answer = grown(this.columns.answer, Uint16Array);
+      this.put(this.columns.answer, arrays.answer, this.places(this.answers, head.answers), before);
+      head.parameters.forEach((given, number) => {
+        const names = given.levels !== null;
+        let mine = this.parameters.find((one) => one.name === given.name && (one.levels !== null) === names);
+        if (!mine) {
+          mine = { name: given.name, unit: given.unit, levels: names ? [] : null, data: null };
+          if (names && before) mine.levels.push("none");
+          this.parameters.push(mine);
+        }
+        mine.data = grown(mine.data, names ? Uint16Array : Float32Array, names ? undefined : NaN);
+        const from = arrays[`parameter ${number}`];
+        if (names) this.put(mine.data, from, this.places(mine.levels, given.levels), before);
+        else mine.data.set(from, before);
+      });
+      this.count = count;
+      for (const one of this.parameters) {
+        if (one.data.length === count) continue;
+        const missing = one.levels ? this.places(one.levels, ["none"])[0] : NaN;
+        one.data = grown(one.data, one.data.constructor, missing);
+      }
+    }
+
+    places(known, names) {
+      return names.map((name) => {
+        if (!known.includes(name)) known.push(name);
+        return known.indexOf(name);
+      });
+    }
+
+    put(target, from, places, before) {
+      for (let k = 0; k < from.length; k++) target[before + k] = places[from[k]];
+    }
+
+    // Each parameter with what it is shown by: names, its numbers one by one, or parts of its range.
+    axes() {
+      const made = this.parameters.map((one) => this.axis(one)).filter((one) => one.labels.length > 1);
+      if (this.sources.length > 1) made.unshift({ name: "run", unit: "", labels: this.sources.map((one) => one.name), level: this.columns.source, names: true });
+      return made;
+    }
+
+    axis({ name, unit, levels, data }) {
+      if (levels) return { name, unit, labels: levels, level: data, names: true };
+      const seen = new Set();
+      for (let k = 0; k < data.length && seen.size <= MOST_LEVELS; k++) if (!Number.isNaN(data[k])) seen.add(data[k]);
+      const level = new Uint16Array(data.length);
+      let labels, place;
+      if (seen.size <= MOST_LEVELS) {
+        const sorted = [...seen].sort((a, b) => a - b);
+        labels = sorted.map(short);
+        const index = new Map(sorted.map((value, k) => [value, k]));
+        place = (value) => index.get(value);
+      } else {
+        let low = Infinity, high = -Infinity;
+        for (let k = 0; k < data.length; k++) {
+          if (data[k] < low) low = data[k];
+          if (data[k] > high) high = data[k];
+        }
+        const width = (high - low) / PARTS;
+        const digits = Math.max(0, 2 - Math.floor(Math.log10(high - low)));
+        const end = (k) => String(Number((low + k * width).toFixed(Math.min(digits, 12))));
+        labels = Array.from({ length: PARTS }, (_, k) => `${end(k)} to ${end(k + 1)}`);
+        place = (value) => Math.min(PARTS - 1, Math.floor((value - low) / width));
+      }
+      let missing = false;
+      for (let k = 0; k < data.length; k++) {
+        if (Number.isNaN(data[k])) {
+          level[k] = labels.length;
+          missing = true;
+        } else level[k] = place(data[k]);
+      }
+      if (missing) labels = [...labels, "none"];
+      return { name, unit, labels, level, names: false, parts: seen.size > MOST_LEVELS };
+    }
+  }
+
+  // ---- the explorer ------------------------------------------------------------------------------------------------
+
+  class Explorer {
+    constructor(place, table) {
+      this.place = place;
+      this.table = table;
+      this.state = { across: null, up: null, by: null, measure: "accuracy", fixed: {}, cell: null, show: "all", order: "worst" };
+      this.hover = null;
+      this.parts = { controls: make("div", { class: "parameters" }), options: make("div", { class: "options" }), maps: make("div", { class: "maps" }), legend: make("div", { class: "legend" }), status: make("p", { class: "status", role: "status", "aria-live": "polite" }), alongs: make("div", { class: "alongs" }), gallery: make("div", { class: "gallery" }), bar: make("div", { class: "options" }) };
+      const heading = (text) => make("h2", {}, text);
+      place.append(heading("Accuracy over two parameters"), this.parts.options, this.parts.controls, this.parts.maps, this.parts.legend, this.parts.status, heading("Pictures"), this.parts.bar, this.parts.gallery, heading("Along each parameter"), make("p", { class: "soft" }, "Accuracy with its 95 % interval (Clopper and Pearson), over what is chosen above."), this.parts.alongs);
+      window.addEventListener("hashchange", () => this.arrive());
+    }
+
+    // The rows have grown.
+    renew() {
+      this.axes = this.table.axes();
+      this.byName = new Map(this.axes.map((axis) => [axis.name, axis]));
+      this.read();
+      this.show();
+    }
+
+    arrive() {
+      if (location.hash.slice(1) === this.written()) return;
+      this.read();
+      this.show();
+    }
+
+    read() {
+      const given = new URLSearchParams(location.hash.slice(1));
+      const state = this.state;
+      // First the parameters of a grid, then those that were drawn, then names.
+      const rank = (axis) => (axis.names ? 2 : axis.parts ? 1 : 0);
+      const order = [...this.axes].sort((a, b) => rank(a) - rank(b));
+      const pick = (name, other) => (this.byName.has(name) ? name : (order.find((axis) => axis.name !== other) || {}).name || null);
+      state.across = pick(given.get("across"), given.get("up"));
+      state.up = pick(given.get("up") === state.across ? null : given.get("up"), state.across);
+      if (state.up === state.across) state.up = null;
+      state.by = this.byName.has(given.get("by")) ? given.get("by") : null;
+      state.measure = ["accuracy", "margin", "count"].includes(given.get("measure")) ? given.get("measure") : "accuracy";
+      state.show = ["all", "wrong", "right"].includes(given.get("show")) ? given.get("show") : "all";
+      state.order = ["worst", "best", "first"].includes(given.get("order")) ? given.get("order") : "worst";
+      state.fixed = {};
+      for (const axis of this.axes) {
+        const level = axis.labels.indexOf(given.get(`at.${axis.name}`));
+        if (level >= 0 && axis.name !== state.across && axis.name !== state.up) state.fixed[axis.name] = level;
+      }
+      const cell = (given.get("cell") || "").split(",").map(Number);
+      state.cell = cell.length === 3 && cell.every(Number.isInteger) ? cell : null;
+    }
+
+    written() {
+      const state = this.state, out = new URLSearchParams();
+      for (const name of ["across", "up", "by"]) if (state[name]) out.set(name, state[name]);
+      if (state.measure !== "accuracy") out.set("measure", state.measure);
+      if (state.show !== "all") out.set("show", state.show);
+      if (state.order !== "worst") out.set("order", state.order);
+      for (const [name, level] of Object.entries(state.fixed)) out.set(`at.${name}`, this.byName.get(name).labels[level]);
+      if (state.cell) out.set("cell", state.cell.join(","));
+      return out.toString();
+    }
+
+    change(some) {
+      Object.assign(this.state, some);
+      history.replaceState(null, "", `#${this.written()}`);
+      this.show();
+    }
+
+    show() {
+      this.kept = this.chosen();
+      this.showControls();
+      this.showMaps();
+      this.showAlong();
+      this.showGallery();
+    }
+
+    // Which rows have the values that are fixed; null where all have.
+    chosen() {
+      const fixed = Object.entries(this.state.fixed);
+      if (!fixed.length) return null;
+      const kept = new Uint8Array(this.table.count).fill(1);
+      for (const [name, level] of fixed) {
+        const levels = this.byName.get(name).level;
+        for (let k = 0; k < kept.length; k++) if (levels[k] !== level) kept[k] = 0;
+      }
+      return kept;
+    }
+
+    // Counts over up to three axes: the last one fastest.
+    counted(axes) {
+      const sizes = axes.map((axis) => axis.labels.length), size = sizes.reduce((a, b) => a * b, 1);
+      const all = new Float64Array(size), right = new Float64Array(size), judged = new Float64Array(size), margin = new Float64Array(size), margins = new Float64Array(size);
+      const { right: verdict, margin: given } = this.table.columns, kept = this.kept;
+      const levels = axes.map((axis) => axis.level);
+      for (let k = 0; k < this.table.count; k++) {
+        if (kept && !kept[k]) continue;
+        let place = 0;
+        for (let a = 0; a < levels.length; a++) place = place * sizes[a] + levels[a][k];
+        all[place] += 1;
+        if (verdict[k] !== UNKNOWN) {
+          judged[place] += 1;
+          right[place] += verdict[k];
+        }
+        if (given[k] === given[k]) {
+          margin[place] += given[k];
+          margins[place] += 1;
+        }
+      }
+      return { all, right, judged, margin, margins };
+    }
+
+    // ---- what is chosen ----------------------------------------------------------------------------------------------
+
+    showControls() {
+      const state = this.state;
+      const names = [["", "nothing"], ...this.axes.filter((axis) => axis.names && axis.name !== state.across && axis.name !== state.up).map((axis) => [axis.name, axis.name])];
+      this.parts.options.replaceChildren(
+        choice("Colour", [["accuracy", "accuracy"], ["margin", "mean margin"], ["count", "configurations"]], state.measure, (measure) => this.change({ measure })),
+        names.length > 1 ? choice("Side by side", names, state.by || "", (by) => this.change({ by: by || null, cell: null })) : "",
+        make("button", { type: "button", onclick: (event) => this.share(event.target) }, "Copy link to this view"),
+      );
+      const open = document.activeElement && document.activeElement.id;
+      this.parts.controls.replaceChildren(...this.axes.map((axis, number) => this.control(axis, number)));
+      if (open && document.getElementById(open)) document.getElementById(open).focus();
+    }
+
+    control(axis, number) {
+      const state = this.state, fixed = state.fixed[axis.name];
+      const role = axis.name === state.across ? ACROSS : axis.name === state.up ? UP : fixed !== undefined ? ONE : OVERALL;
+      const id = `parameter-${number}`;
+      const select = make("select", { id, "aria-label": `${axis.name}: how it is shown`, onchange: (event) => this.assign(axis.name, event.target.value) });
+      for (const one of [ACROSS, UP, ONE, OVERALL]) select.append(make("option", { selected: one === role }, one));
+      const parts = [make("label", { for: id }, named(axis.name, axis.unit)), select];
+      if (role === ONE) {
+        const text = make("output", {}, axis.labels[fixed]);
+        const range = make("input", { type: "range", id: `${id}-value`, min: 0, max: axis.labels.length - 1, value: fixed, "aria-label": `${axis.name}: value`, "aria-valuetext": axis.labels[fixed], oninput: (event) => {
+          text.textContent = axis.labels[event.target.value];
+          this.change({ fixed: { ...this.state.fixed, [axis.name]: Number(event.target.value) } });
+        } });
+        parts.push(make("span", { class: "value" }, range, text));
+      }
+      return make("div", { class: "parameter" }, ...parts);
+    }
+
+    // Exactly two parameters span the map: one that takes another's place gives it its own.
+    assign(name, role) {
+      const state = this.state, next = { across: state.across, up: state.up, fixed: { ...state.fixed }, cell: null, by: state.by };
+      const free = this.axes.find((axis) => ![state.across, state.up].includes(axis.name));
+      delete next.fixed[name];
+      if (role === ACROSS || role === UP) {
+        const key = role === ACROSS ? "across" : "up", other = role === ACROSS ? "up" : "across";
+        if (next[other] === name) next[other] = next[key];
+        next[key] = name;
+        if (next.by === name) next.by = null;
+      } else {
+        for (const key of ["across", "up"]) if (next[key] === name) next[key] = free ? free.name : null;
+        if (free && next.fixed[free.name] !== undefined && [next.across, next.up].includes(free.name)) delete next.fixed[free.name];
+        if (role === ONE) next.fixed[name] = 0;
+        if (next.across === null) [next.across, next.up] = [next.up, null];
+      }
+      this.change(next);
+    }
+
+    async share(button) {
+      try {
+        await navigator.clipboard.writeText(location.href);
+        button.textContent = "Copied";
+      } catch {
+        prompt("The link to this view:", location.href);
+      }
+      setTimeout(() => { button.textContent = "Copy link to this view"; }, 1500);
+    }
+
+    // ---- the maps ----------------------------------------------------------------------------------------------------
+
+    showMaps() {
+      const state = this.state, single = { name: "", unit: "", labels: [""], level: new Uint8Array(this.table.count), names: true };
+      const across = this.byName.get(state.across) || single, up = this.byName.get(state.up) || single, by = this.byName.get(state.by) || single;
+      const counts = this.counted([by, up, across]);
+      const values = Array.from(counts.all, (all, k) => (state.measure === "count" ? all : state.measure === "margin" ? (counts.margins[k] ? counts.margin[k] / counts.margins[k] : null) : counts.judged[k] ? counts.right[k] / counts.judged[k] : null));
+      const finite = values.filter((value) => value !== null);
+      const [low, high] = state.measure === "accuracy" ? [0, 1] : finite.length ? [Math.min(...finite), Math.max(...finite)] : [0, 1];
+      // The darkest colour is the worst: the smallest accuracy, the largest margin.
+      const shade = (value) => (state.measure === "margin" ? 1 - (value - low) / (high - low || 1) : (value - low) / (high - low || 1));
+      const area = across.labels.length * up.labels.length, stop = [...(state.cell || [0, 0, 0])];
+      this.cells = { across, up, by };
+      this.parts.maps.replaceChildren(...by.labels.map((label, part) => {
+        const head = make("tr", {}, make("td", {}), ...across.labels.map((text) => make("th", { scope: "col" }, make("span", {}, text))));
+        const rows = up.labels.map((text, row) => make("tr", {}, make("th", { scope: "row" }, text), ...across.labels.map((_, column) => {
+          const place = part * area + row * across.labels.length + column;
+          const cell = [part, row, column], value = values[place];
+          const pinned = state.cell && state.cell.every((one, k) => one === cell[k]);
+          const words = this.words(cell, counts, place, value);
+          const written = value === null ? "" : state.measure === "accuracy" ? String(Math.round(100 * value)) : short(Number(value.toPrecision(2)));
+          return make("td", {}, make("button", { type: "button", class: value === null ? "cell none" : "cell", style: value === null ? {} : colour(shade(value)), "aria-label": words, "aria-pressed": pinned ? "true" : "false", title: words, tabindex: cell.every((one, k) => one === stop[k]) ? 0 : -1, "data-cell": cell.join(",") }, written));
+        })));
+        rows.reverse();
+        const table = make("table", { class: "map", style: { "min-width": `${6.2 + 2 * across.labels.length}rem` } }, make("thead", {}, head), make("tbody", {}, ...rows));
+        const title = [state.by ? `${by.name} ${label}` : "", up.name ? `${named(up.name, up.unit)} against ${named(across.name, across.unit)}` : named(across.name, across.unit)].filter(Boolean).join(": ");
+        return make("figure", { class: "map", style: { "flex-basis": `${7 + 2.1 * across.labels.length}rem` } }, make("figcaption", {}, title), make("div", { class: "scroll" }, table));
+      }));
+      this.listen();
+      this.legend(low, high, shade);
+      this.say();
+    }
+
+    words([part, row, column], counts, place, value) {
+      const { across, up, by } = this.cells;
+      const where = [[by, part], [up, row], [across, column]].filter(([axis]) => axis.name).map(([axis, level]) => `${axis.name} ${axis.labels[level]}`).join(", ");
+      if (!counts.all[place]) return `${where}: no configuration`;
+      const judged = counts.judged[place];
+      const [low, high] = judged ? interval(counts.right[place], judged) : [null, null];
+      const margin = counts.margins[place] ? `, mean margin ${short(counts.margin[place] / counts.margins[place])}` : "";
+      return `${where}: right in ${counts.right[place]} of ${judged} (${percent(judged ? counts.right[place] / judged : null)}, ${percent(low)} to ${percent(high)})${margin}`;
+    }
+
+    listen() {
+      const maps = this.parts.maps;
+      const at = (event) => event.target.closest && event.target.closest("[data-cell]");
+      const cell = (button) => button.dataset.cell.split(",").map(Number);
+      maps.onclick = (event) => {
+        const button = at(event);
+        if (!button) return;
+        const same = this.state.cell && this.state.cell.join(",") === button.dataset.cell;
+        this.hover = null;
+        this.change({ cell: same ? null : cell(button) });
+        const again = maps.querySelector(`[data-cell="${button.dataset.cell}"]`);
+        if (again) again.focus();
+      };
+      const look = (button) => {
+        clearTimeout(this.waits);
+        this.waits = setTimeout(() => {
+          this.hover = button ? cell(button) : null;
+          this.say();
+          this.showGallery();
+        }, 60);
+      };
+      maps.onpointerover = (event) => { if (event.pointerType !== "touch" && at(event)) look(at(event)); };
+      maps.onpointerleave = () => look(null);
+      maps.onkeydown = (event) => {
+        const button = at(event), step = { ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [1, 0], ArrowDown: [-1, 0] }[event.key];
+        if (!button || !step) return;
+        const [part, row, column] = cell(button);
+        const next = maps.querySelector(`[data-cell="${part},${row + step[0]},${column + step[1]}"]`);
+        event.preventDefault();
+        if (!next) return;
+        button.tabIndex = -1;
+        next.tabIndex = 0;
+        next.focus();
+      };
+    }
+
+    say() {
+      const cell = this.hover || this.state.cell;
+      const button = cell && this.parts.maps.querySelector(`[data-cell="${cell.join(",")}"]`);
+      this.parts.status.textContent = button ? button.getAttribute("aria-label") : `${this.number()} configurations. Point at a cell, or choose one, to see its pictures.`;
+    }
+
+    number() {
+      if (!this.kept) return this.table.count.toLocaleString("en");
+      let sum = 0;
+      for (const one of this.kept) sum += one;
+      return `${sum.toLocaleString("en")} of ${this.table.count.toLocaleString("en")}`;
+    }
+
+    legend(low, high, shade) {
+      const steps = Array.from({ length: 9 }, (_, k) => low + ((high - low) * k) / 8);
+      const unit = { accuracy: "accuracy in %", margin: "mean margin; above 0: wrong", count: "configurations" }[this.state.measure];
+      const text = (value) => (this.state.measure === "accuracy" ? String(Math.round(100 * value)) : short(Number(value.toPrecision(2))));
+      this.parts.legend.replaceChildren(make("span", {}, unit), ...steps.map((value, k) => make("span", { class: "swatch", style: colour(shade(value)) }, k % 4 ? "" : text(value))));
+    }
+
+    // ---- along each parameter ----------------------------------------------------------------------------------------
+
+    showAlong() {
+      const by = this.byName.get(this.state.by) || null;
+      const shown = this.axes.filter((axis) => this.state.fixed[axis.name] === undefined && axis !== by && axis.labels.length <= 200);
+      this.parts.alongs.replaceChildren(...shown.map((axis) => this.along(axis, by)));
+    }
+
+    along(axis, by) {
+      const parts = by ? by.labels : [""], counts = this.counted(by ? [by, axis] : [axis]);
+      const wide = 420, high = 190, left = 34, bottom = 40, n = axis.labels.length;
+      const x = (level, part) => left + ((level + 0.5 + (parts.length > 1 ? (part - (parts.length - 1) / 2) * Math.min(0.12, 0.7 / parts.length) : 0)) * (wide - left - 8)) / n;
+      const y = (share) => 8 + (1 - share) * (high - bottom - 8);
+      const marks = [], rows = [];
+      for (const share of [0, 0.5, 1]) marks.push(drawn("line", { x1: left, x2: wide - 8, y1: y(share), y2: y(share), class: "rule" }), drawn("text", { x: left - 6, y: y(share) + 4, "text-anchor": "end" }, String(100 * share)));
+      const every = Math.ceil(n / Math.max(1, Math.floor(46 / Math.max(...axis.labels.map((text) => text.length + 1)))));
+      axis.labels.forEach((text, level) => {
+        if (level % every === 0) marks.push(drawn("text", { x: x(level, (parts.length - 1) / 2), y: high - 24, "text-anchor": "middle" }, text.length > 16 ? `${text.slice(0, 15)}…` : text));
+      });
+      marks.push(drawn("text", { x: (wide + left) / 2, y: high - 6, "text-anchor": "middle", class: "name" }, named(axis.name, axis.unit)));
+      parts.forEach((part, series) => axis.labels.forEach((text, level) => {
+        const place = series * n + level, judged = counts.judged[place];
+        if (!judged) return;
+        const share = counts.right[place] / judged, [low, top] = interval(counts.right[place], judged);
+        const words = `${part ? `${part}, ` : ""}${text}: ${percent(share)}, ${percent(low)} to ${percent(top)}, of ${judged}`;
+        const dot = shape(series, x(level, series), y(share));
+        marks.push(drawn("g", { class: `series s${series % 6}` }, drawn("title", {}, words), drawn("line", { x1: x(level, series), x2: x(level, series), y1: y(low), y2: y(top) }), dot));
+        rows.push(words);
+      }));
+      const picture = drawn("svg", { viewBox: `0 0 ${wide} ${high}`, class: "along", role: "img", "aria-label": `Accuracy along ${named(axis.name, axis.unit)}. ${rows.slice(0, 40).join("; ")}` }, ...marks);
+      const key = by ? make("p", { class: "key" }, ...parts.map((part, series) => make("span", { class: `s${series % 6}` }, drawn("svg", { viewBox: "0 0 12 12", "aria-hidden": "true" }, shape(series, 6, 6)), ` ${part}`))) : null;
+      return make("figure", {}, picture, ...(key ? [key] : []));
+    }
+
+    // ---- pictures ----------------------------------------------------------------------------------------------------
+
+    showGallery() {
+      const state = this.state, cell = this.hover || state.cell, { across, up, by } = this.cells;
+      const { right, margin } = this.table.columns, kept = this.kept, found = [];
+      let all = 0;
+      const sign = state.order === "worst" ? 1 : -1;
+      const better = (a, b) => sign * (value(a) - value(b));
+      const value = (k) => (margin[k] === margin[k] ? margin[k] : -sign * Infinity);
+      for (let k = 0; k < this.table.count; k++) {
+        if (kept && !kept[k]) continue;
+        if (cell && (by.level[k] !== cell[0] || up.level[k] !== cell[1] || across.level[k] !== cell[2])) continue;
+        if (state.show !== "all" && right[k] !== (state.show === "right" ? 1 : 0)) continue;
+        all += 1;
+        if (found.length < SHOWN) {
+          found.push(k);
+          if (state.order !== "first" && found.length === SHOWN) found.sort((a, b) => better(b, a));
+        } else if (state.order !== "first" && better(k, found[SHOWN - 1]) > 0) {
+          let place = SHOWN - 1;
+          while (place > 0 && better(k, found[place - 1]) > 0) {
+            found[place] = found[place - 1];
+            place -= 1;
+          }
+          found[place] = k;
+        }
+      }
+      if (state.order !== "first") found.sort((a, b) => better(b, a));
+      this.parts.bar.replaceChildren(
+        choice("Show", [["all", "all"], ["wrong", "wrong answers"], ["right", "right answers"]], state.show, (show) => this.change({ show })),
+        choice("First", [["worst", "worst margin"], ["best", "best margin"], ["first", "as they were made"]], state.order, (order) => this.change({ order })),
+        make("span", { class: "soft" }, `${Math.min(all, SHOWN)} of ${all.toLocaleString("en")}${cell ? " in this cell" : ""}`),
+        ...(state.cell ? [make("button", { type: "button", onclick: () => this.change({ cell: null }) }, "All cells")] : []),
+      );
+      this.parts.gallery.replaceChildren(...found.map((k) => this.card(k)));
+    }
+
+    card(k) {
+      const { answer, probability, right, step, source } = this.table.columns;
+      const label = this.table.answers[answer[k]] || "no answer", share = probability[k] === NO_PROBABILITY ? "" : ` ${percent(Math.round(probability[k] / 100) / 100)}`;
+      const verdict = right[k] === UNKNOWN ? "not judged" : right[k] ? "right" : "wrong";
+      const address = this.table.sources[source[k]].picture(step[k]);
+      const picture = address ? make("img", { src: address, alt: `${verdict}: ${label}`, loading: "lazy" }) : null;
+      return make("button", { type: "button", class: `card ${verdict.replace(" ", "-")}`, onclick: () => this.details(k) }, ...(picture ? [picture] : []), make("span", {}, make("strong", {}, verdict === "wrong" ? "✗ " : verdict === "right" ? "✓ " : ""), `${label}${share}`));
+    }
+
+    details(k) {
+      const { answer, probability, right, margin, step, source } = this.table.columns, from = this.table.sources[source[k]];
+      const facts = [["run", from.name], ["configuration", String(step[k])], ["answer", this.table.answers[answer[k]]], ["verdict", ["wrong", "right", "not judged"][right[k]]], ["probability", probability[k] === NO_PROBABILITY ? "none" : percent(probability[k] / 10000)], ["margin", short(Number(margin[k].toPrecision(4)))]];
+      for (const one of this.table.parameters) {
+        const value = one.levels ? one.levels[one.data[k]] : short(one.data[k]);
+        facts.push([named(one.name, one.unit), value]);
+      }
+      const address = from.picture(step[k]);
+      const dialog = make("dialog", { "aria-label": `Configuration ${step[k]}`, onclose: (event) => event.target.remove(), onclick: (event) => { if (event.target === dialog) dialog.close(); } },
+        address ? make("img", { src: address, alt: "what the model saw" }) : null,
+        make("table", { class: "facts" }, make("tbody", {}, ...facts.map(([name, value]) => make("tr", {}, make("th", { scope: "row" }, name), make("td", {}, value))))),
+        make("button", { type: "button", onclick: () => dialog.close() }, "Close"));
+      document.body.append(dialog);
+      dialog.showModal();
+    }
+  }
+
+  // A mark of its own for each series, for those who do not tell colours apart.
+  function shape(series, x, y) {
+    const r = 4;
+    const paths = [`M${x - r},${y}a${r},${r} 0 1,0 ${2 * r},0a${r},${r} 0 1,0 ${-2 * r},0`, `M${x - r},${y - r}h${2 * r}v${2 * r}h${-2 * r}z`, `M${x},${y - r - 1}l${r + 1},${2 * r}h${-2 * r - 2}z`, `M${x},${y - r - 1}l${r + 1},${r + 1}l${-r - 1},${r + 1}l${-r - 1},${-r - 1}z`, `M${x - r},${y - r}l${2 * r},${2 * r}M${x + r},${y - r}l${-2 * r},${2 * r}`, `M${x - r},${y}h${2 * r}M${x},${y - r}v${2 * r}`];
+    return drawn("path", { d: paths[series % paths.length], class: "dot" });
+  }
+
+  // ---- where rows come from ----------------------------------------------------------------------------------------
+
+  async function embedded(id) {
+    const text = document.getElementById(id).textContent.trim();
+    const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+    return unpacked(await new Response(stream).arrayBuffer());
+  }
+
+  async function fetched(address) {
+    const answer = await fetch(address);
+    if (!answer.ok) throw new Error((await answer.text()) || `the server answered ${answer.status}`);
+    return unpacked(await answer.arrayBuffer());
+  }
+
+  async function explore(place) {
+    const runs = JSON.parse(document.getElementById("runs").textContent);
+    const table = new Table(), status = make("p", { class: "status", role: "status" }, "Reading the rows …");
+    place.append(status);
+    place.hidden = false;
+    const body = make("div", {});
+    place.append(body);
+    const explorer = new Explorer(body, table);
+    table.sources = runs.map((run) => ({ name: run.name, picture: pictures(run) }));
+    const renew = () => {
+      for (const still of document.querySelectorAll("[data-still]")) still.hidden = true;
+      explorer.renew();
+    };
+    const load = async (run, number) => {
+      if (run.embedded) return table.add(await embedded(run.embedded), number);
+      let last = 0;
+      for (;;) {
+        const part = await fetched(`${run.rows}${run.parts ? `?after=${last}` : ""}`);
+        last = Math.max(last, part.head.last);
+        if (part.head.count) table.add(part, number);
+        if (!run.parts) return;
+        if (part.head.count) renew();
+        if (!part.head.more) {
+          if (!part.head.running) return;
+          status.textContent = "This sweep goes on; the page follows it.";
+          await new Promise((done) => setTimeout(done, FOLLOW));
+        }
+      }
+    };
+    try {
+      await Promise.all(runs.map(load));
+      status.remove();
+      if (table.count) renew();
+    } catch (error) {
+      status.textContent = `The rows can't be read: ${error.message}`;
+    }
+  }
+
+  function pictures(run) {
+    const given = run.pictures;
+    if (!given) return () => null;
+    if (given.embedded) return (step) => given.embedded[Math.floor(step / given.models)] || null;
+    const kept = given.kept ? new Set(given.kept) : null;
+    return (step) => {
+      const number = Math.floor(step / given.models);
+      if (kept && !kept.has(number)) return null;
+      return `${given.folder}/${String(Math.floor(number / 1000)).padStart(4, "0")}/${number}.${given.suffix}`;
+    };
+  }
+
+  const place = document.getElementById("explorer");
+  if (place) explore(place);
+})();

@@ -1,0 +1,104 @@
+"""Small pictures of a sweep's configurations: ``images/rows/0001/1234.jpg``, a thousand to a folder."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from advsearch.runs.directory import CONFIG
+from advsearch.runs.files import write_bytes
+from advsearch.runs.images import Bytes, to_8bit
+from advsearch.settings import read_yaml, split_names
+from advsearch.viewer.columns import Columns
+
+FOLDER = "rows"
+"""In `images/` of the run."""
+
+A_FOLDER = 1000
+"""Pictures in each folder."""
+
+SIDE = 128
+"""Longest side of a thumbnail, pixels."""
+
+QUALITY = 85
+"""Of the JPEG files, from 1 to 95."""
+
+BYTES = 5000
+"""What a thumbnail of `SIDE` takes, about; measured on pictures of the bundled objects."""
+
+
+def thumbnail(picture: object) -> bytes:
+    """Return a display-referred picture (H, W, 3) in [0, 1] as a JPEG of at most `SIDE` pixels a side."""
+    from PIL import Image
+
+    values: Bytes = to_8bit(picture)
+    image = Image.fromarray(values)
+    image.thumbnail((SIDE, SIDE))
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", quality=QUALITY)
+    return buffer.getvalue()
+
+
+def path_of(run: Path, number: int) -> Path:
+    """Return where the thumbnail of a picture is kept."""
+    return run / "images" / FOLDER / f"{number // A_FOLDER:04d}" / f"{number}.jpg"
+
+
+def keep(run: Path, number: int, picture: object) -> None:
+    """Keep the thumbnail of a picture.
+
+    Raises:
+        StorageError: it cannot be written.
+    """
+    write_bytes(path_of(run, number), thumbnail(picture), durable=False)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """The thumbnails that a run has.
+
+    Attributes:
+        run: its folder.
+        numbers: of the pictures, sorted.
+        models: how many configurations in a row are of one picture.
+        some: whether only some of the pictures were kept.
+        suffix: of the files.
+    """
+
+    run: Path
+    numbers: tuple[int, ...]
+    models: int
+    some: bool
+    suffix: str = "jpg"
+
+    def embedded(self, columns: Columns, most: int) -> Iterator[tuple[str, str]]:
+        """Yield number and data address of thumbnails, of the worst margins first, up to `most` bytes."""
+        order = np.argsort(-np.nan_to_num(columns.margin, nan=-np.inf), kind="stable")
+        there, spent = set(self.numbers), 0
+        for step in columns.step[order]:
+            number = int(step) // self.models
+            if number not in there:
+                continue
+            there.discard(number)
+            data = path_of(self.run, number).read_bytes()
+            spent += len(data) * 4 // 3
+            if spent > most:
+                return
+            yield str(number), "data:image/jpeg;base64," + base64.b64encode(data).decode("ascii")
+
+
+def kept_pictures(run: Path) -> Kept | None:
+    """Return which thumbnails a sweep has; None where it has none."""
+    folder = run / "images" / FOLDER
+    files = [file for file in folder.glob("*/*.jpg") if file.stem.isdecimal() and not file.is_symlink()]
+    if not files:
+        return None
+    numbers = sorted(int(file.stem) for file in files)
+    settings = read_yaml(run / CONFIG)
+    models = len(split_names(str(settings.get("model"))))
+    return Kept(run, tuple(numbers), models, settings.get("keep_pictures") != "all")

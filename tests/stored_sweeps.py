@@ -1,0 +1,60 @@
+"""Sweeps without a renderer, for tests of what shows them."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+from samples import sweep
+
+from advsearch.config import SweepConfig
+from advsearch.described import Value
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.store import Row
+from advsearch.viewer import thumbnails
+from advsearch.viewer.page import write_page
+
+YAWS, ELEVATIONS, ENVIRONMENTS = (0.0, 45.0, 90.0), (10.0, 40.0), ("noon", "studio")
+
+
+def described(value: float | str, unit: str = "") -> Value:
+    """A value as a row has it."""
+    return {"value": value, "unit": unit}
+
+
+def make_sweep(path: Path, *, keep: str = "none", label: str = "mug", ended: bool = True) -> Path:
+    """Make the run of a sweep of 24 configurations, wrong at noon from 40 degrees, and return its folder."""
+    config = SweepConfig(object="mug", run=str(path), grid={"pose.yaw": list(YAWS)}, keep_pictures=keep)
+    points = list(itertools.product(ENVIRONMENTS, YAWS, ELEVATIONS, (0.5, 0.75)))
+    with RunDirectory.create_for(config) as run:
+        rows = []
+        for step, (environment, yaw, elevation, power) in enumerate(points):
+            wrong = environment == "noon" and elevation > 30
+            values: dict[str, Value] = {
+                "environment": described(environment),
+                "model": described("reference"),
+                "pose.yaw": described(yaw, "degrees"),
+                "camera.elevation": described(elevation, "degrees"),
+                "light.power": described(power + step / 1000, "1"),
+            }
+            rows.append(
+                Row("sweep", step, correct=not wrong, margin=2.0 + step / 100 if wrong else -3.0, probability=0.9,
+                    label="cup" if wrong else label, values=values)
+            )  # fmt: skip
+            if keep == "all" or (keep == "wrong" and wrong):
+                thumbnails.keep(run.path, step, np.full((16, 16, 3), step / len(points), np.float32))
+        run.record(*rows)
+        if ended:
+            right = sum(bool(one.correct) for one in rows)
+            counts = {
+                "configurations": len(rows),
+                "correct": right,
+                "accuracy": right / len(rows),
+                "interval": (0.5, 0.9),
+            }
+            axis = {"axis": "pose.yaw", "unit": "degrees", "value": 45.0, **counts}
+            summary = sweep(**counts, planned=len(rows), run=str(path), axes=[axis])
+            run.write_summary(summary)
+            write_page(run.path, summary)
+    return path

@@ -1,0 +1,80 @@
+"""Rows of a sweep as columns of numbers."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from advsearch.described import Value
+from advsearch.runs.store import NAME, Row, Store
+from advsearch.viewer.columns import NO_PROBABILITY, UNKNOWN, Columns, columns_of, read_columns
+
+
+def row(step: int, **values: Any) -> Row:
+    """A row with values in degrees, or names."""
+    units = {name: "" if isinstance(value, str) else "degrees" for name, value in values.items()}
+    named: dict[str, Value] = {name: {"value": value, "unit": units[name]} for name, value in values.items()}
+    label, right = f"a{step % 3}", step % 2 == 0
+    return Row("sweep", step, correct=right, margin=step - 1.5, label=label, probability=0.25, values=named)
+
+
+def unpacked(columns: Columns) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Head and columns as a reader of the bytes finds them."""
+    data = columns.packed()
+    size = int.from_bytes(data[:4], "little")
+    head = json.loads(data[4 : 4 + size])
+    kinds = {one["name"]: (np.dtype(one["type"]), one["at"]) for one in head["columns"]}
+    return head, {
+        name: np.frombuffer(data, kind.newbyteorder("<"), head["count"], 4 + size + at)
+        for name, (kind, at) in kinds.items()
+    }
+
+
+def test_what_is_packed_is_what_the_rows_are() -> None:
+    head, columns = unpacked(columns_of([row(k, yaw=10.0 * k, environment="ab"[k % 2]) for k in range(5)]))
+    assert head["count"] == 5
+    assert list(columns["step"]) == [0, 1, 2, 3, 4]
+    assert list(columns["right"]) == [1, 0, 1, 0, 1]
+    assert [head["answers"][k] for k in columns["answer"]] == ["a0", "a1", "a2", "a0", "a1"]
+    assert list(columns["probability"]) == [2500] * 5
+    assert np.allclose(columns["margin"], [-1.5, -0.5, 0.5, 1.5, 2.5])
+    yaw, environment = head["parameters"]
+    assert (yaw["name"], yaw["unit"], yaw["levels"]) == ("yaw", "degrees", None)
+    assert list(columns["parameter 0"]) == [0, 10, 20, 30, 40]
+    assert [environment["levels"][k] for k in columns["parameter 1"]] == ["a", "b", "a", "b", "a"]
+
+
+def test_columns_begin_at_multiples_of_their_size() -> None:
+    head, _ = unpacked(columns_of([row(k, name="x" * k, yaw=1.0) for k in range(3)]))
+    for one in head["columns"]:
+        assert one["at"] % np.dtype(one["type"]).itemsize == 0
+
+
+def test_what_a_row_lacks_is_said() -> None:
+    bare = Row("sweep", 7, values={})
+    head, columns = unpacked(columns_of([row(0, yaw=1.0, name="n"), bare, row(2, yaw=3.0, late=5.0)]))
+    assert columns["right"][1] == UNKNOWN
+    assert columns["probability"][1] == NO_PROBABILITY
+    assert math.isnan(columns["margin"][1])
+    assert np.isnan(columns["parameter 0"]).tolist() == [False, True, False]
+    assert [head["parameters"][1]["levels"][k] for k in columns["parameter 1"]] == ["n", "none", "none"]
+    assert np.isnan(columns["parameter 2"]).tolist() == [True, True, False]
+
+
+def test_numbers_among_names_become_names() -> None:
+    head, columns = unpacked(columns_of([row(0, mixed=1.5), row(1, mixed="inside")]))
+    assert [head["parameters"][0]["levels"][k] for k in columns["parameter 0"]] == ["1.5", "inside"]
+
+
+def test_rows_are_read_in_parts(tmp_path: Path) -> None:
+    with Store(tmp_path / NAME) as store:
+        store.append([row(k, yaw=float(k)) for k in range(10)])
+        store.append([Row("verification", 0)])
+    first = read_columns(tmp_path, most=4)
+    assert (first.step.tolist(), first.last) == ([0, 1, 2, 3], 4)
+    assert read_columns(tmp_path, after=first.last).step.tolist() == [4, 5, 6, 7, 8, 9]
+    assert read_columns(tmp_path, after=10).step.tolist() == []

@@ -1,0 +1,81 @@
+"""The page of a sweep, and the folder that any server can serve."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from stored_sweeps import make_sweep
+
+from advsearch.cli.main import main
+from advsearch.errors import InputError
+from advsearch.viewer.bundle import renewed, write_bundle
+from advsearch.viewer.page import asset
+
+
+def test_the_page_needs_nothing_else(tmp_path: Path) -> None:
+    page = (make_sweep(tmp_path / "run", keep="all") / "report.html").read_text()
+    assert not re.search(r"""(src|href)=["'](?!data:)""", page), "something is loaded from elsewhere"
+    assert "connect-src" not in page
+    assert page.count("data:image/jpeg") == 24
+
+
+def test_without_a_script_the_page_says_what_was_found(tmp_path: Path) -> None:
+    page = (make_sweep(tmp_path / "run") / "report.html").read_text()
+    body = re.sub(r"<script.*?</script>", "", page, flags=re.DOTALL)
+    assert "Right in 18 of 24 configurations" in body.replace("&nbsp;", " ")
+    assert "Accuracy by" in body
+
+
+def test_texts_of_a_run_are_no_markup(tmp_path: Path) -> None:
+    page = (
+        make_sweep(tmp_path / "</script><img onerror=1>", label="<script>alert(1)</script>") / "report.html"
+    ).read_text()
+    assert "alert(1)" not in re.sub(r'<script type="application/octet-stream".*?</script>', "", page)
+    assert "<img onerror" not in page
+    assert page.count("</script>") == 3  # what runs, what the explorer reads, and its own
+
+
+def test_the_folder_has_page_rows_and_pictures(tmp_path: Path) -> None:
+    first, second = make_sweep(tmp_path / "a", keep="wrong"), make_sweep(tmp_path / "b")
+    index = write_bundle([first, second], tmp_path / "site")
+    runs = json.loads(re.findall(r'id="runs">(.*?)</script>', index.read_text())[0])
+    assert [one["name"] for one in runs] == ["a", "b"]
+    for one in runs:
+        assert (index.parent / one["rows"]).is_file()
+    kept = runs[0]["pictures"]
+    assert len(kept["kept"]) == 6
+    for number in kept["kept"]:
+        assert (index.parent / kept["folder"] / "0000" / f"{number}.{kept['suffix']}").is_file()
+    assert "pictures" not in runs[1]
+
+
+def test_a_folder_that_is_not_empty_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match="not empty"):
+        write_bundle([make_sweep(tmp_path / "a")], tmp_path)
+
+
+def test_the_page_is_made_anew(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = make_sweep(tmp_path / "a")
+    before = (run / "report.html").read_text()
+    shutil.rmtree(run / "images", ignore_errors=True)
+    (run / "report.html").unlink()
+    assert renewed(run).read_text() == before
+    assert main(["view", str(run)]) == 0
+    assert capsys.readouterr().out.strip() == str(run / "report.html")
+
+
+def test_several_runs_need_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runs = [str(make_sweep(tmp_path / name)) for name in "ab"]
+    assert main(["view", *runs]) == 2
+    assert "--bundle" in capsys.readouterr().err
+
+
+def test_the_explorer_is_plain_text() -> None:
+    """It stands between script tags as it is."""
+    assert "</script" not in asset("viewer.js").lower()
+    assert "<!--" not in asset("viewer.js")

@@ -1,0 +1,191 @@
+"""The dashboard's server: what it answers, and what it refuses."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from http.client import HTTPConnection, HTTPResponse
+from pathlib import Path
+
+import pytest
+from stored_sweeps import make_sweep
+
+from advsearch.errors import InputError
+from advsearch.runs.directory import RunDirectory
+from advsearch.viewer.server import Dashboard
+
+
+@contextmanager
+def serving(*runs: Path, host: str = "127.0.0.1") -> Iterator[Dashboard]:
+    """A server of these runs, for as long as the block."""
+    server = Dashboard(runs, host, 0)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+def ask(server: Dashboard, path: str, method: str = "GET", **headers: str) -> tuple[HTTPResponse, bytes]:
+    """The answer to one request, whatever the path looks like."""
+    connection = HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+    given = {
+        "Host": f"127.0.0.1:{server.server_port}",
+        **{name.replace("_", "-"): text for name, text in headers.items()},
+    }
+    connection.putrequest(method, path, skip_host=True)
+    for name, text in given.items():
+        connection.putheader(name, text)
+    connection.endheaders()
+    answer = connection.getresponse()
+    return answer, answer.read()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_sweep(tmp_path_factory.mktemp("runs") / "first", keep="all")
+
+
+@pytest.fixture(scope="module")
+def server(run: Path) -> Iterator[Dashboard]:
+    with serving(run, make_sweep(run.parent / "second, <b>")) as started:
+        yield started
+
+
+def test_it_lists_runs_and_shows_them(server: Dashboard) -> None:
+    _, page = ask(server, "/")
+    assert b"/runs/first/" in page
+    assert b"<b>" not in page
+    answer, page = ask(server, "/runs/first/")
+    assert answer.status == 200
+    assert b"/runs/first/rows" in page
+    answer, page = ask(server, "/runs/second%2C%20%3Cb%3E/")
+    assert answer.status == 200
+    answer, page = ask(server, "/compare/?run=first&run=second%2C%20%3Cb%3E")
+    assert answer.status == 200
+    assert page.count(b'"rows": ') == 2
+
+
+def test_rows_and_pictures(server: Dashboard, run: Path) -> None:
+    answer, data = ask(server, "/runs/first/rows?after=0")
+    assert data == (run / "columns.bin").read_bytes()
+    answer, data = ask(server, "/runs/first/pictures/0000/3.jpg")
+    assert (answer.status, answer.headers["Content-Type"]) == (200, "image/jpeg")
+    assert data == (run / "images/rows/0000/3.jpg").read_bytes()
+
+
+def test_a_sweep_that_goes_on_is_followed(tmp_path: Path) -> None:
+    path = make_sweep(tmp_path / "going", ended=False)
+    with serving(path) as server, RunDirectory.resume(path):
+        _, data = ask(server, "/runs/going/rows?after=0")
+        assert b'"running": true' in data
+        assert b'"count": 24' in data
+        _, data = ask(server, "/runs/going/rows?after=24")
+        assert b'"count": 0' in data
+        assert b"not ended yet" in ask(server, "/runs/going/")[1]
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/../../etc/passwd", "/runs/../first/run.yaml", "/runs/first/../../../etc/passwd", "/runs/..%2f..%2fetc/",
+        "/runs/first/run.yaml", "/runs/first/results.sqlite", "/runs/first/pictures/0000/..%2f..%2frun.yaml",
+        "/runs/first/pictures/../../run.yaml", "/runs/first/pictures/0000/99.jpg", "/runs/first/pictures/0000/-1.jpg",
+        "/runs/%00/", "/runs//", "/runs/none/", "/compare/?run=none", "http://elsewhere/", "/" + "a" * 9000,
+    ],
+)  # fmt: skip
+def test_nothing_else_is_answered(server: Dashboard, path: str) -> None:
+    answer, data = ask(server, path)
+    assert answer.status in (400, 404, 414)
+    assert len(data) < 200
+    assert b"root:" not in data
+
+
+def test_a_picture_that_is_a_link_is_none(server: Dashboard, run: Path, tmp_path: Path) -> None:
+    secret = tmp_path / "secret"
+    secret.write_text("secret")
+    (run / "images/rows/0000/77.jpg").symlink_to(secret)
+    try:
+        answer, data = ask(server, "/runs/first/pictures/0000/77.jpg")
+    finally:
+        (run / "images/rows/0000/77.jpg").unlink()
+    assert answer.status == 404
+    assert b"secret" not in data
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "evil.example"},
+        {"Host": "evil.example:80"},
+        {"Host": ""},
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "no-cors"},
+    ],
+)
+def test_another_sites_page_reads_nothing(server: Dashboard, headers: dict[str, str]) -> None:
+    answer, data = ask(server, "/runs/first/rows", **headers)
+    assert answer.status == 403
+    assert len(data) < 200
+
+
+def test_a_name_that_leads_here_is_refused_with_the_right_port(server: Dashboard) -> None:
+    assert ask(server, "/", Host=f"evil.example:{server.server_port}")[0].status == 403
+    assert ask(server, "/", Host=f"localhost:{server.server_port}")[0].status == 200
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "CONNECT"])
+def test_nothing_is_changed(server: Dashboard, method: str) -> None:
+    assert ask(server, "/", method)[0].status == 501
+
+
+def test_beyond_this_machine_the_token_is_asked_for(run: Path) -> None:
+    with serving(run, host="0.0.0.0") as server:
+        assert server.token is not None
+        assert server.token in server.address
+        assert ask(server, "/")[0].status == 401
+        assert ask(server, "/?token=wrong")[0].status == 401
+        answer, _ = ask(server, f"/?token={server.token}")
+        assert answer.status == 200
+        cookie = answer.headers["Set-Cookie"]
+        assert "HttpOnly" in cookie
+        assert "SameSite=Strict" in cookie
+        assert ask(server, "/runs/first/rows", Cookie=cookie.split(";")[0])[0].status == 200
+        assert ask(server, "/runs/first/rows", Cookie="advsearch-1=x")[0].status == 401
+
+
+def test_many_at_once_are_answered(server: Dashboard) -> None:
+    with ThreadPoolExecutor(50) as pool:
+        seen = list(pool.map(lambda _: ask(server, "/runs/first/pictures/0000/1.jpg")[0].status, range(300)))
+    assert seen == [200] * 300
+
+
+def test_a_client_that_goes_away_does_no_harm(server: Dashboard) -> None:
+    for data in (b"", b"GET / HT", b"\x00" * 100 + b"\r\n\r\n", b"GET / HTTP/1.1\r\n" + b"A: b\r\n" * 200 + b"\r\n"):
+        with socket.create_connection(("127.0.0.1", server.server_port)) as connection:
+            connection.sendall(data)
+    assert ask(server, "/")[0].status == 200
+
+
+def test_a_damaged_or_missing_run_is_told(tmp_path: Path) -> None:
+    damaged, gone = make_sweep(tmp_path / "damaged", ended=False), make_sweep(tmp_path / "gone", ended=False)
+    with serving(damaged, gone) as server:
+        (damaged / "results.sqlite").write_bytes(b"no database")
+        (gone / "results.sqlite").unlink()
+        for name in ("damaged", "gone"):
+            answer, data = ask(server, f"/runs/{name}/rows")
+            assert answer.status == 500
+            assert b"expected" in data
+        assert ask(server, "/")[0].status == 200
+
+
+def test_a_port_that_is_taken_is_told(server: Dashboard) -> None:
+    with pytest.raises(InputError, match="cannot listen"):
+        Dashboard((), "127.0.0.1", server.server_port)
