@@ -13,7 +13,7 @@ from advsearch.described import Value
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.viewer import thumbnails
-from advsearch.viewer.page import write_page
+from advsearch.viewer.sweep_page import write_page
 
 YAWS, ELEVATIONS, ENVIRONMENTS = (0.0, 45.0, 90.0), (10.0, 40.0), ("noon", "studio")
 

@@ -23,7 +23,6 @@ from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.rows import verified_rate
 from advsearch.errors import InputError
 from advsearch.report.notebook import attack_html
-from advsearch.report.page import write_report
 from advsearch.runs import store
 from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
@@ -36,6 +35,7 @@ from advsearch.runs.results.attack import (
     CleanAnswer,
     ControlGroup,
     DescribedValue,
+    FoundValue,
     LinearTransport,
     NotFinite,
     PathSegments,
@@ -50,6 +50,7 @@ from advsearch.runs.results.attack import (
 from advsearch.runs.results.base import Formation, MovedValue
 from advsearch.scene.formation import to_8_bit
 from advsearch.tasks.base import typical
+from advsearch.viewer.attack_page import write_report
 
 T = TypeVar("T")
 
@@ -235,7 +236,7 @@ def _summary(
             objective=search.claimed_objective, re_evaluated=search.best_objective, success_rate=search.success_rate
         ),
         gradients=None if search is None else _gradients(search),
-        configuration=None if search is None else _described(problem, search.best_u),
+        configuration=None if search is None else _found_values(problem, search.best_u),
         renders=_renders(findings, problem),
         steps=len(search.history) if search else 0,
         non_finite=NotFinite(
@@ -275,6 +276,27 @@ def _control(findings: Findings) -> ControlGroup | None:
 def _described(problem: Problem, u: Tensor) -> dict[str, DescribedValue]:
     values = problem.describe(problem.domain.project(u))
     return {name: DescribedValue.of(value) for name, value in values.items()}
+
+
+def _found_values(problem: Problem, u: Tensor) -> dict[str, FoundValue]:
+    """The answer in a few values, each beside the clean scene's and, of a single number, both ends of its range."""
+    start = problem.domain.start
+    single = [group for group in problem.space.groups if group.size == 1 and group.begin < len(start)]
+    ends = []
+    for end in (0.0, 1.0):
+        moved = start.clone()
+        moved[[group.begin for group in single]] = end
+        ends.append(problem.describe(moved))
+    clean, names, found = problem.describe(start), {group.name for group in single}, {}
+    for name, value in _described(problem, u).items():
+        given: dict[str, object] = {"value": value.value, "unit": value.unit}
+        if name in clean and isinstance(clean[name]["value"], (int, float, str)):
+            given["clean"] = clean[name]["value"]
+        low, high = (described[name]["value"] if name in described else None for described in ends)
+        if name in names and isinstance(low, float) and isinstance(high, float) and low < high:
+            given |= {"low": low, "high": high}
+        found[name] = FoundValue.of(given)
+    return found
 
 
 def _transport(findings: Findings) -> LinearTransport:

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from advsearch.errors import InputError
-from advsearch.report.page import write_report
 from advsearch.runs.directory import REPORT
 from advsearch.runs.files import placed_by, write_bytes, write_text
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
+from advsearch.viewer.attack_page import write_report
 from advsearch.viewer.columns import read_columns
-from advsearch.viewer.page import Shown, page, write_page
+from advsearch.viewer.sweep_page import Shown, page, write_page
 from advsearch.viewer.thumbnails import kept_pictures, path_of
 
 INDEX = "index.html"

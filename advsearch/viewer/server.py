@@ -25,12 +25,12 @@ from urllib.parse import parse_qs, quote, unquote, urlsplit
 
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.files import open_regular
-from advsearch.report.markup import Html, element
-from advsearch.report.style import CSS
+from advsearch.report.markup import element
 from advsearch.runs import listing, lock
 from advsearch.runs.directory import COLUMNS, HOME, REPORT, is_run
 from advsearch.viewer.columns import read_columns
-from advsearch.viewer.page import Shown, asset, page, result_of
+from advsearch.viewer.document import document
+from advsearch.viewer.sweep_page import Shown, page, result_of
 from advsearch.viewer.thumbnails import kept_pictures, path_of
 
 LOOPBACK = "127.0.0.1"
@@ -315,21 +315,7 @@ def list_page(runs: Mapping[str, Path]) -> str:
     button = element("p", element("button", "Show the chosen sweeps side by side", type="submit"))
     form = element("form", element("ul", *lines, class_="runs"), button if sweeps > 1 else None, action="/compare/")
     none = element("p", "No runs here yet: advsearch sweep, or advsearch attack, makes one.")
-    head = element(
-        "head",
-        element("meta", charset="utf-8"),
-        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element(
-            "meta",
-            http_equiv="Content-Security-Policy",
-            content="default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'self'",
-        ),
-        element("meta", name="color-scheme", content="light dark"),
-        element("title", "Runs - advsearch"),
-        element("style", Html(CSS + asset("viewer.css"))),
-    )
-    body = element("body", element("header", element("h1", "Runs")), element("main", form if lines else none))
-    return "<!doctype html>\n" + element("html", head, body, lang="en") + "\n"
+    return document("Runs", element("header", element("h1", "Runs")), element("main", form if lines else none))
 
 
 def _is_loopback(host: str) -> bool:

@@ -13,7 +13,7 @@ from stored_sweeps import make_sweep
 from advsearch.cli.main import main
 from advsearch.errors import InputError
 from advsearch.viewer.bundle import renewed, write_bundle
-from advsearch.viewer.page import asset
+from advsearch.viewer.document import asset
 
 
 def test_the_page_needs_nothing_else(tmp_path: Path) -> None:
@@ -77,5 +77,5 @@ def test_several_runs_need_a_folder(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 def test_the_explorer_is_plain_text() -> None:
     """It stands between script tags as it is."""
-    assert "</script" not in asset("viewer.js").lower()
-    assert "<!--" not in asset("viewer.js")
+    assert "</script" not in asset("sweep.js").lower()
+    assert "<!--" not in asset("sweep.js")

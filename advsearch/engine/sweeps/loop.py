@@ -39,7 +39,7 @@ from advsearch.runs.results.base import Formation
 from advsearch.runs.results.sweep import SweepSummary, WorstClaim, WorstConfiguration, WorstVerified
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
-from advsearch.viewer.page import write_page
+from advsearch.viewer.sweep_page import write_page
 
 KIND = "sweep"
 """Rows of the sweep; those of the trials are called "verification"."""

@@ -17,6 +17,14 @@ class DescribedValue(Fields):
     unit: str
 
 
+class FoundValue(DescribedValue):
+    """One value of the answer, and where it lies."""
+
+    clean: int | float | str | None = Field(default=None, description="the clean scene's; absent of several numbers")
+    low: float | None = Field(default=None, description="the least that the control allows; absent without a range")
+    high: float | None = Field(default=None, description="the most")
+
+
 class UsualAnswer(Fields):
     """What the model usually answers in trials of a configuration."""
 
@@ -191,7 +199,7 @@ class AttackSummary(SceneResult):
     )
     claimed: SearchClaim | None = Field(default=None, description="what the search itself believes")
     gradients: SearchGradients | None = Field(default=None, description="of the search")
-    configuration: dict[str, DescribedValue] | None = Field(default=None, description="the answer in a few values")
+    configuration: dict[str, FoundValue] | None = Field(default=None, description="the answer in a few values")
     renders: dict[str, int] = Field(
         description="of the search, its gradients, the baseline and the verification; `products`: predicted instead"
     )

@@ -17,11 +17,12 @@ from advsearch.errors import FileFormatError
 from advsearch.report import wording
 from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
 from advsearch.report.markup import Html, element, join
-from advsearch.report.page import LARGE_PICTURE, SMALLER_SIDE, write_report
 from advsearch.report.phrases import percent
 from advsearch.report.studies import gap_figure
 from advsearch.report.style import CSS
 from advsearch.runs.images import read_png
+from advsearch.viewer.attack_page import LARGE_PICTURE, SMALLER_SIDE, write_report
+from advsearch.viewer.document import asset
 
 VOID = {"meta", "img", "br", "hr"}
 
@@ -47,7 +48,7 @@ class Page(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        if self.open and self.open[-1] != "style":
+        if self.open and self.open[-1] not in ("style", "script"):
             self.words.append(data)
 
     @property
@@ -128,10 +129,13 @@ def test_the_page_does_not_say_what_was_not_asked(tmp_path: Path) -> None:
 def test_the_page_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
     path = write_report(make_run(tmp_path / "run"))
     text, page = path.read_text(), Page(path.read_text())
-    assert "//" not in re.sub(r"base64,[A-Za-z0-9+/=]+", "", text)
+    code = asset("attack.js")
+    assert not re.search(r"\b(fetch|import|XMLHttpRequest|WebSocket|https?:)", code)
+    assert "//" not in re.sub(r"base64,[A-Za-z0-9+/=]+", "", text.replace(code, ""))
     assert "url(" not in text and "@import" not in text
-    assert {tag for tag, _ in page.tags}.isdisjoint({"script", "link", "iframe", "object", "a", "form"})
-    assert len(page.all("img")) == 8
+    assert {tag for tag, _ in page.tags}.isdisjoint({"link", "iframe", "object", "a", "form"})
+    assert [script.get("type") for script in page.all("script")] == ["application/json", None]
+    assert len(page.all("img")) == 7
     assert all(str(image["src"]).startswith("data:image/") for image in page.all("img"))
 
 
@@ -179,9 +183,10 @@ def test_names_cannot_become_markup(tmp_path: Path) -> None:
     )  # fmt: skip
     make_run(tmp_path / "run", summary)
     page = page_of(tmp_path / "run")
-    assert not page.all("script")
+    assert [script.get("type") for script in page.all("script")] == ["application/json", None]
     assert page.text.lower().count("alert('x')") > 15
     known = {"charset", "http-equiv", "content", "name", "lang", "class", "src", "alt", "scope", "role", "style"}
+    known |= {"id", "hidden", "data-picture", "title", "type"}
     for tag, attributes in page.tags:
         found = {name for name in attributes if not name.startswith("aria-")}
         assert tag in ("svg", "g", "path", "text") or found <= known

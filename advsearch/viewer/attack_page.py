@@ -1,24 +1,25 @@
-"""`report.html`: one self-contained page about one run. No scripts, no links to elsewhere."""
+"""The page of an attack: one file that needs no other. Without its script it lacks the slider and the animation."""
 
 from __future__ import annotations
 
-import base64
-import re
+import io
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from advsearch import __version__
+import numpy as np
+
+from advsearch.files import JsonObject
 from advsearch.report import wording
 from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
 from advsearch.report.markup import Html, element, join
 from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, marks_text
-from advsearch.report.style import CSS
 from advsearch.runs import directory, images, store
 from advsearch.runs.files import write_text
-from advsearch.runs.results.attack import AttackSummary, UsualAnswer
+from advsearch.runs.results.attack import AttackSummary, FoundValue, UsualAnswer
 from advsearch.runs.summary import attack_of
+from advsearch.viewer.document import data_script, data_url, document
 
 LARGE_PICTURE = 1_000_000
 """Bytes above which a PNG is put into the page at a smaller size; the file itself stays as it is."""
@@ -26,11 +27,13 @@ LARGE_PICTURE = 1_000_000
 SMALLER_SIDE = 640
 """Longest side in pixels of such a smaller picture."""
 
+FRAME_QUALITY = 85
+"""Of the JPEG frames of the search, from 1 to 95."""
+
 MOST_TRIALS = 24
 """Pictures of the verification that the page shows."""
 
-_KINDS = {".png": "image/png", ".gif": "image/gif"}
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
+_PNG = "image/png"
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,7 @@ class RunData:
         recipe: the text of `run.yaml`; empty when there is none.
         pictures: path inside the run directory to a data URL, sorted.
         curves: kind of evaluation to its objectives in order.
+        frames: of the animation of the search, as data URLs.
     """
 
     path: Path
@@ -50,6 +54,7 @@ class RunData:
     recipe: str
     pictures: Mapping[str, str]
     curves: Mapping[str, list[float | None]]
+    frames: Sequence[str] = ()
 
 
 def write_report(run: str | Path) -> Path:
@@ -72,33 +77,26 @@ def read_run(path: Path) -> RunData:
         recipe=recipe.read_text(encoding="utf-8", errors="replace") if recipe.is_file() else "",
         pictures=_read_pictures(path),
         curves=_read_curves(path / store.NAME),
+        frames=_read_frames(path / directory.IMAGES / "search.gif"),
     )
 
 
 def page(data: RunData) -> str:
     """Return the page as HTML."""
     summary = data.summary
-    head = element(
-        "head",
-        element("meta", charset="utf-8"),
-        element("meta", http_equiv="Content-Security-Policy", content=_POLICY),
-        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element("meta", name="color-scheme", content="light dark"),
-        element("title", f"{wording.title(summary)} - advsearch"),
-        element("style", Html(CSS)),
-    )
     main = element(
         "main",
         _pictures(data),
+        _changes(summary),
         _textures(data),
         _rates(summary),
         _curve(data),
         _cost(summary),
         _repeat(data),
     )
-    footer = element("footer", f"advsearch {__version__}, run {data.path.name}. This page needs no other file.")
-    body = Html(re.sub(r"(\d) %", r"\1&nbsp;%", element("body", _header(summary), main, footer)))
-    return "<!doctype html>\n" + element("html", head, body, lang="en") + "\n"
+    footer = f"run {data.path.name}. This page needs no other file."
+    frames = [data_script(_animation(data), "frames")] if data.frames else []
+    return document(wording.title(summary), _header(summary), main, data=frames, script="attack.js", footer=footer)
 
 
 def _header(summary: AttackSummary) -> Html:
@@ -128,12 +126,15 @@ def _pictures(data: RunData) -> Html:
     ]
     trials = [name for name in data.pictures if name.startswith("images/verification")]
     trials = ([name for name in trials if name.endswith("-answer.png")] or trials)[:MOST_TRIALS]
-    animation = _figure(data, "images/search.gif", "", "from the first step to the last")
+    compare = element("div", id="compare", hidden="hidden")
+    search = element("div", element("h2", "The search, step by step"), element("div", id="search"), hidden="hidden")
     return join(
-        _section("What the model sees", shown),
+        element("h2", "What the model sees"),
+        compare,
+        _section("", shown),
         _section("What it answers", answered, "large", marks_text(summary.task)),
         _details("Pictures of the verification", [_figure(data, name, "", _trial(name)) for name in trials], "small"),
-        _details("The search as an animation", [animation], "single"),
+        search if data.frames else None,
     )
 
 
@@ -249,7 +250,8 @@ def _section(heading: str, figures: Iterable[Html | None], css: str = "", note: 
     if not shown:
         return Html("")
     remark = element("p", note, class_="soft") if note else None
-    return join(element("h2", heading), element("div", *shown, class_=f"pictures {css}".strip()), remark)
+    title = element("h2", heading) if heading else None
+    return join(title, element("div", *shown, class_=f"pictures {css}".strip()), remark)
 
 
 def _details(heading: str, figures: Iterable[Html | None], css: str = "") -> Html:
@@ -263,7 +265,8 @@ def _details(heading: str, figures: Iterable[Html | None], css: str = "") -> Htm
 def _figure(data: RunData, name: str, heading: str, caption: str) -> Html | None:
     if name not in data.pictures:
         return None
-    picture = element("img", src=data.pictures[name], alt=": ".join(filter(None, (heading, caption))))
+    alt = ": ".join(filter(None, (heading, caption)))
+    picture = element("img", src=data.pictures[name], alt=alt, data_picture=Path(name).stem)
     label = element("strong", heading) if heading else None
     return element("figure", picture, element("figcaption", label, ": " if heading else None, caption))
 
@@ -283,20 +286,79 @@ def _table_of_facts(facts: Mapping[str, str]) -> Html:
     return element("table", element("tbody", *lines), class_="facts")
 
 
+def _changes(summary: AttackSummary) -> Html:
+    """The answer in a few values, each in its range where it has one."""
+    found = summary.configuration or {}
+    if not found:
+        return Html("")
+    heads = ("", "clean", "adversarial", "in its range")
+    lines = []
+    for name, one in found.items():
+        unit = "" if one.unit in ("", "1", "name") else f" {one.unit}"
+        clean = "" if one.clean is None else wording.number_text(one.clean)
+        cells = (element("td", clean), element("td", f"{_value_text(one.value)}{unit}"), element("td", _place(one)))
+        lines.append(element("tr", element("th", name, scope="row"), *cells))
+    head = element("thead", element("tr", *(element("th", text, scope="col") for text in heads)))
+    table = element("div", element("table", head, element("tbody", *lines)), class_="scroll")
+    return join(element("h2", "What was changed"), table)
+
+
+def _value_text(value: float | str | Sequence[float]) -> str:
+    return ", ".join(map(wording.number_text, value)) if isinstance(value, list) else wording.number_text(value)
+
+
+def _place(one: FoundValue) -> Html | None:
+    """Where the clean and the found value lie between the ends of the range: a ring and a dot."""
+    if one.low is None or one.high is None or not isinstance(one.value, (int, float)):
+        return None
+    width = one.high - one.low
+
+    def at(value: float) -> str:
+        return f"left: {min(max((value - one_low) / width, 0.0), 1.0):.1%}"
+
+    one_low = one.low
+    marks = [element("span", style=at(one.clean), class_="from")] if isinstance(one.clean, (int, float)) else []
+    words = f"from {wording.number_text(one.low)} to {wording.number_text(one.high)}"
+    dot = element("span", style=at(one.value), class_="to")
+    return element("div", *marks, dot, class_="place", role="img", aria_label=words, title=words)
+
+
+def _animation(data: RunData) -> JsonObject:
+    """The frames of the search with the steps they are of, where each step has one; the last is the answer."""
+    searched, count = data.curves.get("search", []), len(data.frames) - 1
+    steps = [round(number) for number in np.linspace(0, max(len(searched) - 1, 0), count)]
+    objectives = [searched[step] if step < len(searched) else None for step in steps]
+    return {"pictures": list(data.frames), "steps": list(steps), "objectives": list(objectives)}
+
+
 def _read_pictures(path: Path) -> dict[str, str]:
     """Return a data URL for each picture of the run."""
     found = sorted(
-        file for folder in (directory.IMAGES, directory.ARTIFACTS) for file in (path / folder).glob("*.*")
-        if file.suffix in _KINDS and file.is_file()
+        file for folder in (directory.IMAGES, directory.ARTIFACTS) for file in (path / folder).glob("*.png")
+        if file.is_file()
     )  # fmt: skip
     return {file.relative_to(path).as_posix(): _data_url(file) for file in found}
 
 
+def _read_frames(file: Path) -> list[str]:
+    """Return the frames of an animation as data URLs; none where it is missing or damaged."""
+    from PIL import Image, ImageSequence
+
+    frames = []
+    try:
+        with Image.open(file) as animation:
+            for frame in ImageSequence.Iterator(animation):
+                stream = io.BytesIO()
+                frame.convert("RGB").save(stream, "JPEG", quality=FRAME_QUALITY)
+                frames.append(data_url(stream.getvalue(), "image/jpeg"))
+    except (OSError, SyntaxError, Image.DecompressionBombError):
+        return []
+    return frames if len(frames) > 1 else []
+
+
 def _data_url(file: Path) -> str:
     data = file.read_bytes()
-    if len(data) > LARGE_PICTURE and file.suffix == ".png":
-        data = images.smaller_png(data, SMALLER_SIDE)
-    return f"data:{_KINDS[file.suffix]};base64,{base64.b64encode(data).decode('ascii')}"
+    return data_url(images.smaller_png(data, SMALLER_SIDE) if len(data) > LARGE_PICTURE else data, _PNG)
 
 
 def _read_curves(path: Path) -> dict[str, list[float | None]]:

@@ -8,27 +8,22 @@ from __future__ import annotations
 
 import base64
 import gzip
-import hashlib
-import json
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
-from importlib import resources
 from pathlib import Path
 
-from advsearch import __version__
 from advsearch.files import JsonObject
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
 from advsearch.report.notebook import axis_cells
 from advsearch.report.phrases import percent
-from advsearch.report.style import CSS
 from advsearch.runs import directory
 from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.results.sweep import AxisRow, SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.viewer.columns import Columns, read_columns
+from advsearch.viewer.document import data_script, data_url, document
 from advsearch.viewer.thumbnails import Kept, kept_pictures
 
 MOST_EMBEDDED = 3_000_000
@@ -81,21 +76,9 @@ def page(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[Sho
         runs: folder and result of each sweep; None where it has none yet.
         sources: what the explorer of each reads.
     """
-    script, style = asset("viewer.js"), CSS + asset("viewer.css")
     connects = any(isinstance(one.rows, str) for one in sources)
-    policy = f"default-src 'none'; script-src '{_digest(script)}'; style-src 'unsafe-inline'; img-src data:"
-    policy += " 'self'; connect-src 'self'" if connects else ""
     summaries = [(path, summary) for path, summary in runs if summary is not None]
     title = ", ".join(path.name for path, _ in runs)
-    head = element(
-        "head",
-        element("meta", charset="utf-8"),
-        element("meta", http_equiv="Content-Security-Policy", content=policy + "; base-uri 'none'; form-action 'none'"),
-        element("meta", name="viewport", content="width=device-width, initial-scale=1"),
-        element("meta", name="color-scheme", content="light dark"),
-        element("title", f"{title} - advsearch"),
-        element("style", Html(style)),
-    )
     described, data = [], []
     sources = [one for one in sources if one.rows is not None]
     for number, source in enumerate(sources):
@@ -109,32 +92,9 @@ def page(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[Sho
         *(_still(path, summary) for path, summary in summaries),
         *(join(_axes(summary), _cost(path, summary)) for path, summary in summaries),
     )
-    body = element(
-        "body",
-        _header(runs),
-        main,
-        element("footer", f"advsearch {__version__}, {title}."),
-        element("script", Html(_json(described)), type="application/json", id="runs"),
-        *data,
-        element("script", Html(script)),
+    return document(
+        title, _header(runs), main, data=[data_script(described, "runs"), *data], script="sweep.js", connects=connects
     )
-    return "<!doctype html>\n" + element("html", head, body, lang="en") + "\n"
-
-
-@cache
-def asset(name: str) -> str:
-    """Return a file of the viewer."""
-    return (resources.files("advsearch.viewer") / "static" / name).read_text(encoding="utf-8")
-
-
-def _digest(script: str) -> str:
-    return "sha256-" + base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-
-
-def _json(value: object) -> str:
-    """JSON that may stand in a script element, whatever its texts are."""
-    text = json.dumps(value)
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _described(source: Shown, number: int) -> JsonObject:
@@ -209,7 +169,7 @@ def _worst_text(summary: SweepSummary) -> str:
 def _figure(file: Path, caption: str) -> Html | None:
     if not file.is_file():
         return None
-    address = "data:image/png;base64," + base64.b64encode(file.read_bytes()).decode("ascii")
+    address = data_url(file.read_bytes(), "image/png")
     return element("figure", element("img", src=address, alt=caption), element("figcaption", caption))
 
 
