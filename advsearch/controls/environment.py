@@ -12,7 +12,6 @@ section 3), 9 coefficients for each colour channel as multiples of the map's mea
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -28,6 +27,7 @@ from advsearch.errors import InputError
 from advsearch.scene import library, settings
 from advsearch.scene.description import ENVIRONMENT, OWN_MAP, SceneDescription
 from advsearch.scene.exposure import metered_gain
+from advsearch.scene.harmonics import real_harmonics
 from advsearch.scene.settings import CHANNELS, LIT
 
 COEFFICIENTS = 27
@@ -169,31 +169,6 @@ def turn(radiance: Tensor, degrees: Tensor) -> Tensor:
 def harmonics(coefficients: Tensor, like: Tensor) -> Tensor:
     """Return (H, W, 3) light from 9 coefficients a channel, scaled by the mean of the map `like` (H, W, 3)."""
     height, width = like.shape[:2]
-    basis = _basis(height, width)
+    basis = real_harmonics(height, width)
     mean = like.detach().mean(dim=(0, 1))
     return basis @ coefficients.reshape(9, 3) * mean
-
-
-@lru_cache(maxsize=4)
-def _basis(height: int, width: int) -> Tensor:
-    """Real spherical harmonics of degrees 0 to 2 over the map, each with root mean square 1; (H, W, 9)."""
-    theta = (torch.arange(height) + 0.5) * math.pi / height
-    phi = (torch.arange(width) + 0.5) * 2.0 * math.pi / width
-    x = theta.sin()[:, None] * phi.cos()[None]
-    y = theta.sin()[:, None] * phi.sin()[None]
-    z = theta.cos()[:, None].expand(height, width)
-    root3, root15, root5 = math.sqrt(3.0), math.sqrt(15.0), math.sqrt(5.0)
-    return torch.stack(
-        [
-            torch.ones_like(z),
-            root3 * y,
-            root3 * z,
-            root3 * x,
-            root15 * x * y,
-            root15 * y * z,
-            root5 / 2.0 * (3.0 * z * z - 1.0),
-            root15 * x * z,
-            root15 / 2.0 * (x * x - y * y),
-        ],
-        dim=-1,
-    )

@@ -306,6 +306,7 @@ def _transport(findings: Findings) -> LinearTransport:
         return LinearTransport(used=False, reason=findings.rendered_because or "nothing was searched")
     return LinearTransport(
         used=True,
+        reason=transport.given_up,
         conditions=None if transport.conditions is None else BankOfConditions.of(transport.conditions),
         entries=transport.size()[0],
         bytes=transport.size()[1],
@@ -318,11 +319,15 @@ def _transport(findings: Findings) -> LinearTransport:
 def _renders(findings: Findings, problem: Problem) -> dict[str, int]:
     """How many pictures each part took, and how many were predicted instead."""
     search, baseline, transport = findings.search, findings.baseline, findings.transport
-    products = [len(one.history) * problem.draws if one and transport else 0 for one in (search, baseline)]
+    kinds = {"search": search, "baseline": baseline}
+    products = [
+        transport.predicted(kind, len(one.history)) * problem.draws if one and transport else 0
+        for kind, one in kinds.items()
+    ]
     traced = transport.traced if transport else 0
     return {
         "search": (search.renders * problem.draws if search else 0) - products[0] + traced,
-        "gradient": search.gradients if search and not transport else 0,
+        "gradient": max(0, search.gradients - products[0]) if search else 0,
         "baseline": (baseline.renders * problem.draws if baseline else 0) - products[1],
         "verification": findings.verification_renders + len(findings.first_look),
         "products": sum(products),

@@ -135,9 +135,11 @@ class Attack:
     def _measure(self) -> None:
         """Replace the first gradient plan by a measured one, as far as the preparation wants that."""
         problem, wanted = self.problem, self.preparation
+        renderer, full = problem.renderer, wanted.measure == "full"
         if wanted.measure == "no" or not self.policy.uses_gradient:
             return
-        renderer, full = problem.renderer, wanted.measure == "full"
+        if not full and reason_against(problem, self.budget.steps, wanted.specialise) is None:
+            return  # derivatives will come from what predicts the pictures
         u, seed = inside(renderer), seeds.stream(problem.seed, "measure")
         gradients = plan_gradients(renderer.plan, every=full)
         if gradients:

@@ -1,4 +1,4 @@
-"""Searches over base colours by a matrix of light transport, and how far its pictures are from traced ones.
+"""Searches over base colours and light by light transport, and how far its pictures are from traced ones.
 
 The evaluations of the search itself are predicted; the renders of the ranking after it and all trials trace paths.
 Every `EVERY` evaluations the present configuration and that of the matrix are traced with one seed: where the change
@@ -21,11 +21,16 @@ from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.evaluation import Wanted
 from advsearch.engine.problem import OnImage, Problem
 from advsearch.scene.formation import to_8_bit
-from advsearch.scene.transport.renderer import LinearRenderer, samples_to_collect, why_not
+from advsearch.scene.renderer import Renderer
+from advsearch.scene.transport.lights import BasisRenderer
+from advsearch.scene.transport.plan import lights_to_collect, predicting, samples_to_collect, why_not
+from advsearch.scene.transport.renderer import PredictingRenderer
 
 WORTH = 16
 """Evaluations from which a search pays for the matrix, which costs as much as some 6 rendered ones with gradients
 (`benchmarks/transport.py`)."""
+WORTH_A_LIGHT = 8
+"""Evaluations for each light from which a search pays for its basis picture."""
 EVERY = 20
 BOUND = 2.0
 """Levels of 255, root mean square over the picture. On the bundled mug a matrix made anew at 1.7 levels, half way
@@ -41,12 +46,16 @@ class Deviation:
 
     Attributes:
         levels: root mean square difference between the predicted and the traced change of the picture since the matrix
-            was made, in levels of 255; both traced pictures have the same noise, most of which drops out.
+            was made, in levels of 255; both traced pictures have the same noise, most of which drops out. Where light
+            moves, of the picture itself.
         logits: predicted minus traced objective.
+        most: levels up to which a prediction is good enough: `BOUND`, or, where light moves, what a rendered
+            evaluation is off if that is more.
     """
 
     levels: float
     logits: float
+    most: float
 
 
 @dataclass(frozen=True)
@@ -72,7 +81,11 @@ def reason_against(problem: Problem, steps: int, specialise: bool) -> str | None
         return "nothing is left out"
     if steps < WORTH:
         return f"a matrix pays from {WORTH} evaluations on"
-    return why_not(problem.renderer, _varying(problem))
+    reason = why_not(problem.renderer, _varying(problem))
+    if reason is None and problem.conditions is None:
+        worth = WORTH_A_LIGHT * lights_to_collect(problem.renderer)
+        return f"basis pictures pay from {worth} evaluations on" if steps < worth else None
+    return reason
 
 
 def _varying(problem: Problem) -> list[str]:
@@ -122,6 +135,15 @@ class Predictor(ABC):
         """How often the matrix was made anew; None where none is."""
         return None
 
+    def predicted(self, kind: str, evaluations: int) -> int:
+        """How many of the first evaluations of a search were predicted."""
+        return evaluations
+
+    @property
+    def given_up(self) -> str | None:
+        """Why pictures were rendered from some evaluation on, in words; None if they were not."""
+        return None
+
     @property
     def conditions(self) -> Conditions | None:
         """What there is to say of conditions; None where nothing varies."""
@@ -140,7 +162,7 @@ class Linearised:
 
     u: Tensor
     index: int
-    renderer: LinearRenderer | None = None
+    renderer: PredictingRenderer | None = None
 
 
 @dataclass
@@ -150,8 +172,8 @@ class Transport(Predictor):
     Attributes:
         problem: what is searched.
         steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
-        renewals: by kind of search, the evaluations at which the matrix was made anew; may be filled before a search
-            that goes on.
+        renewals: by kind of search, the evaluations at which the matrix was made anew, or, where there is none that
+            could be, from which on pictures are traced; may be filled before a search that goes on.
         deviations: what the comparisons found, in order.
         keep: told of `renewals` whenever there is another one.
         seconds: spent on making matrices and on comparing.
@@ -175,17 +197,42 @@ class Transport(Predictor):
 
     @property
     def renewed(self) -> int:
-        return sum(len(found) for found in self.renewals.values())
+        return sum(len(found) for found in self.renewals.values()) if self._renewable else 0
+
+    @property
+    def _renewable(self) -> bool:
+        """Whether there is something to linearise again: basis pictures of lights stay what they are."""
+        return self.start.entries > 0
+
+    def predicted(self, kind: str, evaluations: int) -> int:
+        return min(evaluations, self._end(kind))
+
+    def _end(self, kind: str) -> int:
+        """The evaluation from which on pictures are traced."""
+        found = self.renewals.get(kind)
+        return self.steps if self._renewable or not found else min(found[0], self.steps)
+
+    @property
+    def given_up(self) -> str | None:
+        found = [f"{at} of the {kind}" for kind, (at, *_) in self.renewals.items() if not self._renewable]
+        return (
+            f"pictures are rendered from evaluation {found[0]} on: predicted ones were too far off" if found else None
+        )
 
     @property
     def traced(self) -> int:
-        return 1 + self.renewed + 2 * len(self.deviations)
+        return (1 + self.renewed) * self._pictures + 2 * len(self.deviations)
 
     def prepare(self, tick: Tick = lambda samples: None) -> None:
         self._start = self._made(self.problem.domain.start, "start", 0, tick)
 
     @property
-    def start(self) -> LinearRenderer:
+    def _pictures(self) -> int:
+        """Pictures that are traced to make a matrix."""
+        return self.start.lights if isinstance(self.start, BasisRenderer) else 1
+
+    @property
+    def start(self) -> PredictingRenderer:
         """Where every search begins."""
         return self._ready(self._begin, "start")[1]
 
@@ -204,9 +251,9 @@ class Transport(Predictor):
         traced = self.problem.evaluator(kind, on_image)
 
         def evaluate(u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
-            if index >= self.steps:
+            renderer = self._compared(kind, index, u) if index < self._end(kind) else None
+            if renderer is None:
                 return traced(u, index=index, gradient=gradient, samples=samples)
-            renderer = self._compared(kind, index, u)
             noise = seeds.stream(self.problem.seed, kind, index)
             return self.problem.evaluated(u, noise, index, gradient, samples, on_image, renderer)[0]
 
@@ -217,21 +264,21 @@ class Transport(Predictor):
         with torch.no_grad():
             return self.problem.judge(to_8_bit(self.start(u)), u).success
 
-    def _compared(self, kind: str, index: int, u: Tensor) -> LinearRenderer:
-        """The matrix to predict this evaluation with, compared and made anew where that is due."""
+    def _compared(self, kind: str, index: int, u: Tensor) -> PredictingRenderer | None:
+        """The matrix to predict this evaluation with, compared and made anew where that is due; None gives up."""
         present, renderer = self._ready(self._present.get(kind, self._begin), kind)
         if index and index % EVERY == 0 and kind.startswith("search"):
             found = self.deviation(renderer, present.u, u, index)
             self.deviations.append(found)
-            if found.levels > BOUND:
-                present = self._made(u, kind, index)
+            if found.levels > found.most:
+                present = self._made(u, kind, index) if self._renewable else present
                 if index not in self.renewals.setdefault(kind, []):  # else in an earlier life of the run
                     self.renewals[kind].append(index)
                     self.keep(self.renewals)
         self._present[kind], renderer = self._ready(present, kind)
-        return renderer
+        return renderer if index < self._end(kind) else None
 
-    def _ready(self, place: Linearised, kind: str) -> tuple[Linearised, LinearRenderer]:
+    def _ready(self, place: Linearised, kind: str) -> tuple[Linearised, PredictingRenderer]:
         made = place if place.renderer is not None else self._made(place.u, kind, place.index)
         assert made.renderer is not None
         return made, made.renderer
@@ -239,25 +286,46 @@ class Transport(Predictor):
     def _made(self, u: Tensor, kind: str, index: int, tick: Tick = lambda samples: None) -> Linearised:
         begun = time.perf_counter()
         seed = seeds.stream(self.problem.seed, f"transport {kind}", index)
-        made = LinearRenderer(self.problem.renderer, u, seed, tick)
+        made = predicting(self.problem.renderer, u, seed, tick)
         self.seconds += time.perf_counter() - begun
         return Linearised(u.detach().clone(), index, made)
 
-    def deviation(self, linear: LinearRenderer, at: Tensor, u: Tensor, index: int) -> Deviation:
+    def deviation(self, linear: PredictingRenderer, at: Tensor, u: Tensor, index: int) -> Deviation:
         """Compare what a prediction says of the change since its matrix was made at `at` with what two traced pictures
         do."""
         begun = time.perf_counter()
-        found = deviation_of(self.problem, linear, at, u, seeds.stream(self.problem.seed, "transport check", index))
+        problem, seed = self.problem, seeds.stream(self.problem.seed, "transport check", index)
+        if isinstance(linear, BasisRenderer):
+            found = deviation_under_light(problem.renderer, problem.loss, linear, u, seed, problem.spp)
+        else:
+            found = deviation_of(problem, linear, at, u, seed)
         self.seconds += time.perf_counter() - begun
         return found
 
 
-def deviation_of(problem: Problem, linear: LinearRenderer, at: Tensor, u: Tensor, seed: int) -> Deviation:
+def deviation_of(problem: Problem, linear: PredictingRenderer, at: Tensor, u: Tensor, seed: int) -> Deviation:
     """Compare what a prediction says of the change from one configuration of the whole space to another with what two
     traced pictures with one seed do."""
     with torch.no_grad():
         before, after = (problem.renderer(one, seed=seed, spp=CHECK_SPP) for one in (at, u))
         predicted = linear(u)
-        off = float((((predicted - linear(at)) - (after - before)) ** 2).mean())
+        levels = levels_apart(predicted - linear(at), after - before)
         logits = float(problem.loss(predicted) - problem.loss(after))
-    return Deviation(255.0 * math.sqrt(off), logits)
+    return Deviation(levels, logits, BOUND)
+
+
+def deviation_under_light(
+    renderer: Renderer, loss: Callable[[Tensor], Tensor], predicted: PredictingRenderer, u: Tensor, seed: int, spp: int
+) -> Deviation:
+    """Compare a predicted picture with a traced one. It may be as far from that as a rendered one, at `spp` samples a
+    pixel: noise grows with the power of light, and that of two lights does not drop out of a change."""
+    with torch.no_grad():
+        found, traced = predicted(u), renderer(u, seed=seed, spp=CHECK_SPP)
+        rendered = renderer(u, seed=seeds.stream(seed, "rendered"), spp=spp)
+        logits = float(loss(found) - loss(traced))
+    return Deviation(levels_apart(found, traced), logits, max(BOUND, levels_apart(rendered, traced)))
+
+
+def levels_apart(one: Tensor, other: Tensor) -> float:
+    """Root mean square difference of two pictures in levels of 255."""
+    return 255.0 * math.sqrt(float(((one - other) ** 2).mean()))

@@ -17,6 +17,7 @@ import advsearch
 from advsearch.engine import transport as searching
 from advsearch.scene.mitsuba_backend.transport import Vertices
 from advsearch.scene.renderer import Renderer
+from advsearch.scene.transport import plan
 from advsearch.scene.transport import renderer as linear
 from advsearch.scene.transport.matrix import COARSE, TextureTransport
 
@@ -127,7 +128,7 @@ def test_smoothed_rows_keep_where_they_look_and_take_the_sum_that_is_asked_for()
     [
         (["texture"], {}, None),
         (["patch"], {}, None),
-        (["texture", "pose"], {}, "pose.yaw changes more than a base colour"),
+        (["texture", "pose"], {}, "pose.yaw changes more than base colours and light"),
         ({"texture": {}, "haze": {"density": 0.2}}, {}, "there is haze"),
         (["texture"], {"denoise": "none"}, "noise is part of the picture without the denoiser"),
         (["texture"], {"estimators": {"texture": "adjoint"}}, "the estimator of texture.texels is forced"),
@@ -135,7 +136,7 @@ def test_smoothed_rows_keep_where_they_look_and_take_the_sum_that_is_asked_for()
 )
 def test_where_it_can_predict(controls: object, options: dict[str, object], reason: str | None) -> None:
     made = advsearch.load_scene("mug").renderer(controls, resolution=16, **options)  # type: ignore[arg-type]
-    assert linear.why_not(made) == reason
+    assert plan.why_not(made) == reason
 
 
 def test_a_matrix_that_is_too_large_is_not_made(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -151,7 +152,7 @@ SMALL = {"resolution": SIZE, "trials": 6, "steps": 18, "verify_spp": 8, "control
 
 def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
     made, guesses = 0, 0
-    linearised, likely = linear.LinearRenderer, searching.Transport.likely
+    linearised, likely = plan.predicting, searching.Transport.likely
 
     def counted(*given: Any) -> Any:
         nonlocal made
@@ -163,7 +164,7 @@ def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.Monke
         guesses += 1
         return likely(self, u)
 
-    monkeypatch.setattr(searching, "LinearRenderer", counted)
+    monkeypatch.setattr(searching, "predicting", counted)
     monkeypatch.setattr(searching.Transport, "likely", guessed)
     monkeypatch.setattr(searching, "BOUND", 100.0)
     found = advsearch.attack("mug", smallest=True, baseline=False, run=None, **SMALL).summary  # type: ignore[arg-type]

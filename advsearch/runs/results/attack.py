@@ -159,7 +159,7 @@ class LinearTransport(Fields):
     """The matrix that predicted the pictures of the searches."""
 
     used: bool
-    reason: str | None = Field(default=None, description="why every picture was rendered")
+    reason: str | None = Field(default=None, description="why pictures were rendered, all or from some evaluation on")
     conditions: BankOfConditions | None = Field(default=None, description="with `over`")
     entries: int | None = Field(default=None, description="of the matrix")
     bytes: int | None = Field(default=None, description="of its memory")

@@ -1,10 +1,12 @@
-"""A renderer without rays: pictures of configurations that change base colours only, to first order."""
+"""Renderers without rays; and the one for configurations that change base colours only, to first order."""
 
 from __future__ import annotations
 
 import copy
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 import torch
 from torch import Tensor
@@ -34,10 +36,36 @@ class TransportTooLargeError(Exception):
     """A matrix that takes more memory than it may."""
 
 
-class LinearRenderer(Renderer):
-    """A renderer of the same space whose pictures come from a matrix; differentiable, without noise.
+class PredictingRenderer(Renderer, ABC):
+    """A renderer of the same space that traces no paths for its pictures; differentiable, without noise.
 
     The seed and the samples of a call mean nothing to it.
+
+    Attributes:
+        products: pictures it has made.
+    """
+
+    products: int
+
+    @property
+    @abstractmethod
+    def entries(self) -> int:
+        """Entries of all matrices, for one colour channel."""
+
+    @property
+    @abstractmethod
+    def bytes(self) -> int:
+        """Memory of all matrices and pictures, 16 bits a number."""
+
+    def _through(self, u: Tensor) -> Tensor:
+        return u
+
+    def _differenced(self) -> tuple[Group, ...]:
+        return ()
+
+
+class LinearRenderer(PredictingRenderer):
+    """A renderer whose pictures come from a matrix.
 
     Args:
         renderer: the one that traces paths.
@@ -47,10 +75,11 @@ class LinearRenderer(Renderer):
         spp: samples a pixel.
         quick: take the noise out of the rows of the matrix as it was taken out of the base picture, which they
             resemble, and not by the denoiser.
-        names: the inputs that get a matrix; None for all base colours that the space sets.
+        names: the inputs that get a matrix; None for all base colours that the space sets. Without any there is the
+            base picture alone.
+        light: inputs in the place of those of u.
 
     Attributes:
-        products: pictures it has made.
         transports: by input.
         there: the inputs where it was linearised.
 
@@ -68,30 +97,33 @@ class LinearRenderer(Renderer):
         spp: int = SPP,
         quick: bool = False,
         names: Collection[str] | None = None,
+        light: Mapping[str, Tensor] = MappingProxyType({}),
     ) -> None:
         vars(self).update(vars(copy.copy(renderer)))
         self.products = 0
         with torch.no_grad():
             inputs = self._assembled(u)
             self._applied = {name: value for name, value in inputs.items() if name in ON_PICTURE}
-            traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE}
+            traced = {name: value for name, value in inputs.items() if name not in ON_PICTURE} | dict(light)
             linear = [name for name in traced if name in (linear_inputs(renderer) if names is None else names)]
             self.there = {name: traced[name].clone() for name in linear}
             self.transports = {
                 name: TextureTransport(self.formation.resolution, (value.shape[0], value.shape[1]))
                 for name, value in self.there.items()
             }
-            seen = self._traced(traced, seed, tick, spp)
-            self._base = Halves(self._finished(seen, quick))
+            if self.transports:
+                base = self._finished(self._traced(traced, seed, tick, spp), quick)
+            else:
+                base = self.primal(traced, seed, spp, self._hide)
+                tick(spp)
+            self._base = Halves(base)
 
     @property
     def entries(self) -> int:
-        """Entries of all matrices, for one colour channel."""
         return sum(one.entries for one in self.transports.values())
 
     @property
     def bytes(self) -> int:
-        """Memory of all matrices and of the base picture, 16 bits a number."""
         height, width = self.formation.resolution
         return sum(one.bytes for one in self.transports.values()) + 8 * height * width
 
@@ -105,13 +137,13 @@ class LinearRenderer(Renderer):
         Raises:
             TransportTooLargeError: a matrix would take more than `MOST_BYTES`.
         """
-        samples, passes = _passes(self, spp)
+        samples, count = passes(self, spp)
         found: list[Paths] = []
         for name, transport in self.transports.items():
-            for number in range(passes):
+            for number in range(count):
                 noise = seeds.stream(seed, f"transport {name}", number)
                 paths = self.scene.transport(inputs, name, noise, samples)
-                transport.add(paths.vertices, 1.0 / passes)
+                transport.add(paths.vertices, 1.0 / count)
                 if self.bytes > scaled(MOST_BYTES):
                     raise TransportTooLargeError(f"the matrix would take more than {scaled(MOST_BYTES) / 2**30:g} GiB")
                 found.append(replace(paths, vertices=[]))
@@ -147,50 +179,13 @@ class LinearRenderer(Renderer):
         controls do to the finished picture comes from `u`."""
         return self.space.picture(u, self.formation.display(self._formed({**inputs, **self._applied}, 0, 1)))
 
-    def _through(self, u: Tensor) -> Tensor:
-        return u
-
-    def _differenced(self) -> tuple[Group, ...]:
-        return ()
-
 
 def linear_inputs(renderer: Renderer) -> frozenset[str]:
     """The inputs of a scene to which radiance is linear."""
     return frozenset(name for name in renderer.scene.names if name.endswith(LINEAR))
 
 
-def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
-    """Why pictures of a renderer's space cannot be predicted by a matrix, in words; None if they can.
-
-    Args:
-        varying: names of controls that stand still for each matrix, whatever they change.
-    """
-    plan, linear = renderer.plan, linear_inputs(renderer)
-    if renderer.scene.volumetric:
-        return "there is haze"
-    if renderer.formation.denoiser != "oidn":
-        return "noise is part of the picture without the denoiser"
-    searched = [group for group in plan.groups if group.control not in varying]
-    for group in searched:
-        if "forced" in group.reason and group.estimator not in ("none", "image"):
-            return f"the estimator of {group.name} is forced"
-        if group.estimator == "image":
-            continue
-        if group.estimator != "adjoint" or not renderer.routes.get(group.name, frozenset()) <= linear:
-            return f"{group.name} changes more than a base colour"
-    if not any(renderer.routes.get(group.name) for group in searched):
-        return "nothing that is searched needs a render to be differentiated"
-    return None
-
-
-def samples_to_collect(renderer: Renderer) -> int:
-    """Samples a pixel that a linear renderer traces before it can begin."""
-    inputs = {name for group in renderer.plan.groups for name in renderer.routes.get(group.name, ())}
-    samples, passes = _passes(renderer, SPP)
-    return samples * passes * len(inputs & linear_inputs(renderer))
-
-
-def _passes(renderer: Renderer, spp: int) -> tuple[int, int]:
+def passes(renderer: Renderer, spp: int) -> tuple[int, int]:
     """Samples a pixel of a pass, and how many passes there are."""
     height, width = renderer.formation.resolution
     samples = max(1, min(spp, PASS // (height * width)))

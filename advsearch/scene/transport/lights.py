@@ -1,0 +1,279 @@
+"""Pictures of a scene in which nothing moves but the power and colour of its lights: one basis picture for each light.
+
+Light of different lamps adds up, channel by channel, so that
+
+    radiance = sum over lights of weight x basis picture,        weight: three colour channels, from the configuration,
+
+where a basis picture is rendered once with one light alone, and denoised once. An environment whose power, exposure and
+tint move is one light. Where spherical harmonics are added to it, each of them is another one, beside the map itself:
+the weights are those with which the basis maps come nearest to the map, by least squares over solid angle. What is cut
+off below zero is why they need not meet it.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.scene.assembly import ON_PICTURE
+from advsearch.scene.gradients.group import Group
+from advsearch.scene.harmonics import real_harmonics
+from advsearch.scene.renderer import Renderer
+from advsearch.scene.transport.renderer import LinearRenderer, PredictingRenderer
+
+ENVIRONMENT = "environment.padded"
+LAMPS = (".intensity", ".radiance")
+"""What the names of inputs end in that are the light of a lamp, (3,)."""
+SAME = 1e-3
+"""Relative difference up to which a map is a multiple of another one: float32 after a tone curve and back."""
+PROBED = 64
+"""Options of a discrete choice that are looked at, at most."""
+FEW = 4
+"""Every so many rows and columns of a map are looked at first."""
+BETWEEN = (0.02, 0.29, 0.61, 0.97)
+"""Places in the range of a continuous parameter at which is looked what it changes."""
+
+Inputs = Mapping[str, Tensor]
+
+
+def light_inputs(renderer: Renderer) -> frozenset[str]:
+    """The inputs of a scene that are light."""
+    return frozenset(name for name in renderer.scene.names if name == ENVIRONMENT or name.endswith(LAMPS))
+
+
+# ---- what moves -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """What of a space is power and colour of lights, exposure, or done to the finished picture.
+
+    Attributes:
+        groups: by `control.parameter`, the inputs that it changes; none where only the finished picture changes.
+        harmonic: those that add spherical harmonics to the environment.
+    """
+
+    groups: Mapping[str, frozenset[str]]
+    harmonic: frozenset[str]
+
+    @property
+    def moved(self) -> frozenset[str]:
+        """The inputs that are light and move."""
+        return frozenset(name for names in self.groups.values() for name in names) - ON_PICTURE
+
+
+def lighting(renderer: Renderer) -> Lighting:
+    """Return which groups of coordinates change nothing but light, and the picture behind the renderer.
+
+    Found by looking at the inputs of configurations, so that it holds for whatever sets them.
+    """
+    middle = 0.5 * renderer.start + 0.25
+    groups, harmonic = {}, set()
+    with torch.no_grad():
+        here = renderer.scene.assembly(renderer.space.inputs(middle))
+        for group in renderer.space.groups:
+            found: set[str] = set()
+            for place in _places(group, middle):
+                changes = _changes(here, renderer.scene.assembly(renderer.space.inputs(place)))
+                if None in changes.values():
+                    break
+                found |= changes.keys()
+                if changes.get(ENVIRONMENT) == "harmonics":
+                    harmonic.add(group.name)
+            else:
+                groups[group.name] = frozenset(found)
+    return Lighting(groups, frozenset(harmonic & groups.keys()))
+
+
+def _places(group: Group, middle: Tensor) -> Iterator[Tensor]:
+    """Configurations that differ in one group."""
+    if group.options:
+        step = -(-group.options // PROBED)
+        values = [(number + 0.5) / group.options for number in range(0, group.options, step)]
+    else:
+        values = list(BETWEEN)
+    numbers = [torch.full((group.size,), value) for value in values]
+    if group.size > 1:
+        numbers.append(torch.rand(group.size, generator=torch.Generator().manual_seed(0)))
+    for one in numbers:
+        place = middle.clone()
+        place[group.coordinates] = one
+        yield place
+
+
+def _changes(here: Inputs, there: Inputs) -> dict[str, str | None]:
+    """The inputs that differ, with how, in words; None of one that is more than light."""
+    found: dict[str, str | None] = {name: None for name in here.keys() ^ there.keys()}
+    for name in here.keys() & there.keys():
+        one, other = here[name], there[name]
+        if one.shape == other.shape and torch.equal(one, other):
+            continue
+        if name in ON_PICTURE or name.endswith(LAMPS):
+            found[name] = "power"
+        else:
+            found[name] = _change_of_map(one, other) if name == ENVIRONMENT else None
+    return found
+
+
+def _change_of_map(one: Tensor, other: Tensor) -> str | None:
+    """How a map (H, W, 3) differs from another one: times a colour, or plus spherical harmonics; None if neither."""
+    if one.shape != other.shape:
+        return None
+    if _explained(one[None], other):
+        return "power"
+    basis = torch.cat([one[None], _harmonic_maps(one)])
+    some = basis[:, ::FEW, ::FEW], other[::FEW, ::FEW]  # tells most others apart in a tenth of the time
+    return "harmonics" if _explained(*some) and _explained(basis, other) else None
+
+
+def _explained(basis: Tensor, lit: Tensor) -> bool:
+    """Whether a map is a sum of others (k, H, W, 3), as far as it and the first of them are above zero."""
+    both = ((basis[0] > 0.0) & (lit > 0.0)).to(torch.float32)
+    span = Span(basis * both)
+    left = lit * both - span.map(span.weights(lit * both))
+    return float(left.norm()) <= SAME * float(lit.norm())
+
+
+def _harmonic_maps(like: Tensor) -> Tensor:
+    """Spherical harmonics of degrees 0 to 2, (9, H, W, 3): each lifted to at least zero by a multiple of the first."""
+    basis = real_harmonics(like.shape[0], like.shape[1] - 2)
+    padded = torch.cat([basis[:, -1:], basis, basis[:, :1]], dim=1).permute(2, 0, 1)
+    lifted = padded - padded.amin(dim=(1, 2), keepdim=True).clamp_max(0.0)
+    return (lifted * float(like.mean().clamp_min(1e-12)))[..., None].expand(-1, -1, -1, 3).contiguous()
+
+
+@dataclass(frozen=True, eq=False)
+class Span:
+    """Basis maps of an environment, and how a map is put together from them.
+
+    Attributes:
+        maps: (k, H, W, 3), all at least zero.
+    """
+
+    maps: Tensor
+
+    def weights(self, lit: Tensor) -> Tensor:
+        """Return (k, 3): the weights with which the maps come nearest to (H, W, 3); differentiable."""
+        flat = lit.permute(2, 0, 1).reshape(3, -1, 1)
+        found: Tensor = (self._inverse @ flat)[..., 0].T
+        return found
+
+    def map(self, weights: Tensor) -> Tensor:
+        """Return the map (H, W, 3) of weights (k, 3)."""
+        found: Tensor = torch.einsum("khwc,kc->hwc", self.maps, weights)
+        return found
+
+    @cached_property
+    def _inverse(self) -> Tensor:
+        """(3, k, H W): the pseudo-inverse of each channel, weighted by solid angle."""
+        count, height, width, _ = self.maps.shape
+        sine = torch.sin((torch.arange(height) + 0.5) * torch.pi / height)[:, None].expand(height, width).reshape(-1)
+        columns = self.maps.permute(3, 0, 1, 2).reshape(3, count, -1).double()
+        weighted = columns * sine
+        found: Tensor = torch.linalg.pinv(weighted @ columns.transpose(1, 2)) @ weighted
+        return found.float()
+
+
+# ---- pictures -------------------------------------------------------------------------------------------------------
+
+
+class Lights:
+    """The lights of a scene of which some move, each as what it is alone.
+
+    Args:
+        renderer: of the scene.
+        lighting: what moves.
+        inputs: of a configuration: its map is the environment's first basis map.
+
+    Attributes:
+        alone: the inputs of each light; all others are dark there.
+    """
+
+    def __init__(self, renderer: Renderer, lighting: Lighting, inputs: Inputs) -> None:
+        every = light_inputs(renderer)
+        own = {name: inputs[name] if name in inputs else renderer.scene.base(name) for name in sorted(every)}
+        dark = {name: torch.zeros_like(value) for name, value in own.items()}
+        still = {name: value for name, value in own.items() if name not in lighting.moved and bool((value > 0.0).any())}
+        self._lamps = sorted(lighting.moved & every - {ENVIRONMENT})
+        lit = ENVIRONMENT in lighting.moved
+        self._still = bool(still) or not (self._lamps or lit)
+        self.alone: list[Inputs] = [{**dark, **still}] if self._still else []
+        self.alone += [{**dark, name: torch.ones(3)} for name in self._lamps]
+        self._span = Span(_basis_maps(renderer, own[ENVIRONMENT], bool(lighting.harmonic))) if lit else None
+        if self._span is not None:
+            self.alone += [{**dark, ENVIRONMENT: one} for one in self._span.maps]
+
+    def weights(self, inputs: Inputs) -> Tensor:
+        """Return how much of each light there is in a configuration, (lights, 3); differentiable."""
+        found = [torch.ones(1, 3)] if self._still else []
+        found += [inputs[name].reshape(1, 3) for name in self._lamps]
+        if self._span is not None:
+            found.append(self._span.weights(inputs[ENVIRONMENT]))
+        return torch.cat(found)
+
+
+def _basis_maps(renderer: Renderer, there: Tensor, harmonic: bool) -> Tensor:
+    """The basis maps (k, H, W, 3) of an environment: itself, and spherical harmonics where it is not cut off."""
+    if not harmonic:
+        return there[None]
+    start = renderer.scene.assembly(renderer.space.inputs(renderer.start))[ENVIRONMENT]
+    whole = (there > 0.0) | (start <= 0.0 if start.shape == there.shape else torch.zeros_like(there).bool())
+    return torch.cat([there[None], _harmonic_maps(there) * whole.to(torch.float32)])
+
+
+class BasisRenderer(PredictingRenderer):
+    """A renderer whose pictures are put together from one basis picture a light.
+
+    Where base colours are searched too, each light has matrices of its own, so that radiance is bilinear in both: to
+    first order in the base colours, under any light.
+
+    Args:
+        renderer: the one that traces paths.
+        u: where base colours are linearised; what does not move is as it is there.
+        seed: number of the noise.
+        tick: told of samples a pixel as they are traced, `samples_to_collect` in all.
+        moving: what moves; None looks.
+    """
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        u: Tensor,
+        seed: int,
+        tick: Callable[[int], None] = lambda samples: None,
+        *,
+        moving: Lighting | None = None,
+    ) -> None:
+        vars(self).update(vars(copy.copy(renderer)))
+        self.products = 0
+        with torch.no_grad():
+            self._lights = Lights(renderer, moving or lighting(renderer), self._assembled(u))
+            self._of_each = [
+                LinearRenderer(renderer, u, seeds.stream(seed, "light", number), tick, light=alone)
+                for number, alone in enumerate(self._lights.alone)
+            ]
+
+    @property
+    def lights(self) -> int:
+        """How many there are."""
+        return len(self._of_each)
+
+    @property
+    def entries(self) -> int:
+        return sum(one.entries for one in self._of_each)
+
+    @property
+    def bytes(self) -> int:
+        return sum(one.bytes for one in self._of_each)
+
+    def _rendered(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool) -> Tensor:
+        pictures = [one._rendered(inputs, seed, spp, hide) for one in self._of_each]
+        radiance = torch.einsum("lc,lhwc->hwc", self._lights.weights(inputs), torch.stack(pictures)[..., :3])
+        self.products += 1
+        return torch.cat([radiance, pictures[0][..., 3:]], dim=-1) if hide else radiance
