@@ -30,6 +30,7 @@ from advsearch.controls import OWN
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import END, Fields, Result
 from advsearch.runs.results.gap import CurveResult, GapResult
+from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.region import RegionResult
 from advsearch.runs.results.stability import CaseRow
 from advsearch.runs.results.sweep import SweepSummary
@@ -423,6 +424,7 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("design.md", "attack-fields"): result_fields(AttackSummary),
     ("sweeps.md", "sweep-fields"): result_fields(SweepSummary),
     ("questions.md", "curve-fields"): result_fields(CurveResult),
+    ("questions.md", "matrix-fields"): result_fields(MatrixResult),
     ("questions.md", "gap-fields"): result_fields(GapResult),
     ("questions.md", "region-fields"): result_fields(RegionResult),
     ("stability.md", "case-fields"): result_fields(CaseRow),

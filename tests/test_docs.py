@@ -63,6 +63,7 @@ from advsearch.runs import directory, export, store
 from advsearch.runs.results import KEPT
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.gap import CurveResult
+from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.render import RenderResult
 from advsearch.scene import environments, exposure, library
 from advsearch.scene.description import FRAME_FILL
@@ -204,7 +205,7 @@ def test_every_benchmark_is_in_the_table() -> None:
     assert scripts and not [name for name in scripts if f"| [`{name}`]" not in page]
 
 
-@pytest.mark.parametrize("kind", [*KEPT, CurveResult, RenderResult], ids=lambda kind: kind.__name__)
+@pytest.mark.parametrize("kind", [*KEPT, CurveResult, MatrixResult, RenderResult], ids=lambda kind: kind.__name__)
 def test_every_field_of_a_result_has_a_type_and_most_say_what_they_hold(kind: type[Result]) -> None:
     assert kind.__doc__ and kind.command
     silent = {name for name, field in kind.model_fields.items() if not script("make_figures")._field(field)}

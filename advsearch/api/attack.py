@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from advsearch import seeds
 from advsearch.api.keywords import AttackKeywords, asks
-from advsearch.attacks import Objective, Policy, get_objective, make_policy
-from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
+from advsearch.attacks import Policy, make_policy
+from advsearch.attacks.objectives import check_objective
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.config.scene import one_only
 from advsearch.controls import make_space
 from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
-from advsearch.engine.answers import check_truth, facts_of
+from advsearch.engine.answers import Described, Looked, check_truth, facts_of
 from advsearch.engine.budget import Preparation, RenderBudget, verification_ladder
 from advsearch.engine.loading import Controls, PictureSettings, Scene, framed, load_scene, make_renderer, settings_of
 from advsearch.engine.memory import Memory
-from advsearch.engine.naming import load_models, scene_settings
+from advsearch.engine.naming import AnyModel, load_models, model_name, scene_settings, several
+from advsearch.engine.objective import Wanted, objective_for, task_for
 from advsearch.engine.outcome import AttackResult, Question, summarise
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
@@ -34,15 +34,16 @@ from advsearch.engine.stages import Attack
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
-from advsearch.models.features import features_of
+from advsearch.models.ensemble import together
 from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory, check_free, is_run, run_path
 from advsearch.runs.results.gap import CurveResult
+from advsearch.runs.results.matrix import MatrixResult
 from advsearch.scene.leaving_out import EVERYTHING, NOTHING
 from advsearch.scene.mitsuba_backend.samplers import next_count
-from advsearch.scene.renderer import Renderer
-from advsearch.tasks import AnyTask, Task, make_task
+from advsearch.tasks import AnyTask, Facts, Task, make_task
+from advsearch.tasks.together import Together
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -50,14 +51,11 @@ if TYPE_CHECKING:
 LOADING, PREPARING = "loading the scene and the model", "preparing the scene for rendering"
 """What a person who waits is told before the first picture."""
 
-CLEAN_SPP = 64
-"""Samples a pixel of the clean picture that an objective compares features with."""
-
 
 @asks(AttackConfig, AttackKeywords)
 def attack(
     scene: Scene | str | Path,
-    model: Model | nn.Module | str | Path = "reference",
+    model: AnyModel | Sequence[AnyModel] = "reference",
     *,
     task: AnyTask = "classification",
     controls: Controls = ("texture",),
@@ -76,7 +74,7 @@ def attack(
 
     Args:
         scene: from `load_scene`, or what that takes.
-        model: from `load_model`, or what that takes.
+        model: from `load_model`, or what that takes; with `ensemble`, several.
         task: what judges the model's output: a name, a mapping with a `name` and options, or an instance.
         controls: what may vary: names, instances, or a mapping from names to settings.
         objective: "margin", "log_odds", "cross_entropy", "dlr", "feature_distance", "score", or a function of (output,
@@ -99,7 +97,7 @@ def attack(
         "object": scene.description.object_name,
         "environment": scene.description.environment_name,
         "up": scene.description.up,
-        "model": model if isinstance(model, str) else getattr(model, "name", None) or type(model).__name__,
+        "model": ",".join(map(model_name, several(model))),
         "controls": settings_of(controls),
         "over": settings_of(over),
         "task": as_setting(task) if isinstance(task, Task) else task,
@@ -108,6 +106,10 @@ def attack(
         "set": _set_by(scene, settings.get("exposure")),
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
+    if config.is_matrix and config.ensemble is None:
+        raise InputError(
+            "model: expected one, got several; add `ensemble`, which attacks them together, or attack each by itself"
+        )
     searched, drawn = _controls(config, controls, over)
     asked, objective = _asked(config, task, objective)
     loaded = _model(model, config, asked)
@@ -119,8 +121,8 @@ def attack(
 
 def attack_from_config(
     config: AttackConfig, *, progress: Progress | None = None, resumed: Path | None = None
-) -> AttackResult | CurveResult:
-    """Do what a configuration describes, one attack or a curve of several; see `attack`.
+) -> AttackResult | CurveResult | MatrixResult:
+    """Do what a configuration describes: one attack, a curve or a matrix of several; see `attack`.
 
     Args:
         config: what.
@@ -130,7 +132,11 @@ def attack_from_config(
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
-    if config.is_study:
+    if config.is_matrix:
+        from advsearch.api.gap import matrix_from_config
+
+        return matrix_from_config(config, progress=progress, resumed=resumed)
+    if config.is_curve:
         from advsearch.api.gap import curve_from_config
 
         return curve_from_config(config, progress=progress, resumed=resumed)
@@ -222,10 +228,6 @@ def _controls(
     return shared.given_to(searched), replace(shared, epsilon=None).given_to(drawn)
 
 
-Wanted = str | Callable[..., Tensor]
-"""An objective: its name, or the user's own function."""
-
-
 def _asked(config: AttackConfig, task: AnyTask, objective: Wanted | None) -> tuple[Task, Wanted]:
     """The task, and the objective that was asked for or else the task's own, checked before anything is loaded."""
     made = make_task(task)
@@ -234,24 +236,42 @@ def _asked(config: AttackConfig, task: AnyTask, objective: Wanted | None) -> tup
     return made, wanted
 
 
-def _model(model: Model | nn.Module | str | Path, config: AttackConfig, task: Task) -> tuple[Model, list[str]]:
-    """Load the model; its warnings become sentences of the run."""
-    (loaded,), warnings = load_models([model], task, labels=config.labels, used_threads=config.used_threads)
-    return loaded, warnings
+def _model(model: AnyModel | Sequence[AnyModel], config: AttackConfig, task: Task) -> tuple[Model, list[str]]:
+    """Load the model, or the models of an ensemble as one; their warnings become sentences of the run."""
+    models, warnings = load_models(several(model), task, labels=config.labels, used_threads=config.used_threads)
+    return models[0] if config.ensemble is None else together(models, config.resolution), warnings
 
 
 def _policy_options(config: AttackConfig) -> JsonObject:
     return config.policy_options | ({} if config.step_size is None else {"step_size": config.step_size})
 
 
+def check_from_config(config: AttackConfig) -> None:
+    """Refuse what a configuration names that is not there, or of which nothing could be judged; nothing is rendered.
+
+    Raises:
+        InputError: as for `attack_from_config`.
+    """
+    _task(_job(config))
+
+
+def _task(job: _Job) -> tuple[Task, Callable[[Described, Looked], Facts], PictureSettings]:
+    """The task on the model, what gives it facts, and how pictures are made; refuses what cannot be judged."""
+    config, (model, _) = job.config, job.loaded
+    asked = job.task.seeking(job.objective) if isinstance(job.objective, str) else job.task
+    task = task_for(asked, model).on(model, target=config.target, minimise=config.minimise)
+    facts = partial(facts_of, job.scene, config.object, config.label)
+    pictures = PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed)
+    alone = zip(task.tasks, task.models, strict=True) if isinstance(task, Together) else [(task, model)]
+    for one, network in alone:
+        check_truth(one, network, job.scene, facts(dict), pictures)
+    return task, facts, pictures
+
+
 def _problem(job: _Job) -> Problem:
     config, (model, _) = job.config, job.loaded
     description = job.scene.description
-    asked = job.task.seeking(job.objective) if isinstance(job.objective, str) else job.task
-    task = asked.on(model, target=config.target, minimise=config.minimise)
-    facts = partial(facts_of, job.scene, config.object, config.label)
-    pictures = PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed)
-    check_truth(task, model, job.scene, facts(dict), pictures)
+    task, facts, pictures = _task(job)
     resolution = pictures.size(model)
     description = framed(description, resolution)
     space = make_space((*job.controls, *job.over), description)
@@ -265,7 +285,10 @@ def _problem(job: _Job) -> Problem:
         leave_out=EVERYTHING if config.specialise else NOTHING,
         sampler=config.pixel_sampler,
     )
-    objective = _objective(job, task, renderer)
+    features_seed = seeds.stream(config.seed, "clean features")
+    objective, note = objective_for(job.objective, task, model, renderer, features_seed, config.ensemble)
+    if note:
+        job.loaded[1].append(note)
     return Problem(
         renderer,
         space,
@@ -278,19 +301,6 @@ def _problem(job: _Job) -> Problem:
         searched=len(job.controls),
         draws=config.draws if job.over else 1,
     )
-
-
-def _objective(job: _Job, task: Task, renderer: Renderer) -> Objective:
-    """What is maximised. One that compares features with those of the clean picture is shown that first."""
-    kind = OBJECTIVE_KINDS.get(job.objective) if isinstance(job.objective, str) else None
-    if kind is None or not kind.needs_features:
-        return get_objective(job.objective, task)
-    features = features_of(job.loaded[0])
-    if not features.penultimate:
-        job.loaded[1].append(features.source)
-    with torch.no_grad():
-        clean = renderer(renderer.start, seed=seeds.stream(job.config.seed, "clean features"), spp=CLEAN_SPP)
-    return get_objective(job.objective, task, features=features, clean=clean)
 
 
 def budget_of(config: AttackConfig) -> RenderBudget:
@@ -312,9 +322,11 @@ def preparation_of(config: AttackConfig) -> Preparation:
     return Preparation(config.measure, config.specialise, config.deterministic, config.spp is None)
 
 
-def _question(config: AttackConfig) -> Question:
+def _question(job: _Job) -> Question:
     """What the summary repeats of the settings."""
-    return Question(config.object, config.lit_by, config.policy_name, config.objective, config.command_line())
+    config, objective = job.config, job.objective
+    named = objective if isinstance(objective, str) else config.objective
+    return Question(config.object, config.lit_by, config.policy_name, named, config.command_line())
 
 
 # ---- carrying it out ------------------------------------------------------------------------------------------------
@@ -335,7 +347,7 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
         recorder, prepared = Recorder(kept, problem, memory), preparation_of(job.config)
         attack = Attack(problem, budget_of(job.config), policy, recorder, memory, stages, prepared)
         findings = attack.carry_out()
-        return summarise(_question(job.config), problem, findings, recorder, stages, warnings)
+        return summarise(_question(job), problem, findings, recorder, stages, warnings)
 
 
 def _policy(job: _Job, problem: Problem) -> Policy[Any]:

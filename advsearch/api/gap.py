@@ -1,8 +1,4 @@
-"""Questions that take several attacks: robust accuracy against epsilon, and the worst case beside the average.
-
-Each attack is a run of its own in the folder `parts` of the study's run, so that a study that was stopped goes on with
-the part at which it was stopped.
-"""
+"""Questions that take several attacks: robust accuracy against epsilon, and the worst case beside the average."""
 
 from __future__ import annotations
 
@@ -11,7 +7,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from advsearch.api.attack import attack_once
+import torch
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.api.attack import LOADING, attack_once, check_from_config, problem_from_config
 from advsearch.api.keywords import GapKeywords, asks, configured
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
@@ -19,17 +19,23 @@ from advsearch.config import AttackConfig, GapConfig
 from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.naming import different, load_models
 from advsearch.engine.run_settings import RunSettings
+from advsearch.engine.transfer import Transfer
+from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
-from advsearch.report.studies import curve_figure, gap_figure
+from advsearch.report.drawing import Figures
+from advsearch.report.studies import curve_figure, gap_figure, matrix_figure
+from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, default_name, is_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.listing import finished
 from advsearch.runs.results.attack import AttackSummary, AverageCase
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.results.gap import CurvePoint, CurveResult, GapResult, GapRow, ObjectRow, StudyResult
+from advsearch.runs.results.matrix import MatrixCell, MatrixModel, MatrixResult, MatrixRow
 from advsearch.runs.summary import attack_of
 from advsearch.scene.library import list_objects, load_object
 from advsearch.tasks import make_task
+from advsearch.viewer.study_page import write_matrix_page
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -80,7 +86,15 @@ def curve_from_config(
         curve = [_accuracy(rows, epsilon) for epsilon in epsilons]
         return CurveResult(**vars(common), epsilons=list(epsilons), table=rows, curve=curve)
 
-    return _study(config, lambda parts: _curve(config, epsilons, parts), result, progress or NullProgress(), resumed)
+    return _study(
+        config,
+        lambda parts: _curve(config, epsilons, parts),
+        result,
+        curve_figure,
+        most=len(config.objects) * len(epsilons),
+        progress=progress or NullProgress(),
+        resumed=resumed,
+    )
 
 
 def gap_from_config(config: GapConfig, *, progress: Progress | None = None, resumed: Path | None = None) -> GapResult:
@@ -89,13 +103,59 @@ def gap_from_config(config: GapConfig, *, progress: Progress | None = None, resu
     def result(rows: list[GapRow], common: StudyResult) -> GapResult:
         return GapResult(**vars(common), table=rows)
 
-    return _study(config, lambda parts: _gap(config, parts), result, progress or NullProgress(), resumed)
+    return _study(
+        config,
+        lambda parts: _gap(config, parts),
+        result,
+        gap_figure,
+        most=len(config.objects) * len(config.controls),
+        progress=progress or NullProgress(),
+        resumed=resumed,
+    )
+
+
+def matrix_from_config(
+    config: AttackConfig, *, progress: Progress | None = None, resumed: Path | None = None
+) -> MatrixResult:
+    """Attack several models, and try every answer on each of them in pictures that are the same for all.
+
+    Trial k has the same seed for every answer and every model, and none that a search or its verification has used.
+    Models of one input size are shown the same picture; for another size the same configuration is rendered anew. A
+    success needs the model to be right on the clean scene with the same seed, as everywhere.
+
+    Args:
+        config: with several models.
+        progress: told how far it is.
+        resumed: folder of the run to go on with.
+
+    Raises:
+        InputError: anything that the caller can put right, such as a model that has no class for the label.
+    """
+    names, progress = different(config.models, "model"), progress or NullProgress()
+    progress.stage(LOADING)
+    for name in names:
+        check_from_config(_alone(config, name))
+
+    def result(rows: tuple[list[MatrixModel], list[MatrixRow]], common: StudyResult) -> MatrixResult:
+        return MatrixResult(**vars(common), models=list(names), ensemble=config.ensemble, tested=rows[0], table=rows[1])
+
+    found = _study(
+        config,
+        lambda parts: _matrix(config, names, parts),
+        result,
+        matrix_figure,
+        most=len(names) if config.ensemble is None else 1,
+        progress=progress,
+        resumed=resumed,
+    )
+    write_matrix_page(found)
+    return found
 
 
 # ---- one study ------------------------------------------------------------------------------------------------------
 
 
-Study = TypeVar("Study", bound=CurveResult | GapResult)
+Study = TypeVar("Study", bound=StudyResult)
 Rows = TypeVar("Rows")
 
 
@@ -103,18 +163,29 @@ def _study(
     config: AttackConfig,
     attacks: Callable[[_Parts], Rows],
     result_of: Callable[[Rows, StudyResult], Study],
+    figure_of: Callable[[Study], Figures],
+    *,
+    most: int,
     progress: Progress,
     resumed: Path | None,
 ) -> Study:
-    """Carry out the attacks of a study in its run; `attacks` returns their rows, `result_of` puts these into a result
-    beside what all studies have in common."""
+    """Carry out the attacks of a study in its run.
+
+    Args:
+        config: what is asked.
+        attacks: carries out the attacks and returns their rows.
+        result_of: puts these into a result, beside what all studies have in common.
+        figure_of: draws the result.
+        most: attacks that there will be at most.
+        progress: told how far it is.
+        resumed: folder of the run to go on with.
+    """
     begun = time.perf_counter()
     with RunDirectory.of(config, resumed) as run:
         notes = _label_for_all(config)
         for text in notes:
             progress.message(text)
-        each = len(config.controls) if isinstance(config, GapConfig) else max(1, len(config.epsilons))
-        parts = _Parts(run.path / PARTS, progress, len(config.objects) * each)
+        parts = _Parts(run, progress, most)
         rows = attacks(parts)
         common = StudyResult(
             run=str(run.path),
@@ -132,8 +203,7 @@ def _study(
             command_line=config.command_line(),
         )
         result = result_of(rows, common)
-        figure = gap_figure(result) if isinstance(result, GapResult) else curve_figure(result)
-        for suffix, data in figure.items():
+        for suffix, data in figure_of(result).items():
             write_bytes(run.path / "images" / f"{config.command}.{suffix}", data)
         run.write_summary(result)
         return result
@@ -155,32 +225,35 @@ class _Parts:
     """Carries out attacks, each in a folder of its own, unless they are done already.
 
     Attributes:
+        run: of the study.
+        progress: told how far it is.
         names: of the parts so far.
         warnings: what they said, each sentence once.
         interrupted: whether one was; nothing more is carried out then.
     """
 
-    def __init__(self, folder: Path, progress: Progress, most: int) -> None:
+    def __init__(self, run: RunDirectory, progress: Progress, most: int) -> None:
+        self.run, self.progress = run, progress
         self.names: list[str] = []
         self.warnings: list[str] = []
         self.interrupted = False
-        self._folder, self._progress, self._most = folder, progress, most
+        self._most = most
 
     def attack(self, config: AttackConfig, name: str) -> AttackSummary | None:
         """Return the summary of one attack, or None if there was an interrupt."""
         if self.interrupted:
             return None
-        path = self._folder / name
+        path = self.run.path / PARTS / name
         self.names.append(name)
         budget = f", epsilon {config.epsilon:.3g}" if isinstance(config.epsilon, float) else ""
-        what = f"{config.object}, {' and '.join(config.controls)}{budget}"
-        self._progress.message(f"attack {len(self.names)} of at most {self._most}: {what}")
+        what = f"{config.object} against {config.model}, {' and '.join(config.controls)}{budget}"
+        self.progress.message(f"attack {len(self.names)} of at most {self._most}: {what}")
         if is_run(path) and (path / CONFIG).is_file():
             began = None if finished(path) else AttackConfig.from_yaml(path / CONFIG)
-            summary = attack_once(began, progress=self._progress, resumed=path).summary if began else attack_of(path)
+            summary = attack_once(began, progress=self.progress, resumed=path).summary if began else attack_of(path)
         else:
             own = config.model_copy(update={"run": str(path), "overwrite": True})
-            summary = attack_once(own, progress=self._progress).summary
+            summary = attack_once(own, progress=self.progress).summary
         self.warnings += [text for text in summary.warnings if text not in self.warnings]
         self.interrupted = summary.ending == INTERRUPTED
         return None if self.interrupted else summary
@@ -286,3 +359,55 @@ def _compared(name: str, control: str, summary: AttackSummary, average: AverageC
         renders=summary.renders,
         run=summary.run,
     )
+
+
+# ---- attacked on against tested on -----------------------------------------------------------------------------------
+
+ALL = "all"
+"""What an ensemble is called among the models that were attacked."""
+
+LEAST_SPP = 64
+"""Samples a pixel of the trials, where none of the attacks needed more and nothing was asked for."""
+
+
+def _matrix(config: AttackConfig, names: Sequence[str], parts: _Parts) -> tuple[list[MatrixModel], list[MatrixRow]]:
+    """Attack, then try every answer on every model."""
+    attacked: list[tuple[str, AttackSummary]] = []
+    for place, name in enumerate([ALL] if config.ensemble else names):
+        own = config if config.ensemble else AttackConfig.of(config, model=name)
+        summary = parts.attack(AttackConfig.of(own), f"{place:02d}-" + default_name(name, []))
+        if summary is not None:
+            attacked.append((name, summary))
+    models: list[MatrixModel] = []
+    cells: dict[str, list[MatrixCell]] = {}
+    answers = {name: u for name, summary in attacked if (u := _answer(summary)) is not None}
+    if answers and not parts.interrupted:
+        spp = config.verify_spp or max([LEAST_SPP, *(s.sample_count.spp for _, s in attacked if s.sample_count)])
+        try:
+            with interruptible():
+                parts.progress.stage("loading the models to try the answers on")
+                problems = {name: problem_from_config(_alone(config, name))[0] for name in names}
+                seed, trials = seeds.stream(config.seed, "matrix"), config.trial_count
+                tried = Transfer(problems, parts.run, parts.progress, trials=trials, spp=spp, seed=seed)
+                models = tried.clean()
+                for name, u in answers.items():
+                    cells[name] = tried.on_each(name, u)
+        except KeyboardInterrupt:
+            parts.interrupted = True
+    rows = [
+        MatrixRow(attacked=name, ending=one.ending, run=one.run, renders=one.renders, tested=cells.get(name, []))
+        for name, one in attacked
+    ]
+    return models, rows
+
+
+def _alone(config: AttackConfig, name: str) -> AttackConfig:
+    """What an answer is tried on one model with; nothing is searched."""
+    return AttackConfig.of(config, model=name, ensemble=None)
+
+
+def _answer(summary: AttackSummary) -> Tensor | None:
+    """The configuration that an attack answers with; None where nothing was searched."""
+    if summary.adversarial is None or summary.run is None:
+        return None
+    return torch.from_numpy(read_answer(Path(summary.run)))

@@ -86,6 +86,7 @@ class AttackKeywords(SearchKeywords, total=False):
     """Of `attack`."""
 
     smallest: bool
+    ensemble: Literal["mean", "worst"] | None
     overwrite: bool
 
 

@@ -17,7 +17,7 @@ from advsearch.attacks import make_policy
 from advsearch.attacks.region import ATTEMPTS, MOST_PROBED, GrownBox, grow
 from advsearch.config import AttackConfig, RegionConfig
 from advsearch.engine.budget import RenderBudget, verification_ladder
-from advsearch.engine.memory import ANSWER, Memory
+from advsearch.engine.memory import Memory
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.stages import Attack
@@ -25,11 +25,11 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.studies import map_figure
+from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.base import INTERRUPTED, CleanScene, Formation, MovedValue
 from advsearch.runs.results.region import AxisRange, BoxSide, GrownRegion, MarginMap, RegionResult
-from advsearch.runs.store import NAME, Store
 from advsearch.settings import split_names
 
 if TYPE_CHECKING:
@@ -181,14 +181,12 @@ def _centre(problem: Problem, config: RegionConfig) -> Tensor:
     """The configuration that the box grows around."""
     if config.around is None:
         return problem.domain.start.clone()
-    with Store(find_run(config.around) / NAME, read_only=True) as store:
-        noted = store.noted(ANSWER)
-    sound = isinstance(noted, list) and all(isinstance(number, (int, float)) for number in noted)
-    values = torch.tensor(noted, dtype=torch.float32) if sound else None
-    if values is None or values.shape != problem.domain.start.shape:
+    values = torch.from_numpy(read_answer(find_run(config.around)))
+    if values.shape != problem.domain.start.shape:
         raise InputError(
-            f"`around` {config.around}: expected a finished run over the same controls with at most a few thousand "
-            "numbers, got another one; leave `controls` out so that the run's own are taken"
+            f"`around` {config.around}: expected a run over the same controls, whose answer has "
+            f"{problem.domain.dim} numbers, got one with {len(values)}; leave `controls` out so that the run's own are "
+            "taken"
         )
     return problem.domain.project(values)
 

@@ -6,15 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from torch import nn
-
 from advsearch.api.attack import LOADING
 from advsearch.api.keywords import SweepKeywords, asks
 from advsearch.config import SweepConfig
 from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.budget import verification_ladder
 from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, settings_of
-from advsearch.engine.naming import different, load_models, scene_settings
+from advsearch.engine.naming import AnyModel, different, load_models, model_name, scene_settings, several
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.axes import read_axes
 from advsearch.engine.sweeps.job import Job, NamedScene, check_scenes
@@ -37,7 +35,6 @@ SAMPLES = 100
 """Draws where there is no grid and nothing is said."""
 
 AnyScene = Scene | str | Path
-AnyModel = Model | nn.Module | str | Path
 
 
 @asks(SweepConfig, SweepKeywords)
@@ -78,7 +75,7 @@ def sweep(
     if names and len(names) < len(scenes):
         raise InputError("scene: expected scenes from load_scene or names of objects, got some of each")
     described: dict[str, object] = {
-        "model": ",".join(_model_name(one) for one in networks),
+        "model": ",".join(model_name(one) for one in networks),
         "task": as_setting(task) if isinstance(task, Task) else task,
         "controls": settings_of(controls),
         "grid": dict(grid or {}),
@@ -96,8 +93,7 @@ def sweep(
     resumed = _stopped(config)
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
-    asked = [name for one in networks for name in (split_names(one) if isinstance(one, str) else (one,))]
-    job = _job(config, loaded or _places(config), asked, task, controls)
+    job = _job(config, loaded or _places(config), several(networks), task, controls)
     return _kept(config, job, progress, resumed) if config.run is not None else carry_out(job, None, progress)
 
 
@@ -129,12 +125,6 @@ def _several(given: Any) -> list[Any]:
     if not listed:
         raise InputError("scene and model: expected at least one of each, got an empty list")
     return listed
-
-
-def _model_name(model: AnyModel) -> str:
-    if isinstance(model, (str, Path)):
-        return str(model)
-    return str(getattr(model, "name", None) or type(model).__name__)
 
 
 def _place(scene: Scene) -> NamedScene:
@@ -228,7 +218,7 @@ def _places(config: SweepConfig) -> tuple[NamedScene, ...]:
 
 def _models(models: Sequence[AnyModel], config: SweepConfig, task: Task) -> tuple[tuple[Model, ...], list[str]]:
     """Load the models; their warnings become sentences of the run."""
-    names = [_model_name(one) for one in models]
+    names = [model_name(one) for one in models]
     if len(set(names)) < len(names):
         raise InputError(
             f"model: expected models with different names, got {', '.join(names)}; from Python, "

@@ -13,14 +13,18 @@ if TYPE_CHECKING:
     from advsearch.runs.results.attack import AttackSummary, VerifiedRate
     from advsearch.runs.results.base import Interval
     from advsearch.runs.results.gap import CurveResult
+    from advsearch.runs.results.matrix import MatrixResult
 
 HELP = "find the configuration of a scene that the model gets wrong most badly"
 
 
-def answer(summary: AttackSummary | CurveResult) -> str:
-    """Return the verdict, the rates, the cost and the place of the pictures; of a curve, its tables."""
+def answer(summary: AttackSummary | CurveResult | MatrixResult) -> str:
+    """Return the verdict, the rates, the cost and the place of the pictures; of a curve or a matrix, its tables."""
     from advsearch.runs.results.gap import CurveResult
+    from advsearch.runs.results.matrix import MatrixResult
 
+    if isinstance(summary, MatrixResult):
+        return _matrix(summary)
     if isinstance(summary, CurveResult):
         from advsearch.cli import gap
 
@@ -69,6 +73,15 @@ def _facts(summary: AttackSummary) -> dict[str, str]:
     }
 
 
+def _matrix(result: MatrixResult) -> str:
+    from advsearch.report.transfer import matrix_heads, matrix_rows, matrix_text
+
+    facts = [["time", wording.seconds_text(result.seconds["total"])], ["run", str(result.run)]]
+    ending = "Interrupted." if result.ending == "interrupted" else ""
+    parts = [matrix_text(result), columns([matrix_heads(result), *matrix_rows(result)]), columns(facts), ending]
+    return "\n\n".join(filter(None, parts)) + "".join(f"\n\nNote: {text}" for text in result.warnings)
+
+
 COMMAND = QuestionCommand(
     "attack",
     HELP,
@@ -76,6 +89,7 @@ COMMAND = QuestionCommand(
     (
         "attack --object mug --control texture",
         "attack --object mug --control texture --epsilon 0.03 --set camera.azimuth=130 --seed 1",
+        "attack --object mug --model reference,torchvision:resnet18 --label mug,cup",
     ),
     more=", and verify it with fresh renders",
 )

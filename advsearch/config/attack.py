@@ -27,7 +27,7 @@ class AttackConfig(DerivativeConfig):
     """Everything that decides what `attack` does. Frozen; unknown names are refused."""
 
     command: ClassVar[str] = "attack"
-    several: ClassVar[tuple[str, ...]] = ("object", "epsilon")
+    several: ClassVar[tuple[str, ...]] = ("object", "epsilon", "model")
 
     clashes: ClassVar[tuple[Clash, ...]] = (
         *DerivativeConfig.clashes,
@@ -39,7 +39,17 @@ class AttackConfig(DerivativeConfig):
         Clash(
             "smallest",
             lambda one: one.is_study,
-            "is about one object; name one `object`, and one `epsilon` as the largest",
+            "is about one object and one model; name one `object`, one `model`, and one `epsilon` as the largest",
+        ),
+        Clash(
+            "model",
+            lambda one: one.is_matrix and one.is_curve,
+            "several make a matrix, of one object and one epsilon; name one `object` and one `epsilon`, or one `model`",
+        ),
+        Clash(
+            "ensemble",
+            lambda one: not one.is_matrix,
+            "is of several models; name them in `model`, separated by commas, or leave `ensemble` out",
         ),
         Clash(
             "smallest",
@@ -47,7 +57,7 @@ class AttackConfig(DerivativeConfig):
             "takes several searches; give `steps` for each, and leave `seconds` out",
         ),
         Clash("smallest", lambda one: one.over, "cannot be combined with `over` yet; leave one of them out"),
-        Clash("minimise", lambda one: one.is_study, "has no robust accuracy; name one `object` and one `epsilon`"),
+        Clash("minimise", lambda one: one.is_curve, "has no robust accuracy; name one `object` and one `epsilon`"),
         Clash("minimise", lambda one: one.target, "makes the right answer easier to give; leave `target` out"),
         Clash("minimise", lambda one: one.smallest, "has no smallest change; leave `smallest` out"),
         Clash(
@@ -67,7 +77,7 @@ class AttackConfig(DerivativeConfig):
         ),
         Clash(
             "average",
-            lambda one: one.command == "attack" and one.is_study,
+            lambda one: one.command == "attack" and one.is_curve,
             "is not part of a curve; `advsearch gap` compares with the average, or name one `object` and one `epsilon`",
         ),
     )
@@ -76,6 +86,18 @@ class AttackConfig(DerivativeConfig):
         SceneConfig,
         "object",
         description="what the model should recognise; several, separated by commas, are attacked one after the other",
+    )
+    model: str = setting_as_in(
+        SceneConfig,
+        "model",
+        description="the network under test; of several, separated by commas, each is attacked and its answer tried "
+        "on all",
+    )
+    ensemble: Literal["mean", "worst"] | None = setting(
+        None,
+        "model",
+        "attack several models together with one answer: maximise the mean of their objectives, or the least of them",
+        otherwise="each by itself",
     )
     measure: Literal["no", "quick", "full"] = setting(
         "quick",
@@ -185,9 +207,19 @@ class AttackConfig(DerivativeConfig):
         return {} if isinstance(self.policy, str) else {k: v for k, v in self.policy.items() if k != "name"}
 
     @property
-    def is_study(self) -> bool:
-        """Whether it takes several attacks: over objects, or over epsilons."""
+    def is_curve(self) -> bool:
+        """Whether it takes several attacks, over objects or over epsilons."""
         return bool(self.epsilons) or len(self.objects) > 1
+
+    @property
+    def is_matrix(self) -> bool:
+        """Whether there are several models."""
+        return len(self.models) > 1
+
+    @property
+    def is_study(self) -> bool:
+        """Whether it takes several attacks."""
+        return self.is_curve or self.is_matrix
 
     @property
     def trial_count(self) -> int:

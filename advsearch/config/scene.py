@@ -219,6 +219,11 @@ class SceneConfig(Config):
         """The objects by name."""
         return split_names(self.object)
 
+    @property
+    def models(self) -> tuple[str, ...]:
+        """The models by name."""
+        return split_names(self.model)
+
     @field_validator(
         "object",
         "environment",

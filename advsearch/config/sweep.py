@@ -111,11 +111,6 @@ class SweepConfig(SceneConfig):
         """The environments by name."""
         return split_names(self.lit_by)
 
-    @property
-    def models(self) -> tuple[str, ...]:
-        """The models by name."""
-        return split_names(self.model)
-
     @field_validator("trials")
     @classmethod
     def _none_or_enough(cls, value: int) -> int:

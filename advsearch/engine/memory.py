@@ -30,11 +30,6 @@ PLAN = "gradient plan"
 TRANSPORT = "transport"
 """That under which it keeps at which evaluations the matrix of light transport was made anew."""
 
-ANSWER = "answer"
-"""The note under which it keeps the configuration that was verified, if it has at most `MOST_NUMBERS`."""
-
-MOST_NUMBERS = 4096
-
 
 class Frames:
     """Pictures of a search for its animation: at most some sixty of them.

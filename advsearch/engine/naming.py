@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
+
+from torch import nn
 
 from advsearch import threads
 from advsearch.controls import CONTROLS
@@ -12,6 +15,7 @@ from advsearch.errors import InputError
 from advsearch.models import Model, ModelWarning, load_model
 from advsearch.models.loading import named_code
 from advsearch.scene.settings import Given
+from advsearch.settings import split_names
 from advsearch.tasks import Task
 
 
@@ -61,6 +65,23 @@ def load_models(
         if not issubclass(one.category, ModelWarning):
             warnings.warn_explicit(one.message, one.category, one.filename, one.lineno)
     return loaded, sentences
+
+
+AnyModel = Model | nn.Module | str | Path
+"""What `load_model` takes."""
+
+
+def several(models: AnyModel | Sequence[AnyModel]) -> list[AnyModel]:
+    """Return one model or several in a list; names may stand in a text with commas between them."""
+    listed: list[AnyModel] = list(models) if isinstance(models, (list, tuple)) else [models]  # type: ignore[list-item]
+    return [one for given in listed for one in (split_names(given) if isinstance(given, str) else (given,))]
+
+
+def model_name(model: AnyModel) -> str:
+    """Return what a model is called in settings."""
+    if isinstance(model, (str, Path)):
+        return str(model)
+    return str(getattr(model, "name", None) or type(model).__name__)
 
 
 def different(names: Sequence[str], setting: str) -> Sequence[str]:

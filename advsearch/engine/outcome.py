@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -16,7 +15,6 @@ from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.smallest import Bracket
-from advsearch.engine.memory import ANSWER, MOST_NUMBERS
 from advsearch.engine.pictures import write_artifacts, write_pictures
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
@@ -24,6 +22,7 @@ from advsearch.engine.rows import verified_rate
 from advsearch.errors import InputError
 from advsearch.report.notebook import attack_html
 from advsearch.runs import store
+from advsearch.runs.answer import write_answer
 from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import (
@@ -53,6 +52,9 @@ from advsearch.tasks.base import typical
 from advsearch.viewer.attack_page import write_report
 
 T = TypeVar("T")
+
+MOST_NUMBERS = 4096
+"""Numbers of a distribution that a summary names, at most."""
 
 PICTURE_SPP = 64
 """Samples a pixel of the pictures that are kept, unless verification needed more."""
@@ -162,8 +164,7 @@ def summarise(
         write_artifacts(run, artifacts)
         for name, data in space.files(u).items():
             write_bytes(run.path / "artifacts" / name, data)
-        if u.numel() <= MOST_NUMBERS:
-            run.store.set_note(ANSWER, json.dumps(u.tolist()))
+        write_answer(run.path, u.numpy())
     summary = _summary(asked, problem, findings, clean, adversarial, u)
     where = {"run": None if run is None else str(run.path), "warnings": warnings}
     summary = summary.model_copy(update={**where, "seconds": {**stages.seconds, "total": stages.total}})

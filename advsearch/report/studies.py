@@ -7,7 +7,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from advsearch.report.drawing import BLUE, GREY, RED, Figures, drawn
+from advsearch.report.wording import short_name
 from advsearch.runs.results.gap import CurveResult, GapResult, GapRow
+from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.region import BoxSide, MarginMap
 from advsearch.runs.results.sweep import AxisRow, SweepMap, SweepSummary
 
@@ -57,6 +59,30 @@ def gap_figure(answer: GapResult) -> Figures:
         axes.figure.legend(loc="outside lower center", ncols=2)
 
     return _figure(draw, (6.4, 1.6 + 0.36 * len(rows)))
+
+
+def matrix_figure(answer: MatrixResult) -> Figures:
+    """Draw the share of trials in which each answer is a success on each model; nothing where none was tried."""
+    rows = [row for row in answer.table if row.tested]
+    if not rows:
+        return {}
+
+    def draw(axes: Any) -> None:
+        rates = [[cell.verified.rate for cell in row.tested] for row in rows]
+        axes.imshow(rates, cmap="Reds", vmin=0.0, vmax=1.0, aspect="auto")
+        for up, row in enumerate(rows):
+            for across, cell in enumerate(row.tested):
+                rated = cell.verified
+                colour = "white" if rated.rate > 0.6 else "black"
+                text = f"{rated.successes}/{rated.trials}"
+                axes.text(across, up, text, ha="center", va="center", color=colour)
+        names = [short_name(one.model) for one in answer.tested]
+        axes.set_xticks(range(len(names)), names, rotation=20 if max(map(len, names)) > 12 else 0)
+        axes.set_yticks(range(len(rows)), [short_name(row.attacked) for row in rows])
+        axes.set(xlabel="tested on", ylabel="attacked on")
+        axes.set_title(f"{', '.join(answer.objects)}, {', '.join(answer.controls)}: wrong in trials")
+
+    return _figure(draw, (2.6 + 1.3 * len(answer.models), 1.8 + 0.5 * len(rows)))
 
 
 def map_figure(drawn: MarginMap, box: Sequence[BoxSide]) -> Figures:

@@ -64,6 +64,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "norm": ("l3", "expected linf or l2, got l3"),
     "texture_resolution": (0, "expected a whole number from 2 to 4096, got 0"),
     "estimators": ({"pose": 3}, "expected NAME for all controls, or CONTROL=NAME or CONTROL.PARAMETER=NAME"),
+    "ensemble": ("median", "expected mean or worst, got median"),
     "measure": ("some", "expected no, quick or full, got some"),
     "policy": (None, "expected the name of a policy, or NAME={OPTION: VALUE}, got None"),
     "steps": (2.5, "expected a whole number from 1 to 1000000, got 2.5"),
@@ -89,7 +90,7 @@ WRONG: dict[str, tuple[Any, str]] = {
 GIVEN: dict[str, Any] = {
     "object": "mug.obj", "environment": "room.hdr", "up": "y",
     "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
-    "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2",
+    "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2,other.pt2", "ensemble": "mean",
     "labels": "labels.json", "task": "detection", "label": "coffee mug,cup",
     "controls": {"texture": {}, "pose": {"yaw": [0, 90]}}, "epsilon": {"texture": 0.03, "pose": 2.0},
     "seconds": 20.0, "target": "bowl", "minimise": False, "smallest": False, "over": {"camera": {}}, "draws": 2,
@@ -281,6 +282,8 @@ CLASHES: tuple[tuple[type[Config], dict[str, Any], str], ...] = (
     (AttackConfig, {"smallest": True, "epsilon": "0.1,0.2"}, "smallest: finds one epsilon by itself"),
     (CheckConfig, {"loss": "linear", "objective": "logit-gap"}, "objective: is of the model's loss, which"),
     (AttackConfig, {"smallest": True, "object": "mug,bowl"}, "smallest: is about one object"),
+    (AttackConfig, {"model": "a.pt2,b.pt2", "object": "mug,bowl"}, "model: several make a matrix"),
+    (AttackConfig, {"ensemble": "mean"}, "ensemble: is of several models"),
     (AttackConfig, {"smallest": True, "seconds": 5}, "smallest: takes several searches"),
     (AttackConfig, {"smallest": True, "over": "camera"}, "smallest: cannot be combined with `over` yet"),
     (AttackConfig, {"minimise": True, "object": "mug,bowl"}, "minimise: has no robust accuracy"),
@@ -523,7 +526,7 @@ def test_a_bad_base_is_named(tmp_path: Path, text: str, message: str) -> None:
 def test_several_of_a_kind_are_for_a_sweep(
     command: str, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if name == "object" and command in ("attack", "gap"):
+    if (name, command) in (("object", "attack"), ("object", "gap"), ("model", "attack")):
         return
     monkeypatch.chdir(tmp_path)
     flags = {"object": "mug", "environment": "noon", "model": "reference"} | {name: "one,two"}

@@ -599,6 +599,28 @@ def test_models_of_several_sizes_get_pictures_of_their_size() -> None:
     assert [row.renders for row in result.rows()] == [1, 1, 1, 1] and result.summary.renders["sweep"] == 4
 
 
+def test_models_of_one_size_are_shown_the_same_pictures() -> None:
+    """Byte for byte, in the same order; a third of another size makes no difference to them."""
+
+    class Keeps(Brightness):
+        def forward(self, images: Tensor) -> Tensor:
+            shown.setdefault(self.name, []).append(images.clone())
+            return super().forward(images)
+
+        def __init__(self, name: str) -> None:
+            super().__init__(0.5)
+            self.name = name
+
+    shown: dict[str, list[Tensor]] = {}
+    sizes = {"a": SIZE, "b": SIZE, "c": 24}
+    models = [advsearch.load_model(Keeps(one), labels=LABELS, input_size=sizes[one], name=one) for one in sizes]
+    shown.clear()  # what each was shown when it was loaded
+    advsearch.sweep("mug", models, {"pose.yaw": [0, 90, 180]}, trials=0)
+    first, second, third = (torch.cat(shown[name]) for name in sizes)
+    assert torch.equal(first, second) and len(first) == len(third) == 3
+    assert float((first[0] - first[1]).abs().max()) > 0.0, "they are pictures of different configurations"
+
+
 def test_nothing_but_outer_axes_is_fine_and_one_configuration_is_refused() -> None:
     assert advsearch.sweep("mug,bowl", model(), label="mug", trials=0).summary.configurations == 2
     with pytest.raises(InputError, match=r"grid: expected something that varies, got nothing; add an axis such as"):

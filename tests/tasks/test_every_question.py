@@ -9,35 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
+from small_models import SIDE, Finder, Painter
 
 from advsearch.cli.main import main
 from advsearch.runs.images import read_png
 from advsearch.runs.store import Store
-
-SIDE = 32
-MUG, CORNER = [0.12, 0.12, 0.86, 0.86], [0.02, 0.02, 0.2, 0.2]
-
-
-class Finder(nn.Module):
-    """Two boxes, of which the first is about where the mug is: it has a blue band. A cup that lacks it is a bowl."""
-
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        blue = (x[:, 2] - x[:, 0])[:, 15:21, 8:22].mean(dim=(1, 2))
-        light = x[:, :, :6, :6].mean(dim=(1, 2, 3))
-        cup, dog = 30.0 * (blue - 0.1), 30.0 * (light - 0.6)
-        none = torch.full_like(cup, -4.0)
-        rows = torch.stack([torch.stack([cup, -cup, none], dim=1), torch.stack([none, none, dog], dim=1)], dim=1)
-        return x.new_tensor([[MUG, CORNER]]).expand(x.shape[0], -1, -1), rows.sigmoid()
-
-
-class Painter(nn.Module):
-    """Logits of each pixel: a mug is bright or blue, all else is background; nothing is a dog."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        bright, blue = x.mean(dim=1) - 0.5, x[:, 2] - x[:, 0] - 0.02
-        mug = 20.0 * torch.maximum(bright, blue)
-        return torch.stack([torch.zeros_like(mug), mug, mug - 5.0], dim=1)
 
 
 @pytest.fixture(scope="module", params=["detection", "segmentation"])

@@ -7,6 +7,7 @@ from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.check import CheckResult
 from advsearch.runs.results.gap import CurveResult, GapResult
+from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.plan import PlanResult
 from advsearch.runs.results.precision import PrecisionResult
 from advsearch.runs.results.region import RegionResult
@@ -28,6 +29,6 @@ KEPT: tuple[type[Result], ...] = (
 
 def kind_of(values: JsonObject) -> type[Result] | None:
     """Return the result that the values of a `summary.json` are of; None if there is none of that command."""
-    if values.get("command") == CurveResult.command and "parts" in values:
-        return CurveResult
+    if values.get("command") == AttackSummary.command and "parts" in values:
+        return MatrixResult if "models" in values else CurveResult
     return next((kind for kind in KEPT if kind.command == values.get("command")), None)

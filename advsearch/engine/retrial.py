@@ -1,0 +1,124 @@
+"""Answers of searches tried again: on other models, or in other pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from advsearch.attacks import Ending, Verification, run_trials, verify
+from advsearch.engine.memory import Memory
+from advsearch.engine.problem import Problem
+from advsearch.engine.record import Recorder
+from advsearch.progress import Progress
+from advsearch.runs.directory import RunDirectory
+from advsearch.scene.formation import to_8_bit
+from advsearch.tasks import Judgement
+
+
+def unchanged(picture: Tensor, seed: int) -> Tensor:
+    """Return a picture as it is."""
+    return picture
+
+
+@dataclass(frozen=True, eq=False)
+class Condition:
+    """What an answer is tried under.
+
+    Attributes:
+        name: in tables and in the kinds of rows.
+        problem: renders, asks and judges.
+        spp: samples a pixel.
+        source: conditions with equal sources are shown the same picture before it is changed.
+        change: what happens to a picture (H, W, 3) sRGB in [0, 1] before the model sees it, by the seed of its trial.
+    """
+
+    name: str
+    problem: Problem
+    spp: int
+    source: Hashable
+    change: Callable[[Tensor, int], Tensor] = unchanged
+
+
+class Retrials:
+    """Tries the clean scene and answers under conditions; what the run has stored already is read back.
+
+    Trial k has the same seed for the clean scene, for every answer and under every condition.
+
+    Args:
+        conditions: at least one.
+        run: keeps the rows.
+        progress: told of every trial.
+        trials: of each answer under each condition.
+        seed: root of these trials, which nothing else uses.
+    """
+
+    def __init__(
+        self, conditions: Sequence[Condition], run: RunDirectory, progress: Progress, *, trials: int, seed: int
+    ) -> None:
+        self._conditions, self._progress, self._count, self._seed = conditions, progress, trials, seed
+        memory = Memory(run)
+        self._stored = memory.trial
+        self._recorders = {one.name: Recorder(run, one.problem, memory) for one in conditions}
+        self._clean: dict[str, tuple[Judgement, ...]] = {}
+        self._pictures: dict[tuple[Hashable, int, int], Tensor] = {}
+
+    def clean(self, condition: Condition) -> tuple[Judgement, ...]:
+        """Try the clean scene under one condition, once."""
+        if condition.name not in self._clean:
+            self._clean[condition.name] = run_trials(
+                self._trial("clean", condition),
+                condition.problem.domain.start,
+                spp=condition.spp,
+                seed=self._seed,
+                trials=self._count,
+            )
+        return self._clean[condition.name]
+
+    def answer(self, kind: str, u: Tensor, condition: Condition) -> Verification:
+        """Try an answer (d,) under one condition, beside the clean scene; a claim of nothing is never confirmed.
+
+        Args:
+            kind: what it is called among the rows; "KIND under CONDITION" is theirs.
+            u: (d,) the configuration.
+            condition: one of those.
+        """
+        return verify(
+            self._trial(kind, condition),
+            condition.problem.domain,
+            u,
+            claim=Ending.NOT_VERIFIED,
+            spp=condition.spp,
+            seed=self._seed,
+            trials=self._count,
+            clean=self.clean(condition),
+            rule=condition.problem.rule,
+        )
+
+    def forget(self) -> None:
+        """Drop the pictures that are kept for other conditions of one source; call it before another configuration."""
+        self._pictures.clear()
+
+    def _trial(self, kind: str, condition: Condition) -> Callable[[Tensor, int, int], Judgement]:
+        """Trials of one configuration, one after the other."""
+        problem, rows, count = condition.problem, f"{kind} under {condition.name}", 0
+
+        def trial(u: Tensor, seed: int, spp: int) -> Judgement:
+            nonlocal count
+            number, count = count, count + 1
+            judged = self._stored(rows, number)
+            if judged is None:
+                picture = condition.change(self._picture(condition, u, seed), seed)
+                judged = problem.judge(to_8_bit(picture), problem.whole(u, seed))
+            self._recorders[condition.name].trial(rows, number, spp, judged, seed, u)
+            self._progress.advance(1)
+            return judged
+
+        return trial
+
+    def _picture(self, condition: Condition, u: Tensor, seed: int) -> Tensor:
+        key = condition.source, seed, condition.spp
+        if key not in self._pictures:
+            self._pictures[key] = condition.problem.picture(u, seed, condition.spp)
+        return self._pictures[key]

@@ -1,0 +1,109 @@
+"""One task for several models at once: an answer counts where it is one for each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch.models import Model
+from advsearch.models.ensemble import Outputs, of_each
+from advsearch.options import FROM_RUN
+from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Task, Truth
+
+Truths = tuple[Truth, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Together(Task):
+    """A task of several models, each of which judges by labels of its own.
+
+    An answer is right where all models are right, and a success where it is one for every model. So the margin is the
+    largest of the models' margins, and the score the least of their scores.
+
+    Args:
+        task: of each model.
+        models: that are asked, in the order of the outputs of `advsearch.models.ensemble.together`.
+        tasks: of each model, by `on`.
+    """
+
+    name = "ensemble"
+    varies = True
+
+    task: Task
+    models: tuple[Model, ...]
+    tasks: tuple[Task, ...] = field(default=(), metadata=FROM_RUN)
+
+    def on(self, model: Model, *, target: str | None = None, minimise: bool = False) -> Together:
+        """See `Task.on`."""
+        tasks = tuple(self.task.on(one, target=target, minimise=minimise) for one in self.models)
+        wanted = None if target is None else tuple(one.target for one in tasks)
+        return replace(self, tasks=tasks, target=wanted, minimise=minimise)
+
+    def check(self, facts: Facts) -> None:
+        """See `Task.check`: of every model."""
+        for one in self.tasks:
+            one.check(facts)
+
+    def truth(self, facts: Facts) -> Truths:
+        """Return what is true for each model."""
+        return tuple(one.truth(facts) for one in self.tasks)
+
+    def truth_names(self, truth: Truths) -> tuple[str, ...]:
+        """Return the names of all models, each once."""
+        pairs = zip(self.tasks, truth, strict=True)
+        return tuple(dict.fromkeys(name for one, own in pairs for name in one.truth_names(own)))
+
+    @property
+    def target_names(self) -> tuple[str, ...]:
+        """See `Task.target_names`."""
+        return tuple(dict.fromkeys(name for one in self.tasks for name in one.target_names))
+
+    def margin(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
+        """Return the largest margin of the models, (N,)."""
+        return torch.stack([one.margin(*own) for one, *own in self._each(output, truth)]).amax(dim=0)
+
+    def score(self, output: Sequence[Outputs], truth: Truths) -> Tensor:
+        """Return the least score of the models, (N,)."""
+        return torch.stack([one.score(*own) for one, *own in self._each(output, truth)]).amin(dim=0)
+
+    def answers(self, output: Sequence[Outputs], count: int = 1) -> list[tuple[Answer, ...]]:
+        """Return one answer for each picture: what each model says, in their order."""
+        said = [one.answers(own) for one, own in zip(self.tasks, of_each(output), strict=True)]
+        return [(_joined([first for first, *_ in each]),) for each in zip(*said, strict=True)]
+
+    def judge(self, output: Sequence[Outputs], truth: Truths) -> list[Judgement]:
+        """See `Task.judge`; the payload is that of each model."""
+        judged = [one.judge(*own) for one, *own in self._each(output, truth)]
+        return [self._together(each) for each in zip(*judged, strict=True)]
+
+    def _together(self, each: Sequence[Judgement]) -> Judgement:
+        payloads = {model.name: one.payload for model, one in zip(self.models, each, strict=True)}
+        return Judgement(
+            score=min(one.score for one in each) if all(one.score == one.score for one in each) else float("nan"),
+            margin=max(one.margin for one in each) if all(one.margin == one.margin for one in each) else float("nan"),
+            right=all(one.right for one in each),
+            answer=_joined([one.answer for one in each]),
+            payload=payloads if any(one is not None for one in payloads.values()) else None,
+        )
+
+    def marks(self, output: Sequence[Outputs], truth: Truths) -> list[list[Mark]]:
+        """See `Task.marks`: what is true once, and what each model says under its name."""
+        found: list[list[Mark]] = [[] for _ in output]
+        for number, (one, *own) in enumerate(self._each(output, truth)):
+            for listed, marks in zip(found, one.marks(*own), strict=True):
+                listed += [mark for mark in marks if mark.true and not number]
+                name = self.models[number].name
+                listed += [replace(mark, text=f"{name}: {mark.text}") for mark in marks if not mark.true]
+        return found
+
+    def _each(self, output: Sequence[Outputs], truth: Truths) -> list[tuple[Any, Any, Any]]:
+        """The task, the output and the truth of each model."""
+        return list(zip(self.tasks, of_each(output), truth, strict=True))
+
+
+def _joined(answers: Sequence[Answer]) -> Answer:
+    return Answer("; ".join(one.label for one in answers))

@@ -1,0 +1,185 @@
+"""Attacks on several models: the matrix of attacked on against tested on, and one answer for all."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from small_models import easy, hard
+from torch import Tensor
+
+import advsearch
+from advsearch.api.attack import attack_from_config
+from advsearch.attacks import get_objective
+from advsearch.cli.main import main
+from advsearch.config import AttackConfig, GapConfig
+from advsearch.engine.objective import of_ensemble
+from advsearch.engine.retrial import Retrials
+from advsearch.errors import InputError
+from advsearch.models.ensemble import of_each, together
+from advsearch.runs.results.matrix import MatrixResult
+from advsearch.runs.store import Store
+from advsearch.runs.summary import read_result
+from advsearch.tasks import Classification
+from advsearch.tasks.together import Together
+
+BOTH = "small_models:easy,small_models:hard"
+SHORT: dict[str, Any] = {
+    "object": "mug", "controls": {"texture": {"epsilon": 0.3}}, "steps": 6, "trials": 6,
+    "verify_spp": 4, "spp": 2, "denoise": "none", "baseline": False, "measure": "no", "specialise": False,
+}  # fmt: skip
+
+
+def carried_out(run: Path, **more: Any) -> MatrixResult:
+    result = attack_from_config(AttackConfig(**{**SHORT, "model": BOTH, "run": str(run), **more}))
+    assert isinstance(result, MatrixResult)
+    return result
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> MatrixResult:
+    """The matrix of two models of other labels and another input size."""
+    return carried_out(tmp_path_factory.mktemp("matrix") / "run")
+
+
+def test_every_answer_is_tried_on_every_model(whole: MatrixResult, capsys: pytest.CaptureFixture[str]) -> None:
+    """What misleads the hard one misleads the easy one too."""
+    result, run = whole, Path(str(whole.run))
+    names = ["small_models:easy", "small_models:hard"]
+    assert [row.attacked for row in result.table] == names and result.models == names
+    assert [[cell.model for cell in row.tested] for row in result.table] == [names, names]
+    assert [one.input_size for one in result.tested] == [(32, 32), (24, 24)]
+    assert [one.clean.correct for one in result.tested] == [6, 6]
+    verified = {(row.attacked[13:], cell.model[13:]): cell for row in result.table for cell in row.tested}
+    assert verified["easy", "easy"].ending == "found"
+    assert verified["hard", "hard"].ending == verified["hard", "easy"].ending == "found"
+    assert all(cell.verified.trials == 6 and cell.verified.spp == 4 for cell in verified.values())
+    assert read_result(run).to_dict() == result.to_dict()
+    with Store(run / "results.sqlite", read_only=True) as store:
+        counts = store.counts()
+        seeds = {tuple(row.seed for row in store.rows(kind)) for kind in counts}
+    assert len(counts) == 6 and set(counts.values()) == {6} and len(seeds) == 1, "the same seeds for all"
+    assert main(["show", str(run)]) == 0
+    said = capsys.readouterr().out
+    assert "attacked on" in said and "tested on small_models:hard" in said and "6/6, 54-100 % *" in said
+    page = (run / "report.html").read_text("utf-8")
+    assert "tested on small_models:hard" in page and "<script" not in page
+    assert (run / "images" / "attack.svg").is_file()
+
+
+def test_a_matrix_goes_on_with_the_trial_at_which_it_was_stopped(
+    whole: MatrixResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, done = Retrials._picture, 0
+
+    def stopped(*given: Any) -> Any:
+        nonlocal done
+        done += 1
+        if done == 15:
+            raise KeyboardInterrupt
+        return real(*given)
+
+    monkeypatch.setattr(Retrials, "_picture", stopped)
+    first = carried_out(tmp_path / "run")
+    assert first.ending == "interrupted" and first.goes_on
+    again = attack_from_config(AttackConfig.from_yaml(tmp_path / "run" / "run.yaml"), resumed=tmp_path / "run")
+    assert isinstance(again, MatrixResult) and again.ending == "done"
+    assert [row.tested for row in again.table] == [row.tested for row in whole.table]
+    assert done < 2 * 6 * 3 + 2, "what was tried is not tried again"
+
+
+def test_one_answer_for_all_models(tmp_path: Path) -> None:
+    result = carried_out(tmp_path / "run", ensemble="worst")
+    (row,) = result.table
+    assert row.attacked == "all" and [cell.ending for cell in row.tested] == ["found", "found"]
+    part = json.loads((tmp_path / "run" / "parts" / "00-all" / "summary.json").read_text("utf-8"))
+    assert (part["task"], part["objective"], part["ending"]) == ("ensemble", "margin", "found")
+    assert part["clean"]["label"] == "mug; mug" and part["adversarial"]["label"] == "vase; vase"
+
+
+def test_models_are_attacked_together_from_python() -> None:
+    result = advsearch.attack(
+        "mug", [easy(), hard()], ensemble="mean", **{k: v for k, v in SHORT.items() if k != "object"}
+    )
+    assert result.found and result.summary.model == "easy and hard"
+    with pytest.raises(InputError, match="model: expected one, got several; add `ensemble`"):
+        advsearch.attack("mug", [easy(), hard()])
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"object": "mug,bowl"}, "model: several make a matrix, of one object and one epsilon"),
+        ({"epsilon": (0.1, 0.2)}, "model: several make a matrix, of one object and one epsilon"),
+        ({"smallest": True}, "smallest: is about one object and one model"),
+        ({"model": "reference", "ensemble": "mean"}, "ensemble: is of several models"),
+    ],
+)
+def test_what_does_not_go_with_several_models_is_refused(more: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        AttackConfig(**{"object": "mug", "model": "a.pt2,b.pt2", **more})
+
+
+def test_a_gap_has_one_model() -> None:
+    with pytest.raises(InputError, match="model: expected one model, got a,b"):
+        GapConfig(object="mug", model="a,b")
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"model": "small_models:easy,small_models:strange"}, "the label of mug itself does not fit the model"),
+        ({"model": "small_models:easy,small_models:easy"}, "model: expected different names"),
+        ({"ensemble": "mean", "objective": "feature_distance"}, "compares the features of one model"),
+    ],
+)
+def test_models_that_do_not_fit_are_refused_in_words(tmp_path: Path, more: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        carried_out(tmp_path / "run", **more)
+
+
+# ---- several models as one ------------------------------------------------------------------------------------------
+
+
+def test_an_ensemble_answers_as_its_models_do() -> None:
+    models = easy(), hard()
+    pictures = torch.rand((3, 32, 32, 3), generator=torch.Generator().manual_seed(0))
+    both = together(models)
+    assert both.input_size == (32, 32) and both.differentiable and len(both(pictures)) == 3
+    for own, output in zip(models, of_each(both(pictures)), strict=True):
+        assert torch.equal(output, own(pictures))
+
+
+@pytest.mark.parametrize(("way", "value", "slopes"), [("mean", 1.5, (0.5, 0.5)), ("worst", 1.0, (0.0, 1.0))])
+def test_objectives_are_put_together(way: Any, value: float, slopes: tuple[float, float]) -> None:
+    """Margins of 2 and 1; a gradient goes to both, or to the least."""
+    first, second = torch.tensor([[0.0, 2.0]], requires_grad=True), torch.tensor([[1.0, 0.0]], requires_grad=True)
+    objective = of_ensemble([get_objective("margin", Classification())] * 2, way)
+    found: Tensor = objective([(first, second)], torch.zeros(1, 2, 2, 3), ((0,), (1,)))
+    assert found.tolist() == [value]
+    found.sum().backward()
+    assert first.grad is not None and second.grad is not None
+    assert (float(first.grad[0, 1]), float(second.grad[0, 0])) == slopes
+
+
+@pytest.mark.parametrize(
+    ("logits", "score", "right"),
+    [
+        ([[0.0, 2.0], [0.0, 1.0]], 1.0, False),
+        ([[0.0, 2.0], [3.0, 0.0]], -3.0, False),
+        ([[1.0, 0.0], [3.0, 0.0]], -3.0, True),
+    ],
+    ids=["both wrong", "one wrong", "both right"],
+)
+def test_an_answer_counts_where_it_does_for_each_model(logits: list[list[float]], score: float, right: bool) -> None:
+    """One model that errs is neither a success nor a right answer."""
+    tasks = (Classification(labels=("mug", "vase")), Classification(labels=("cup", "jar")))
+    task = Together(task=tasks[0], models=(easy(), hard()), tasks=tasks)
+    output = [tuple(torch.tensor([one]) for one in logits)]
+    (judged,) = task.judge(output, ((0,), (0,)))
+    assert (judged.score, judged.right, judged.success) == (score, right, score > 0.0)
+    assert float(task.score(output, ((0,), (0,)))[0]) == score
+    assert (judged.margin <= 0.0) == right

@@ -1,0 +1,67 @@
+"""Small networks that see the bundled mug by its colours, for tests of tasks and of several models."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+import advsearch
+from advsearch import Model
+
+SIDE = 32
+MUG, CORNER = [0.12, 0.12, 0.86, 0.86], [0.02, 0.02, 0.2, 0.2]
+
+
+class Finder(nn.Module):
+    """Two boxes, of which the first is about where the mug is: it has a blue band. A cup that lacks it is a bowl."""
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        blue = (x[:, 2] - x[:, 0])[:, 15:21, 8:22].mean(dim=(1, 2))
+        light = x[:, :, :6, :6].mean(dim=(1, 2, 3))
+        cup, dog = 30.0 * (blue - 0.1), 30.0 * (light - 0.6)
+        none = torch.full_like(cup, -4.0)
+        rows = torch.stack([torch.stack([cup, -cup, none], dim=1), torch.stack([none, none, dog], dim=1)], dim=1)
+        return x.new_tensor([[MUG, CORNER]]).expand(x.shape[0], -1, -1), rows.sigmoid()
+
+
+class Painter(nn.Module):
+    """Logits of each pixel: a mug is bright or blue, all else is background; nothing is a dog."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        bright, blue = x.mean(dim=1) - 0.5, x[:, 2] - x[:, 0] - 0.02
+        mug = 20.0 * torch.maximum(bright, blue)
+        return torch.stack([torch.zeros_like(mug), mug, mug - 5.0], dim=1)
+
+
+class Blue(nn.Module):
+    """A mug where the band in the middle is bluer than a threshold, else a vase.
+
+    Args:
+        threshold: how much more blue than red there has to be.
+        last: whether the mug is the last of three classes, or the first of two.
+    """
+
+    def __init__(self, threshold: float, last: bool = False) -> None:
+        super().__init__()
+        self.threshold, self.last = threshold, last
+
+    def forward(self, x: Tensor) -> Tensor:
+        side = x.shape[2]
+        band = (x[:, 2] - x[:, 0])[:, 15 * side // 32 : 21 * side // 32, side // 4 : 22 * side // 32]
+        mug = 40.0 * (band.mean(dim=(1, 2)) - self.threshold)
+        return torch.stack([-mug - 9.0, -mug, mug] if self.last else [mug, -mug], dim=1)
+
+
+def easy() -> Model:
+    """A classifier that is misled by little."""
+    return advsearch.load_model(Blue(0.11), labels=["mug", "vase"], input_size=SIDE, name="easy")
+
+
+def hard() -> Model:
+    """Another one that takes more, with other labels and another input size."""
+    return advsearch.load_model(Blue(0.07, True), labels=["dog", "vase", "mug"], input_size=24, name="hard")
+
+
+def strange() -> Model:
+    """One that knows no mug."""
+    return advsearch.load_model(Blue(0.1), labels=["cat", "dog"], input_size=SIDE, name="strange")
