@@ -45,11 +45,9 @@ def write_matrix_page(result: MatrixResult) -> Path:
         again(result.command_line),
     )
     title = f"{', '.join(result.objects)}, {len(result.models)} models"
-    return write_text(
-        run / REPORT,
-        document(title, heading(what, matrix_text(result), result.warnings), main, run.name),
-        durable=False,
-    )
+    header = heading(what, matrix_text(result), result.warnings)
+    page = document(title, header, main, footer=f"run {run.name}. This page needs no other file.")
+    return write_text(run / REPORT, page, durable=False)
 
 
 # ---- parts ----------------------------------------------------------------------------------------------------------
