@@ -13,14 +13,13 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.api.keywords import RegionKeywords, asks, configured
-from advsearch.attacks import make_policy
 from advsearch.attacks.region import ATTEMPTS, MOST_PROBED, GrownBox, grow
 from advsearch.config import AttackConfig, RegionConfig
 from advsearch.engine.budget import RenderBudget, verification_ladder
 from advsearch.engine.memory import Memory
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
-from advsearch.engine.stages import Attack
+from advsearch.engine.verifier import Verifier
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
@@ -99,10 +98,10 @@ def region_from_config(
     with RunDirectory.of(config, resumed) as run:
         memory = Memory(run)
         spent = RenderBudget(ladder=verification_ladder(config.pixel_sampler, config.verify_spp))
-        attack = Attack(problem, spent, make_policy("random"), Recorder(run, problem, memory), memory, stages)
+        verifier = Verifier(problem, spent, Recorder(run, problem, memory), memory, stages)
         try:
             with interruptible():
-                answer, ending = _answer(attack, config, varied, centre, run), "done"
+                answer, ending = _answer(verifier, config, varied, centre, run), "done"
         except KeyboardInterrupt:
             answer, ending = GrownRegion(), INTERRUPTED
         stages.end()
@@ -118,7 +117,7 @@ def region_from_config(
             image_formation=Formation.of(problem.renderer.formation),
             clean=CleanScene(moved=[MovedValue.of(one) for one in problem.space.moved]),
             warnings=warnings,
-            renders={"verification": attack.findings.verification_renders},
+            renders={"verification": verifier.findings.verification_renders},
             seconds={**stages.seconds, "total": stages.total},
             seed=config.seed,
             command_line=config.command_line(),
@@ -127,11 +126,11 @@ def region_from_config(
         return result
 
 
-def _answer(attack: Attack, config: RegionConfig, varied: Varied, centre: Tensor, run: RunDirectory) -> GrownRegion:
+def _answer(verifier: Verifier, config: RegionConfig, varied: Varied, centre: Tensor, run: RunDirectory) -> GrownRegion:
     """Look at the centre, grow the box, check it, and draw the map if one was asked for."""
-    problem, stages = attack.problem, attack.stages
-    attack.choose_spp({"centre": centre})
-    verdict, spp = _verdict(attack, centre), attack.findings.spp
+    problem, stages = verifier.problem, verifier.stages
+    verifier.choose_spp({"centre": centre})
+    verdict, spp = _verdict(verifier, centre), verifier.findings.spp
 
     def at(values: Tensor) -> Tensor:
         u = centre.clone()
@@ -151,7 +150,7 @@ def _answer(attack: Attack, config: RegionConfig, varied: Varied, centre: Tensor
         checking = True
 
     def same(values: Tensor, number: int) -> bool:
-        trial = attack.one_trial("region", number, at(values))
+        trial = verifier.trial("region", number, at(values))
         stages.progress.advance(1)
         return trial.success == verdict
 
@@ -167,7 +166,7 @@ def _answer(attack: Attack, config: RegionConfig, varied: Varied, centre: Tensor
         interval=grown.interval,
         volume=grown.volume,
         spp=spp,
-        map=_map(attack, config.map, at, box, run) if config.map else None,
+        map=_map(verifier, config.map, at, box, run) if config.map else None,
     )
 
 
@@ -210,18 +209,18 @@ def _varied(problem: Problem, config: RegionConfig) -> Varied:
     return Varied(names, torch.cat([places[name] for name in names]))
 
 
-def _verdict(attack: Attack, centre: Tensor) -> bool:
+def _verdict(verifier: Verifier, centre: Tensor) -> bool:
     """Whether the model is wrong at the centre.
 
     Raises:
         InputError: that depends on the noise.
     """
-    attack.stages.begin("verification", "looking at the centre", AT_CENTRE)
+    verifier.stages.begin("verification", "looking at the centre", AT_CENTRE)
     wrong = 0
     for number in range(AT_CENTRE):
-        wrong += attack.one_trial("centre", number, centre).success
-        attack.stages.progress.advance(1)
-    verdict = attack.problem.rule.decided(wrong, AT_CENTRE)
+        wrong += verifier.trial("centre", number, centre).success
+        verifier.stages.progress.advance(1)
+    verdict = verifier.problem.rule.decided(wrong, AT_CENTRE)
     if verdict is None:
         raise InputError(
             f"the model is wrong in {wrong} of {AT_CENTRE} trials at the centre, so its verdict there depends on the "
@@ -254,19 +253,19 @@ def _number(described: Any, number: str) -> float:
     return float(value[int(number)] if number else value)
 
 
-def _map(attack: Attack, side: int, at: Any, box: Sequence[BoxSide], run: RunDirectory) -> MarginMap:
+def _map(verifier: Verifier, side: int, at: Any, box: Sequence[BoxSide], run: RunDirectory) -> MarginMap:
     """The margin on a grid over two parameters, as numbers and as a picture."""
-    hint = f"{side * side} pictures of {attack.findings.spp} samples a pixel; `map` or `verify_spp` shorten it"
-    attack.stages.begin("map", "drawing the map", side * side, hint=hint)
+    hint = f"{side * side} pictures of {verifier.findings.spp} samples a pixel; `map` or `verify_spp` shorten it"
+    verifier.stages.begin("map", "drawing the map", side * side, hint=hint)
     steps = torch.linspace(0.0, 1.0, side) if side > 1 else torch.tensor([0.5])
 
     def margin(row: int, column: int) -> float:
-        trial = attack.one_trial("map", row * side + column, at(torch.stack([steps[column], steps[row]])))
-        attack.stages.progress.advance(1)
+        trial = verifier.trial("map", row * side + column, at(torch.stack([steps[column], steps[row]])))
+        verifier.stages.progress.advance(1)
         return trial.score
 
     margins = [[margin(row, column) for column in range(len(steps))] for row in range(len(steps))]
-    ends = [attack.problem.describe(at(torch.full((2,), end))) for end in (0.0, 1.0)]
+    ends = [verifier.problem.describe(at(torch.full((2,), end))) for end in (0.0, 1.0)]
     axes = []
     for side_of in box:
         known = side_of.name in ends[0]

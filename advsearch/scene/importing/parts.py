@@ -25,6 +25,7 @@ from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.importing import gltf
 from advsearch.scene.importing.checks import check_faces, checked
 from advsearch.scene.importing.files import damaged, shown, text_of
+from advsearch.scene.importing.gltf_entries import Header
 from advsearch.scene.importing.images import without_pillows_limit
 from advsearch.scene.importing.references import Named, References
 from advsearch.scene.importing.surfaces import UNNAMED, ImportedSurface, SurfaceReader
@@ -149,7 +150,7 @@ def _has_face_uvs(path: Path, data: bytes) -> bool:
     return path.suffix.lower() == ".ply" and b"texcoord" in data.split(b"end_header")[0]
 
 
-def _file_notes(path: Path, data: bytes, header: gltf.Header | None, references: References) -> list[str]:
+def _file_notes(path: Path, data: bytes, header: Header | None, references: References) -> list[str]:
     """Return the warnings about material files, and about features of the file that are not carried over."""
     notes = []
     for name, reason in references.refused.items():
@@ -170,7 +171,7 @@ def _file_notes(path: Path, data: bytes, header: gltf.Header | None, references:
     return notes
 
 
-def _named_textures(path: Path, data: bytes, header: gltf.Header | None, references: References) -> Named:
+def _named_textures(path: Path, data: bytes, header: Header | None, references: References) -> Named:
     """Return, for each material that names a base colour texture, the file that names it and the texture's name."""
     if path.suffix.lower() == ".ply":
         found = re.search(r"^comment TextureFile\s+(.*?)\s*$", text_of(data.split(b"end_header")[0]), re.MULTILINE)

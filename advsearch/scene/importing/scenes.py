@@ -21,6 +21,7 @@ from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.importing import gltf
 from advsearch.scene.importing.files import read_bytes, safe_name, shown
 from advsearch.scene.importing.geometry import FLAT
+from advsearch.scene.importing.gltf_entries import CameraEntry, Header, Light, Node
 from advsearch.scene.importing.objects import SUFFIXES, object_of
 from advsearch.scene.importing.parts import GLTF, ImportedPart, read_parts
 from advsearch.scene.parts import MeshPart, PlacedCamera, PointLamp, ScenePart
@@ -222,7 +223,7 @@ def clean(name: str) -> str:
     return re.sub(r"[^\w-]+", "-", name).strip("-")[:60] or "part"
 
 
-def _named(path: Path, header: gltf.Header, name: str, with_mesh: set[int]) -> int:
+def _named(path: Path, header: Header, name: str, with_mesh: set[int]) -> int:
     """The number of the node of that name which has a mesh, or one below it."""
     labels = {index: header.label(index) for index in range(len(header.nodes)) if _below(header, index) & with_mesh}
     found = [index for index, label in labels.items() if name in (label, f"node {index}")]
@@ -234,7 +235,7 @@ def _named(path: Path, header: gltf.Header, name: str, with_mesh: set[int]) -> i
     return found[0]
 
 
-def _below(header: gltf.Header, index: int) -> set[int]:
+def _below(header: Header, index: int) -> set[int]:
     """A node and all that hangs on it."""
     found, level = {index}, [index]
     while level:
@@ -243,7 +244,7 @@ def _below(header: gltf.Header, index: int) -> set[int]:
     return found
 
 
-def _poses(header: gltf.Header) -> Iterator[tuple[int, Doubles]]:
+def _poses(header: Header) -> Iterator[tuple[int, Doubles]]:
     """Yield the nodes of the file's scene with their poses (4, 4) in it."""
     children = {child for node in header.nodes for child in node.children}
     roots = [index for index in range(len(header.nodes)) if index not in children]
@@ -257,7 +258,7 @@ def _poses(header: gltf.Header) -> Iterator[tuple[int, Doubles]]:
         level.extend((child, pose) for child in header.nodes[index].children)
 
 
-def _matrix(node: gltf.Node) -> Doubles:
+def _matrix(node: Node) -> Doubles:
     """The transform (4, 4) of one node."""
     if node.matrix is not None:
         return np.asarray(np.array(node.matrix, dtype=np.float64).reshape(4, 4).T)
@@ -277,7 +278,7 @@ def _matrix(node: gltf.Node) -> Doubles:
     return matrix
 
 
-def _lamp(name: str, light: gltf.Light, pose: Doubles, frame: FileFrame) -> PointLamp:
+def _lamp(name: str, light: Light, pose: Doubles, frame: FileFrame) -> PointLamp:
     """A light at its place; light falls off with the square of the distance in object sizes as it does in the file."""
     power = np.array(light.color) * light.intensity / LUMENS
     if light.type == "directional":
@@ -290,7 +291,7 @@ def _lamp(name: str, light: gltf.Light, pose: Doubles, frame: FileFrame) -> Poin
     return PointLamp(name, dark=not power.any(), position=(x, y, z), intensity=(red, green, blue))
 
 
-def _camera(camera: gltf.CameraEntry, pose: Doubles, frame: FileFrame) -> PlacedCamera:
+def _camera(camera: CameraEntry, pose: Doubles, frame: FileFrame) -> PlacedCamera:
     assert camera.perspective is not None
     turn = UPRIGHT @ pose[:3, :3] @ BEHIND
     matrix = np.eye(4)
@@ -300,7 +301,7 @@ def _camera(camera: gltf.CameraEntry, pose: Doubles, frame: FileFrame) -> Placed
     return PlacedCamera(matrix, math.degrees(2.0 * math.atan(math.tan(camera.perspective.yfov / 2.0) * larger)))
 
 
-def _changed(path: Path, header: gltf.Header) -> Iterator[str]:
+def _changed(path: Path, header: Header) -> Iterator[str]:
     """Yield sentences about lights and cameras that are not what they are in the file."""
     kinds = [light.type for light in header.lights]
     if "spot" in kinds:

@@ -1,0 +1,147 @@
+"""Searches of one run: rendered or predicted, read back where they are stored, a random one beside the policy's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.attacks import (
+    Domain,
+    Ending,
+    Evaluate,
+    Evaluation,
+    Policy,
+    SearchResult,
+    StepRecord,
+    make_policy,
+    planned_renders,
+    search,
+)
+from advsearch.engine.bank import Bank
+from advsearch.engine.budget import RenderBudget
+from advsearch.engine.memory import TRANSPORT, Frames, Memory
+from advsearch.engine.problem import Problem
+from advsearch.engine.record import Findings, Recorder, Stages
+from advsearch.engine.transport import Transport, reason_against
+from advsearch.report.wording import count
+from advsearch.scene.transport.renderer import TransportTooLargeError
+
+
+@dataclass
+class Searches:
+    """The searches of one run.
+
+    Attributes:
+        problem: what is attacked.
+        budget: how many evaluations.
+        policy: what proposes.
+        recorder: keeps rows.
+        memory: what the run has stored already.
+        stages: told which stage runs.
+        findings: gets the searches, their pictures and what predicts them.
+        specialise: whether pictures may be predicted.
+    """
+
+    problem: Problem
+    budget: RenderBudget
+    policy: Policy[Any]
+    recorder: Recorder
+    memory: Memory
+    stages: Stages
+    findings: Findings
+    specialise: bool
+
+    def collect_transport(self) -> None:
+        """Make the matrix that predicts the pictures of the searches, where there can be one and it pays."""
+        problem, steps, findings = self.problem, self.budget.steps, self.findings
+        findings.rendered_because = reason_against(problem, steps, self.specialise) or ""
+        if findings.rendered_because:
+            return
+        stored, keep = self.memory.note(TRANSPORT), partial(self.memory.set_note, TRANSPORT)
+        if problem.conditions is None:
+            findings.transport = Transport(problem, steps, renewals=stored or {}, keep=keep)
+        else:
+            findings.transport = Bank(problem, steps, grown=stored or [], keep=keep)
+        hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"
+        self.stages.begin("transport", "collecting light transport", findings.transport.samples, hint=hint)
+        try:
+            findings.transport.prepare(self.stages.progress.advance)
+        except TransportTooLargeError as error:
+            findings.transport, findings.rendered_because = None, str(error)
+
+    def run(self) -> None:
+        """The search, and the random one beside it, with as many renders."""
+        budget, findings, seed = self.budget, self.findings, self.problem.seed
+        frames = Frames(budget.steps)
+        findings.frames = frames.pictures
+        self.begin("search", f"searching with {self.policy.name}", budget.steps, "`steps` or `seconds` shorten it")
+        findings.search = self.search("search", self.policy, budget.steps, self.problem.seed, frames, budget.seconds)
+        if not budget.baseline or self.policy.name == "random":
+            return
+        steps = budget.steps if budget.seconds is None else _spent(findings.search)
+        self.begin("baseline", "searching at random, to compare", steps, "`baseline=false` leaves it out")
+        findings.baseline = self.search("baseline", make_policy("random"), steps, seeds.stream(seed, "baseline"))
+
+    def search(
+        self,
+        kind: str,
+        policy: Policy[Any],
+        steps: int,
+        seed: int,
+        frames: Frames | None = None,
+        seconds: float | None = None,
+        domain: Domain | None = None,
+    ) -> SearchResult:
+        """Search, reading back what is stored already.
+
+        Raises:
+            KeyboardInterrupt: the search was interrupted; the result of an interrupted main search is kept before.
+        """
+
+        before = 0
+
+        def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
+            nonlocal before
+            self.recorder.step(kind, record, u, evaluation)
+            self.stages.progress.advance(record.renders - before, best=record.best)
+            before = record.renders
+
+        domain = self.problem.domain if domain is None else domain
+        found = search(
+            self._evaluator(kind, frames),
+            replace(domain, exact=True) if isinstance(self.findings.transport, Transport) else domain,
+            policy,
+            steps=steps,
+            seed=seed,
+            close=self.budget.close_looks,
+            late=self.memory.clock(kind, steps, seconds),
+            on_step=on_step,
+        )
+        if found.ending is Ending.INTERRUPTED:
+            self.findings.search = self.findings.search or found
+            raise KeyboardInterrupt
+        return found
+
+    def _evaluator(self, kind: str, frames: Frames | None) -> Evaluate:
+        """What the evaluations of a search come from: rendered, or predicted; what is stored is read back."""
+        transport = self.findings.transport
+        if transport is None:
+            return self.memory.evaluator(kind, lambda tell: self.problem.evaluator(kind, tell), frames)
+        return self.memory.evaluator(kind, lambda tell: transport.evaluator(kind, tell), frames, transport.passed)
+
+    def begin(self, name: str, title: str, steps: int, shorter: str) -> None:
+        """Begin the stage of a search of at most so many steps, and its ranking."""
+        renders = planned_renders(steps, close=self.budget.close_looks)
+        hint = f"{renders} pictures of {count(self.problem.spp, 'sample')} a pixel; {shorter}"
+        if self.findings.transport is not None:
+            hint = f"{steps} pictures predicted and {renders - steps} traced; {shorter}"
+        self.stages.begin(name, title, renders, hint=hint, at_most=True)
+
+
+def _spent(found: SearchResult) -> int:
+    """Renders of the search itself, without those of the ranking."""
+    return max(1, found.history[-1].renders) if found.history else 1

@@ -1,0 +1,58 @@
+"""The smallest change that flips the answer: searches and trials in turn, within ever smaller budgets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.attacks import Domain, Ending, SearchResult
+from advsearch.attacks.smallest import ATTEMPTS, MOST_CHECKS, ROUNDS, confirmed, smallest
+from advsearch.engine.searches import Searches
+from advsearch.engine.transport import Transport
+from advsearch.engine.verifier import Verifier
+
+CONFIRMED = 40
+"""Trials in a row that the upper end of a smallest epsilon has to pass, or as many checks as have them."""
+
+
+def find_smallest(searches: Searches, verifier: Verifier) -> None:
+    """Bracket the smallest epsilon; every claim on the way goes through trials with seeds of its own.
+
+    What is verified at the end is the configuration at the upper end of the bracket.
+    """
+    problem, budget, findings = searches.problem, searches.budget, searches.findings
+    results: list[SearchResult] = []
+
+    def found(inside: Domain, number: int) -> Tensor:
+        searches.begin(
+            "search", f"search {number + 1} of at most {ROUNDS}", budget.steps, "`steps` shortens each search"
+        )
+        kind, seed = f"search {number}" if number else "search", seeds.stream(problem.seed, "smallest", number)
+        results.append(searches.search(kind, searches.policy, budget.steps, seed, domain=inside))
+        verifier.begin("trying smaller changes", MOST_CHECKS * budget.trials, at_most=True)
+        return results[-1].best_u
+
+    def passes(u: Tensor, check: int) -> bool:
+        failures, allowed = 0, problem.rule.allowed(budget.trials)
+        for number in range(budget.trials):
+            failures += not verifier.trial(f"check {check}", number, u).success
+            verifier.stages.progress.advance(1)
+            if failures > allowed:
+                return False
+        return True
+
+    times = -(-CONFIRMED // budget.trials)
+    likely = findings.transport.likely if isinstance(findings.transport, Transport) else None
+    bracket = smallest(found, passes, problem.domain, likely=likely)
+    if bracket.u is not None:
+        most = ATTEMPTS * times * budget.trials
+        verifier.begin("checking the smallest change", most, at_most=True)
+    bracket = confirmed(bracket, passes, problem.domain, times=times)
+    renders, gradients = sum(one.renders for one in results), sum(one.gradients for one in results)
+    answer = results[0].best_u if bracket.u is None else bracket.u
+    ending = results[0].ending if bracket.u is None else Ending.FOUND
+    findings.smallest = bracket
+    own = results[0 if bracket.u is None else bracket.found_by]
+    findings.search = replace(own, best_u=answer, ending=ending, renders=renders, gradients=gradients)

@@ -1,0 +1,131 @@
+"""What the types of a glTF header leave open: limits, extensions, and that whatever is referred to is there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from advsearch import files
+from advsearch.errors import FileFormatError
+from advsearch.scene.importing.checks import check_faces
+from advsearch.scene.importing.files import damaged, shown
+from advsearch.scene.importing.gltf_entries import Header, Primitive
+
+LARGEST_VALUES = 1 << 28
+"""Bytes that all views, and all accessors, of a file may have; they may overlap, so its size says nothing."""
+
+LARGEST_TREE = 20_000
+"""Nodes, and pieces of geometry at their places, in one file."""
+
+DEEPEST_TREE = 500
+"""Nodes from the root to a leaf."""
+
+_FLOAT = 5126
+_UNREADABLE = ("compression", "quantization", "basisu")
+
+
+def check_header(path: Path, header: Header) -> None:
+    """Check what the types leave open: extensions, limits, and that whatever is referred to is there.
+
+    Raises:
+        FileFormatError: the header needs what is not supported, refers to what is not there, or is over a limit.
+    """
+    needed = sorted(name for name in header.extensionsRequired if any(word in name for word in _UNREADABLE))
+    if needed:
+        names = shown(", ".join(needed), quoted=False)
+        raise FileFormatError(f"{path}: needs {names}, which is not supported; export it without that option")
+    for view in header.bufferViews:
+        _check_index(path, "buffers", view.buffer, header.buffers)
+    for accessor in header.accessors:
+        _check_index(path, "bufferViews", accessor.bufferView, header.bufferViews)
+    for texture in header.textures:
+        _check_index(path, "images", texture.plain().source, header.images)
+    for image in header.images:
+        _check_index(path, "bufferViews", image.bufferView, header.bufferViews)
+    for material in header.materials:
+        surface = material.plain().pbrMetallicRoughness
+        for use in (surface.baseColorTexture, surface.metallicRoughnessTexture) if surface else ():
+            _check_index(path, "textures", None if use is None else use.index, header.textures)
+    sizes = (sum(view.byteLength for view in header.bufferViews), sum(a.size() for a in header.accessors))
+    if max(sizes) > files.scaled(LARGEST_VALUES):
+        most = f"geometry and pictures of at most {files.scaled(LARGEST_VALUES):,} bytes"
+        raise files.too_large(path, most, f"{max(sizes):,}")
+    for mesh in header.meshes:
+        for primitive in mesh.primitives:
+            _check_primitive(path, header, primitive)
+    _check_tree(path, header)
+
+
+def _check_index(path: Path, kind: str, index: int | None, entries: list[Any]) -> None:
+    if index is not None and index >= len(entries):
+        raise damaged(path, f"glTF with {index + 1} {kind}, as it refers to", f"{len(entries)}")
+
+
+def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
+    """Refuse what would be read wrongly: integers where floats are meant, attributes of different lengths."""
+    for index in (*primitive.attributes.values(), primitive.indices):
+        _check_index(path, "accessors", index, header.accessors)
+    _check_index(path, "materials", primitive.material, header.materials)
+    for name in ("POSITION", "NORMAL", "TEXCOORD_0"):
+        if name not in primitive.attributes:
+            continue
+        accessor = header.accessors[primitive.attributes[name]]
+        if accessor.componentType != _FLOAT:
+            got = f"{name} values that are not 32-bit floats"
+            raise FileFormatError(f"{path}: expected floats, got {got}; export it without quantization")
+        kind = "VEC2" if name == "TEXCOORD_0" else "VEC3"
+        if accessor.type != kind:
+            raise damaged(path, f"{name} of type {kind}", accessor.type)
+    if primitive.indices is not None and header.accessors[primitive.indices].type != "SCALAR":
+        raise damaged(path, "indices of type SCALAR", header.accessors[primitive.indices].type)
+    for index in (*primitive.attributes.values(), primitive.indices):
+        used = None if index is None else header.accessors[index]
+        if used is not None and used.sparse is not None:
+            raise FileFormatError(f"{path}: has sparse accessors, which are not supported; export it without them")
+        if used is not None and used.bufferView is None:
+            raise damaged(path, "accessors with a bufferView", "one without values")
+
+
+def _triangles(header: Header, primitive: Primitive) -> int:
+    """Return how many triangles a primitive has, at most."""
+    index = primitive.attributes.get("POSITION") if primitive.indices is None else primitive.indices
+    if index is None or primitive.mode < 4:
+        return 0
+    count = header.accessors[index].count
+    return count // 3 if primitive.mode == 4 else max(0, count - 2)
+
+
+def _check_tree(path: Path, header: Header) -> None:
+    """Check that the nodes form trees, as glTF demands, and neither too large nor too deep ones."""
+    for scene in header.scenes:
+        for root in scene.nodes:
+            _check_index(path, "nodes", root, header.nodes)
+    _check_index(path, "scenes", header.scene, header.scenes)
+    parents: set[int] = set()
+    triangles = [sum(_triangles(header, primitive) for primitive in mesh.primitives) for mesh in header.meshes]
+    pieces, drawn = 0, 0
+    for node in header.nodes:
+        _check_index(path, "meshes", node.mesh, header.meshes)
+        _check_index(path, "cameras", node.camera, header.cameras)
+        _check_index(path, "lights", node.lamp, header.lights)
+        if node.mesh is not None:
+            pieces, drawn = pieces + len(header.meshes[node.mesh].primitives), drawn + triangles[node.mesh]
+        for child in node.children:
+            _check_index(path, "nodes", child, header.nodes)
+            if child in parents:
+                raise damaged(path, "nodes with one parent each", f"two for node {child}")
+            parents.add(child)
+    pieces = max(pieces, sum(len(mesh.primitives) for mesh in header.meshes), len(header.nodes))
+    check_faces(path, max(drawn, sum(triangles)))
+    if pieces > files.scaled(LARGEST_TREE):
+        raise files.too_large(path, f"glTF of at most {files.scaled(LARGEST_TREE):,} nodes and pieces", f"{pieces:,}")
+    level, reached = [index for index in range(len(header.nodes)) if index not in parents], 0
+    for _ in range(files.scaled(DEEPEST_TREE)):
+        reached += len(level)
+        level = [child for index in level for child in header.nodes[index].children]
+        if not level:
+            break
+    if level:
+        raise files.too_large(path, f"nodes of at most {files.scaled(DEEPEST_TREE)} levels", "more")
+    if reached < len(header.nodes):
+        raise damaged(path, "nodes that form trees", "a cycle")

@@ -1,0 +1,226 @@
+"""The entries of a glTF header, as far as they are read; field names are the format's (glTF 2.0, section 5)."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, FailFast, Field, JsonValue
+
+T = TypeVar("T")
+
+List = Annotated[list[T], FailFast()]
+"""A list of which only the first wrong entry is reported; a million reports take gigabytes."""
+
+Index = Annotated[int, Field(ge=0, lt=1 << 32)]
+Size = Annotated[int, Field(ge=0, lt=1 << 40)]
+_COMPONENTS = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
+_ELEMENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+
+
+class _Entry(BaseModel):
+    """A JSON object of glTF; what it holds beyond the fields is dropped."""
+
+    model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False, frozen=True)
+
+
+class Asset(_Entry):
+    version: str
+
+
+class Buffer(_Entry):
+    byteLength: Size
+    uri: str | None = None
+
+
+class BufferView(_Entry):
+    buffer: Index
+    byteLength: Size
+    byteOffset: Size = 0
+    byteStride: Annotated[int, Field(ge=4, le=252)] | None = None
+
+
+class Accessor(_Entry):
+    componentType: Literal[5120, 5121, 5122, 5123, 5125, 5126]
+    count: Size
+    type: Literal["SCALAR", "VEC2", "VEC3", "VEC4", "MAT2", "MAT3", "MAT4"]
+    bufferView: Index | None = None
+    byteOffset: Size = 0
+    sparse: dict[str, JsonValue] | None = Field(default=None, exclude=True)
+
+    def size(self) -> int:
+        """Bytes of its values, packed."""
+        return self.count * _COMPONENTS[self.componentType] * _ELEMENTS[self.type]
+
+
+class Primitive(_Entry):
+    attributes: dict[str, Index]
+    indices: Index | None = None
+    material: Index | None = None
+    mode: Annotated[int, Field(ge=0, le=6)] = 4
+
+
+class MeshEntry(_Entry):
+    primitives: List[Primitive]
+    name: str | None = None
+
+
+class _LightUse(_Entry):
+    light: Index
+
+
+class _NodeExtensions(_Entry):
+    punctual: _LightUse | None = Field(default=None, alias="KHR_lights_punctual")
+
+
+class Node(_Entry):
+    children: List[Index] = []
+    mesh: Index | None = None
+    camera: Index | None = None
+    extensions: _NodeExtensions | None = None
+    matrix: Annotated[list[float], Field(min_length=16, max_length=16)] | None = None
+    translation: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
+    rotation: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
+    scale: Annotated[list[float], Field(min_length=3, max_length=3)] | None = None
+    name: str | None = None
+
+    @property
+    def lamp(self) -> int | None:
+        """Number of the light that the node carries."""
+        carried = self.extensions.punctual if self.extensions else None
+        return None if carried is None else carried.light
+
+
+class SceneEntry(_Entry):
+    nodes: List[Index] = []
+
+
+class Perspective(_Entry):
+    yfov: Annotated[float, Field(gt=0.0, lt=3.1416)]
+    aspectRatio: Annotated[float, Field(gt=0.0)] | None = None
+
+
+class CameraEntry(_Entry):
+    type: Literal["perspective", "orthographic"]
+    perspective: Perspective | None = None
+    name: str | None = None
+
+
+class Light(_Entry):
+    """A light of KHR_lights_punctual: `intensity` in candela, of a directional one in lux."""
+
+    type: Literal["point", "spot", "directional"]
+    color: Annotated[list[float], Field(min_length=3, max_length=3)] = [1.0, 1.0, 1.0]
+    intensity: Annotated[float, Field(ge=0.0)] = 1.0
+    name: str | None = None
+
+
+class _Lights(_Entry):
+    lights: List[Light] = []
+
+
+class _Extensions(_Entry):
+    punctual: _Lights | None = Field(default=None, alias="KHR_lights_punctual")
+
+
+class TextureUse(_Entry):
+    index: Index
+
+
+Factor = Annotated[list[float], Field(min_length=4, max_length=4)]
+
+
+class MetallicRoughness(_Entry):
+    baseColorFactor: Factor | None = None
+    baseColorTexture: TextureUse | None = None
+    metallicFactor: float | None = None
+    roughnessFactor: float | None = None
+    metallicRoughnessTexture: TextureUse | None = None
+
+
+class SpecularGlossiness(_Entry):
+    diffuseFactor: Factor | None = None
+    diffuseTexture: TextureUse | None = None
+    glossinessFactor: float = 1.0
+
+
+class _MaterialExtensions(_Entry):
+    glossiness: SpecularGlossiness | None = Field(default=None, alias="KHR_materials_pbrSpecularGlossiness")
+
+
+class MaterialEntry(_Entry):
+    pbrMetallicRoughness: MetallicRoughness | None = None
+    name: str | None = None
+    normalTexture: TextureUse | None = None
+    emissiveTexture: TextureUse | None = None
+    emissiveFactor: list[float] = []
+    alphaMode: str = "OPAQUE"
+    extensions: _MaterialExtensions | None = None
+
+    def plain(self) -> MaterialEntry:
+        """Return the material without extensions: the diffuse colour of an old one is its base colour."""
+        old = self.extensions.glossiness if self.extensions else None
+        if old is None:
+            return MaterialEntry(pbrMetallicRoughness=self.pbrMetallicRoughness, name=self.name)
+        surface = MetallicRoughness(
+            baseColorFactor=old.diffuseFactor,
+            baseColorTexture=old.diffuseTexture,
+            metallicFactor=0.0,
+            roughnessFactor=1.0 - old.glossinessFactor,
+        )
+        return MaterialEntry(pbrMetallicRoughness=surface, name=self.name)
+
+
+class _WebpSource(_Entry):
+    source: Index | None = None
+
+
+class _TextureExtensions(_Entry):
+    webp: _WebpSource | None = Field(default=None, alias="EXT_texture_webp")
+
+
+class Texture(_Entry):
+    source: Index | None = None
+    extensions: _TextureExtensions | None = None
+
+    def plain(self) -> Texture:
+        """Return the texture without extensions."""
+        webp = self.extensions.webp if self.extensions else None
+        return Texture(source=self.source if webp is None or webp.source is None else webp.source)
+
+
+class Image(_Entry):
+    uri: str | None = None
+    bufferView: Index | None = None
+    mimeType: str | None = None
+
+
+class Header(_Entry):
+    """What is read of the JSON of a glTF file; field names are the format's (glTF 2.0, section 5)."""
+
+    asset: Asset
+    scene: Index | None = None
+    scenes: List[SceneEntry] = []
+    nodes: List[Node] = []
+    meshes: List[MeshEntry] = []
+    accessors: List[Accessor] = []
+    bufferViews: List[BufferView] = []
+    buffers: List[Buffer] = []
+    materials: List[MaterialEntry] = []
+    textures: List[Texture] = []
+    images: List[Image] = []
+    cameras: List[CameraEntry] = []
+    extensions: _Extensions | None = None
+    extensionsUsed: List[str] = []
+    extensionsRequired: List[str] = []
+
+    @property
+    def lights(self) -> list[Light]:
+        """The lights that nodes may carry."""
+        found = self.extensions.punctual if self.extensions else None
+        return [] if found is None else found.lights
+
+    def label(self, index: int) -> str:
+        """Return what a node is called: by its name, its mesh's, or its number."""
+        node = self.nodes[index]
+        mesh = None if node.mesh is None else self.meshes[node.mesh].name
+        return node.name or mesh or f"node {index}"

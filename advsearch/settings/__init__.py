@@ -1,0 +1,27 @@
+"""The machinery of a typed configuration: settings with one description each, read from YAML, flags and Python alike.
+
+`config` declares the settings themselves.
+"""
+
+from __future__ import annotations
+
+from advsearch.settings.configuration import Config
+from advsearch.settings.declaration import Clash, Setting, setting, setting_as_in, settings
+from advsearch.settings.values import all_finite, check_once, number_or_text, parse_assignment, split_names
+from advsearch.settings.yaml_files import HEADER, read_yaml
+
+__all__ = [
+    "HEADER",
+    "Clash",
+    "Config",
+    "Setting",
+    "all_finite",
+    "check_once",
+    "number_or_text",
+    "parse_assignment",
+    "read_yaml",
+    "setting",
+    "setting_as_in",
+    "settings",
+    "split_names",
+]

@@ -1,0 +1,205 @@
+"""A typed configuration: what a command needs to know, checked as a whole."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator, model_validator
+
+from advsearch.errors import AdvsearchError, InputError, UnknownNameError
+from advsearch.files import JsonObject
+from advsearch.settings.command_line import as_flags
+from advsearch.settings.declaration import Clash, settings
+from advsearch.settings.values import all_finite, is_file, is_shallow, shown, split_names
+from advsearch.settings.yaml_files import HEADER, SCHEMA, put, read_yaml
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+PLACE: Mapping[str, bool | None] = {"run": None, "overwrite": False}
+"""The settings that say where a run is kept, not what it does, as a repetition has them."""
+
+FILES = ("object", "environment", "model", "labels")
+"""The settings that may name files."""
+
+
+class SettingsError(InputError):
+    """One or more settings have values that are not allowed.
+
+    Attributes:
+        problems: pairs of a setting's name and what is wrong with it.
+    """
+
+    def __init__(self, problems: tuple[tuple[str, str], ...], file: str | Path = "") -> None:
+        where = f"{file}: " if file else ""
+        super().__init__("; ".join(f"{where}{name}: {text}" for name, text in problems))
+        self.problems = problems
+
+
+class Config(BaseModel):
+    """What a command needs to know. Frozen; unknown names are refused. Each command's configuration is a subclass.
+
+    Raises:
+        InputError: a value is outside its range or an unknown setting is named; the message lists every problem.
+    """
+
+    command: ClassVar[str]
+    without: ClassVar[tuple[str, ...]] = ()
+    """Settings of a class above that the command does not have."""
+    clashes: ClassVar[tuple[Clash, ...]] = ()
+    free: ClassVar[tuple[str, ...]] = (*PLACE, "threads")
+    """Settings that decide no number, so that they may be changed before a run goes on."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True, allow_inf_nan=False)
+
+    def __init__(self, **data: Any) -> None:
+        deep = {name: value for name, value in data.items() if not is_shallow(value)}
+        if deep:
+            raise _settings_error(type(self), [{"loc": (name,), "input": deep[name], "type": ""} for name in deep])
+        try:
+            super().__init__(**data)
+        except ValidationError as error:
+            raise _settings_error(type(self), error.errors(include_url=False)) from None
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_number_from_bool(cls, value: Any, info: Any) -> Any:
+        """Refuse true for a number: YAML's `epsilon: yes` is a slip, not 1."""
+        if isinstance(value, bool) and cls.model_fields[info.field_name].annotation is not bool:
+            raise ValueError("a truth value is not accepted here")
+        return value
+
+    @field_validator("*")
+    @classmethod
+    def _finite(cls, value: Any) -> Any:
+        """Refuse NaN and infinity however deep they are, and whole numbers that no machine has."""
+        if not all_finite(value):
+            raise ValueError("not finite")
+        return value
+
+    @model_validator(mode="after")
+    def _without_clashes(self) -> Self:
+        """Refuse what would be ignored, and settings that exclude each other."""
+        defaults = {one.field: one.default for one in settings(type(self))}
+        for name in self.without:
+            if getattr(self, name) != type(self).model_fields[name].get_default(call_default_factory=True):
+                raise InputError(f"{name}: `advsearch {self.command}` has no such setting; leave it out")
+        for clash in self.clashes:
+            given = clash.setting not in self.without and getattr(self, clash.setting) != defaults[clash.setting]
+            if given and clash.with_others(self):
+                raise InputError(f"{clash.setting.rstrip('_')}: {clash.why}")
+        return self
+
+    @classmethod
+    def from_yaml(cls, path: str | Path, overrides: Mapping[str, object] | None = None) -> Self:
+        """Return the configuration that the YAML file at `path` describes, with `overrides` put over it.
+
+        Args:
+            path: a file with one mapping from settings to values; `schema`, `command` and `base` may stand beside
+                them (see `read_yaml`).
+            overrides: setting to value; a dotted name reaches inside: ``set.camera.azimuth``, ``controls.pose.yaw``.
+
+        Raises:
+            FileFormatError: the file is missing, empty or not such a mapping.
+            InputError: as for the class; the message names the file.
+        """
+        data = {name: value for name, value in read_yaml(path).items() if name not in ("schema", "command")}
+        for name, value in (overrides or {}).items():
+            put(data, name, value)
+        try:
+            return cls(**data)
+        except SettingsError as error:
+            raise SettingsError(error.problems, path) from None
+
+    @classmethod
+    def shared(cls, other: Config) -> dict[str, object]:
+        """Return the settings that this command and another's have from the same class, but for the run's place."""
+        both = next(one for one in cls.__mro__ if issubclass(one, Config) and isinstance(other, one))
+        apart = (*PLACE, *cls.without, *other.without)
+        return {name: getattr(other, name) for name in both.model_fields if name not in apart}
+
+    @classmethod
+    def of(cls, other: Config, **changes: object) -> Self:
+        """Return what another command's configuration describes as one of this, in a place of its own.
+
+        Args:
+            other: gives the settings that are `shared`.
+            **changes: settings that are different.
+        """
+        return cls(**{**cls.shared(other), **changes})
+
+    def to_yaml(self) -> str:
+        """Return the YAML form; `from_yaml` of it gives an equal configuration."""
+        data = {"schema": SCHEMA, "command": self.command, **self.plain()}
+        return HEADER + str(yaml.safe_dump(data, sort_keys=False))
+
+    def plain(self) -> JsonObject:
+        """Return every setting by the name it has in YAML, as JSON values."""
+        return self.model_dump(by_alias=True, mode="json")
+
+    @property
+    def place(self) -> tuple[str | None, bool]:
+        """Where a run of this is kept, if that is said, and whether what is there is replaced."""
+        return getattr(self, "run", None), getattr(self, "overwrite", False)
+
+    @property
+    def title(self) -> tuple[str, ...]:
+        """What names a run of this whose place is not said."""
+        return (self.command,)
+
+    def recipe(self) -> Self:
+        """Return what `run.yaml` holds: no place for the run (a repetition gets its own) and files by absolute path."""
+        places = {name: _absolute(getattr(self, name)) for name in FILES if name in type(self).model_fields}
+        return self.model_copy(update={**places, **PLACE})
+
+    def deciding(self) -> JsonObject:
+        """Return the settings that decide a run's numbers, as JSON values: all that are not `free`. Files have their
+        names only, since they may have been moved."""
+        given = {name: value for name, value in self.plain().items() if name not in self.free}
+        files = {name: _bare(value) for name in FILES if isinstance(value := given.get(name), str)}
+        return {**given, **files}
+
+    def command_line(self) -> str:
+        """Return the shell command that repeats this in a place of its own: all settings that are not the default."""
+        words = ["advsearch", self.command]
+        for one in settings(type(self)):
+            value = getattr(self, one.field)
+            if value != one.default and one.field not in PLACE:
+                words += as_flags(one, value)
+        return shlex.join(words)
+
+
+def _settings_error(config: type[Config], errors: Sequence[Any]) -> AdvsearchError:
+    """Return pydantic's findings (`ValidationError.errors`) as one error of ours: one problem a setting."""
+    declared = settings(config)
+    known = {one.name: one for one in declared} | {one.field: one for one in declared}
+    problems: dict[str, str] = {}
+    for error in errors:
+        name = str(error["loc"][0])
+        if name not in known:
+            return UnknownNameError("setting", name, {one.name for one in declared})
+        got = "nothing" if error["type"] == "missing" else shown(error["input"])
+        if known[name].form in ("assignments", "controls") and len(error["loc"]) > 1:
+            got = f"{error['loc'][1]}={got}"
+        problems.setdefault(known[name].name, f"expected {known[name].expects}, got {got}")
+    return SettingsError(tuple(problems.items()))
+
+
+def _bare(value: str) -> str:
+    """Return names with no folders before them."""
+    return ",".join(Path(part).name for part in split_names(value))
+
+
+def _absolute(value: str | None) -> str | None:
+    """Return the absolute path of `value` where it is a file, and the name it is otherwise; of a list, each part."""
+    return None if value is None else ",".join(map(_absolute_file, split_names(value)))
+
+
+def _absolute_file(name: str) -> str:
+    is_path = ("/" in name or Path(name).suffix != "") and is_file(name)
+    return str(Path(name).resolve()) if is_path else name
