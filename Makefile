@@ -31,6 +31,7 @@ attack: $(STAMP) ## search the worst texture for a mug; more flags through ARGS=
 	@$(BIN)/advsearch attack --object mug --control texture $(ARGS)
 
 test: $(STAMP) ## run the tests; ARGS="-k name" picks some
+	@bash tools/browser.sh
 	@$(BIN)/python -m pytest -n $(JOBS) --dist worksteal $(ARGS)
 
 test-quick: $(STAMP) ## run the quick tests of every room

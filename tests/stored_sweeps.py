@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +16,7 @@ from advsearch.described import Value
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.viewer import thumbnails
+from advsearch.viewer.server import Dashboard
 from advsearch.viewer.sweep_page import write_page
 
 YAWS, ELEVATIONS, ENVIRONMENTS = (0.0, 45.0, 90.0), (10.0, 40.0), ("noon", "studio")
@@ -58,3 +62,17 @@ def make_sweep(path: Path, *, keep: str = "none", label: str = "mug", ended: boo
             run.write_summary(summary)
             write_page(run.path, summary)
     return path
+
+
+@contextmanager
+def serving(*runs: Path, host: str = "127.0.0.1") -> Iterator[Dashboard]:
+    """A server of these runs, for as long as the block."""
+    server = Dashboard(runs, host, 0)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()

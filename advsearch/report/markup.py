@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from html import escape
 
-_VOID = frozenset({"meta", "img", "br", "hr", "input"})
+_VOID = frozenset({"meta", "img", "br", "hr", "input", "link"})
 
 
 class Html(str):

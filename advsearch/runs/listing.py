@@ -57,8 +57,13 @@ def finished(path: Path) -> bool:
     return (path / summary.NAME).is_file() and not summary.read_result(path).goes_on
 
 
-def described(path: Path) -> Listed:
-    """Return the run in a folder; what cannot be read is shown as far as it can."""
+def described(path: Path, *, counts: bool = True) -> Listed:
+    """Return the run in a folder; what cannot be read is shown as far as it can.
+
+    Args:
+        path: of the folder.
+        counts: whether rows are counted, which takes a second for a million.
+    """
     config: dict[str, object] = {}
     result: Result | None = None
     kinds: dict[str, int] = {}
@@ -66,8 +71,9 @@ def described(path: Path) -> Listed:
         config = read_yaml(path / CONFIG)
     with suppress(AdvsearchError):
         result = summary.read_result(path)
-    with suppress(AdvsearchError), store.Store(path / store.NAME, read_only=True) as results:
-        kinds = results.counts()
+    if counts:
+        with suppress(AdvsearchError), store.Store(path / store.NAME, read_only=True) as results:
+            kinds = results.counts()
     object_name = getattr(result, "object", None) or ",".join(getattr(result, "objects", ()))
     controls = getattr(result, "controls", ()) or config.get("controls") or ()
     return Listed(

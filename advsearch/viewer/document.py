@@ -44,6 +44,7 @@ def document(
         element("meta", name="viewport", content="width=device-width, initial-scale=1"),
         element("meta", name="color-scheme", content="light dark"),
         element("title", f"{title} - advsearch"),
+        element("link", rel="icon", href="data:,"),
         element("style", Html(CSS + asset("viewer.css"))),
     )
     end = element("footer", f"advsearch {__version__}, {footer or title}")

@@ -246,7 +246,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _page(self, _query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
         run = self._run(name)
-        if listing.described(run).command == "sweep":
+        if listing.described(run, counts=False).command == "sweep":
             return "text/html; charset=utf-8", page([(run, result_of(run))], [_source(name, run)]).encode()
         report = run / REPORT
         if report.is_symlink() or not report.is_file():
@@ -258,7 +258,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not names:
             raise Refused(HTTPStatus.BAD_REQUEST, "choose at least one sweep")
         runs = [(name, self._run(name)) for name in names]
-        other = [name for name, run in runs if listing.described(run).command != "sweep"]
+        other = [name for name, run in runs if listing.described(run, counts=False).command != "sweep"]
         if other:
             raise Refused(HTTPStatus.BAD_REQUEST, f"only sweeps can be shown side by side; {', '.join(other)} is none")
         pages = page([(run, result_of(run)) for _, run in runs], [_source(name, run) for name, run in runs])
@@ -305,7 +305,7 @@ def list_page(runs: Mapping[str, Path]) -> str:
     """Return the page that lists runs, by the name under which each is shown."""
     lines, sweeps = [], 0
     for name, path in runs.items():
-        one = listing.described(path)
+        one = listing.described(path, counts=False)
         sweep = one.command == "sweep"
         sweeps += sweep
         what = ", ".join(filter(None, (one.command, one.object, " and ".join(one.controls), one.state, one.answer)))

@@ -24,7 +24,7 @@ from advsearch.runs.images import read_png
 from advsearch.viewer.attack_page import LARGE_PICTURE, SMALLER_SIDE, write_report
 from advsearch.viewer.document import asset
 
-VOID = {"meta", "img", "br", "hr"}
+VOID = {"meta", "img", "br", "hr", "link"}
 
 
 class Page(HTMLParser):
@@ -133,8 +133,9 @@ def test_the_page_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
     assert not re.search(r"\b(fetch|import|XMLHttpRequest|WebSocket|https?:)", code)
     assert "//" not in re.sub(r"base64,[A-Za-z0-9+/=]+", "", text.replace(code, ""))
     assert "url(" not in text and "@import" not in text
-    assert {tag for tag, _ in page.tags}.isdisjoint({"link", "iframe", "object", "a", "form"})
+    assert {tag for tag, _ in page.tags}.isdisjoint({"iframe", "object", "a", "form"})
     assert [script.get("type") for script in page.all("script")] == ["application/json", None]
+    assert page.all("link") == [{"rel": "icon", "href": "data:,"}]
     assert len(page.all("img")) == 7
     assert all(str(image["src"]).startswith("data:image/") for image in page.all("img"))
 
@@ -186,7 +187,7 @@ def test_names_cannot_become_markup(tmp_path: Path) -> None:
     assert [script.get("type") for script in page.all("script")] == ["application/json", None]
     assert page.text.lower().count("alert('x')") > 15
     known = {"charset", "http-equiv", "content", "name", "lang", "class", "src", "alt", "scope", "role", "style"}
-    known |= {"id", "hidden", "data-picture", "title", "type"}
+    known |= {"rel", "href", "id", "hidden", "data-picture", "title", "type"}
     for tag, attributes in page.tags:
         found = {name for name in attributes if not name.startswith("aria-")}
         assert tag in ("svg", "g", "path", "text") or found <= known

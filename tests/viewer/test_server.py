@@ -3,33 +3,17 @@
 from __future__ import annotations
 
 import socket
-import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from http.client import HTTPConnection, HTTPResponse
 from pathlib import Path
 
 import pytest
-from stored_sweeps import make_sweep
+from stored_sweeps import make_sweep, serving
 
 from advsearch.errors import InputError
 from advsearch.runs.directory import RunDirectory
 from advsearch.viewer.server import Dashboard
-
-
-@contextmanager
-def serving(*runs: Path, host: str = "127.0.0.1") -> Iterator[Dashboard]:
-    """A server of these runs, for as long as the block."""
-    server = Dashboard(runs, host, 0)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
-    thread.start()
-    try:
-        yield server
-    finally:
-        server.shutdown()
-        server.server_close()
-        thread.join()
 
 
 def ask(server: Dashboard, path: str, method: str = "GET", **headers: str) -> tuple[HTTPResponse, bytes]:

@@ -32,7 +32,7 @@
   }
 
   function choice(label, options, value, told) {
-    const select = make("select", { onchange: (event) => told(event.target.value) });
+    const select = make("select", { "aria-label": label, onchange: (event) => told(event.target.value) });
     for (const [name, text] of options) select.append(make("option", { value: name, selected: name === value }, text));
     return make("label", {}, make("span", {}, label), select);
   }
@@ -221,6 +221,7 @@
 
     // The rows have grown.
     renew() {
+      this.known = null;
       this.axes = this.table.axes();
       this.byName = new Map(this.axes.map((axis) => [axis.name, axis]));
       this.read();
@@ -274,7 +275,11 @@
     }
 
     show() {
-      this.kept = this.chosen();
+      const fixed = JSON.stringify(this.state.fixed);
+      if (!this.known || this.known.fixed !== fixed) {
+        this.known = { fixed, counts: new Map() };
+        this.kept = this.chosen();
+      }
       this.showControls();
       this.showMaps();
       this.showAlong();
@@ -293,8 +298,14 @@
       return kept;
     }
 
-    // Counts over up to three axes: the last one fastest.
+    // Counts over up to three axes, the last one fastest; kept until other rows are chosen.
     counted(axes) {
+      const name = axes.map((axis) => axis.name).join("\n");
+      if (!this.known.counts.has(name)) this.known.counts.set(name, this.count(axes));
+      return this.known.counts.get(name);
+    }
+
+    count(axes) {
       const sizes = axes.map((axis) => axis.labels.length), size = sizes.reduce((a, b) => a * b, 1);
       const all = new Float64Array(size), right = new Float64Array(size), judged = new Float64Array(size), margin = new Float64Array(size), margins = new Float64Array(size);
       const { right: verdict, margin: given } = this.table.columns, kept = this.kept;

@@ -1,0 +1,150 @@
+"""How quick the page of a sweep of a million rows is in a browser: python benchmarks/viewer.py [--rows 1000000].
+
+The rows are made up; what is timed is reading them from the store when the sweep ends, and in Chromium (through
+Playwright, both of which `make test` sees to): the first paint of the page from `advsearch dashboard`, the map, and
+each interaction until the page is painted again. Seconds; medians of five for interactions.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import shutil
+import statistics
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from advsearch.config import SweepConfig
+from advsearch.described import Value
+from advsearch.runs.directory import COLUMNS, RunDirectory
+from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.store import Row
+from advsearch.viewer.server import Dashboard
+from advsearch.viewer.sweep_page import write_page
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+REPEATS = 5
+BATCH = 10_000
+PAINTED = """(change) => new Promise((done) => {
+  const begun = performance.now();
+  change();
+  requestAnimationFrame(() => setTimeout(() => done(performance.now() - begun)));
+})"""
+CHANGES = {
+    "another parameter across": "() => choose('parameter-2', across = across === 'across' ? 'up' : 'across')",
+    "another value on a slider": "() => slide('parameter-0-value', value = 1 - value)",
+    "a cell": "() => document.querySelectorAll('[data-cell]')[place = (place + 7) % 40].click()",
+    "wrong answers only": "() => pick('Show', shown = shown === 'wrong' ? 'all' : 'wrong')",
+    "maps side by side": "() => pick('Side by side', by = by === '' ? 'object' : '')",
+}
+HELPERS = """() => {
+  Object.assign(window, {across: 'across', value: 0, place: 0, shown: 'all', by: ''});
+  const set = (element, value, kind) => { element.value = value; element.dispatchEvent(new Event(kind)); };
+  window.choose = (id, value) => set(document.getElementById(id), value, 'change');
+  window.slide = (id, value) => set(document.getElementById(id), value, 'input');
+  window.pick = (label, value) => set(document.querySelector(`select[aria-label="${label}"]`), value, 'change');
+}"""
+
+
+def row(step: int, chance: random.Random) -> Row:
+    """A made-up row: 24 yaws, 8 elevations, 4 environments, 2 objects, and two numbers drawn by chance."""
+    yaw, elevation = 15.0 * (step % 24), 5.0 + 8.0 * (step // 24 % 8)
+    environment, thing = "abcd"[step // 192 % 4], "xy"[step // 768 % 2]
+    wrong = chance.random() < 0.1 + 0.6 * (elevation > 50 and environment == "b")
+    values: dict[str, Value] = {
+        "environment": {"value": environment, "unit": ""},
+        "object": {"value": thing, "unit": ""},
+        "pose.yaw": {"value": yaw, "unit": "degrees"},
+        "camera.elevation": {"value": elevation, "unit": "degrees"},
+        "light.power": {"value": chance.uniform(0.5, 2.0), "unit": "1"},
+        "pose.x": {"value": chance.uniform(-0.2, 0.2), "unit": "object sizes"},
+    }
+    label = "cup" if wrong else "mug"
+    margin = chance.gauss(2.0 if wrong else -3.0, 1.0)
+    return Row("sweep", step, correct=not wrong, margin=margin, label=label, probability=0.9, values=values)
+
+
+def make(folder: Path, count: int) -> dict[str, float]:
+    """Make the run of a sweep that has ended, and say what that took."""
+    config = SweepConfig(object="mug", run=str(folder), grid={"pose.yaw": [0, 15]})
+    chance, right = random.Random(0), 0
+    with RunDirectory.create_for(config) as run:
+        for begin in range(0, count, BATCH):
+            rows = [row(step, chance) for step in range(begin, min(begin + BATCH, count))]
+            right += sum(bool(one.correct) for one in rows)
+            run.record(*rows)
+        share = right / count
+        summary = SweepSummary.of(
+            {
+                "run": str(folder), "environment": "a,b,c,d", "controls": [], "ending": "finished", "seed": 0,
+                "seconds": {"total": 1.0}, "command_line": "", "object": "x,y", "model": "made up",
+                "task": "classification", "image_formation": None, "planned": count, "configurations": count,
+                "correct": right, "accuracy": share, "interval": (share - 0.001, share + 0.001), "not_finite": 0,
+                "answers": {}, "axes": [], "cells": None, "worst": None, "grid": {}, "samples": 1, "sampler": None,
+                "spp": 16, "renders": {"sweep": count}, "renders_per_second": None, "warnings": [],
+            }
+        )  # fmt: skip
+        begun = time.perf_counter()
+        run.write_summary(summary)
+        write_page(run.path, summary)
+        return {"columns when it ends [s]": time.perf_counter() - begun}
+
+
+def timed(page: Page, address: str) -> dict[str, float]:
+    """Open the page and interact."""
+    begun = time.perf_counter()
+    page.goto(address, wait_until="commit")
+    page.wait_for_selector("[data-cell]", timeout=120_000)
+    answer = {"map [s]": time.perf_counter() - begun}
+    answer["first paint [s]"] = (
+        page.evaluate("performance.getEntriesByName('first-contentful-paint')[0].startTime") / 1e3
+    )
+    page.evaluate(HELPERS)
+    page.evaluate("() => choose('parameter-0', 'one value')")
+    for name, change in CHANGES.items():
+        seconds = [page.evaluate(f"() => ({PAINTED})({change})") / 1e3 for _ in range(REPEATS)]
+        answer[f"{name} [s]"] = statistics.median(seconds)
+    return answer
+
+
+def main() -> int:
+    """Make the sweep, open it, and print what was measured."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rows", type=int, default=1_000_000, help="rows of the sweep")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    args = parser.parse_args()
+    from playwright.sync_api import sync_playwright
+
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        print("there is no Chromium here: apt-get install chromium", file=sys.stderr)
+        return 2
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / "sweep"
+        found = make(run, args.rows)
+        found["columns [MB]"] = (run / COLUMNS).stat().st_size / 1e6
+        server = Dashboard([run])
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+            page = browser.new_page(bypass_csp=True)
+            found |= timed(page, f"{server.address}runs/sweep/")
+            browser.close()
+        server.shutdown()
+    if args.json:
+        print(json.dumps({"rows": args.rows, **found}, indent=2))
+        return 0
+    for name, value in found.items():
+        print(f"{name:32} {value:8.3f}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,231 @@
+"""The pages in a real browser: what they do, that they ask nobody, and that everybody can use them."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from samples import make_run
+from stored_sweeps import make_sweep, serving
+
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.store import Row, Store
+from advsearch.viewer.attack_page import write_report
+from advsearch.viewer.document import asset
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+Open = Callable[..., Any]
+
+
+def test_a_browser_is_looked_for() -> None:
+    """Where there is none the tests below are skipped; tools/browser.sh, which `make test` calls, installs one."""
+    assert CHROMIUM is None or Path(CHROMIUM).is_file()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    playwright = pytest.importorskip("playwright.sync_api", reason="no playwright here: make setup installs it")
+    if CHROMIUM is None:
+        pytest.skip("there is no Chromium here: apt-get install chromium")
+    with playwright.sync_playwright() as started:
+        running = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield running
+        running.close()
+
+
+@contextmanager
+def opened(browser: Browser, address: str, width: int = 1440, **settings: Any) -> Iterator[Page]:
+    """An open page; fails where it complains, or asks anybody but the server that it came from."""
+    context = browser.new_context(viewport={"width": width, "height": 900}, **settings)
+    page = context.new_page()
+    complaints: list[str] = []
+    origin = address[: address.index("/", 8)]
+    page.on("console", lambda one: complaints.append(one.text) if one.type in ("error", "warning") else None)
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.on("request", lambda one: None if one.url.startswith((origin, "data:")) else complaints.append(one.url))
+    page.goto(address)
+    try:
+        yield page
+        assert complaints == []
+    finally:
+        context.close()
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_sweep(tmp_path_factory.mktemp("runs") / "first", keep="all")
+
+
+@pytest.fixture(scope="module")
+def attack(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = make_run(tmp_path_factory.mktemp("runs") / "attack")
+    write_report(run)
+    return run
+
+
+def until(page: Page, happened: Callable[[], object]) -> None:
+    """Wait until something has happened; the page's policy lets Playwright's own waiting run no code in it."""
+    for _ in range(200):
+        if happened():
+            return
+        page.wait_for_timeout(50)
+    raise AssertionError("it did not happen")
+
+
+def explored(page: Page) -> None:
+    """Try everything that the explorer has."""
+    page.wait_for_selector("[data-cell]")
+    assert page.locator("[data-cell]").count() == 6  # three yaws, two elevations
+    assert "24 configurations" in page.locator("#explorer .status").inner_text()
+    worst = page.locator('[data-cell="0,1,2"]')
+    assert "pose.yaw 90: right in 2 of 4 (50 %, 6.8 % to 93.2 %)" in str(worst.get_attribute("aria-label"))
+
+    worst.hover()
+    until(page, lambda: page.locator(".card").count() == 4)
+    page.locator("h1").hover()
+    until(page, lambda: page.locator(".card").count() == 24)
+
+    worst.click()
+    assert page.locator('[data-cell="0,1,2"]').get_attribute("aria-pressed") == "true"
+    page.get_by_label("Show", exact=True).select_option("wrong")
+    assert page.locator(".card").count() == 2
+    assert page.locator(".card.wrong strong").first.inner_text().strip() == "✗"
+    page.locator(".card").first.click()
+    assert "camera.elevation [degrees]" in page.locator("dialog").inner_text()
+    page.locator("dialog button").click()
+
+    page.locator("#parameter-0").select_option("one value")  # environment
+    assert "24" in page.locator("#explorer .status").inner_text()
+    page.locator("#parameter-0-value").fill("1")
+    assert page.locator("output").inner_text() == "studio"
+    assert page.locator(".card").count() == 0  # nothing is wrong in the studio
+
+    address = page.url
+    assert "at.environment=studio" in address
+    page.goto("about:blank")
+    page.goto(address)
+    page.wait_for_selector("[data-cell]")
+    assert page.locator("output").inner_text() == "studio"
+    assert page.get_by_label("Show", exact=True).input_value() == "wrong"
+
+    page.locator("#parameter-0").select_option("all values")
+    page.get_by_label("Side by side").select_option("environment")
+    assert page.locator("figure.map").count() == 2
+    page.locator("#parameter-0").select_option("up")
+    assert page.locator("figure.map").count() == 1
+    assert page.locator("table.map th[scope=row]").all_inner_texts() == ["studio", "noon"]
+
+
+def test_a_sweep_is_explored_from_its_file(browser: Browser, sweep: Path) -> None:
+    with opened(browser, (sweep / "report.html").as_uri()) as page:
+        explored(page)
+        assert page.locator(".card img").first.get_attribute("src").startswith("data:image/jpeg")  # type: ignore[union-attr]
+
+
+def test_a_sweep_is_explored_from_the_server(browser: Browser, sweep: Path) -> None:
+    with serving(sweep) as server, opened(browser, f"{server.address}runs/first/") as page:
+        explored(page)
+        assert page.locator(".card img").first.evaluate("image => image.complete && image.naturalWidth") == 16
+
+
+def test_the_arrow_keys_go_from_cell_to_cell(browser: Browser, sweep: Path) -> None:
+    with opened(browser, (sweep / "report.html").as_uri()) as page:
+        page.wait_for_selector("[data-cell]")
+        page.locator("[data-cell][tabindex='0']").focus()
+        page.keyboard.press("ArrowRight")
+        page.keyboard.press("ArrowUp")
+        assert page.evaluate("document.activeElement.dataset.cell") == "0,1,1"
+        page.keyboard.press("Enter")
+        assert page.evaluate("document.activeElement.getAttribute('aria-pressed')") == "true"
+
+
+def test_sweeps_stand_side_by_side(browser: Browser, sweep: Path, tmp_path: Path) -> None:
+    with serving(sweep, make_sweep(tmp_path / "second")) as server, opened(browser, server.address) as page:
+        page.get_by_label("compare first").check()
+        page.get_by_label("compare second").check()
+        page.get_by_role("button").click()
+        page.wait_for_selector("[data-cell]")
+        page.get_by_label("Side by side").select_option("run")
+        assert page.locator("figure.map figcaption").all_inner_texts()[0].startswith("run first")
+        assert "48 configurations" in page.locator("#explorer .status").inner_text()
+
+
+def test_a_sweep_that_goes_on_is_followed(browser: Browser, tmp_path: Path) -> None:
+    run = make_sweep(tmp_path / "going", ended=False)
+    with Store(run / "results.sqlite", read_only=True) as store:
+        last = list(store.rows())[-1]
+    with serving(run) as server, RunDirectory.resume(run) as held:
+        with opened(browser, f"{server.address}runs/going/") as page:
+            page.wait_for_selector("[data-cell]")
+            held.record(Row("sweep", 24, correct=False, margin=9.0, label="vase", values=last.values))
+            until(page, lambda: "vase" in page.locator(".gallery").inner_text())
+
+
+def test_an_attack_is_compared_and_played(browser: Browser, attack: Path) -> None:
+    with opened(browser, (attack / "report.html").as_uri()) as page:
+        slider = page.get_by_label("how much of the adversarial")
+        slider.fill("20")
+        assert page.locator(".stage").evaluate("stage => stage.style.getPropertyValue('--shown')") == "20%"
+        step = page.get_by_label("step of the search")
+        step.fill("0")
+        first = page.locator("#search img").get_attribute("src")
+        page.get_by_role("button", name="Play").click()
+        until(page, lambda: page.locator("#search .status").inner_text() == "the answer")
+        assert page.locator("#search img").get_attribute("src") != first
+
+
+@pytest.mark.parametrize("width", [390, 1440])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("which", ["sweep", "attack"])
+def test_everybody_can_use_the_pages(
+    browser: Browser, request: pytest.FixtureRequest, which: str, scheme: str, width: int
+) -> None:
+    """By axe-core's rules, without sideways scrolling of the page."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+    run: Path = request.getfixturevalue(which)
+    with opened(browser, (run / "report.html").as_uri(), width, color_scheme=scheme, bypass_csp=True) as page:
+        page.wait_for_selector("[data-cell]" if which == "sweep" else ".stage")
+        found = axe.Axe().run(page).response["violations"]
+        assert [
+            (one["id"], one["nodes"][0]["html"][:200]) for one in found if one["impact"] in ("serious", "critical")
+        ] == []
+        assert page.evaluate("document.scrollingElement.scrollWidth <= innerWidth")
+
+
+@pytest.mark.parametrize("which", ["sweep", "attack"])
+def test_without_a_script_there_are_still_pictures(
+    browser: Browser, request: pytest.FixtureRequest, which: str
+) -> None:
+    run: Path = request.getfixturevalue(which)
+    with opened(browser, (run / "report.html").as_uri(), java_script_enabled=False) as page:
+        assert not page.locator("#explorer, #compare, #search").filter(visible=True).count()
+        assert page.locator("h1").inner_text()
+        assert page.locator("details").first.inner_text()
+
+
+def test_intervals_are_those_of_clopper_and_pearson(browser: Browser, sweep: Path) -> None:
+    from advsearch.attacks import clopper_pearson
+
+    code = asset("sweep.js")
+    part = code[code.index("  const factorials") : code.index("  function colour")]
+    page = browser.new_page()
+    for right, count in (
+        (0, 1),
+        (1, 1),
+        (0, 20),
+        (17, 20),
+        (500, 1000),
+        (3, 100_000),
+        (99_990, 100_000),
+        (0, 1_000_000),
+    ):
+        mine = page.evaluate(f"(() => {{ {part}; return interval({right}, {count}); }})()")
+        assert mine == pytest.approx(clopper_pearson(right, count), abs=2e-7), (right, count)
