@@ -11,7 +11,6 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from advsearch.errors import InputError
 from advsearch.seeds import stream
@@ -21,6 +20,9 @@ SAMPLERS: tuple[str, ...] = get_args(Sampler)
 
 NET = 1 << 16
 """Points of one scrambled net."""
+
+MOST_DIMENSIONS = 21201
+"""Numbers of a Sobol point, at most: for so many Joe and Kuo give directions."""
 
 BLOCK_NUMBERS = 1 << 18
 """Numbers that are drawn at once, at most (unless one point has more)."""
@@ -47,9 +49,9 @@ class Draws:
     def __init__(self, dimensions: int, sampler: str, seed: int, name: str = "draws") -> None:
         if sampler not in SAMPLERS:
             raise InputError(f"sampler: expected one of {', '.join(SAMPLERS)}, got {sampler!r}")
-        if sampler == "sobol" and dimensions > qmc.Sobol.MAXDIM:
+        if sampler == "sobol" and dimensions > MOST_DIMENSIONS:
             raise InputError(
-                f"`sampler` sobol: expected at most {qmc.Sobol.MAXDIM} numbers to draw, got {dimensions}; use "
+                f"`sampler` sobol: expected at most {MOST_DIMENSIONS} numbers to draw, got {dimensions}; use "
                 "`sampler=random`"
             )
         self.dimensions = dimensions
@@ -82,6 +84,8 @@ class Draws:
         return np.random.default_rng(stream(self._seed, self._name, number)).random((self._rows, self.dimensions))
 
     def _sobol(self, number: int) -> Doubles:
+        from scipy.stats import qmc  # takes a quarter of a second, and few runs draw from nets
+
         net, within = divmod(number * self._rows, NET)
         if net != self._net or self._engine is None or within < self._drawn:
             seed = stream(self._seed, self._name, net)

@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import trimesh
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.color import linear_to_srgb
@@ -89,6 +88,8 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     Raises:
         FileFormatError: the file is damaged, not a mesh, refers to missing geometry, or has no faces.
     """
+    import trimesh  # takes half a second, and bundled objects do without
+
     references = References(path)
     header = gltf.read_header(path, data) if path.suffix.lower() in GLTF else None
     readable = checked(path, data) if header is None else gltf.rewritten(path, data, header)
@@ -119,6 +120,8 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
 
 def _parse(path: Path, data: bytes, references: References) -> list[tuple[Any, Array, int]]:
     """Run trimesh's parser; return what it found with transforms (4, 4) and nodes, always in the same order."""
+    import trimesh
+
     kind = path.suffix.lower().lstrip(".")
     options: dict[str, bool] = {"process": False}
     if kind == "ply":  # with fix_texture, vertices are shuffled and their normals are not

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
-from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from advsearch import files
 from advsearch.errors import FileFormatError
@@ -17,6 +16,9 @@ from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import shown
 from advsearch.scene.importing.images import LARGEST_PIXELS, TEXTURE_LIMIT, check_pixels, display_image
 from advsearch.scene.importing.references import Named, plain_name
+
+if TYPE_CHECKING:
+    from trimesh.visual.material import PBRMaterial
 
 Floats = npt.NDArray[np.float32]
 
@@ -84,6 +86,8 @@ class SurfaceReader:
         return self._known[id(material)]
 
     def _read(self, material: Any) -> ImportedSurface:
+        from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
         if isinstance(material, PBRMaterial):
             return self._gltf(material)
         if isinstance(material, SimpleMaterial):
