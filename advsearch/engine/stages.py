@@ -108,11 +108,12 @@ class Attack:
     def _measure(self) -> None:
         """Replace the first gradient plan by a measured one, as far as the preparation wants that."""
         problem, wanted = self.problem, self.preparation
-        renderer, full = problem.renderer, wanted.measure == "full"
+        full = wanted.measure == "full"
         if wanted.measure == "no" or not self.policy.uses_gradient:
             return
         if not full and reason_against(problem, self.budget.steps, wanted.specialise) is None:
             return  # derivatives will come from what predicts the pictures
+        renderer = problem.renderer
         u, seed = inside(renderer), seeds.stream(problem.seed, "measure")
         gradients = plan_gradients(renderer.plan, every=full)
         if gradients:
