@@ -23,7 +23,6 @@ from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import CONFIG, RunDirectory, check_free, is_run, run_path
 from advsearch.runs.listing import finished
-from advsearch.scene.description import NO_MAP
 from advsearch.scene.mitsuba_backend.samplers import next_count
 from advsearch.settings import split_names
 from advsearch.tasks import AnyTask, Task, make_task
@@ -203,17 +202,14 @@ def _places(config: SweepConfig) -> tuple[NamedScene, ...]:
     """Every object under every environment; each is loaded once."""
     given = scene_settings(config.set_, config.exposure)
     objects, environments = different(config.objects, "object"), different(config.environments, "environment")
-    firsts = {name: load_scene(name, environments[0], up=config.up, settings=given) for name in objects}
-    lights = {environments[0]: firsts[objects[0]].description.environment}
+    asked = environments[0] if config.environment else None
+    scenes = {name: load_scene(name, asked, up=config.up, settings=given) for name in objects}
+    if asked is None:
+        return tuple(NamedScene(name, scene.description.environment_name, scene) for name, scene in scenes.items())
+    lights = {asked: scenes[objects[0]].description.environment}
     for name in environments[1:]:
-        lights[name] = load_scene(firsts[objects[0]].description.object, name).description.environment
-    asked = {light: (lights[light] or NO_MAP) if config.environment else None for light in environments}
-
-    def lit(name: str, light: str) -> Scene:
-        first = firsts[name]
-        return first.under(load_scene(first.description.object, asked[light], settings=given))
-
-    return tuple(NamedScene(name, light, lit(name, light)) for name in objects for light in environments)
+        lights[name] = load_scene(scenes[objects[0]].description.object, name).description.environment
+    return tuple(NamedScene(name, light, scenes[name].lit_by(lights[light])) for name in objects for light in lights)
 
 
 def _models(models: Sequence[AnyModel], config: SweepConfig, task: Task) -> tuple[tuple[Model, ...], list[str]]:

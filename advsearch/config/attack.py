@@ -72,7 +72,10 @@ class AttackConfig(DerivativeConfig):
         ),
         Clash(
             "estimators",
-            lambda one: {name.partition(".")[0] for name in one.estimators} & {*map(instance, one.over)},
+            lambda one: (
+                {name.partition(".")[0] for name in one.estimators}
+                & {part for name in map(instance, one.over) for part in (name, name.rpartition(":")[2])}
+            ),
             "names a control that varies by chance, whose derivative nobody asks for; leave it out",
         ),
         Clash(
@@ -228,6 +231,6 @@ class AttackConfig(DerivativeConfig):
 
 
 def instance(asked: str) -> str:
-    """The name of a control's instance as it is asked for: `key` of `light:key`, `camera` of `camera.azimuth`."""
-    kind, _, own = asked.partition(":")
-    return (own or kind).partition(".")[0]
+    """A control as it is asked for, without its parameter: `light:key`, or `camera` of `camera.azimuth`."""
+    kind, colon, own = asked.partition(":")
+    return kind.partition(".")[0] + colon + own.partition(".")[0]

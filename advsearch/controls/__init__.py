@@ -5,6 +5,7 @@ A package outside adds its own (docs/controls/writing.md).
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from typing import Any
@@ -15,7 +16,7 @@ from advsearch.controls.numbers import NumberControl
 from advsearch.controls.space import Space
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.registry import Registry
-from advsearch.scene.description import ENVIRONMENT, SceneDescription
+from advsearch.scene.description import ENVIRONMENT, OBJECT, SceneDescription
 
 OWN = {
     "pose": "PoseControl",
@@ -51,8 +52,9 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
     """Return a control from its name and settings.
 
     Args:
-        asked: "kind"; "kind:name" for an instance with a name of its own (light:key); or "kind.parameter" to search
-            one parameter only, over its default range. With "kind" among the settings, this is the instance's name.
+        asked: "kind"; "kind:mesh" for what is about one mesh, and that another than the object (pose:chair); else
+            "kind:name" for an instance with a name of its own (light:key); or "kind.parameter" to search one parameter
+            only, over its default range. With "kind" among the settings, this is the instance's name.
             A kind is a word, or "package.module:Class" where the class has a capital and the module is no control.
         settings: values for its parameters and choices; None or missing keeps the default.
 
@@ -91,9 +93,31 @@ def _read_name(asked: str, given: dict[str, object]) -> tuple[str, str, str | No
         return str(said), asked, None
     if CONTROLS.names_class(asked):
         return asked, CONTROLS[asked].kind, None
-    if colon and not name.isidentifier():
-        raise InputError(f"`controls` {asked}: expected a name of letters, digits and _ after the colon, got {name!r}")
-    return kind, name or kind, parameter if dot else None
+    check_instance(f"`controls` {asked}", name, colon)
+    return kind, instance_of(kind, name), parameter if dot else None
+
+
+def instance_of(kind: str, name: str) -> str:
+    """Return what an instance is called: "key" of ``light:key``, but "pose:chair" where the name is that of a mesh.
+
+    Args:
+        kind: word for the control.
+        name: what stands behind the colon; empty if there is none.
+    """
+    of_a_mesh = kind in CONTROLS and CONTROLS[kind].of_a_mesh
+    if not name or (of_a_mesh and name == OBJECT):
+        return kind
+    return f"{kind}:{name}" if of_a_mesh else name
+
+
+def check_instance(where: str, name: str, colon: str = ":") -> None:
+    """Refuse what can't stand behind the colon of `KIND:NAME`.
+
+    Raises:
+        InputError: it has other characters than letters, digits, dashes and underscores, or is empty.
+    """
+    if colon and not re.fullmatch(r"[\w-]+", name):
+        raise InputError(f"{where}: expected a name of letters, digits, - and _ after the colon, got {name!r}")
 
 
 def _default_range(control: type[Control], parameter: str) -> object:
@@ -111,16 +135,17 @@ def gathered(asked: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, o
     `camera.azimuth` and `camera.elevation` become one control that searches both.
 
     Args:
-        asked: settings by name; a name may be "kind", "kind:name" or "kind.parameter".
+        asked: settings by name; a name may be "kind", "kind:name", "kind.parameter" or "kind:name.parameter".
     """
     found: dict[str, dict[str, object]] = {}
     for name, given in asked.items():
-        kind, dot, rest = name.partition(".")
+        head, dot, rest = name.partition(".")
+        kind = head.partition(":")[0]
         if not dot or kind not in CONTROLS:
             found.setdefault(name, {}).update(given or {})
             continue
         parameter, colon, instance = rest.partition(":")
-        into = found.setdefault(kind + colon + instance, {})
+        into = found.setdefault(head + colon + instance, {})
         into.update({parameter: _default_range(CONTROLS[kind], parameter), **(given or {})})
     return found
 
@@ -157,16 +182,35 @@ def compose(controls: Sequence[Control], scene: SceneDescription) -> Space:
             f"light:key,light:fill"
         )
     described, moved = scene, list[Moved]()
+    check_about(controls, scene)
     for control in controls:
         prepared = control.prepare(scene)
         moved += check_prepared(control.name, scene, prepared)
         scene = prepared
+    for control in controls:
+        if control.mesh != OBJECT:
+            control.mesh_in(scene)
     bound = tuple(control.bind(scene) for control in controls)
     moved += [one for control in bound for one in control.moved]
     lit_by = [str(one.used) for one in moved if one.parameter == ENVIRONMENT]
     lit_by += [scene.environment_spec] if scene.environment_spec != described.environment_spec else []
     ordered = tuple(sorted(moved, key=lambda one: names.index(one.control)))
     return Space(bound, scene, ordered, lit_by[0] if lit_by else None)
+
+
+def check_about(controls: Sequence[Control], scene: SceneDescription) -> None:
+    """Refuse the name of a mesh for a control that is not about one mesh or only about the object.
+
+    Raises:
+        InputError: one has it.
+    """
+    for control in controls:
+        if control.name != control.kind and control.name in scene.around:
+            able = ", ".join(kind for kind in CONTROLS if CONTROLS[kind].of_a_mesh)
+            raise InputError(
+                f"`controls` {control.kind}:{control.name}: {control.kind} can't be given to another mesh than the "
+                f"object; {able} can, as in pose:{control.name}"
+            )
 
 
 def _suggestion(control: Control) -> str:

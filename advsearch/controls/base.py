@@ -24,11 +24,12 @@ from advsearch.controls.clean import Moved
 from advsearch.controls.values import is_number, is_whole
 from advsearch.described import Value as Value
 from advsearch.errors import InputError, UnknownNameError
-from advsearch.scene.description import SceneDescription
+from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.gradients.group import WHOLE_RANGE as WHOLE_RANGE
 from advsearch.scene.gradients.group import Budget as Budget
 from advsearch.scene.gradients.group import Group as Group
 from advsearch.scene.parameters import Parameter as Parameter
+from advsearch.scene.parts import MeshPart
 
 NOTHING: Mapping[str, Tensor] = MappingProxyType({})
 """No scene inputs yet."""
@@ -142,6 +143,7 @@ class Control(ABC):
         summary: one sentence.
         parameters: what may vary.
         choices: what may be chosen.
+        of_a_mesh: it is about one mesh, and may be about another than the object: the name of that is then `KIND:MESH`.
         name: the instance's name; `kind` unless said otherwise.
     """
 
@@ -149,12 +151,29 @@ class Control(ABC):
     summary: ClassVar[str]
     parameters: ClassVar[tuple[Parameter, ...]]
     choices: ClassVar[tuple[Choice, ...]]
+    of_a_mesh: ClassVar[bool] = False
     name: str
 
-    @classmethod
-    def setting(cls, parameter: Parameter) -> str:
+    @property
+    def mesh(self) -> str:
+        """Name of the mesh that it is about: the one behind the colon of its name, or else the object."""
+        return (self.name.partition(":")[2] if self.of_a_mesh else "") or OBJECT
+
+    def mesh_in(self, scene: SceneDescription) -> MeshPart:
+        """Return that mesh in a scene.
+
+        Raises:
+            UnknownNameError: there is none of that name.
+        """
+        if self.mesh not in scene.meshes:
+            raise UnknownNameError(
+                "mesh of the scene", self.mesh, scene.meshes, f"It stands in `controls` {self.name}."
+            )
+        return scene.meshes[self.mesh]
+
+    def setting(self, parameter: Parameter) -> str:
         """Return the name of the scene's setting that says the same as a parameter, whether or not there is one."""
-        return f"{cls.kind}.{parameter.name}"
+        return f"{self.kind if self.mesh == OBJECT else self.name}.{parameter.name}"
 
     def settings(self) -> dict[str, object]:
         """Return what `make_control` needs to make an equal instance, as JSON values."""

@@ -70,8 +70,7 @@ class CameraControl(NumberControl):
             return SENSOR_WIDTH / 2.0 / math.tan(math.radians(scene.number("camera.fov")) / 2.0)
         return super().default(scene, parameter)
 
-    @classmethod
-    def setting(cls, parameter: Parameter) -> str:
+    def setting(self, parameter: Parameter) -> str:
         return "camera.fov" if parameter.name == "focal_length" else super().setting(parameter)
 
     def search_range(self, scene: SceneDescription, parameter: Parameter) -> tuple[float, float] | None:

@@ -102,8 +102,7 @@ class EnvironmentControl(NumberControl):
         by_name = OWN_MAP not in self._allowed() and scene.bundled_environment in self._allowed()
         return str(scene.bundled_environment) if by_name else OWN_MAP
 
-    @classmethod
-    def setting(cls, parameter: Parameter) -> str:
+    def setting(self, parameter: Parameter) -> str:
         return ENVIRONMENT if parameter.name == "which" else super().setting(parameter)
 
     def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:

@@ -1,6 +1,8 @@
-"""The `pose` control: where the object stands, how it is turned, and how large it is.
+"""The `pose` control: where the object or another mesh stands, how it is turned, and how large it is.
 
     world = scale * exp([rotation]) Rz(yaw) Ry(pitch) Rx(roll) (v - middle), then put on the ground and shifted
+
+A mesh around the object is put back on the height at which it stood, and shifted from where it stood.
 
 The three angles are those of the scene's settings. `rotation` is a rotation vector on top of them (axis times angle):
 angles alone lock at a pitch of 90 degrees, where yaw and roll turn about one axis, while the vector is well conditioned
@@ -11,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import ClassVar
 
 import torch
@@ -20,7 +23,8 @@ from advsearch.controls.base import Choice, Parameter
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
-from advsearch.scene.geometry import affine
+from advsearch.scene.geometry import affine, standing
+from advsearch.scene.parts import MeshPart
 from advsearch.scene.settings import GEOMETRIC, POSE
 
 
@@ -28,6 +32,7 @@ class PoseControl(NumberControl):
     """Where the object stands, how it is turned, and how large it is."""
 
     kind: ClassVar[str] = "pose"
+    of_a_mesh: ClassVar[bool] = True
     summary: ClassVar[str] = "Where the object stands, how it is turned, and how large it is."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         *POSE[:3],
@@ -54,17 +59,31 @@ class PoseControl(NumberControl):
             raise InputError(f"{self.name}.on_ground: expected yes or no, got {given!r}")
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        vertices = torch.from_numpy(scene.object.mesh.vertices)
+        base, vertices, floor = _standing(self.mesh_in(scene), scene.around.get(self.mesh))
         middle = (vertices.amin(dim=0) + vertices.amax(dim=0)) / 2.0
         turned = rotation_vector(values["rotation"]) @ euler(values["yaw"], values["pitch"], values["roll"])
         linear = values["scale"] * turned
         if self.chosen["on_ground"] in ("yes", True):
             lowest = ((vertices - middle) @ linear[2]).amin()
         else:
-            lowest = -middle[2]
-        shift = torch.stack([values["x"], values["y"], values["z"] - lowest])
+            lowest = floor - middle[2]
+        shift = torch.stack([values["x"], values["y"], floor + values["z"] - lowest])
         translation = shift - linear @ middle + torch.cat([middle[:2], torch.zeros(1)])
-        return {"object.to_world": affine(linear, translation)}
+        return {f"{self.mesh}.to_world": affine(linear, translation) @ base}
+
+
+@lru_cache(maxsize=16)
+def _standing(mesh: MeshPart, placed: MeshPart | None) -> tuple[Tensor, Tensor, float]:
+    """Where a mesh stands before it is posed: from its own coordinates (4, 4), its vertices (V, 3) there, their floor.
+
+    Args:
+        mesh: as the settings have it.
+        placed: as it came, of a mesh around the object; the object's own coordinates are those of the scene.
+    """
+    if placed is None:
+        return torch.eye(4), torch.from_numpy(mesh.mesh.vertices), 0.0
+    places = standing(placed)
+    return torch.from_numpy(placed.to_world).float(), torch.from_numpy(places).float(), float(places[:, 2].min())
 
 
 def euler(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:

@@ -127,12 +127,19 @@ class Space:
     def artifacts(self, u: Tensor) -> dict[str, Tensor]:
         """Return the pictures worth keeping of a configuration, by file stem."""
         parts = self._among_others(u).items()
-        return {name: image for control, arguments in parts for name, image in control.artifacts(*arguments).items()}
+        named = (control.artifacts(*arguments) for control, arguments in parts)
+        return {file_name(name): image for one in named for name, image in one.items()}
 
     def files(self, u: Tensor) -> dict[str, bytes]:
         """Return the other files worth keeping of a configuration, by name."""
         parts = self._among_others(u).items()
-        return {name: data for control, arguments in parts for name, data in control.files(*arguments).items()}
+        named = (control.files(*arguments) for control, arguments in parts)
+        return {file_name(name): data for one in named for name, data in one.items()}
+
+
+def file_name(name: str) -> str:
+    """Return a control's name as it stands in names of files: texture@chair of texture:chair."""
+    return name.replace(":", "@")
 
 
 def _with_inputs(control: BoundControl, u: Tensor, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -33,7 +33,6 @@ from torch import Tensor
 
 from advsearch.controls.base import NOTHING, BoundControl, Budget, Choice, Control, Group, Parameter, Value
 from advsearch.controls.values import LARGEST_EPSILON
-from advsearch.errors import UnknownNameError
 from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
@@ -45,7 +44,6 @@ DEFAULT_EPSILON = 0.1
 """Default radius of the L-infinity ball; the default L2 ball has the same root-mean-square change at its edge."""
 NORMS = ("linf", "l2")
 FORMS = ("texels", "palette", "waves")
-OBJECT = "object"
 LARGEST_WAVES = 64
 LARGEST_PALETTE = 64
 LLOYD_STEPS = 30
@@ -65,7 +63,6 @@ class TextureControl(Control):
         form: "texels" (each on its own), "palette" (a few colours) or "waves" (smooth).
         colors: number of colours of the palette, 1 to 64.
         waves: number of waves along each side of the texture, 1 to 64.
-        part: which mesh of the scene: "object", or the name of a part such as an occluder.
         texels: stands for form "texels" when `texture.texels` is asked for; its range cannot be set.
         palette: likewise.
         amplitudes: likewise, for form "waves".
@@ -78,13 +75,13 @@ class TextureControl(Control):
     form: str | None = None
     colors: int = 6
     waves: int = 8
-    part: str = OBJECT
     texels: object = None
     palette: object = None
     amplitudes: object = None
     name: str = "texture"
 
     kind: ClassVar[str] = "texture"
+    of_a_mesh: ClassVar[bool] = True
     summary: ClassVar[str] = "The base-colour map of the object or another mesh, inside a ball around the original."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
@@ -146,7 +143,6 @@ class TextureControl(Control):
         Choice("form", "texels", "What is searched: texels, palette (a few colours) or waves (smooth patterns)."),
         Choice("colors", 6, "Number of colours of the palette.", whole=(1, LARGEST_PALETTE)),
         Choice("waves", 8, "Number of waves along each side of the texture.", whole=(1, LARGEST_WAVES)),
-        Choice("part", OBJECT, "Which mesh of the scene: object, or the name of an instance that put one there."),
     )
 
     def __post_init__(self) -> None:
@@ -156,22 +152,11 @@ class TextureControl(Control):
         object.__setattr__(self, "form", self.chosen_form(FORMS, self.form))
 
     def bind(self, scene: SceneDescription) -> BoundControl:
-        mesh, base_color = self._target(scene)
-        own = torch.from_numpy(base_color.copy())
+        mesh = self.mesh_in(scene)
+        own = torch.from_numpy(mesh.base_color.copy())
         side = self.resolution or min(max(max(own.shape[:2]), RESOLUTIONS[0]), RESOLUTIONS[1])
         original = resampled(own, int(side))
-        return BoundTexture(self.name, self.part, original, self._painter(mesh, original))
-
-    def _target(self, scene: SceneDescription) -> tuple[Mesh, Floats]:
-        """The mesh to paint and its base colour (h, w, 3) sRGB.
-
-        Raises:
-            UnknownNameError: the scene has no such mesh.
-        """
-        if self.part not in scene.meshes:
-            raise UnknownNameError(f"{self.name}.part", str(self.part), scene.meshes)
-        mesh = scene.meshes[self.part]
-        return mesh.mesh, mesh.base_color
+        return BoundTexture(self.name, self.mesh, original, self._painter(mesh.mesh, original))
 
     def _painter(self, mesh: Mesh, original: Tensor) -> Painter:
         if self.form == "palette":
@@ -268,7 +253,7 @@ class BoundTexture(BoundControl):
 
     Args:
         name: the instance's name.
-        part: name of the mesh.
+        on: name of the mesh.
         original: (h, w, 3) float32 display-referred sRGB in [0, 1].
         painter: maps u to texels.
     """

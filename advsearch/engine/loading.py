@@ -12,7 +12,7 @@ from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
-from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.description import ENVIRONMENT, NO_MAP, SceneDescription, check_meshes, describe
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients.motion import Motion
 from advsearch.scene.leaving_out import EVERYTHING
@@ -66,13 +66,12 @@ class Scene:
         space = make_space(as_controls(controls), description)
         return make_renderer(description, space, resolution, denoise, seed, estimators, sampler=sampler)
 
-    def under(self, other: Scene) -> Scene:
-        """Return another scene of the same object with what stands around it here."""
+    def lit_by(self, environment: EnvironmentAsset | None) -> Scene:
+        """Return the scene under another environment that was asked for; None for no map."""
+        name = NO_MAP if environment is None else environment.name
         own = self.description
-        if not own.parts:
-            return other
-        values = {**other.description.values, "ground.size": own.values["ground.size"]}
-        return Scene(replace(other.description, parts=own.parts, cameras=own.cameras, values=values))
+        given = own.given | {ENVIRONMENT}
+        return Scene(replace(own, environment=environment, environment_spec=name, given=given))
 
     def __repr__(self) -> str:
         described = self.description
@@ -88,6 +87,7 @@ class Scene:
         """
         settings.resolve(given)
         own = self.description
+        check_meshes(own, given)
         return Scene(replace(own, values={**own.values, **given}, given=own.given | set(given)))
 
 

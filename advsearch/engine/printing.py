@@ -13,6 +13,7 @@ from scipy import ndimage
 from advsearch.config import AttackConfig
 from advsearch.controls.base import Control
 from advsearch.controls.patch.control import enlarged
+from advsearch.controls.space import file_name
 from advsearch.engine.loading import as_controls, load_scene
 from advsearch.errors import FileFormatError, InputError
 from advsearch.report.sheets import Mask, Piece
@@ -59,13 +60,13 @@ def printable(run: str | Path, size: float) -> list[Piece]:
     scene = load_scene(config.object, NO_MAP, up=config.up)
     pieces: list[Piece] = []
     for control in as_controls(config.controls):
-        picture = folder / ARTIFACTS / f"{control.name}.png"
+        picture = folder / ARTIFACTS / f"{file_name(control.name)}.png"
         if control.kind == "patch":
             pixels = read_png(folder / ARTIFACTS / f"{control.name}-pixels.png")
             given = config.controls.get(control.name, {}).get("size")
             pieces.append(_patch(control.name, pixels, size * _side(control, summary, given)))
         elif control.kind == "texture" and picture.is_file():
-            mesh = scene.description.meshes[str(getattr(control, "part", "object"))].mesh
+            mesh = control.mesh_in(scene.description).mesh
             extent = float(np.ptp(scene.description.object.mesh.vertices, axis=0).max())
             pieces.extend(_charts(control.name, read_png(picture), mesh, size / extent))
     if not pieces:

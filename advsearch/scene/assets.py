@@ -5,6 +5,7 @@ This module imports numpy only, so that the scripts in `scenes/` and the importe
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -52,6 +53,11 @@ class Material:
     metallic: float = 0.0
     specular: float = 0.5
     clearcoat: float = 0.0
+
+    def with_values(self, values: Mapping[str, float | None], prefix: str) -> Material:
+        """Return the material with the settings over it whose names are `prefix` and the attribute's."""
+        given = {name: value for name in vars(self) if (value := values.get(prefix + name)) is not None}
+        return replace(self, **given)
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ in degrees. The camera at azimuth 0 and elevation 0 looks from +x towards the ob
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,8 @@ class SceneDescription:
     Attributes:
         object: the thing to recognise.
         environment: the map that lights it; None where only lamps do.
-        values: every setting of `advsearch.scene.settings` by name; None where the scene works the value out.
+        values: every setting of `advsearch.scene.settings` by name; None where the scene works the value out. Those of
+            meshes around the object, `pose:chair.yaw`, only where they were given.
         object_spec: how the object was asked for: a bundled name, a path, or an asset's own name.
         environment_spec: how the environment was asked for, likewise.
         up: the up axis that was given for a mesh file, or None.
@@ -96,14 +98,19 @@ class SceneDescription:
             raise UnknownNameError("camera of the scene", camera, (ORBIT_CAMERA, *self.cameras))
         return replace(self, camera=camera)
 
-    @property
+    @cached_property
     def meshes(self) -> Mapping[str, MeshPart]:
-        """Every mesh by name; the one under test is `OBJECT`, in its base pose."""
-        from advsearch.scene.geometry import object_to_world
+        """Every mesh by name, as the settings have it; the one under test is `OBJECT`."""
+        from advsearch.scene.geometry import moved_part, object_to_world
 
         own = self.object
         under_test = MeshPart(OBJECT, own.mesh, object_to_world(self), own.base_color, self.material)
-        return {OBJECT: under_test, **{one.name: one for one in self.parts if isinstance(one, MeshPart)}}
+        return {OBJECT: under_test, **{name: moved_part(one, self.values) for name, one in self.around.items()}}
+
+    @property
+    def around(self) -> Mapping[str, MeshPart]:
+        """The meshes around the object by name, as they came."""
+        return {one.name: one for one in self.parts if isinstance(one, MeshPart)}
 
     @property
     def lamps(self) -> Mapping[str, PointLamp | BallLamp]:
@@ -166,10 +173,7 @@ class SceneDescription:
     @property
     def material(self) -> Material:
         """The object's material with the `material.*` settings over it."""
-        own = self.object.material
-        names = ("roughness", "metallic", "specular", "clearcoat")
-        given = {name: self.values.get(f"material.{name}") for name in names}
-        return Material(**{name: getattr(own, name) if value is None else value for name, value in given.items()})
+        return self.object.material.with_values(self.values, "material.")
 
     @property
     def gain(self) -> float:
@@ -207,7 +211,7 @@ def describe(
     if node is not None and "ground.size" not in (given or {}):
         values = {**values, "ground.size": 0.0}
     asked = () if environment_spec is None else (ENVIRONMENT,)
-    return SceneDescription(
+    described = SceneDescription(
         around.object,
         _environment(lit_by),
         values,
@@ -218,6 +222,20 @@ def describe(
         parts=around.surroundings,
         cameras=around.cameras,
     )
+    check_meshes(described, values)
+    return described
+
+
+def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
+    """Check that a scene has the meshes whose settings are named.
+
+    Raises:
+        UnknownNameError: it has not.
+    """
+    for name in names:
+        mesh = settings.mesh_of(name)
+        if mesh is not None and mesh not in scene.around:
+            raise UnknownNameError("mesh around the object", mesh, scene.around, f"It stands in `set` {name}.")
 
 
 def _scene(path: Path, node: str, up: str | None) -> ImportedScene:

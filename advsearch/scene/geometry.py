@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -10,6 +12,8 @@ import torch
 
 from advsearch.scene.description import ORBIT_CAMERA, SceneDescription
 from advsearch.scene.framing import camera_axes, framing_distance, middle
+from advsearch.scene.parts import MeshPart
+from advsearch.scene.settings import POSE
 
 Doubles = npt.NDArray[np.float64]
 
@@ -34,14 +38,44 @@ def object_to_world(description: SceneDescription) -> Doubles:
 
     "On the ground" means that the lowest vertex is at z = 0 before `pose.z` is added, whatever the rotation.
     """
-    number = description.number
     vertices = description.object.mesh.vertices.astype(np.float64)
-    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
-    linear = number("pose.scale") * rotation(number("pose.yaw"), number("pose.pitch"), number("pose.roll"))
-    lowest = float(((vertices - middle) @ linear.T)[:, 2].min())
+    return _posed(vertices, 0.0, {one.name: description.number(f"pose.{one.name}") for one in POSE})
+
+
+def moved_part(part: MeshPart, values: Mapping[str, float | None]) -> MeshPart:
+    """Return a mesh around the object as the settings have it: posed about its own middle, where it stands.
+
+    Args:
+        part: as it came.
+        values: every setting of the scene; those of the mesh are `pose:NAME.yaw` and so on.
+    """
+    pose = {one.name: value for one in POSE if (value := values.get(f"pose:{part.name}.{one.name}")) is not None}
+    if pose:
+        places = standing(part)
+        pose = {**{one.name: float(one.default) for one in POSE}, **pose}
+        part = replace(part, to_world=_posed(places, float(places[:, 2].min()), pose) @ part.to_world)
+    return replace(part, material=part.material.with_values(values, f"material:{part.name}."))
+
+
+def standing(part: MeshPart) -> Doubles:
+    """Return where the vertices (V, 3) of a mesh are in its base pose."""
+    return np.asarray(part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T + part.to_world[:3, 3])
+
+
+def _posed(places: Doubles, floor: float, pose: Mapping[str, float]) -> Doubles:
+    """Scale and rotate about the middle of the bounding box, put the lowest vertex at `floor`, shift.
+
+    Args:
+        places: (V, 3) before.
+        floor: where the lowest vertex comes to be before `z` is added.
+        pose: parameters of `settings.POSE` by name.
+    """
+    middle = (places.min(axis=0) + places.max(axis=0)) / 2.0
+    linear = pose["scale"] * rotation(pose["yaw"], pose["pitch"], pose["roll"])
+    lowest = float(((places - middle) @ linear.T)[:, 2].min())
     matrix = np.eye(4)
     matrix[:3, :3] = linear
-    matrix[:3, 3] = np.array([number("pose.x"), number("pose.y"), number("pose.z") - lowest]) - linear @ middle
+    matrix[:3, 3] = np.array([pose["x"], pose["y"], floor + pose["z"] - lowest]) - linear @ middle
     matrix[:2, 3] += middle[:2]
     return matrix
 

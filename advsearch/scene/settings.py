@@ -160,12 +160,31 @@ SETTINGS: Mapping[str, Parameter] = {
 """Every setting by `family.parameter`; of no other control's parameters."""
 
 
+OF_A_MESH = ("pose", "material")
+"""Families that a scene has once more for each mesh around the object: ``pose:chair.yaw``."""
+
 Given = Mapping[str, float | str | Sequence[float]]
 """Settings as they are asked for, by name; `resolve` refuses what is no number."""
 
 
+def parameter_of(name: str) -> Parameter | None:
+    """Return the parameter that a setting's name means, also of a mesh around the object; None if there is none."""
+    family, _, rest = name.partition(":")
+    if rest and family in OF_A_MESH:
+        name = f"{family}.{rest.rpartition('.')[2]}"
+    return SETTINGS.get(name)
+
+
+def mesh_of(name: str) -> str | None:
+    """Return the mesh around the object whose setting it is: ``chair`` of ``pose:chair.yaw``; None for the scene's."""
+    mesh, dot, _ = name.partition(":")[2].rpartition(".")
+    return mesh if dot else None
+
+
 def resolve(given: Given) -> dict[str, float | None]:
     """Return every setting's value: what was given, checked, over the defaults; None where the scene works it out.
+
+    Settings of meshes around the object are there where they were given.
 
     Raises:
         UnknownNameError: a name is not a setting.
@@ -176,9 +195,9 @@ def resolve(given: Given) -> dict[str, float | None]:
 
 
 def _checked(name: str, value: object) -> float:
-    if name not in SETTINGS:
+    setting = parameter_of(name)
+    if setting is None:
         raise UnknownNameError("scene parameter", name, SETTINGS, "Write it as `set` NAME=VALUE.")
-    setting = SETTINGS[name]
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(f"`set` {name}: expected a number in {setting.unit}, got {value!r}")
     number = float(value)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -139,9 +140,14 @@ def _pictures(data: RunData) -> Html:
 
 
 def _textures(data: RunData) -> Html:
-    original = _figure(data, "artifacts/texture-original.png", "Original", "texture as it was")
-    changed = _figure(data, "artifacts/texture.png", "Adversarial", "texture that was found; artifacts/texture.png")
-    return _section("The texture", [original, changed], "pair")
+    """The texture of the object, and of every other mesh (`texture@NAME.png`), before and after."""
+    before = [name for name in data.pictures if re.fullmatch(r"artifacts/texture(@[\w-]+)?-original\.png", name)]
+    figures = []
+    for original in before:
+        changed = original.removesuffix("-original.png") + ".png"
+        figures.append(_figure(data, original, "Original", "texture as it was"))
+        figures.append(_figure(data, changed, "Adversarial", f"texture that was found; {changed}"))
+    return _section("The textures" if len(before) > 1 else "The texture", figures, "pair")
 
 
 def _rates(summary: AttackSummary) -> Html:

@@ -10,13 +10,15 @@ import pytest
 import torch
 
 import advsearch
-from advsearch.controls.material.control import BASE_COLOR, NUMBERS, MaterialControl
+from advsearch.controls.material.control import NUMBERS, MaterialControl
 from advsearch.controls.material.patterns import PATTERNS, SIDE, covering, tile
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription, describe
 from advsearch.scene.settings import CHANNELS
 from advsearch.scene.surface_map import texel_positions
+
+BASE_COLOR = "object.base_color"
 
 AGREEMENT = 0.15
 """Relative difference allowed between a 64-sample adjoint and a 64-sample difference of a smooth weight."""

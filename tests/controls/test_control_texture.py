@@ -141,19 +141,19 @@ def part(scene: SceneDescription) -> MeshPart:
 
 def test_another_mesh_of_the_scene_can_be_painted(scene: SceneDescription) -> None:
     both = scene.with_part(part(scene))
-    bound = TextureControl(part="post", name="second", resolution=16).bind(both)
+    bound = TextureControl(name="texture:post", resolution=16).bind(both)
     (found,) = bound.inputs(bound.start).items()
     assert found[0] == "post.base_color"
     torch.testing.assert_close(found[1], srgb_to_linear(torch.full((16, 16, 3), 0.25)))
-    space = make_space([TextureControl(), TextureControl(part="post", name="second")], both)
+    space = make_space([TextureControl(), TextureControl(name="texture:post")], both)
     assert set(space.inputs(space.start)) == {"object.base_color", "post.base_color"}
-    with pytest.raises(UnknownNameError, match=r"unknown texture.part 'pots'. Did you mean 'post'"):
-        TextureControl(part="pots").bind(both)
+    with pytest.raises(UnknownNameError, match=r"unknown mesh of the scene 'pots'. Did you mean 'post'"):
+        TextureControl(name="texture:pots").bind(both)
 
 
 def test_settings_make_the_same_control_again() -> None:
-    control = TextureControl(form="waves", waves=5, part="post", name="second")
-    again = make_control("second", control.settings())
+    control = TextureControl(form="waves", waves=5, name="texture:post")
+    again = make_control("texture:post", control.settings())
     assert again == control
     assert make_control("texture.palette") == TextureControl(form="palette", palette=[0.0, 1.0])
     assert TextureControl(palette=[0.0, 1.0]).form == "palette"

@@ -50,9 +50,9 @@ def test_controls_declare_settings_that_a_run_has() -> None:
     ("asked", "name"),
     [
         ("texture", "texture"),
-        ("texture:label", "label"),
+        ("texture:label", "texture:label"),
         ("texture.palette", "texture"),
-        ("texture.texels:label", "label"),
+        ("texture.texels:label", "texture:label"),
     ],
 )
 def test_a_control_takes_the_settings_of_the_run_whatever_its_name(asked: str, name: str) -> None:
@@ -73,8 +73,8 @@ def test_what_a_control_says_itself_goes_over_the_run() -> None:
 
 
 def test_an_epsilon_for_one_control_leaves_the_others_their_own() -> None:
-    found = settings("texture,geometry,texture:label", epsilon="geometry=0.02,label=0.3")
-    assert (found["texture"]["epsilon"], found["geometry"]["epsilon"], found["label"]["epsilon"]) == (None, 0.02, 0.3)
+    found = settings("texture,geometry,texture:label", epsilon="geometry=0.02,texture:label=0.3")
+    assert [one["epsilon"] for one in found.values()] == [None, 0.02, 0.3]
 
 
 @pytest.mark.parametrize(("norm", "expected"), [(None, "linf"), ("linf", "linf"), ("l2", "l2")])

@@ -173,11 +173,19 @@ def test_wrong_numbers_of_lights_and_cameras_are_damage(file: Path, data: bytes)
 
 
 def test_an_attack_on_a_node_is_verified_and_goes_on_from_its_file(file: Path, tmp_path: Path) -> None:
-    small = ["--resolution", "16", "--spp", "1", "--steps", "2", "--trials", "6", "--label", "book", "--json"]
-    run = tmp_path / "run"
-    assert main(["attack", "--object", f"{file}#crate", "--control", "pose,texture", *small, "--run", str(run)]) == 0
-    assert json.loads((run / "summary.json").read_text())["object"] == f"{file}#crate"
-    assert main(["sweep", "--object", f"{file}#crate", "--grid", "pose.yaw=0,90", *small[:4], "--label", "book"]) == 0
+    small = ["--resolution", "16", "--spp", "1", "--steps", "2", "--trials", "6", "--label", "ball", "--json"]
+    run, fixed = tmp_path / "run", ["--set", "pose:the-wall.z=0.5", "--set", "material:the-wall.roughness=0.3"]
+    assert main(["attack", "--object", f"{file}#crate", "--control", "pose,pose:the-wall,texture:floor", *small, *fixed,
+                 "--run", str(run)]) == 0  # fmt: skip
+    summary = json.loads((run / "summary.json").read_text())
+    assert summary["object"] == f"{file}#crate"
+    assert {"pose.yaw", "pose:the-wall.yaw", "texture:floor.linf"} <= set(summary["configuration"])
+    assert (run / "artifacts" / "texture@floor.png").is_file()
+    assert "artifacts/texture@floor.png" in (run / "report.html").read_text()
+    assert (
+        main(["sweep", "--object", f"{file}#crate", "--grid", "pose:floor.yaw=0,90", *small[:4], "--label", "ball"])
+        == 0
+    )
 
 
 def test_import_says_what_was_understood(file: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -25,7 +25,6 @@ from advsearch.scene.assembly import MovingMesh
 from advsearch.scene.assets import Mesh
 from advsearch.scene.description import SceneDescription
 
-OFFSETS = "object.offsets"
 FORMS = ("modes", "large-steps")
 DEFAULT_EPSILON = 0.03
 LARGEST_EPSILON = 0.5
@@ -58,6 +57,7 @@ class GeometryControl(Control):
     name: str = "geometry"
 
     kind: ClassVar[str] = "geometry"
+    of_a_mesh: ClassVar[bool] = True
     summary: ClassVar[str] = "A smooth change of the object's shape, at most so far."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
@@ -103,9 +103,9 @@ class GeometryControl(Control):
         object.__setattr__(self, "form", self.chosen_form(FORMS, self.form))
 
     def bind(self, scene: SceneDescription) -> BoundControl:
-        mesh = scene.object.mesh
+        mesh = self.mesh_in(scene).mesh
         shaper: Shaper = Moded(mesh, int(self.modes)) if self.form == "modes" else Pushed(mesh)
-        return BoundGeometry(self.name, mesh, shaper, float(self.epsilon))
+        return BoundGeometry(self.name, self.mesh, mesh, shaper, float(self.epsilon))
 
 
 class Shaper(ABC):
@@ -147,17 +147,19 @@ class Pushed(Shaper):
 
 
 class BoundGeometry(BoundControl):
-    """The shape of one object.
+    """The shape of one mesh.
 
     Args:
         name: the instance's name.
-        mesh: the object's.
+        on: name of the mesh.
+        mesh: its geometry.
         shaper: maps u to a field of displacements.
         epsilon: largest displacement, in the mesh's units.
     """
 
-    def __init__(self, name: str, mesh: Mesh, shaper: Shaper, epsilon: float) -> None:
+    def __init__(self, name: str, on: str, mesh: Mesh, shaper: Shaper, epsilon: float) -> None:
         self.name = name
+        self._offsets = f"{on}.offsets"
         self._mesh, self._shaper = mesh, shaper
         solid = body(mesh)
         self._index = torch.from_numpy(solid.index)
@@ -166,7 +168,7 @@ class BoundGeometry(BoundControl):
         self.start = torch.full((shaper.group.size,), 0.5)
 
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
-        return {OFFSETS: self.offsets(u).index_select(0, self._index).float()}
+        return {self._offsets: self.offsets(u).index_select(0, self._index).float()}
 
     def offsets(self, u: Tensor) -> Tensor:
         """Displacement of each place, (P, 3) float64."""
@@ -183,7 +185,7 @@ class BoundGeometry(BoundControl):
 
     def files(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, bytes]:
         moving = MovingMesh(self._mesh, np.eye(4))
-        vertices, normals = moving.place(None, self.inputs(u.detach())[OFFSETS])
+        vertices, normals = moving.place(None, self.inputs(u.detach())[self._offsets])
         return {f"{self.name}.obj": obj_bytes(vertices, normals, self._mesh)}
 
 

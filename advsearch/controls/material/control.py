@@ -27,7 +27,6 @@ from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.settings import CHANNELS, MATERIAL, colors
 
-BASE_COLOR = "object.base_color"
 OWN = "own"
 NUMBERS = tuple(one.name for one in MATERIAL)
 RENDERED = {"metallic": (0.0, 0.999), "specular": (0.02, 1.0), "clearcoat": (1e-4, 1.0)}
@@ -42,6 +41,7 @@ class MaterialControl(NumberControl):
     """The object's gloss, metal, coat and tint, and which named material covers it."""
 
     kind: ClassVar[str] = "material"
+    of_a_mesh: ClassVar[bool] = True
     summary: ClassVar[str] = "The object's gloss, metal, coat and tint, and which named material covers it."
     parameters: ClassVar[tuple[Parameter, ...]] = (
         Parameter(
@@ -68,7 +68,7 @@ class MaterialControl(NumberControl):
         return scene.number(self.setting(parameter)) if given else self.default(scene, parameter)
 
     def refines(self, scene: SceneDescription) -> frozenset[str]:
-        return frozenset({BASE_COLOR}) if self._colours() else frozenset()
+        return frozenset({self._base_color}) if self._colours() else frozenset()
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         which = (OWN, *PATTERNS)[int(values["which"])]
@@ -76,20 +76,24 @@ class MaterialControl(NumberControl):
         inputs: dict[str, Tensor] = {}
         for name in NUMBERS:
             if self._varies(name):
-                inputs[f"object.{name}"] = _rendered(name, values[name]).reshape(1)
+                inputs[f"{self.mesh}.{name}"] = _rendered(name, values[name]).reshape(1)
             elif self._names_a_material():
-                inputs[f"object.{name}"] = torch.tensor([float(getattr(own, name))])
+                inputs[f"{self.mesh}.{name}"] = torch.tensor([float(getattr(own, name))])
         if self._colours():
             tint = torch.stack([values[name] for name in CHANNELS])
-            inputs[BASE_COLOR] = srgb_to_linear(tint) * self._reflectance(scene, which, so_far)
+            inputs[self._base_color] = srgb_to_linear(tint) * self._reflectance(scene, which, so_far)
         return inputs
 
     def kept_pictures(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         if not self._colours():
             return {}
-        return {self.name: linear_to_srgb(self.scene_inputs(scene, values, so_far)[BASE_COLOR])}
+        return {self.name: linear_to_srgb(self.scene_inputs(scene, values, so_far)[self._base_color])}
 
     # ---- inside -----------------------------------------------------------------------------------------------------
+
+    @property
+    def _base_color(self) -> str:
+        return f"{self.mesh}.base_color"
 
     def _varies(self, name: str) -> bool:
         """Whether a parameter was set or is searched; otherwise it is the named material's own."""
@@ -113,17 +117,16 @@ class MaterialControl(NumberControl):
     def _colours(self) -> bool:
         return self._names_a_material() or any(self._varies(name) for name in CHANNELS)
 
-    @staticmethod
-    def _own(scene: SceneDescription, which: str) -> Material:
-        return scene.material if which == OWN else PATTERNS[which].material
+    def _own(self, scene: SceneDescription, which: str) -> Material:
+        return self.mesh_in(scene).material if which == OWN else PATTERNS[which].material
 
-    @staticmethod
-    def _reflectance(scene: SceneDescription, which: str, so_far: Mapping[str, Tensor]) -> Tensor:
+    def _reflectance(self, scene: SceneDescription, which: str, so_far: Mapping[str, Tensor]) -> Tensor:
         """Linear reflectance (h, w, 3) before the tint: what the controls before made of the texture, or a pattern."""
         if which == OWN:
-            before = so_far.get(BASE_COLOR)
-            return srgb_to_linear(torch.from_numpy(scene.object.base_color.copy())) if before is None else before
-        return _linear_covering(scene.object.mesh, which)
+            before = so_far.get(self._base_color)
+            own = self.mesh_in(scene).base_color
+            return srgb_to_linear(torch.from_numpy(own.copy())) if before is None else before
+        return _linear_covering(self.mesh_in(scene).mesh, which)
 
 
 def _rendered(name: str, value: Tensor) -> Tensor:

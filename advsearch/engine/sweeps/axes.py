@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from advsearch.controls import CONTROLS, Control, NumberControl, Parameter
+from advsearch.controls import CONTROLS, Control, NumberControl, Parameter, check_instance, instance_of
 from advsearch.controls.values import Number, OneOf, read
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.description import SceneDescription
@@ -90,7 +90,7 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
     head, dot, rest = name.partition(".")
     parameter_name, colon, late = rest.partition(":")
     kind, early_colon, early = head.partition(":")
-    instance = late or early or kind
+    instance = head if head in instances else instance_of(kind, late or early)
     if head in _OUTER and not dot:
         raise InputError(f"`grid` {name}: several of them are given as a list: {_OUTER[head]}")
     control: Any = type(instances[instance]) if instance in instances else CONTROLS.get(kind)
@@ -102,8 +102,7 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
         raise InputError(
             f"`grid` {name}: expected CONTROL.PARAMETER, got no parameter; choose one of {', '.join(known)}"
         )
-    if (colon or early_colon) and not instance.isidentifier():
-        raise InputError(f"`grid` {name}: expected a name of letters, digits and _ after the colon, got {instance!r}")
+    check_instance(f"`grid` {name}", late or early, colon or early_colon)
     if parameter_name not in known:
         raise UnknownNameError(f"parameter of control {control.kind}", parameter_name, known, f"In `grid` {name}.")
     parameter = control.parameters[known.index(parameter_name)]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
-from advsearch.controls import CONTROLS, Control, Space, make_space
+from advsearch.controls import Control, Space, make_control, make_space
 from advsearch.described import Value
 from advsearch.engine.answers import Looked, check_truth, facts_of
 from advsearch.engine.domains import domain_of
@@ -140,8 +140,9 @@ def check_scenes(places: Sequence[NamedScene], controls: Sequence[Control], axes
         InputError: a parameter is fixed and in the grid, or several environments meet a control that chooses one.
     """
     given = {name for place in places for name in place.scene.description.given}
-    kinds = {control.name: type(control) for control in controls}
-    settings = {axis: (kinds.get(axis.instance) or CONTROLS[axis.control]).setting(axis.parameter) for axis in axes}
+    drawn = {control.name: control for control in controls}
+    varied = {axis: drawn.get(axis.instance) or make_control(axis.instance, {"kind": axis.control}) for axis in axes}
+    settings = {axis: control.setting(axis.parameter) for axis, control in varied.items()}
     for axis, setting in settings.items():
         if setting in given and setting != ENVIRONMENT:
             raise InputError(f"`grid` {axis.name}: `set` fixes it already; leave it out of one of the two")

@@ -86,7 +86,7 @@ class MitsubaScene:
         self.volumetric = any(part.volumetric for part in description.parts)
         plugins = scene_dict(description, resolution, filter, sampler)
         translated = [mesh_translation(description.meshes[OBJECT], None if "lobes" in leave_out else IDLE_LOBES)]
-        translated += [translation(part) for part in description.parts]
+        translated += [translation(description.meshes.get(part.name, part)) for part in description.parts]
         self._path: Plugin = {"type": integrator}
         for one in translated:
             plugins |= one.plugins

@@ -1,0 +1,146 @@
+"""Controls of other meshes than the object: `pose:post` moves the post as `pose` moves the object."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from advsearch.config import AttackConfig
+from advsearch.controls import CONTROLS, Space, gathered, make_control, make_space
+from advsearch.engine.loading import Controls, Scene
+from advsearch.engine.sweeps.axes import read_axes
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.assembly import Assembly
+from advsearch.scene.assets import Material, Mesh
+from advsearch.scene.description import SceneDescription, describe
+from advsearch.scene.parts import MeshPart
+
+HEIGHT = 0.5
+"""The post stands on something of this height."""
+
+
+@pytest.fixture(scope="module")
+def scene() -> SceneDescription:
+    """The mug with a post of 0.2 x 0.4 x 0.6 beside it, its middle at (2, -1)."""
+    x, y, z = np.meshgrid([0.0, 0.2], [0.0, 0.4], [0.0, 0.6], indexing="ij")
+    corners = np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32)
+    faces = np.array([[0, 1, 2], [1, 2, 3], [4, 5, 6], [5, 6, 7]], dtype=np.uint32)
+    upwards = np.tile(np.array([0.0, 0.0, 1.0], dtype=np.float32), (8, 1))
+    mesh = Mesh(corners, faces, upwards, np.zeros((8, 2), dtype=np.float32))
+    place = np.eye(4)
+    place[:3, 3] = 1.9, -1.2, HEIGHT
+    color = np.full((4, 4, 3), 0.25, dtype=np.float32)
+    return describe("mug").with_part(MeshPart("post", mesh, place, color, Material(roughness=0.7)))
+
+
+def places(scene: SceneDescription, space: Space | None = None) -> np.ndarray:
+    """Where the post's vertices are: in the clean scene, or at the start of a space."""
+    if space is not None:
+        vertices = Assembly(space.scene or scene)(space.inputs(space.start))["post.vertices"]
+        return np.asarray(vertices.double().numpy())
+    part = scene.meshes["post"]
+    return np.asarray(part.mesh.vertices @ part.to_world[:3, :3].T + part.to_world[:3, 3])
+
+
+def test_at_its_start_the_mesh_stands_where_it_stood(scene: SceneDescription) -> None:
+    space = make_space([make_control("pose:post")], scene)
+    np.testing.assert_allclose(places(scene, space), places(scene), atol=1e-6)
+    assert set(space.inputs(space.start)) == {"post.to_world"}
+
+
+def test_it_turns_about_its_own_middle_and_stays_on_what_it_stands_on(scene: SceneDescription) -> None:
+    turned = places(scene, make_space([make_control("pose:post", {"yaw": [90.0, 91.0]})], scene))
+    np.testing.assert_allclose(turned.min(axis=0), [1.8, -1.1, HEIGHT], atol=1e-5)
+    np.testing.assert_allclose(turned.max(axis=0), [2.2, -0.9, HEIGHT + 0.6], atol=1e-5)
+    lying = places(scene, make_space([make_control("pose:post", {"roll": [90.0, 91.0]})], scene))
+    np.testing.assert_allclose(lying.min(axis=0)[2], HEIGHT, atol=1e-5)
+    assert np.ptp(lying, axis=0) == pytest.approx([0.2, 0.6, 0.4], abs=1e-5)
+    held = places(scene, make_space([make_control("pose:post", {"roll": [90.0, 91.0], "on_ground": "no"})], scene))
+    assert (held.min(axis=0)[2] + held.max(axis=0)[2]) / 2.0 == pytest.approx(HEIGHT + 0.3, abs=1e-5)
+
+
+def test_a_setting_and_a_control_mean_the_same(scene: SceneDescription) -> None:
+    given = {"pose:post.yaw": 30.0, "pose:post.pitch": -10.0, "pose:post.x": 0.5, "pose:post.z": 0.1}
+    fixed = Scene(scene).with_settings({**given, "pose:post.scale": 2.0}).description
+    control = make_control("pose:post", {"yaw": 30.0, "pitch": -10.0, "x": 0.5, "z": 0.1, "scale": [2.0, 3.0]})
+    np.testing.assert_allclose(places(scene, make_space([control], scene)), places(fixed), atol=1e-5)
+    again = make_space([make_control("pose:post", {"yaw": [0.0, 90.0]})], fixed)
+    np.testing.assert_allclose(places(fixed, again), places(fixed), atol=1e-5)
+    with pytest.raises(InputError, match=r"`set` pose:post.yaw=30 and `controls` pose:post contradict each other"):
+        make_space([make_control("pose:post", {"yaw": [90, 100]})], fixed)
+
+
+def test_coordinates_have_the_names_of_their_mesh(scene: SceneDescription) -> None:
+    settings: dict[str, dict[str, object]] = {"pose": {}, "pose:post.yaw": {}, "material:post": {"roughness": [0, 1]}}
+    space = make_space([make_control(name, given) for name, given in gathered(settings).items()], scene)
+    named = space.describe(space.start)
+    assert {"pose.yaw", "pose:post.yaw", "material:post.roughness"} <= set(named)
+    assert named["material:post.roughness"]["value"] == pytest.approx(0.7)
+    assert {group.name for group in space.groups} >= {"pose.yaw", "pose:post.yaw", "material:post.roughness"}
+
+
+def test_every_such_control_reaches_its_mesh_alone(scene: SceneDescription) -> None:
+    able = [kind for kind in CONTROLS if CONTROLS[kind].of_a_mesh]
+    assert set(able) == {"pose", "texture", "material", "geometry"}
+    for kind in ("pose", "texture", "material"):
+        space = make_space([make_control(f"{kind}:post")], scene)
+        assert {name.partition(".")[0] for name in space.inputs(space.start)} == {"post"}, kind
+        assert space.controls[0].name == f"{kind}:post"
+    mug = describe("mug")
+    twin = mug.with_part(MeshPart("twin", mug.object.mesh, np.eye(4), mug.object.base_color))
+    space = make_space([make_control("geometry:twin", {"modes": 4})], twin)
+    assert set(space.inputs(space.start)) == {"twin.offsets"}
+    assert list(space.files(space.start)) == ["geometry@twin.obj"]  # a name that every file system takes
+
+
+def test_the_object_is_a_mesh_too() -> None:
+    assert make_control("pose:object").name == "pose"
+
+
+def test_names_that_are_none_are_refused(scene: SceneDescription) -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown mesh of the scene 'pots'. Did you mean 'post'"):
+        make_space([make_control("pose:pots")], scene)
+    with pytest.raises(UnknownNameError, match=r"unknown mesh around the object 'pots'.*`set` pose:pots.yaw"):
+        Scene(scene).with_settings({"pose:pots.yaw": 3.0})
+    with pytest.raises(UnknownNameError, match=r"unknown scene parameter 'pose:post.yaww'"):
+        Scene(scene).with_settings({"pose:post.yaww": 3.0})
+    with pytest.raises(UnknownNameError, match=r"unknown mesh around the object 'post'"):
+        describe("mug", given={"pose:post.yaw": 3.0})
+    for kind in ("patch", "light", "camera"):
+        with pytest.raises(InputError, match=rf"`controls` {kind}:post: {kind} can't be given to another mesh"):
+            make_space([make_control(f"{kind}:post")], scene)
+    with pytest.raises(InputError, match=r"expected a name of letters, digits, - and _ after the colon, got 'a b'"):
+        make_control("pose:a b")
+
+
+def test_a_grid_over_the_pose_of_another_mesh(scene: SceneDescription) -> None:
+    (axis,) = read_axes({"pose:post.yaw": "0:360:4"}, [])
+    assert (axis.name, axis.instance, axis.values) == ("pose:post.yaw", "pose:post", (0.0, 90.0, 180.0, 270.0))
+
+
+def test_what_varies_by_chance_may_be_another_mesh() -> None:
+    config = AttackConfig(object="mug", controls="pose", over="pose:post", estimators={"pose.yaw": "differences"})
+    assert config.over == {"pose:post": {}}
+    AttackConfig(object="mug", controls="material:post", over="pose:post", estimators={"material:post": "adjoint"})
+    with pytest.raises(InputError, match="names a control that is searched already"):
+        AttackConfig(object="mug", controls="pose:post.yaw", over="pose:post")
+    with pytest.raises(InputError, match="names a control that varies by chance"):
+        AttackConfig(object="mug", controls="pose", over="pose:post", estimators={"pose:post.yaw": "secant"})
+
+
+def test_a_moved_mesh_is_seen_and_differentiated(scene: SceneDescription) -> None:
+    beside = Scene(scene).with_settings({"pose:post.x": -1.6, "pose:post.y": 1.6, "pose:post.z": -0.3})
+    controls: Controls = {"pose:post": {"yaw": [0, 90]}, "material:post": {"red": [0.1, 1.0]}}
+    renderer = beside.renderer(controls, resolution=24, denoise="none")
+    u = renderer.start.clone().requires_grad_()
+    picture = renderer(u, seed=0, spp=4)
+    (slope,) = torch.autograd.grad(picture.square().sum(), u)
+    assert torch.isfinite(slope).all() and (slope != 0.0).all()
+    assert not torch.equal(picture, renderer(torch.tensor([0.5, 1.0]), seed=0, spp=4))
+
+
+def test_settings_make_the_same_controls_again() -> None:
+    for kind in ("pose", "texture", "material", "geometry"):
+        control = make_control(f"{kind}:post")
+        assert make_control(control.name, control.settings()).name == f"{kind}:post"
