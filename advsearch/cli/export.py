@@ -18,6 +18,7 @@ HELP = "write a run's evaluated configurations as a table (CSV, JSON or Parquet)
 _EXAMPLES = """examples:
   advsearch export mug-texture-001
   advsearch export runs/mug-texture-001 --kind search --out search.parquet
+  advsearch export mug-sweep-001 --format 3db --out folder
   advsearch export mug-patch-001 --format print --size 95 --out sheets.pdf
 """
 
@@ -33,7 +34,7 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         allow_abbrev=False,
     )
     parser.add_argument("run", metavar="RUN", help="a run's name or folder")
-    parser.add_argument("--format", help="csv, json, parquet or print (default: by the name of --out, or csv)")
+    parser.add_argument("--format", help="csv, json, parquet, 3db or print (default: by the name of --out, or csv)")
     parser.add_argument("--out", metavar="FILE", help="the file to write (default: standard output)")
     parser.add_argument(
         "--json", action="store_true", help="the same as --format json; with --out, tell what was written"
@@ -56,6 +57,8 @@ def run(args: argparse.Namespace) -> int:
     for name in ("size", "paper", "icc"):
         if getattr(args, name) is not None:
             raise InputError(f"--{name}: belongs to --format print; leave it out")
+    if args.format == "3db":
+        return _threedb(args, out)
     by_name = "" if out is None else out.suffix.removeprefix(".").lower()
     otherwise = by_name if by_name in FORMATS else "json" if args.json and out is None else "csv"
     format = args.format or otherwise
@@ -76,6 +79,27 @@ def run(args: argparse.Namespace) -> int:
         output.print_json({"schema": 1, "command": "export", "rows": count, "format": format, "out": str(out)})
     elif out is not None:
         print(f"{count} rows in {out}", file=sys.stderr)
+    return 0
+
+
+def _threedb(args: argparse.Namespace, out: Path | None) -> int:
+    """Write a folder as 3DB does."""
+    from advsearch.runs.directory import find_run
+    from advsearch.runs.store import NAME, Store
+    from advsearch.runs.threedb import write_threedb
+    from advsearch.viewer.thumbnails import kept_pictures
+
+    if out is None:
+        raise InputError("--out: 3db writes a folder; give its name")
+    folder = find_run(args.run)
+    kept = kept_pictures(folder)
+    with Store(folder / NAME, read_only=True) as store:
+        picture = kept.png_of if kept else lambda _: None
+        count = write_threedb(lambda: store.rows(args.kind or "sweep"), out, picture)
+    if args.json:
+        output.print_json({"schema": 1, "command": "export", "rows": count, "format": "3db", "out": str(out)})
+    else:
+        print(f"{count} rows in {out}; look at them with: python -m threedboard {out}", file=sys.stderr)
     return 0
 
 

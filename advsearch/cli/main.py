@@ -41,6 +41,7 @@ COMMANDS = {
     "stability": "advsearch.cli.stability",
     "precision": "advsearch.cli.precision",
     "import": "advsearch.cli.import_command",
+    "import-3db": "advsearch.cli.import_3db",
     "list": "advsearch.cli.list",
     "labels": "advsearch.cli.labels",
     "show": "advsearch.cli.show",

@@ -76,6 +76,18 @@ class Kept:
     some: bool
     suffix: str = "jpg"
 
+    def png_of(self, step: int) -> bytes | None:
+        """Return the picture of a configuration as a PNG; None where it was not kept."""
+        from PIL import Image
+
+        file = path_of(self.run, step // self.models)
+        if not file.is_file():
+            return None
+        stream = io.BytesIO()
+        with Image.open(file) as image:
+            image.save(stream, "PNG")
+        return stream.getvalue()
+
     def embedded(self, columns: Columns, most: int) -> Iterator[tuple[str, str]]:
         """Yield number and data address of thumbnails, of the worst margins first, up to `most` bytes."""
         order = np.argsort(-np.nan_to_num(columns.margin, nan=-np.inf), kind="stable")
@@ -99,6 +111,6 @@ def kept_pictures(run: Path) -> Kept | None:
     if not files:
         return None
     numbers = sorted(int(file.stem) for file in files)
-    settings = read_yaml(run / CONFIG)
-    models = len(split_names(str(settings.get("model"))))
+    settings = read_yaml(run / CONFIG) if (run / CONFIG).is_file() else {}
+    models = len(split_names(str(settings.get("model", "one"))))
     return Kept(run, tuple(numbers), models, settings.get("keep_pictures") != "all")

@@ -1,0 +1,38 @@
+"""`advsearch import-3db`: a folder that 3DB wrote, as a run to look at."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from advsearch.cli import output
+
+HELP = "read a folder that 3DB wrote into a run"
+
+
+def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
+    """Add the command."""
+    parser = subparsers.add_parser(
+        "import-3db",
+        help=HELP,
+        description="Read details.log, class_maps.json and images/ of 3DB into a run: rows, small pictures, a page.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("folder", metavar="FOLDER", help="what 3DB wrote")
+    parser.add_argument("--run", help="name or folder of the run (default: runs/FOLDER-3db-NNN)")
+    parser.add_argument("--overwrite", action="store_true", help="replace the run that is there")
+    output.add_flags(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the run and say where it is."""
+    from advsearch.engine.sweeps.imported import import_threedb
+    from advsearch.runs.summary import read_result
+
+    path = import_threedb(Path(args.folder), args.run, overwrite=args.overwrite)
+    if args.json:
+        output.print_json(read_result(path).to_dict())
+    else:
+        print(f"{path}: {read_result(path).brief}; {path / 'report.html'} shows it")
+    return 0

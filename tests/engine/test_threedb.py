@@ -1,0 +1,130 @@
+"""Folders of 3DB: written so that its dashboard reads them, and read into a run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from stored_sweeps import make_sweep
+
+from advsearch.cli.main import main
+from advsearch.engine.sweeps.imported import import_threedb
+from advsearch.errors import FileFormatError, InputError
+from advsearch.runs.store import NAME, Row, Store
+from advsearch.runs.threedb import write_threedb
+from advsearch.viewer.thumbnails import kept_pictures
+
+
+def lines_of(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "details.log").read_text().splitlines()]
+
+
+def rows_of(run: Path) -> list[Row]:
+    with Store(run / NAME, read_only=True) as store:
+        return list(store.rows("sweep"))
+
+
+def write(folder: Path, *lines: Any, classes: Any = ("cup", "mug")) -> Path:
+    """A folder of 3DB with these lines."""
+    folder.mkdir()
+    (folder / "class_maps.json").write_text(json.dumps(classes))
+    (folder / "details.log").write_text(
+        "".join((one if isinstance(one, str) else json.dumps(one)) + "\n" for one in lines)
+    )
+    return folder
+
+
+LINE = {
+    "id": "a-1", "environment": "park.blend", "model": "mug.blend", "is_correct": "True", "loss": 0.25,
+    "prediction": [1, 0], "output_type": "classes", "render_args": {"OrientationControl.rotation_x": 0.5, "on": True},
+}  # fmt: skip
+
+
+def test_a_sweep_is_written_as_its_dashboard_reads_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = make_sweep(tmp_path / "run", keep="wrong")
+    out = tmp_path / "out"
+    assert main(["export", str(run), "--format", "3db", "--out", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rows"] == 24
+    lines, classes = lines_of(out), json.loads((out / "class_maps.json").read_text())
+    assert len({tuple(line) for line in lines}) == 1, "every line has the same keys in the same order"
+    assert len({tuple(line["render_args"]) for line in lines}) == 1
+    for line, row in zip(lines, rows_of(run), strict=True):
+        assert line["is_correct"] == str(row.correct)
+        assert classes[line["prediction"][0]] == row.label
+        assert line["render_args"]["pose.yaw"] == row.values["pose.yaw"]["value"]
+        assert (out / "images" / f"{line['id']}_rgb.png").is_file() == (not row.correct)
+    assert main(["export", str(run), "--format", "3db", "--out", str(out)]) == 2
+    assert "not empty" in capsys.readouterr().err
+
+
+def test_what_is_written_is_read_again(tmp_path: Path) -> None:
+    run = make_sweep(tmp_path / "run", keep="all")
+    main(["export", str(run), "--format", "3db", "--out", str(tmp_path / "out")])
+    again = import_threedb(tmp_path / "out", tmp_path / "again")
+    for before, after in zip(rows_of(run), rows_of(again), strict=True):
+        assert (before.correct, before.label, before.margin) == (after.correct, after.label, after.margin)
+        assert after.values["pose.yaw"]["value"] == before.values["pose.yaw"]["value"]
+        assert after.values["environment"] == before.values["environment"]
+    kept = kept_pictures(again)
+    assert kept is not None
+    assert kept.numbers == tuple(range(24))
+    assert "Right in 18 of 24" in (again / "report.html").read_text().replace("&nbsp;", " ")
+
+
+def test_a_folder_of_3db_becomes_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write(tmp_path / "in", LINE, {**LINE, "id": "b", "is_correct": "False", "prediction": [0, 1]})
+    assert main(["import-3db", str(folder), "--run", str(tmp_path / "run"), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert (summary["configurations"], summary["correct"], summary["answers"]) == (2, 1, {"cup": 1})
+    first, second = rows_of(tmp_path / "run")
+    assert (first.label, first.correct, second.label, second.correct) == ("mug", True, "cup", False)
+    assert first.values["OrientationControl.rotation_x"]["value"] == 0.5
+    assert first.values["on"]["value"] == "True"
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("no json", "line 1"),
+        ("[1, 2]", "render_args"),
+        ({"id": 1}, "render_args"),
+        ("[" * 5000, "nested"),
+        ('{"render_args": {}, "loss": ' + "1" * 100_000 + "}", "line 1"),
+    ],
+)
+def test_a_damaged_log_is_named(tmp_path: Path, line: Any, message: str) -> None:
+    with pytest.raises(FileFormatError, match=message):
+        import_threedb(write(tmp_path / "in", line), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_id_leads_nowhere_else(tmp_path: Path) -> None:
+    secret = tmp_path / "secret_rgb.png"
+    secret.write_bytes(b"no picture")
+    run = import_threedb(write(tmp_path / "in", {**LINE, "id": "../../secret"}), tmp_path / "run")
+    assert kept_pictures(run) is None
+
+
+def test_a_large_picture_is_refused(tmp_path: Path) -> None:
+    from PIL import Image
+
+    folder = write(tmp_path / "in", LINE)
+    (folder / "images").mkdir()
+    Image.new("1", (20_000, 20_000)).save(folder / "images" / "a-1_rgb.png")
+    with pytest.raises(FileFormatError, match="pixels"):
+        import_threedb(folder, tmp_path / "run")
+
+
+def test_a_missing_or_empty_log_is_named(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    with pytest.raises(FileFormatError, match=r"details\.log"):
+        import_threedb(tmp_path / "in", tmp_path / "run")
+    with pytest.raises(FileFormatError, match="empty"):
+        import_threedb(write(tmp_path / "none"), tmp_path / "run")
+
+
+def test_a_run_without_rows_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="rows of a sweep"):
+        write_threedb(list[Row], tmp_path / "out", lambda _: None)
