@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from advsearch.api.region import region as region
     from advsearch.api.render import Rendering as Rendering
     from advsearch.api.render import render as render
+    from advsearch.api.replay import replay as replay
     from advsearch.api.stability import stability as stability
     from advsearch.api.sweep import sweep as sweep
     from advsearch.engine.loading import Scene as Scene
@@ -47,6 +48,7 @@ _HOMES = {
     "precision": "advsearch.api.precision",
     "region": "advsearch.api.region",
     "render": "advsearch.api.render",
+    "replay": "advsearch.api.replay",
     "stability": "advsearch.api.stability",
     "sweep": "advsearch.api.sweep",
 }

@@ -32,6 +32,7 @@ from advsearch.runs.results.base import END, Fields, Result
 from advsearch.runs.results.gap import CurveResult, GapResult
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.region import RegionResult
+from advsearch.runs.results.replay import ReplayResult
 from advsearch.runs.results.stability import CaseRow
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.scene.settings import SETTINGS
@@ -425,6 +426,7 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("sweeps.md", "sweep-fields"): result_fields(SweepSummary),
     ("questions.md", "curve-fields"): result_fields(CurveResult),
     ("questions.md", "matrix-fields"): result_fields(MatrixResult),
+    ("questions.md", "replay-fields"): result_fields(ReplayResult),
     ("questions.md", "gap-fields"): result_fields(GapResult),
     ("questions.md", "region-fields"): result_fields(RegionResult),
     ("stability.md", "case-fields"): result_fields(CaseRow),

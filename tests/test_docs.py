@@ -45,9 +45,11 @@ from advsearch.config import (
     CONFIGS,
     TRIALS,
     TRIALS_OVER,
+    WAYS,
     AttackConfig,
     RegionConfig,
     RenderConfig,
+    ReplayConfig,
     SceneConfig,
     StabilityConfig,
     SweepConfig,
@@ -370,6 +372,9 @@ def check_names(config: Config) -> None:
     """Look up every name in a configuration, as its command would; nothing is loaded."""
     if isinstance(config, StabilityConfig):
         chosen(config.cases, config.groups)
+        return
+    if isinstance(config, ReplayConfig):
+        assert set(config.chosen) <= set(WAYS)
         return
     assert isinstance(config, SceneConfig)
     over = getattr(config, "over", {})

@@ -120,6 +120,15 @@ class RegionKeywords(PictureKeywords, NamedKeywords, total=False):
     verify_spp: int | None
 
 
+class ReplayKeywords(RunKeywords, total=False):
+    """Of `replay`."""
+
+    ways: Names | None
+    model: Names | None
+    trials: int
+    threads: int | None
+
+
 class PlanKeywords(DerivativeKeywords, NamedKeywords, total=False):
     """Of `plan`."""
 

@@ -31,6 +31,7 @@ COMMANDS = {
     "run": "advsearch.cli.run",
     "gap": "advsearch.cli.gap",
     "region": "advsearch.cli.region",
+    "replay": "advsearch.cli.replay",
     "resume": "advsearch.cli.resume",
     "runs": "advsearch.cli.runs",
     "dashboard": "advsearch.cli.dashboard",

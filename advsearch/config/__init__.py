@@ -13,6 +13,7 @@ from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.precision import QUANTITIES, SAMPLERS, PrecisionConfig
 from advsearch.config.questions import FEWEST_SAMPLES, GapConfig, RegionConfig
 from advsearch.config.rendering import RenderConfig
+from advsearch.config.replaying import WAYS, ReplayConfig
 from advsearch.config.scene import AUTO_SHARE, CLOSE_LOOKS, SEARCH_SPP, SceneConfig
 from advsearch.config.sweep import SweepConfig
 from advsearch.settings import Config
@@ -25,6 +26,7 @@ CONFIGS: dict[str, type[Config]] = {
         SweepConfig,
         GapConfig,
         RegionConfig,
+        ReplayConfig,
         PlanConfig,
         CheckConfig,
         StabilityConfig,
@@ -44,6 +46,7 @@ __all__ = [
     "SEARCH_SPP",
     "TRIALS",
     "TRIALS_OVER",
+    "WAYS",
     "AttackConfig",
     "CheckConfig",
     "DerivativeConfig",
@@ -52,6 +55,7 @@ __all__ = [
     "PrecisionConfig",
     "RegionConfig",
     "RenderConfig",
+    "ReplayConfig",
     "SceneConfig",
     "StabilityConfig",
     "SweepConfig",

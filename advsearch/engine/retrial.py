@@ -63,6 +63,7 @@ class Retrials:
         self._recorders = {one.name: Recorder(run, one.problem, memory) for one in conditions}
         self._clean: dict[str, tuple[Judgement, ...]] = {}
         self._pictures: dict[tuple[Hashable, int, int], Tensor] = {}
+        self._pictured = ""
 
     def clean(self, condition: Condition) -> tuple[Judgement, ...]:
         """Try the clean scene under one condition, once."""
@@ -96,10 +97,6 @@ class Retrials:
             rule=condition.problem.rule,
         )
 
-    def forget(self) -> None:
-        """Drop the pictures that are kept for other conditions of one source; call it before another configuration."""
-        self._pictures.clear()
-
     def _trial(self, kind: str, condition: Condition) -> Callable[[Tensor, int, int], Judgement]:
         """Trials of one configuration, one after the other."""
         problem, rows, count = condition.problem, f"{kind} under {condition.name}", 0
@@ -109,7 +106,7 @@ class Retrials:
             number, count = count, count + 1
             judged = self._stored(rows, number)
             if judged is None:
-                picture = condition.change(self._picture(condition, u, seed), seed)
+                picture = condition.change(self._picture(kind, condition, u, seed), seed)
                 judged = problem.judge(to_8_bit(picture), problem.whole(u, seed))
             self._recorders[condition.name].trial(rows, number, spp, judged, seed, u)
             self._progress.advance(1)
@@ -117,7 +114,11 @@ class Retrials:
 
         return trial
 
-    def _picture(self, condition: Condition, u: Tensor, seed: int) -> Tensor:
+    def _picture(self, kind: str, condition: Condition, u: Tensor, seed: int) -> Tensor:
+        """The picture of a trial; those of the configuration that is tried now are kept for other conditions."""
+        if kind != self._pictured:
+            self._pictures.clear()
+            self._pictured = kind
         key = condition.source, seed, condition.spp
         if key not in self._pictures:
             self._pictures[key] = condition.problem.picture(u, seed, condition.spp)

@@ -59,7 +59,6 @@ class Transfer:
         return [_cell(name, one) for name, one in checked.items()]
 
     def _begin(self, title: str) -> None:
-        self._retrials.forget()
         self._progress.stage(title, self._each, hint=f"{self._each} answers; `trials` or `verify_spp` shorten it")
 
     def _control(self, one: Condition) -> MatrixModel:

@@ -18,6 +18,8 @@ from advsearch.scene.mitsuba_backend.samplers import SAMPLER, SAMPLERS
 
 DENOISERS = ("oidn", "none")
 FILTERS = ("box", "gaussian")
+DARK = 1e-6
+"""Keeps the slope of a power finite in black; half of one of 255 levels comes of it."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,9 @@ class ImageFormation:
         exposure: stops over the metered exposure; kept for the record, `gain` is what is applied.
         resolution: (height, width) in pixels.
         gain: factor from radiance to display-linear values.
-        transfer: "srgb"; or "linear", neither clipped nor encoded, for checks of derivatives: the mean of a noisy
+        transfer: "srgb"; "gamma", a power of 1/2.2 in its place; "reinhard", sRGB after x / (1 + x), which clips
+            nothing (Reinhard, Stark, Shirley and Ferwerda 2002, Photographic tone reproduction for digital images,
+            equation 3); or "linear", neither clipped nor encoded, for checks of derivatives: the mean of a noisy
             picture after a curve is not the curve of the mean.
     """
 
@@ -62,6 +66,11 @@ class ImageFormation:
         """Map linear radiance (..., 3) to display-referred sRGB in [0, 1]; differentiable, flat where clipped."""
         if self.transfer == "linear":
             return radiance * self.gain
+        if self.transfer == "gamma":
+            return (radiance * self.gain).clamp(DARK, 1.0) ** (1.0 / 2.2)
+        if self.transfer == "reinhard":
+            light = (radiance * self.gain).clamp_min(0.0)
+            return linear_to_srgb(light / (1.0 + light))
         return linear_to_srgb(radiance * self.gain)
 
 

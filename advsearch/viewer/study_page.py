@@ -7,10 +7,12 @@ from pathlib import Path
 
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
+from advsearch.report.replays import HEADS, replay_rows, replay_text
 from advsearch.report.transfer import matrix_heads, matrix_rows, matrix_text
 from advsearch.runs.directory import REPORT
 from advsearch.runs.files import write_text
 from advsearch.runs.results.matrix import MatrixResult
+from advsearch.runs.results.replay import ReplayResult
 from advsearch.viewer.document import document
 
 
@@ -47,6 +49,40 @@ def write_matrix_page(result: MatrixResult) -> Path:
     title = f"{', '.join(result.objects)}, {len(result.models)} models"
     header = heading(what, matrix_text(result), result.warnings)
     page = document(title, header, main, footer=f"run {run.name}. This page needs no other file.")
+    return write_text(run / REPORT, page, durable=False)
+
+
+def write_replay_page(result: ReplayResult) -> Path:
+    """Write `report.html` into the run of a replay, and return its path.
+
+    Raises:
+        StorageError: it could not be written.
+    """
+    run = Path(str(result.run))
+    what = f"answer of {Path(result.answer).name} ({result.answered}); {result.object}, {', '.join(result.controls)}"
+    note = (
+        "Trials with fresh seeds, the same under every condition, rounded to 8 bits, with 95 % Clopper-Pearson "
+        "intervals. A success is what the search sought, where the clean scene is right with the same seed under the "
+        "same condition."
+    )
+    facts = {
+        "Answer": result.answer,
+        "Model": result.model,
+        "Environment": result.environment,
+        "Renders": str(result.renders),
+        "Time": wording.seconds_text(result.seconds["total"]),
+        "Seed": str(result.seed),
+    }
+    main = element(
+        "main",
+        element("h2", "Under other conditions"),
+        table(HEADS, replay_rows(result)),
+        element("p", note, class_="soft"),
+        join(element("h2", "Cost and conditions"), facts_table(facts)),
+        again(result.command_line),
+    )
+    header = heading(what, replay_text(result), result.warnings)
+    page = document(f"{run.name}, replay", header, main, footer=f"run {run.name}. This page needs no other file.")
     return write_text(run / REPORT, page, durable=False)
 
 

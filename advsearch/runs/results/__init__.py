@@ -11,6 +11,7 @@ from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.plan import PlanResult
 from advsearch.runs.results.precision import PrecisionResult
 from advsearch.runs.results.region import RegionResult
+from advsearch.runs.results.replay import ReplayResult
 from advsearch.runs.results.stability import StabilityResult
 from advsearch.runs.results.sweep import SweepSummary
 
@@ -19,6 +20,7 @@ KEPT: tuple[type[Result], ...] = (
     SweepSummary,
     GapResult,
     RegionResult,
+    ReplayResult,
     CheckResult,
     PlanResult,
     PrecisionResult,
