@@ -20,7 +20,9 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.rows import verified_rate
 from advsearch.errors import InputError
+from advsearch.report.drawing import new_axes
 from advsearch.report.notebook import attack_html
+from advsearch.report.studies import search_axes
 from advsearch.runs import store
 from advsearch.runs.answer import write_answer
 from advsearch.runs.export import to_pandas
@@ -124,6 +126,17 @@ class AttackResult:
             InputError: the run was not kept, or pandas is not installed.
         """
         return to_pandas(self.rows(kind))
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw the objective over the search's evaluations, and return the matplotlib axes.
+
+        Args:
+            axes: to draw on; None makes new ones.
+        """
+        axes = new_axes() if axes is None else axes
+        searched = [record.objective for record in self.search.history] if self.search else []
+        search_axes({self.summary.policy: searched}, self.summary.objective, axes)
+        return axes
 
     def __repr__(self) -> str:
         summary, run = self.summary, None if self.run is None else str(self.run)

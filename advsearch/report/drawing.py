@@ -35,6 +35,13 @@ STYLE: dict[Any, Any] = {
 """Names come from users: a dollar sign in one is no formula."""
 
 
+def new_axes() -> Any:
+    """Return matplotlib axes of a new figure of the calling program, which shows it as it shows others."""
+    import matplotlib.pyplot as plt
+
+    return plt.subplots(layout="constrained")[1]
+
+
 def drawn(
     draw: Callable[[Figure], object],
     size: tuple[float, float],

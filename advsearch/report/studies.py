@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import accumulate, cycle
 from typing import Any
 
 from advsearch.report.drawing import BLUE, GREY, RED, Figures, drawn
@@ -109,14 +110,41 @@ def sweep_figure(answer: SweepSummary) -> Figures:
 
     A cell shows the accuracy there; where no cell has more than one configuration, the margin.
     """
-    cells = answer.cells
-    if cells:
-        return _figure(lambda axes: _cells(axes, answer, cells), _map_size(cells))
-    listed = [row for row in answer.axes if not isinstance(row.value, (list, tuple))]
-    rows = listed or answer.axes
-    if len({row.axis for row in rows}) != 1 or len(rows) > MOST_POINTS:
-        return {}
-    return _figure(lambda axes: _along(axes, answer, rows), (5.6, 3.6))
+    size = _map_size(answer.cells) if answer.cells else (5.6, 3.6)
+    return _figure(lambda axes: sweep_axes(answer, axes), size) if answer.cells or _only_axis(answer) else {}
+
+
+def sweep_axes(answer: SweepSummary, axes: Any) -> None:
+    """Draw a sweep on matplotlib axes, as `sweep_figure` does; nothing where there is neither a map nor one axis."""
+    if answer.cells:
+        _cells(axes, answer, answer.cells)
+    elif _only_axis(answer):
+        _along(axes, answer, _only_axis(answer))
+
+
+def search_axes(objectives: Mapping[str, Sequence[float | None]], meaning: str, axes: Any) -> None:
+    """Draw searches on matplotlib axes: the best objective so far over the evaluations, and each single one.
+
+    Args:
+        objectives: name of a search to its objectives in order; None where one was not a number.
+        meaning: label of the vertical axis.
+        axes: of matplotlib.
+    """
+    for (name, values), colour in zip(objectives.items(), cycle((BLUE, RED, GREY))):
+        single = [math.nan if one is None else one for one in values]
+        best = list(accumulate((-math.inf if math.isnan(one) else one for one in single), max))
+        at = range(1, len(single) + 1)
+        axes.plot(at, single, ".", color=colour, alpha=0.35)
+        axes.plot(at, [math.nan if math.isinf(one) else one for one in best], color=colour, label=name)
+    axes.set(xlabel="evaluations", ylabel=meaning)
+    axes.grid(True, axis="y")
+    axes.legend()
+
+
+def _only_axis(answer: SweepSummary) -> Sequence[AxisRow]:
+    """The values of the only axis of a sweep; none where there are more, or too many values."""
+    rows = [row for row in answer.axes if not isinstance(row.value, (list, tuple))] or answer.axes
+    return rows if len({row.axis for row in rows}) == 1 and len(rows) <= MOST_POINTS else ()
 
 
 def _cells(axes: Any, answer: SweepSummary, cells: SweepMap) -> None:

@@ -27,8 +27,9 @@ from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.engine.sweeps.worst import check_worst
 from advsearch.interrupts import interruptible
 from advsearch.progress import Progress
+from advsearch.report.drawing import new_axes
 from advsearch.report.notebook import sweep_html
-from advsearch.report.studies import sweep_figure
+from advsearch.report.studies import sweep_axes, sweep_figure
 from advsearch.report.wording import count
 from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
@@ -91,6 +92,16 @@ class SweepResult:
             InputError: pandas is not installed.
         """
         return to_pandas(self.rows())
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw the map over two axes, or the accuracy along the only one, and return the matplotlib axes.
+
+        Args:
+            axes: to draw on; None makes new ones.
+        """
+        axes = new_axes() if axes is None else axes
+        sweep_axes(self.summary, axes)
+        return axes
 
     def __repr__(self) -> str:
         right = f"{self.summary.correct} of {self.summary.configurations} right"
