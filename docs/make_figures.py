@@ -152,7 +152,7 @@ def scene_parameters(record: Record) -> str:
         [
             f"`{name}`",
             one.unit if one.unit != "1" else "",
-            f"{one.low:g} to {one.high:g}",
+            " or ".join(one.options) or f"{one.low:g} to {one.high:g}",
             one.default if isinstance(one.default, str) else f"{one.default:g}",
             one.description,
         ]

@@ -178,10 +178,9 @@ def _scene(scene: Scene | str | Path, settings: AttackKeywords) -> Scene:
     return load_scene(scene, lit_by, up=settings.get("up"), settings=given)
 
 
-def _set_by(scene: Scene, exposure: float | None) -> dict[str, float]:
+def _set_by(scene: Scene, exposure: float | None) -> dict[str, float | str]:
     """The parameters of the scene that were fixed, but for the exposure where an option says it."""
-    values, given = scene.description.values, scene.description.given
-    fixed = {name: value for name, value in values.items() if name in given and value is not None}
+    fixed = scene.description.given_values
     if exposure:
         fixed.pop("camera.exposure", None)
     return fixed

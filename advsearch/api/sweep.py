@@ -135,12 +135,11 @@ def _place(scene: Scene) -> NamedScene:
 def _described(places: Sequence[NamedScene]) -> dict[str, object]:
     """Settings that say what loaded scenes are."""
     first = places[0].scene.description
-    given = {name: value for name, value in first.values.items() if name in first.given and value is not None}
     return {
         "object": ",".join(dict.fromkeys(place.object for place in places)),
         "environment": ",".join(dict.fromkeys(place.environment for place in places)),
         "up": first.up,
-        "set": given if len(places) == 1 else {},
+        "set": first.given_values if len(places) == 1 else {},
     }
 
 

@@ -75,20 +75,20 @@ class Scene:
 
     def __repr__(self) -> str:
         described = self.description
-        names = sorted(described.given & described.values.keys())
-        fixed = "".join(f", {name}={described.values[name]!r}" for name in names)
+        fixed = "".join(f", {name}={value!r}" for name, value in sorted(described.given_values.items()))
         return f"Scene({described.object_name!r}, {described.environment_name!r}{fixed})"
 
-    def with_settings(self, given: Mapping[str, float]) -> Scene:
+    def with_settings(self, given: Given) -> Scene:
         """Return the scene with some of its parameters fixed to other values.
 
         Raises:
             InputError: a name is unknown or a value out of range.
         """
-        settings.resolve(given)
+        resolved = settings.resolve(given)
         own = self.description
         check_meshes(own, given)
-        return Scene(replace(own, values={**own.values, **given}, given=own.given | set(given)))
+        values = {**own.values, **{name: resolved[name] for name in given}}
+        return Scene(replace(own, values=values, given=own.given | set(given)))
 
 
 @dataclass(frozen=True)

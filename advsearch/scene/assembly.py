@@ -99,6 +99,7 @@ class Assembly:
 
     def __init__(self, description: SceneDescription) -> None:
         self.meshes = {name: MovingMesh(part.mesh, part.to_world) for name, part in description.meshes.items()}
+        self._photograph = description.photograph
 
     def __call__(self, inputs: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return the inputs with poses, displacements and maps worked out; differentiable torch operations."""
@@ -112,5 +113,7 @@ class Assembly:
             found["camera.shift_x"], found["camera.shift_y"] = shift[:1], shift[1:]
         if "environment.data" in found:
             data = found.pop("environment.data")
+            if self._photograph is not None:
+                found["ground.reflectance"] = self._photograph.reflectance(data)
             found["environment.padded"] = torch.cat([data[:, -1:], data, data[:, :1]], dim=1)
         return found

@@ -114,6 +114,7 @@ class EnvironmentAsset:
             in a photograph (a file's own order).
         source: where it came from.
         warnings: what the importer had to repair or leave out, one sentence each.
+        photographed: it shows the floor of a real place: the ground that things stand on is that floor by itself.
 
     Raises:
         InputError: a texel is negative, NaN or infinite.
@@ -123,6 +124,7 @@ class EnvironmentAsset:
     radiance: Floats
     source: str = ""
     warnings: tuple[str, ...] = ()
+    photographed: bool = False
 
     def __post_init__(self) -> None:
         bad = ~(np.isfinite(self.radiance) & (self.radiance >= 0.0)).all(axis=2)

@@ -21,6 +21,7 @@ from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import ImportedScene, import_scene, split_node
 from advsearch.scene.parts import BallLamp, MeshPart, PlacedCamera, PointLamp, ScenePart
+from advsearch.scene.photograph import Photograph, photograph_of
 
 Doubles = npt.NDArray[np.float64]
 
@@ -35,6 +36,8 @@ ORBIT_CAMERA = "orbit"
 """The camera that the settings `camera.*` describe: on a sphere around the object, looking at it."""
 NO_MAP = "none"
 """What the environment of a scene without a map is called."""
+TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in settings.CHANNELS))
+"""Settings that only a table has."""
 OWN_MAP = "own"
 """What the scene's own environment is called where another may be chosen."""
 
@@ -166,6 +169,32 @@ class SceneDescription:
         return value
 
     @property
+    def given_values(self) -> dict[str, float | str]:
+        """The settings that were asked for, as they are written: a choice by its name."""
+        found: dict[str, float | str] = {}
+        for name in self.given & self.values.keys():
+            value, setting = self.values[name], settings.parameter_of(name)
+            if value is not None:
+                found[name] = setting.options[int(value)] if setting is not None and setting.options else value
+        return found
+
+    @property
+    def photograph(self) -> Photograph | None:
+        """The ground that shows the environment's photograph; None where it is a table, or nothing.
+
+        Where `ground.kind` is not given, it does so for a photographed environment, unless a table is described or the
+        environment may be hidden behind a colour, which would hide everything above the horizon alone.
+        """
+        own, kind = self.environment, self.values.get("ground.kind")
+        if own is None or self.number("ground.size") == 0.0:
+            return None
+        if kind is None and (not own.photographed or self.backdrop or not self.given.isdisjoint(TABLE_SETTINGS)):
+            return None
+        if kind is not None and settings.GROUND_KINDS[int(kind)] != settings.PHOTOGRAPH:
+            return None
+        return photograph_of(own, self.number("ground.height"), self.number("environment.rotation"))
+
+    @property
     def ground_color(self) -> tuple[float, ...]:
         """(3,) colour of the ground plane, display-referred sRGB."""
         return tuple(self.number(f"ground.{channel}") for channel in settings.CHANNELS)
@@ -208,7 +237,8 @@ def describe(
     around = ImportedScene(_object(object_spec, up)) if node is None else _scene(Path(str(file)), node, up)
     lit = any(isinstance(part, PointLamp) for part in around.surroundings)
     lit_by = environment_spec or (NO_MAP if lit else DEFAULT_ENVIRONMENT)
-    if node is not None and "ground.size" not in (given or {}):
+    _check_ground(given or {}, lit_by)
+    if node is not None and not {"ground.size", "ground.kind"} & set(given or {}):
         values = {**values, "ground.size": 0.0}
     asked = () if environment_spec is None else (ENVIRONMENT,)
     described = SceneDescription(
@@ -236,6 +266,22 @@ def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
         mesh = settings.mesh_of(name)
         if mesh is not None and mesh not in scene.around:
             raise UnknownNameError("mesh around the object", mesh, scene.around, f"It stands in `set` {name}.")
+
+
+def _check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -> None:
+    """Refuse what contradicts a ground that shows the environment's photograph."""
+    if given.get("ground.kind") != settings.PHOTOGRAPH:
+        return
+    if lit_by == NO_MAP:
+        raise InputError(
+            "`set` ground.kind=photograph: the scene has no environment map to show; give it one, or leave it out"
+        )
+    described = [name for name in TABLE_SETTINGS if name in given]
+    if described:
+        raise InputError(
+            f"`set` ground.kind=photograph and `set` {described[0]} contradict each other: only a table has that; "
+            f"leave one of the two out"
+        )
 
 
 def _scene(path: Path, node: str, up: str | None) -> ImportedScene:

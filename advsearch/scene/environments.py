@@ -68,7 +68,7 @@ def import_environment(path: str | PathLike[str]) -> EnvironmentAsset:
         notes.append(f"{file.name}: expected a map twice as wide as high, got {width} x {height}; it appears stretched")
     if not radiance.any():
         notes.append(f"{file.name}: the environment is black everywhere; it lights nothing")
-    return EnvironmentAsset(safe_name(file), radiance, source=str(file), warnings=tuple(notes))
+    return EnvironmentAsset(safe_name(file), radiance, source=str(file), warnings=tuple(notes), photographed=True)
 
 
 def _stacked(planes: Planes, top: int, end: int) -> Floats:

@@ -79,7 +79,8 @@ def irradiance(scene: SceneDescription, normals: Doubles) -> Doubles:
     vertices = scene.base_vertices
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
     reach = np.abs(middle[:2] + directions[:, :2] * (middle[2] / np.maximum(-directions[:, 2:], 1e-9)))
-    hits = ~upper & (reach <= scene.number("ground.size") / 2.0).all(axis=1)
+    on_table = scene.photograph is None  # else the map itself says what comes from below
+    hits = on_table & ~upper & (reach <= scene.number("ground.size") / 2.0).all(axis=1)
     power = np.where(hits[:, None], bounced * solid[:, None], power)
     facing = np.maximum(np.einsum("nk,wk->nw", normals, directions), 0.0)
     found = np.asarray(np.einsum("nw,wc->nc", facing, power))  # no BLAS, whose last bits depend on its threads

@@ -142,9 +142,29 @@ ENVIRONMENT = (
         "exposure", (), "stops", -10.0, 10.0, 0.0, "Brightness, after metering.", search=(-1.0, 1.0), estimators=LIT
     ),
 )
+GROUND_KINDS = TABLE, PHOTOGRAPH = "table", "photograph"
 GROUND = (
-    Parameter("size", (), "object sizes", 0.0, 1000.0, 3.0, "Side of the square ground plane; 0 leaves it out."),
-    *colors("of the ground plane.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)),
+    Parameter(
+        "kind",
+        (),
+        "name",
+        0.0,
+        1.0,
+        "photograph where the map is a file, else table",
+        "What the object stands on: a square table, or the floor that the environment's photograph shows.",
+        options=GROUND_KINDS,
+    ),
+    Parameter("size", (), "object sizes", 0.0, 1000.0, 3.0, "Side of the table; 0 leaves the ground out."),
+    *colors("of the table.", defaults=(0.55, 0.45, 0.37), estimators=("differences",)),
+    Parameter(
+        "height",
+        (),
+        "object sizes",
+        0.1,
+        1000.0,
+        3.0,
+        "Height above the floor from which the photograph was taken.",
+    ),
 )
 MATERIAL = (
     _surface("roughness", "Roughness of the surface: 0 is polished, 1 is matt.", (0.1, 1.0)),
@@ -198,6 +218,10 @@ def _checked(name: str, value: object) -> float:
     setting = parameter_of(name)
     if setting is None:
         raise UnknownNameError("scene parameter", name, SETTINGS, "Write it as `set` NAME=VALUE.")
+    if setting.options:
+        if value not in setting.options:
+            raise UnknownNameError(name, str(value), setting.options, "Write it as `set` NAME=VALUE.")
+        return float(setting.options.index(str(value)))
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(f"`set` {name}: expected a number in {setting.unit}, got {value!r}")
     number = float(value)

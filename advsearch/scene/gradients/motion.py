@@ -31,7 +31,7 @@ FAR = 1e4
 
 
 class Motion:
-    """Projects a scene's vertices, the ground's edge and what is seen of the environment into the picture.
+    """Projects a scene's vertices, the table's edge or the floor, and what is seen of the environment into the picture.
 
     A camera that goes around an object hardly moves the object's outline, but all that lies behind it.
 
@@ -48,8 +48,9 @@ class Motion:
         self._assembly = assembly
         self._camera = torch.from_numpy(camera_to_world(description, width / height)).to(torch.float64)
         self._fov = description.number("camera.fov")
-        self._ground = description.number("ground.size") / 2.0
-        self._edge = _edge_points(self._ground)
+        floor = None if description.photograph is None else description.photograph.mesh.vertices
+        self._ground = description.number("ground.size") / 2.0 if floor is None else float(floor.max())
+        self._edge = _edge_points(self._ground) if floor is None else torch.from_numpy(floor).double()
         self._far = _far_points(description.backdrop or description.environment is None)
         self._picks = {
             name: torch.from_numpy(np.linspace(0, len(mesh.vertices) - 1, min(POINTS, len(mesh.vertices))).astype(int))

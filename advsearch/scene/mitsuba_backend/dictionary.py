@@ -9,8 +9,13 @@ import numpy as np
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
-from advsearch.scene.mitsuba_backend.inputs import SceneInput, number, transform
+from advsearch.scene.mitsuba_backend.inputs import SceneInput, as_is, number, transform
+from advsearch.scene.mitsuba_backend.meshes import matt, mitsuba_mesh
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
+
+GROUND = "ground"
+GROUND_INPUT = SceneInput("ground.reflectance", f"{GROUND}.*.reflectance.data", as_is, interior=True)
+"""(h, w, 3): the texture of a ground that shows the environment's photograph (`advsearch.scene.photograph`)."""
 
 
 def scene_dict(description: SceneDescription, resolution: tuple[int, int], filter: str, sampler: str) -> Plugin:
@@ -29,9 +34,12 @@ def scene_dict(description: SceneDescription, resolution: tuple[int, int], filte
             "scale": 2.0 ** number("environment.exposure"),
             "to_world": place().rotate([0, 0, 1], number("environment.rotation")).rotate([1, 0, 0], 90),
         }
-    if number("ground.size") > 0.0:
+    photograph = description.photograph
+    if photograph is not None:
+        scene[GROUND] = mitsuba_mesh(GROUND, photograph.mesh, np.eye(4), matt(photograph.base.numpy()))
+    elif number("ground.size") > 0.0:
         reflectance = srgb_to_linear(np.array(description.ground_color, np.float32)).tolist()
-        scene["ground"] = {
+        scene[GROUND] = {
             "type": "rectangle",
             "to_world": place().scale(number("ground.size") / 2.0),
             "bsdf": {

@@ -26,16 +26,9 @@ def principled(base_color: Floats, material: Material, extra: Plugin | None = No
         material: the numbers of the surface. A clearcoat of 0 leaves the lobe out.
         extra: further entries of the plugin's dictionary.
     """
-    mi = mitsuba()
-    linear = srgb_to_linear(base_color)
     surface: Plugin = {
         "type": "principled",
-        "base_color": {
-            "type": "bitmap",
-            "bitmap": mi.Bitmap(np.ascontiguousarray(linear, dtype=np.float32)),
-            "raw": True,
-            "filter_type": "bilinear",
-        },
+        "base_color": _texture(srgb_to_linear(base_color)),
         "roughness": material.roughness,
         "metallic": material.metallic,
         "specular": material.specular,
@@ -44,6 +37,17 @@ def principled(base_color: Floats, material: Material, extra: Plugin | None = No
     if material.clearcoat > 0.0:
         surface["clearcoat"] = material.clearcoat
     return {"type": "twosided", "bsdf": surface}
+
+
+def matt(reflectance: Floats) -> Plugin:
+    """A two-sided diffuse BSDF with a bilinear texture (h, w, 3) of linear reflectance, row 0 at v = 1."""
+    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": _texture(reflectance)}}
+
+
+def _texture(linear: Floats) -> Plugin:
+    mi = mitsuba()
+    bitmap = mi.Bitmap(np.ascontiguousarray(linear, dtype=np.float32))
+    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear"}
 
 
 def mitsuba_mesh(name: str, mesh: Mesh, to_world: npt.NDArray[np.float64], bsdf: Plugin) -> Any:

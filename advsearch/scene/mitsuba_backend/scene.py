@@ -18,7 +18,7 @@ from advsearch.errors import InputError
 from advsearch.scene.assembly import Assembly
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.leaving_out import EVERYTHING
-from advsearch.scene.mitsuba_backend.dictionary import camera_inputs, scene_dict
+from advsearch.scene.mitsuba_backend.dictionary import GROUND_INPUT, camera_inputs, scene_dict
 from advsearch.scene.mitsuba_backend.first_hit import first_hits
 from advsearch.scene.mitsuba_backend.inputs import SceneInput, as_is, as_torch, contiguous, key_of
 from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS
@@ -98,7 +98,7 @@ class MitsubaScene:
         self._parameters = mi.traverse(self._scene)
         self._integrators: dict[tuple[str, int], Any] = {}
         parts = [one for part in translated for one in part.inputs]
-        declared = [*camera_inputs(resolution), ENVIRONMENT_INPUT, *parts]
+        declared = [*camera_inputs(resolution), ENVIRONMENT_INPUT, GROUND_INPUT, *parts]
         self._inputs = {one.name: (key, one) for one in declared if (key := key_of(self._parameters, one.key))}
         self.names = frozenset(self._inputs)
         self.interior = frozenset(name for name, (_, one) in self._inputs.items() if one.interior)

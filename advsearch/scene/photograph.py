@@ -1,0 +1,101 @@
+"""The ground that shows the environment's photograph and catches what the scene does to its light.
+
+A photographed environment shows the floor that its camera stood on. That part of the map is projected from the height
+of the camera onto the plane z = 0, and the plane gets the reflectance that shows the photograph where nothing is in the
+way of the light:
+
+    reflectance(p) = pi map(from (0, 0, height) to p) / E,    E = the irradiance of the map's upper half on the plane
+
+A diffuse surface in the irradiance E' looks like `reflectance E' / pi = map E' / E`: the photograph times what the
+scene leaves of the light, and adds to it. That is the quotient form of differential rendering (Debevec, Rendering
+synthetic objects into real scenes, SIGGRAPH 1998, section 5) in one render instead of two, and an ordinary scene: every
+derivative, guide and mask is that of a plane with a texture.
+
+Where the photograph shows what is brighter than a white floor in this light, a lamp, a window low down or its
+reflection, the reflectance is above 1. Such texels still look as photographed.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advsearch.scene.assets import EnvironmentAsset, Floats, Mesh
+
+SECTORS = 128
+RINGS = 64
+NEAREST, FARTHEST = 0.01, 1000.0
+"""Radii of the innermost and the outermost ring of vertices, in heights of the camera. Beyond, the map itself is seen,
+less than 0.06 degrees below the horizon."""
+
+
+class Photograph:
+    """The floor of one equirectangular map.
+
+    Args:
+        radiance: (H, W, 3) linear radiance, row 0 straight up.
+        height: of the camera above the ground, object sizes.
+        rotation: of the map about the vertical, degrees.
+    """
+
+    def __init__(self, radiance: Floats, height: float, rotation: float) -> None:
+        self._rows = radiance.shape[0]
+        self._first = (self._rows - 1) // 2
+        self.mesh = self._plane(height, math.radians(rotation))
+        self.base = self.reflectance(torch.from_numpy(np.asarray(radiance, dtype=np.float32)))
+
+    def reflectance(self, radiance: Tensor) -> Tensor:
+        """Return the plane's texture (h, W, 3) for a map of any size; 0 where no light comes from above.
+
+        Differentiable; row 0 is the horizon, the last one is straight down, and columns are those of the map.
+        """
+        rows = radiance.shape[0]
+        at = torch.arange(self._first, self._rows, device=radiance.device) * ((rows - 1) / (self._rows - 1))
+        upper = at.floor().long().clamp_max(rows - 2)
+        share = (at - upper)[:, None, None].to(radiance.dtype)
+        lower_half = radiance[upper] + share * (radiance[upper + 1] - radiance[upper])
+        arriving = irradiance(radiance)
+        return torch.where(arriving > 0.0, lower_half * math.pi / arriving.clamp_min(1e-30), 0.0)
+
+    def _plane(self, height: float, rotation: float) -> Mesh:
+        """Rings around the point below the camera, with the map's own coordinates as texture coordinates."""
+        radii = np.concatenate([[0.0], np.geomspace(NEAREST, FARTHEST, RINGS)])
+        turns = np.linspace(0.0, 1.0, SECTORS + 1)
+        radius, turn = np.meshgrid(radii, turns, indexing="ij")
+        azimuth = 0.5 * math.pi - 2.0 * math.pi * turn + rotation
+        polar = math.pi - np.arctan(radius)
+        vertices = height * np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), 0.0 * radius], axis=-1)
+        texels = self._rows - self._first
+        row = polar / math.pi * (self._rows - 1) - self._first
+        uvs = np.stack([turn, 1.0 - (row + 0.5) / texels], axis=-1)
+        corner = np.arange(RINGS + 1)[:-1, None] * (SECTORS + 1) + np.arange(SECTORS)
+        inner, outer = corner.ravel(), corner.ravel() + SECTORS + 1
+        faces = np.concatenate(
+            [np.stack([outer, inner, outer + 1], axis=1), np.stack([inner, inner + 1, outer + 1], axis=1)[SECTORS:]]
+        )
+        normals = np.broadcast_to(np.array([0.0, 0.0, 1.0]), (vertices.size // 3, 3))
+        return Mesh(
+            vertices=vertices.reshape(-1, 3).astype(np.float32),
+            faces=faces.astype(np.uint32),
+            normals=normals.astype(np.float32),
+            uvs=uvs.reshape(-1, 2).astype(np.float32),
+        )
+
+
+@lru_cache(maxsize=4)
+def photograph_of(environment: EnvironmentAsset, height: float, rotation: float) -> Photograph:
+    """Return the floor of an environment; arguments as of `Photograph`."""
+    return Photograph(environment.radiance, height, rotation)
+
+
+def irradiance(radiance: Tensor) -> Tensor:
+    """Return the irradiance (3,) of a map (H, W, 3) on an unshadowed horizontal surface; differentiable."""
+    rows, columns = radiance.shape[:2]
+    edges = (torch.arange(rows + 1, device=radiance.device, dtype=torch.float64) - 0.5) * (math.pi / (rows - 1))
+    within = edges.clamp(0.0, math.pi / 2.0).sin().square() / 2.0  # the integral of cos sin
+    weights = (within.diff() * (2.0 * math.pi / columns)).to(radiance.dtype)
+    return (radiance.sum(dim=1) * weights[:, None]).sum(dim=0)

@@ -1,0 +1,142 @@
+"""The ground that shows the environment's photograph: it looks as photographed, darker where light is kept from it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.engine.loading import Scene, load_scene
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.description import describe
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.photograph import Photograph, irradiance
+from advsearch.scene.settings import resolve
+
+SIZE = 32
+AWAY = {"pose.x": 900.0, "pose.scale": 0.01}
+"""An object that nobody sees."""
+NOISE = 0.05
+"""Mean relative error of 256 samples of this light on a matt floor."""
+GRADIENT_TOLERANCE = 0.05
+"""An adjoint against a difference with common random numbers, both with 256 samples."""
+
+
+def room() -> EnvironmentAsset:
+    """A smooth map with a floor of many colours, brighter above."""
+    polar = (np.arange(32)[:, None] / 31.0) * math.pi
+    turn = (np.arange(64)[None] + 0.5) / 64.0 * 2.0 * math.pi
+    above = 1.0 + 2.0 * np.clip(np.cos(polar), 0.0, 1.0) * (1.0 + 0.5 * np.cos(turn))
+    below = 0.3 + 0.2 * np.sin(3.0 * turn) * np.sin(polar) + 0.0 * polar
+    one = np.where(polar < math.pi / 2.0, above, below)
+    radiance = np.stack([one, 0.7 * one, 0.5 * one**1.5], axis=2).astype(np.float32)
+    return EnvironmentAsset("room", radiance, photographed=True)
+
+
+def from_the_tripod(height: float) -> Tensor:
+    """(4, 4) a camera where the photograph was taken, looking 30 degrees below the horizon."""
+    down = math.radians(30.0)
+    ahead = np.array([math.cos(down), 0.0, -math.sin(down)])
+    left = np.array([0.0, 1.0, 0.0])
+    matrix = np.eye(4, dtype=np.float32)
+    matrix[:3, :3] = np.stack([left, np.cross(ahead, left), ahead], axis=1)
+    matrix[2, 3] = height
+    return torch.from_numpy(matrix)
+
+
+def test_a_floor_as_bright_as_the_light_is_white() -> None:
+    flat = torch.full((16, 32, 3), 2.0)
+    assert torch.allclose(irradiance(flat), torch.full((3,), 2.0 * math.pi), rtol=1e-3)
+    photograph = Photograph(flat.numpy(), 3.0, 0.0)
+    assert torch.allclose(photograph.base, torch.ones_like(photograph.base), rtol=1e-3)
+    finer = photograph.reflectance(torch.full((64, 128, 3), 5.0))
+    assert finer.shape == (photograph.base.shape[0], 128, 3)
+    assert torch.allclose(finer, torch.ones_like(finer), rtol=1e-3)
+    assert not photograph.reflectance(torch.zeros(16, 32, 3)).any()
+
+
+@pytest.mark.parametrize("rotation", [0.0, 70.0])
+def test_from_where_it_was_taken_the_floor_is_the_photograph(rotation: float) -> None:
+    given = {**AWAY, "environment.rotation": rotation}
+    scene = describe("ball", room(), given={**given, "ground.height": 2.0})
+    with_floor, without = scene, replace(scene, values={**scene.values, "ground.size": 0.0})
+    assert scene.photograph is not None and without.photograph is None
+    camera = {"camera.to_world": from_the_tripod(2.0)}
+    floor, photograph = (MitsubaScene(one, (SIZE, SIZE)).radiance(camera, 0, 256) for one in (with_floor, without))
+    assert float(((floor - photograph).abs() / photograph).mean()) < NOISE
+    assert float((floor.mean() / photograph.mean() - 1.0).abs()) < 0.01
+    assert float(photograph.std() / photograph.mean()) > 0.2, "there is nothing to tell apart"
+
+
+def test_the_object_keeps_light_from_the_floor() -> None:
+    scene = describe("ball", room(), given={"camera.elevation": 60.0, "camera.distance": 4.0})
+    away = replace(scene, values={**scene.values, **AWAY})
+    mitsuba = MitsubaScene(scene, (SIZE, SIZE))
+    seen = mitsuba.first_hits({}, "object")
+    ratio = (mitsuba.radiance({}, 0, 64) / MitsubaScene(away, (SIZE, SIZE)).radiance({}, 0, 64)).mean(dim=2)
+    near, outline = (
+        torch.nn.functional.max_pool2d(seen[None].float(), width, stride=1, padding=width // 2)[0] > 0.0
+        for width in (7, 3)
+    )
+    beside = near & ~outline
+    corner = ratio[:4, :4].mean()
+    assert float(ratio[beside].min()) < 0.85 < 0.95 < float(corner) < 1.05
+
+
+def loss(scene: Scene, controls: dict[str, dict[str, object]]) -> tuple[float, float]:
+    """Return the adjoint's derivative at the middle of one coordinate, and a difference over 1 % of it."""
+    render = scene.renderer(controls, resolution=SIZE, denoise="none")
+    weights = torch.linspace(0.0, 1.0, SIZE)[:, None, None] * torch.linspace(1.0, 0.2, SIZE)[None, :, None]
+    u = torch.full_like(render.start, 0.4)
+
+    def value(image: Tensor) -> Tensor:
+        return (image * weights).mean()
+
+    adjoint = render.gradient(value, u, 1, 256)[1]
+    with torch.no_grad():
+        difference = (value(render(u + 0.01, 1, 256)) - value(render(u - 0.01, 1, 256))) / 0.02
+    return float(adjoint.sum()), float(difference)
+
+
+@pytest.mark.parametrize(
+    "controls",
+    [
+        {"environment": {"rotation": [0.0, 90.0]}},
+        {"environment": {"tint_red": [0.5, 1.5]}},
+        {"light": {"power": [0.2, 2.0]}},
+    ],
+    ids=["rotation", "tint", "light"],
+)
+def test_derivatives_reach_the_floor(controls: dict[str, dict[str, object]]) -> None:
+    adjoint, difference = loss(load_scene("mug", room()), controls)
+    assert adjoint == pytest.approx(difference, rel=GRADIENT_TOLERANCE)
+
+
+def test_photographed_environments_show_their_floor_unless_a_table_is_asked_for() -> None:
+    assert describe("mug").photograph is None
+    assert describe("mug", given={"ground.kind": "photograph"}).photograph is not None
+    assert describe("mug", room()).photograph is not None
+    for given in ({"ground.kind": "table"}, {"ground.size": 2.0}, {"ground.red": 0.2}, {"ground.size": 0.0}):
+        assert describe("mug", room(), given=given).photograph is None, given
+    assert replace(describe("mug", room()), backdrop=True).photograph is None
+    assert load_scene("mug", room()).with_settings({"ground.kind": "table"}).description.photograph is None
+
+
+def test_the_kind_of_ground_is_told_by_its_name() -> None:
+    scene = load_scene("mug", room(), settings={"ground.kind": "table", "camera.azimuth": 7.0})
+    assert repr(scene) == "Scene('mug', 'room', camera.azimuth=7.0, ground.kind='table')"
+    assert resolve(scene.description.given_values) == scene.description.values
+
+
+def test_what_contradicts_it_is_explained() -> None:
+    with pytest.raises(InputError, match=r"ground\.kind=photograph: the scene has no environment map to show"):
+        describe("mug", "none", given={"ground.kind": "photograph"})
+    with pytest.raises(InputError, match=r"ground\.kind=photograph and `set` ground\.red contradict each other"):
+        describe("mug", room(), given={"ground.kind": "photograph", "ground.red": 0.5})
+    with pytest.raises(UnknownNameError, match=r"unknown ground.kind 'tabel'. Did you mean 'table'"):
+        describe("mug", given={"ground.kind": "tabel"})
