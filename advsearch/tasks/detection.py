@@ -1,7 +1,10 @@
 """Object detection: whether a model finds the object, by a box where it is and the right name.
 
-Every box that a model returns is looked at, also where it has not suppressed those that overlap: a right one that a
-better one would have displaced counts. Scores p are compared as log-odds, log(p / (1 - p)).
+A model that gives a score of every class for each box has not suppressed those that overlap, which is done class by
+class (greedily) before anybody sees a box. What counts here holds before and after that: the object is found by a right
+box that is left, and has vanished where there was none before either; a box that is a success is one that is left. So a
+right box beside a better one of its class that is not where the object is makes an answer neither right nor a success.
+Boxes that come with their labels count as they are. Scores p are compared as log-odds, log(p / (1 - p)).
 """
 
 from __future__ import annotations
@@ -31,9 +34,9 @@ GOALS = {
 
 SMALLEST = 1e-6
 """Scores and overlaps below this, or as near to 1, count as this: log-odds of 13.8."""
-MOST, LEAST, SAME, LOOKED_AT = 8, 0.1, 0.5, 500
-"""Most boxes that are kept of a picture; the least score of one; overlap from which two of a class are one thing; and
-among how many of the best scores they are looked for."""
+MOST, LEAST, LOOKED_AT = 8, 0.1, 500
+"""Most boxes that are kept of a picture; the least score of one, and of one that is suppressed; and among how many of
+the best scores they are looked for."""
 
 Box = tuple[float, float, float, float]
 
@@ -71,6 +74,8 @@ class Detection(ClassTask):
         iou: least intersection over union with the true box.
         confidence: least score of a box that counts.
         boxes: how the model gives a box, one of `FORMS`.
+        suppression: intersection over union from which two boxes of a class are one thing, of which the better one is
+            left; 1 where a model's own boxes should all count.
         unit: of these numbers: "fractions" of the picture's sides, or "pixels" of the model's input; "" for what the
             boxes in a picture of noise look like.
         seek: what an attack is after, one of `GOALS`.
@@ -85,6 +90,7 @@ class Detection(ClassTask):
 
     iou: float = 0.5
     confidence: float = 0.5
+    suppression: float = 0.5
     boxes: str = "xyxy"
     unit: str = ""
     seek: str = "vanish"
@@ -96,6 +102,10 @@ class Detection(ClassTask):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 < value < 1.0:
                 raise InputError(f"task detection: {name}: expected a number between 0 and 1, got {value!r}")
+        if isinstance(self.suppression, bool) or not 0.0 < self.suppression <= 1.0:
+            raise InputError(
+                f"task detection: suppression: expected a number over 0, up to 1, got {self.suppression!r}"
+            )
         for name, known in (("boxes", FORMS), ("unit", ("", "fractions", "pixels")), ("seek", tuple(GOALS))):
             if getattr(self, name) not in known:
                 expected = ", ".join(filter(None, known))
@@ -143,7 +153,7 @@ class Detection(ClassTask):
         Of `create`: how far the best box where nothing is stands above it.
         """
         wrong = self._created if self.seek == "create" else self._missed
-        return torch.stack([wrong(one, truth) for one in output])
+        return torch.stack([wrong(self._left(one), truth) for one in output])
 
     def score(self, output: Sequence[Detections], truth: Place) -> Tensor:
         """Return how near each of N outputs is to what is sought, (N,), in log-odds: over 0 where it is a success."""
@@ -167,7 +177,7 @@ class Detection(ClassTask):
         missed, at = self._missed(one, truth), self._overlap(one, truth)
         if at is None:
             return missed
-        called = log_odds(_best(self._rivals(one, truth.labels), at >= self.iou)) - self._bar
+        called = log_odds(_best(self._rivals(self._left(one), truth.labels), at >= self.iou)) - self._bar
         return torch.minimum(missed, called)
 
     def _displaced(self, one: Detections, truth: Place) -> Tensor:
@@ -183,13 +193,31 @@ class Detection(ClassTask):
         return torch.minimum(away, sure)
 
     def _created(self, one: Detections, truth: Place) -> Tensor:
-        return log_odds(_best(self._sought(one), self._elsewhere(one, truth))) - self._bar
+        return log_odds(_best(self._sought(self._left(one)), self._elsewhere(one, truth))) - self._bar
 
     @property
     def _bar(self) -> float:
         return math.log(self.confidence / (1.0 - self.confidence))
 
     # ---- boxes and scores of one picture ----------------------------------------------------------------------------
+
+    def _left(self, one: Detections) -> Detections:
+        """What suppression leaves of boxes with a score of every class: the score of one that it removes is 0.
+
+        What has a score under `LEAST`, or under `confidence` if that is less, counts for nobody and is left alone. The
+        choice has no derivative; what is left has.
+        """
+        if "labels" in one or self.suppression == 1.0 or not len(one["boxes"]):
+            return one
+        scores, boxes = one["scores"].detach(), self._fractions(one).detach()
+        rows, classes = (scores >= min(LEAST, self.confidence)).nonzero(as_tuple=True)
+        removed = torch.zeros_like(scores, dtype=torch.bool)
+        for label in classes.unique().tolist():
+            mine = rows[classes == label]
+            if len(mine) > 1:
+                removed[mine, label] = True
+                removed[mine[strongest(boxes[mine], scores[mine, label], len(mine), self.suppression)], label] = False
+        return {**one, "scores": torch.where(removed, 0.0, one["scores"])}
 
     def _fractions(self, one: Detections) -> Tensor:
         """Boxes as shares of width and height, (D, 4)."""
@@ -244,7 +272,7 @@ class Detection(ClassTask):
         with torch.no_grad():
             scores, margins = self.score(output, truth).tolist(), self.margin(output, truth).tolist()
             return [
-                Judgement(score, margin, margin <= 0.0, self._answer(one, truth), self._payload(one, truth))
+                Judgement(score, margin, margin <= 0.0, self._answer(self._left(one), truth), self._payload(one, truth))
                 for score, margin, one in zip(scores, margins, output, strict=True)
             ]
 
@@ -282,7 +310,7 @@ class Detection(ClassTask):
         found: list[tuple[Box, int, float]] = []
         for label in classes[best >= least].unique().tolist():
             mine = ((classes == label) & (best >= least)).nonzero().flatten()
-            for place in mine[strongest(boxes[rows[mine]], best[mine], count, SAME)].tolist():
+            for place in mine[strongest(boxes[rows[mine]], best[mine], count, self.suppression)].tolist():
                 x0, y0, x1, y1 = boxes[rows[place]].tolist()
                 found.append(((x0, y0, x1, y1), label, float(best[place])))
         return sorted(found, key=lambda row: -row[2])[:count]

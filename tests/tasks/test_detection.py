@@ -136,6 +136,48 @@ def test_what_is_no_detection_is_refused(answer: Any, text: str) -> None:
         detections_in(answer, 2, "xyxy")
 
 
+# ---- suppression ----------------------------------------------------------------------------------------------------
+
+FAR = [0.34, 0.2, 0.74, 0.6]
+"""Overlaps `NEAR` by 0.82, and the object by 0.48: not where it is."""
+
+
+def test_a_right_box_that_suppression_drops_is_no_right_answer() -> None:
+    """A better cup beside the object takes the right box away; that is no success either, for the box was there."""
+    output = dense((NEAR, [0.7, 0.0, 0.0]), (FAR, [0.9, 0.0, 0.0]))
+    found = judged(TASK, output)
+    assert not found.right and not found.success and found.answer.label == "cup elsewhere"
+    assert judged(replace(TASK, suppression=1.0), output).right, "every box counts where none is suppressed"
+    assert judged(TASK, sparse((NEAR, 0, 0.7), (FAR, 0, 0.9))).right, "boxes with labels have been through it"
+    assert judged(TASK, dense((NEAR, [0.7, 0.0, 0.0]), (FAR, [0.0, 0.9, 0.0]))).right, "another class drops nothing"
+    assert judged(TASK, dense((NEAR, [0.9, 0.0, 0.0]), (FAR, [0.7, 0.0, 0.0]))).right, "a worse box drops nothing"
+
+
+@pytest.mark.parametrize("seek", ["mislabel", "create"])
+def test_a_box_that_suppression_drops_is_no_success(seek: str) -> None:
+    """Each time the wrong box is there before suppression, and a better one of its class takes it away."""
+    if seek == "mislabel":
+        output = dense((NEAR, [0.0, 0.7, 0.0]), (FAR, [0.0, 0.9, 0.0]))
+    else:  # mostly off the object, beside a better box that frames it
+        output = dense(([0.42, 0.2, 0.82, 0.6], [0.0, 0.0, 0.7]), ([0.32, 0.2, 0.72, 0.6], [0.0, 0.0, 0.9]))
+    task = replace(TASK, seek=seek)
+    assert not judged(task, output).success
+    assert judged(replace(task, suppression=1.0), output).success
+
+
+def test_what_is_left_has_a_derivative_and_what_is_dropped_has_none() -> None:
+    scores = torch.tensor([[0.7, 0.0, 0.0], [0.9, 0.0, 0.0]], requires_grad=True)
+    output = [{"boxes": torch.tensor([NEAR, HERE]), "scores": scores}]
+    TASK.margin(output, TRUTH).sum().backward()
+    assert scores.grad is not None and scores.grad[0].tolist() == [0.0, 0.0, 0.0] and float(scores.grad[1, 0]) < 0.0
+
+
+def test_suppression_is_a_share() -> None:
+    for wrong in (0.0, 1.5, True):
+        with pytest.raises(InputError, match="suppression: expected a number over 0, up to 1"):
+            Detection(suppression=wrong)
+
+
 # ---- the judgement --------------------------------------------------------------------------------------------------
 
 FOUND = dense((HERE, [0.8, 0.1, 0.0]), (AWAY, [0.1, 0.2, 0.1]))

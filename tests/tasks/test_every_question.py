@@ -9,11 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from small_models import SIDE, Finder, Painter
+from small_models import SIDE, Finder, Painter, Slider
+from torch import nn
 
+import advsearch
 from advsearch.cli.main import main
 from advsearch.runs.images import read_png
 from advsearch.runs.store import Store
+from advsearch.tasks import Detection
 
 
 @pytest.fixture(scope="module", params=["detection", "segmentation"])
@@ -148,3 +151,29 @@ def test_a_wrong_name_is_sought_by_its_objective(
     found = answer(capsys, "attack", "--object", "mug", *asked, *SHORT, *flags, "--run", str(tmp_path / "run"))
     assert (found["ending"], found["objective"], found["target"]) == ("found", "mislabel", ["bowl"])
     assert set(found["verified"]["labels"]) == {"bowl"}
+
+
+@pytest.mark.parametrize(
+    ("objective", "network", "controls", "said"),
+    [
+        ("displace", Slider(), {"texture": {"epsilon": 0.4}}, "cup elsewhere"),
+        ("create", Finder(), {"background": {}}, "dog elsewhere"),
+    ],
+)
+def test_a_box_elsewhere_is_sought_by_its_objective(
+    objective: str, network: nn.Module, controls: dict[str, Any], said: str, tmp_path: Path
+) -> None:
+    """From the search to the drawn picture, with the clean scene right and no such box in it."""
+    names = ["cup", "bowl", "dog"][: 2 if objective == "displace" else 3]
+    model = advsearch.load_model(
+        network, labels=names, input_size=SIDE, read=Detection().reader, name="stand-in"
+    )  # fmt: skip
+    result = advsearch.attack(
+        "mug", model, task="detection", label="cup", objective=objective, controls=controls, steps=24, trials=6, spp=2,
+        verify_spp=4, denoise="none", measure="no", specialise=False, baseline=False, run=tmp_path / "run",
+        policy="random" if objective == "create" else "auto",
+    )  # fmt: skip
+    summary = result.summary
+    assert summary.ending == "found" and summary.clean.control and summary.clean.control.correct == 6
+    assert summary.clean.label == "cup" and summary.verified and set(summary.verified.labels) == {said}
+    assert (tmp_path / "run" / "images" / "adversarial-answer.png").is_file()
