@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from unittest import mock
 
 import torch
@@ -28,6 +29,7 @@ from advsearch import threads
 threads.configure()
 
 from advsearch.config import SweepConfig  # noqa: E402
+from advsearch.controls import Space  # noqa: E402
 from advsearch.engine.budget import verification_ladder  # noqa: E402
 from advsearch.engine.loading import PictureSettings, as_controls, framed, load_scene  # noqa: E402
 from advsearch.engine.sweeps import swept_scene  # noqa: E402
@@ -71,7 +73,8 @@ class ConstantRenderer:
 
     non_finite = 0
 
-    def __init__(self, size: tuple[int, int]) -> None:
+    def __init__(self, space: Space, size: tuple[int, int]) -> None:
+        self.space, self.start, self.scene = space, space.start, SimpleNamespace(assembly=dict)
         self.picture = torch.full((*size, 3), 0.5)
         self.formation = ImageFormation(resolution=size)
 
@@ -100,7 +103,7 @@ class Watch(NullProgress):
 def constant(configurations: int) -> None:
     """Print the speed of the loop and how much its memory grows, for a grid and for draws."""
     mock.patch.object(
-        swept_scene, "make_renderer", lambda scene, space, size, *more, **named: ConstantRenderer(size)
+        swept_scene, "make_renderer", lambda scene, space, size, *more, **named: ConstantRenderer(space, size)
     ).start()
     model = load_model(Trivial(), labels=("mug", "vase"), input_size=16, name="trivial")
     side = max(1, round(configurations**0.5))

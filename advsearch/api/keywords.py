@@ -97,6 +97,7 @@ class SweepKeywords(PictureKeywords, total=False):
     sampler: Literal["sobol", "random"]
     batch: int
     keep_pictures: Literal["all", "wrong", "none"]
+    specialise: bool
     trials: int
     verify_spp: int | None
     overwrite: bool

@@ -194,6 +194,7 @@ def _job(
         command_line=config.command_line(),
         warnings=tuple(dict.fromkeys(warnings)),
         keep_pictures=config.keep_pictures,
+        specialise=config.specialise,
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import field_validator
 
 from advsearch.config.attack import FEWEST_TRIALS, AttackConfig
+from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.scene import ControlsByName, SceneConfig
 from advsearch.settings import Clash, number_or_text, setting, setting_as_in, split_names
 
@@ -85,6 +86,13 @@ class SweepConfig(SceneConfig):
     )
     keep_pictures: Literal["all", "wrong", "none"] = setting(
         "none", "sweep", "answers of which small pictures are kept, to look at"
+    )
+    specialise: bool = setting_as_in(
+        DerivativeConfig,
+        "specialise",
+        group="sweep",
+        description="predict pictures that differ in light alone",
+        switched="render every picture, also those that differ in light alone",
     )
     spp: int | None = setting_as_in(
         SceneConfig, "spp", group="sweep", description="samples per pixel of a picture", expects="", ge=1, le=65536

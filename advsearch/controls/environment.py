@@ -159,6 +159,8 @@ def turn(radiance: Tensor, degrees: Tensor) -> Tensor:
     """
     columns = radiance.shape[1]
     shift = torch.remainder(degrees / 360.0, 1.0) * columns
+    if not shift.requires_grad and float(shift) == 0.0:
+        return radiance
     whole = int(shift.detach().floor())
     share = shift - whole
     near, far = radiance.roll(-whole, dims=1), radiance.roll(-whole - 1, dims=1)

@@ -38,6 +38,7 @@ through 40 evaluations, moved the verified margin by 0.1 of 28 logits, for as lo
 CHECK_SPP = 64
 """Samples a pixel of the traced pictures of a comparison."""
 Tick = Callable[[int], None]
+Judged = float | Tensor
 
 
 @dataclass(frozen=True)
@@ -315,7 +316,7 @@ def deviation_of(problem: Problem, linear: PredictingRenderer, at: Tensor, u: Te
 
 
 def deviation_under_light(
-    renderer: Renderer, loss: Callable[[Tensor], Tensor], predicted: PredictingRenderer, u: Tensor, seed: int, spp: int
+    renderer: Renderer, loss: Callable[[Tensor], Judged], predicted: PredictingRenderer, u: Tensor, seed: int, spp: int
 ) -> Deviation:
     """Compare a predicted picture with a traced one. It may be as far from that as a rendered one, at `spp` samples a
     pixel: noise grows with the power of light, and that of two lights does not drop out of a change."""

@@ -13,6 +13,7 @@ import shlex
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, Literal
 
 import numpy as np
@@ -78,6 +79,7 @@ class FakeRenderer:
         self, scene: Any, space: Any, size: tuple[int, int], denoise: str, seed: int, sampler: str = "independent"
     ) -> None:
         self.space, self.size, self.non_finite = space, size, 0
+        self.start, self.scene = space.start, SimpleNamespace(assembly=dict)  # nothing of it is light
         self.formation = ImageFormation(denoiser=denoise, resolution=size)
         self.seen: list[tuple[Tensor, int, int]] = []
         FakeRenderer.made.append(self)
@@ -875,7 +877,7 @@ def test_every_flag_of_its_own_is_documented() -> None:
         if one.group in ("sweep", "verification") and one.field != "spp":
             what, _, rest = help_text(one).partition(": ")
             values, _, default = rest.partition(" (default: ")
-            assert f"| `{one.flag}` | {what} | {values} | {default.removesuffix(')')} |" in page
+            assert f"| `{one.flag}` | {what} | {values or 'no value'} | {default.removesuffix(')')} |" in page
 
 
 def test_ctrl_c_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -68,6 +68,7 @@ class Job:
         command_line: the command that asks the same again.
         warnings: on the way.
         keep_pictures: thumbnails that are kept: "all", "wrong" (what any of the models gets wrong) or "none".
+        specialise: whether pictures that differ in light alone may be predicted.
     """
 
     object: str
@@ -89,6 +90,7 @@ class Job:
     command_line: str
     warnings: tuple[str, ...]
     keep_pictures: Literal["all", "wrong", "none"] = "none"
+    specialise: bool = True
 
     @cached_property
     def sizes(self) -> tuple[tuple[int, int], ...]:

@@ -9,7 +9,7 @@ that was stopped goes on bit for bit as one that was not.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from advsearch.engine.pictures import save_marked
 from advsearch.engine.record import Stages
 from advsearch.engine.rows import judgement_of, trial_row
 from advsearch.engine.sweeps.job import Job, check_all
+from advsearch.engine.sweeps.light import Shown, together
 from advsearch.engine.sweeps.points import Picks, Points
 from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally, rate
 from advsearch.engine.sweeps.swept_scene import SweptScene
@@ -35,9 +36,10 @@ from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.attack import DescribedValue
+from advsearch.runs.results.attack import DescribedValue, LinearTransport
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.sweep import SweepSummary, WorstClaim, WorstConfiguration, WorstVerified
+from advsearch.scene.transport.renderer import SPP as BASIS_SPP
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 from advsearch.viewer.sweep_page import write_page
@@ -134,7 +136,8 @@ class Sweep:
         self._seeds = Seeds(job.pictures.seed, KIND)
         self._kept: list[store.Row] = []
         self._view: SweptScene | None = None
-        self._rendered = 0
+        self._rendered = self._traced = self._predicted = 0
+        self._transport: list[LinearTransport | None] = []
         self._not_finite = run is not None and run.store.note(NOT_FINITE) is not None
         self._told, self._untold = 0.0, 0
         objects, environments = (
@@ -181,8 +184,11 @@ class Sweep:
         begin_scene, begin = divmod(first // self.models, self.per_scene)
         for scene in range(begin_scene, len(self.job.places)):
             view = self._open(scene)
-            for numbers in batches(begin, self.per_scene, self.job.batch):
-                self._batch(view, numbers, tally)
+            try:
+                for numbers in batches(begin, self.per_scene, self.job.batch):
+                    self._batch(view, numbers, tally)
+            finally:
+                self._transport += [one.summary() for one in view.light.values()]
             begin = 0
 
     def _batch(self, view: SweptScene, numbers: range, tally: Tally) -> None:
@@ -191,10 +197,14 @@ class Sweep:
         before = view.number * self.per_scene
         picks = self.points.picks(numbers.start, len(numbers), before)
         noise = [self._seeds(before + number) for number in numbers]
-        seen, values, pictures = view.look(picks, noise, self.samples)
+        seen = view.look(picks, noise)
         seconds = (time.perf_counter() - begun) / (len(numbers) * self.models)
         rows = [
-            self._row(before + number, model, noise[k], seen[model][k], values[model][k], seconds)
+            self._shown_row(
+                self._row(before + number, model, noise[k], seen.judgements[model][k], seen.values[model][k], seconds),
+                model,
+                seen.shown[model][k],
+            )
             for k, number in enumerate(numbers)
             for model in range(self.models)
         ]
@@ -202,12 +212,13 @@ class Sweep:
             self._kept += rows
         else:
             for k, number in enumerate(numbers):
-                if self._is_kept(seen[model][k] for model in range(self.models)):
-                    thumbnails.keep(self.run.path, before + number, pictures[k])
+                if self._is_kept(seen.judgements[model][k] for model in range(self.models)):
+                    thumbnails.keep(self.run.path, before + number, seen.pictures[k])
             self.run.record(*rows)
+        self._spend(rows)
         for k in range(len(numbers)):
             for model in range(self.models):
-                self._count(tally, view.number, picks, k, model, seen[model][k])
+                self._count(tally, view.number, picks, k, model, seen.judgements[model][k])
         self._rendered += len(numbers) * len(view.renderers)
         if view.not_finite and not self._not_finite:
             self._not_finite = True
@@ -238,7 +249,16 @@ class Sweep:
             named["environment"] = {"value": lit_by, "unit": ""}
         named |= {"model": {"value": self.job.models[model].name, "unit": ""}, **values}
         row = trial_row(KIND, number * self.models + model, seed, self.samples, trial, named, sought=False)
-        return replace(row, seconds=seconds, renders=int(self.job.sizes[model] not in self.job.sizes[:model]))
+        return replace(row, seconds=seconds)
+
+    def _shown_row(self, row: store.Row, model: int, shown: Shown) -> store.Row:
+        """The row with how its picture was made: a predicted one has no seed of its own."""
+        row = replace(row, renders=shown.traced if self._is_first_of_size(model) else 0)
+        return replace(row, seed=None, spp=BASIS_SPP) if shown.predicted else row
+
+    def _is_first_of_size(self, model: int) -> bool:
+        """Whether no model before it is shown the same pictures."""
+        return self.job.sizes[model] not in self.job.sizes[:model]
 
     def _tell(self, count: int, tally: Tally) -> None:
         self._untold += count
@@ -259,7 +279,9 @@ class Sweep:
     def _counted(self) -> Tally:
         """Counts of the rows that are stored already, read one after the other."""
         tally = Tally(self._outer, self.job.axes, self._shown)
+        self._traced = self._predicted = 0
         if self.run is None:
+            self._spend(self._kept)
             return tally
         key, picks = (-1, -1), self.points.picks(0, 0)
         for row in self.run.store.rows(KIND):
@@ -271,7 +293,15 @@ class Sweep:
                 size = min(READ_AT_ONCE, self.per_scene - begin)
                 picks = self.points.picks(begin, size, scene * self.per_scene)
             self._count(tally, scene, picks, place, model, judgement_of(row))
+            self._spend([row])
         return tally
+
+    def _spend(self, rows: Sequence[store.Row]) -> None:
+        """Count the pictures that rows took; old ones don't say it."""
+        for row in rows:
+            first = self._is_first_of_size(row.step % self.models)
+            self._traced += int(first) if row.renders is None else row.renders
+            self._predicted += row.seed is None and first
 
     def _count(self, tally: Tally, scene: int, picks: Picks, k: int, model: int, trial: Judgement) -> None:
         tally.add((picks.number + k) * self.models + model, (*self._places[scene], model), picks, k, trial)
@@ -295,7 +325,7 @@ class Sweep:
         return WorstConfiguration(
             configuration=index,
             values={name: DescribedValue.of(value) for name, value in row.values.items()},
-            seed=row.seed or 0,
+            seed=self._seeds(picks.number),
             label_set=list(task.truth_names(truth)),
             claimed=WorstClaim(**vars(seen.answer), margin=seen.margin, payload=seen.payload),
             verified=None,
@@ -349,9 +379,11 @@ class Sweep:
             sampler=job.sampler if job.controls else None,
             spp=self.samples,
             renders={
-                "sweep": tally.seen // self.models * len(set(job.sizes)),
+                "sweep": self._traced,
                 "verification": checked.renders if checked else 0,
+                **({"products": self._predicted} if self._predicted else {}),
             },
+            transport=together(self._transport),
             renders_per_second=self._rendered / swept if self._rendered and swept else None,
             seconds={**seconds, "total": self.stages.total},
             seed=job.pictures.seed,

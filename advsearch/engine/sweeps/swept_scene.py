@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from advsearch import seeds
 from advsearch.described import Value
 from advsearch.engine.loading import framed, make_renderer
 from advsearch.engine.sweeps.job import Job
+from advsearch.engine.sweeps.light import Shown, SweptLight
 from advsearch.engine.sweeps.points import Picks, Points
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
@@ -19,6 +22,23 @@ from advsearch.tasks import Judgement, Mark
 from advsearch.tasks.base import Truth
 
 Values = dict[str, Value]
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What models say of pictures.
+
+    Attributes:
+        judgements: for each model, of each picture.
+        values: for each model, what is stored of each picture that it was shown.
+        shown: for each model, how each picture was made.
+        pictures: (n, H, W, 3) what the first model was shown.
+    """
+
+    judgements: list[list[Judgement]]
+    values: list[list[Values]]
+    shown: list[list[Shown]]
+    pictures: Tensor
 
 
 class SweptScene:
@@ -31,6 +51,7 @@ class SweptScene:
     Attributes:
         points: its configurations for each size of picture, on which what a control frames may depend.
         renderers: likewise.
+        light: what predicts pictures of these that differ in light alone.
         not_finite: whether a picture had values that are not finite, which were set to 0.
     """
 
@@ -46,34 +67,51 @@ class SweptScene:
                 description, space, size, pictures.denoise, pictures.seed, sampler=pictures.sampler
             )
             self.points[size] = job.points(space)
+        self.light = {
+            size: SweptLight(
+                renderer,
+                self.points[size],
+                job.axes,
+                job.spp,
+                seeds.stream(pictures.seed, "sweep light", number),
+                partial(self._score, job.sizes.index(size)),
+                job.specialise,
+            )
+            for size, renderer in self.renderers.items()
+        }
         self._truths = [None if task.varies else job.truth(place, k, {}) for k, task in enumerate(job.tasks)]
 
     @property
     def not_finite(self) -> bool:
-        return any(renderer.non_finite for renderer in self.renderers.values())
+        basis = any(one.not_finite for one in self.light.values())
+        return basis or any(renderer.non_finite for renderer in self.renderers.values())
 
-    def look(
-        self, picks: Picks, noise: Sequence[int], spp: int
-    ) -> tuple[list[list[Judgement]], list[list[Values]], Tensor]:
-        """Render configurations, round to 8 bits, ask and judge.
+    def look(self, picks: Picks, noise: Sequence[int]) -> Seen:
+        """Render or predict configurations, round to 8 bits, ask and judge.
 
         Args:
             picks: n of them.
             noise: a seed for each.
-            spp: samples a pixel.
-
-        Returns:
-            For each model, what it says of each picture; what is stored of each picture that it was shown; and the
-            pictures (n, H, W, 3) that the first model was shown.
         """
-        u, pictures, values = {}, {}, {}
-        for size, renderer in self.renderers.items():
-            u[size] = self.points[size].configurations(picks)
-            pictures[size] = self._pictures(renderer, u[size], noise, spp)
-            values[size] = self.points[size].values(u[size], picks)
+        u, shown, pictures, values = {}, {}, {}, {}
+        for size, points in self.points.items():
+            u[size] = points.configurations(picks)
+            with torch.no_grad():
+                shown[size] = self.light[size].show(picks, u[size], noise, self.number * points.count)
+            pictures[size] = to_8_bit(torch.stack([one.picture for one in shown[size]]))
+            values[size] = points.values(u[size], picks)
         sizes = self._job.sizes
-        seen = [self._judged(model, pictures[size], u[size], values[size]) for model, size in enumerate(sizes)]
-        return seen, [values[size] for size in sizes], pictures[sizes[0]]
+        return Seen(
+            judgements=[self._judged(model, pictures[size], u[size], values[size]) for model, size in enumerate(sizes)],
+            values=[values[size] for size in sizes],
+            shown=[shown[size] for size in sizes],
+            pictures=pictures[sizes[0]],
+        )
+
+    def _score(self, model: int, picture: Tensor, u: Tensor) -> float:
+        """The margin of one model on one picture (H, W, 3), in logits."""
+        values = self._spaces[self._job.sizes[model]].describe(u)
+        return self._judged(model, to_8_bit(picture)[None], u[None], [values])[0].margin
 
     def trial(self, number: int, u: Tensor, seed: int, spp: int) -> Judgement:
         """What one model says of one configuration."""

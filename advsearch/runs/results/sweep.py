@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from advsearch.runs.results.attack import DescribedValue, VerifiedRate
+from advsearch.runs.results.attack import DescribedValue, LinearTransport, VerifiedRate
 from advsearch.runs.results.base import Fields, Formation, Interval, Number, Payload, RunResult, having
 
 AxisValue = int | float | str | tuple[float, float]
@@ -97,7 +97,13 @@ class SweepSummary(CountedAnswers, RunResult):
     samples: int = Field(description="draws at each point of the grid")
     sampler: str | None = Field(description="of the draws; null without any")
     spp: int = Field(description="samples a pixel")
-    renders: Annotated[dict[str, int], having("sweep")] = Field(description="of the sweep and of the verification")
+    renders: Annotated[dict[str, int], having("sweep")] = Field(
+        description="of the sweep and of the verification; `products`: predicted instead"
+    )
+    transport: LinearTransport | None = Field(
+        default=None,
+        description="whether [basis pictures](transport.md#light) predicted pictures; absent where no light moves",
+    )
     renders_per_second: float | None = Field(description="pictures of the sweep; null where nothing was rendered now")
     warnings: list[str] = Field(description="sentences that a reader has to know")
 

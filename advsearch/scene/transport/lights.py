@@ -13,7 +13,7 @@ off below zero is why they need not meet it.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -34,6 +34,7 @@ SAME = 1e-3
 """Relative difference up to which a map is a multiple of another one: float32 after a tone curve and back."""
 PROBED = 64
 """Options of a discrete choice that are looked at, at most."""
+TINY = 1e-30
 FEW = 4
 """Every so many rows and columns of a map are looked at first."""
 BETWEEN = (0.02, 0.29, 0.61, 0.97)
@@ -57,15 +58,25 @@ class Lighting:
     Attributes:
         groups: by `control.parameter`, the inputs that it changes; none where only the finished picture changes.
         harmonic: those that add spherical harmonics to the environment.
+        bright: of the other ones that change a map, their coordinates and what these are where it is brightest: a
+            basis map must not be black in a channel.
     """
 
     groups: Mapping[str, frozenset[str]]
     harmonic: frozenset[str]
+    bright: Sequence[tuple[slice, Tensor]] = ()
 
     @property
     def moved(self) -> frozenset[str]:
         """The inputs that are light and move."""
         return frozenset(name for names in self.groups.values() for name in names) - ON_PICTURE
+
+    def at_its_brightest(self, u: Tensor) -> Tensor:
+        """Return a configuration with as much light of the environment as there can be."""
+        found = u.detach().clone()
+        for coordinates, values in self.bright:
+            found[coordinates] = values
+        return found
 
 
 def lighting(renderer: Renderer) -> Lighting:
@@ -74,21 +85,27 @@ def lighting(renderer: Renderer) -> Lighting:
     Found by looking at the inputs of configurations, so that it holds for whatever sets them.
     """
     middle = 0.5 * renderer.start + 0.25
-    groups, harmonic = {}, set()
+    groups, harmonic, bright = {}, set(), []
     with torch.no_grad():
         here = renderer.scene.assembly(renderer.space.inputs(middle))
         for group in renderer.space.groups:
             found: set[str] = set()
+            most, brightest = -1.0, middle
             for place in _places(group, middle):
-                changes = _changes(here, renderer.scene.assembly(renderer.space.inputs(place)))
+                there = renderer.scene.assembly(renderer.space.inputs(place))
+                changes = _changes(here, there, group.size)
                 if None in changes.values():
                     break
+                if ENVIRONMENT in there and float(there[ENVIRONMENT].sum()) > most:
+                    most, brightest = float(there[ENVIRONMENT].sum()), place
                 found |= changes.keys()
                 if changes.get(ENVIRONMENT) == "harmonics":
                     harmonic.add(group.name)
             else:
                 groups[group.name] = frozenset(found)
-    return Lighting(groups, frozenset(harmonic & groups.keys()))
+                if ENVIRONMENT in found and group.name not in harmonic:
+                    bright.append((group.coordinates, brightest[group.coordinates]))
+    return Lighting(groups, frozenset(harmonic & groups.keys()), tuple(bright))
 
 
 def _places(group: Group, middle: Tensor) -> Iterator[Tensor]:
@@ -107,8 +124,8 @@ def _places(group: Group, middle: Tensor) -> Iterator[Tensor]:
         yield place
 
 
-def _changes(here: Inputs, there: Inputs) -> dict[str, str | None]:
-    """The inputs that differ, with how, in words; None of one that is more than light."""
+def _changes(here: Inputs, there: Inputs, numbers: int) -> dict[str, str | None]:
+    """The inputs that differ by so many numbers, with how, in words; None of one that is more than light."""
     found: dict[str, str | None] = {name: None for name in here.keys() ^ there.keys()}
     for name in here.keys() & there.keys():
         one, other = here[name], there[name]
@@ -117,16 +134,18 @@ def _changes(here: Inputs, there: Inputs) -> dict[str, str | None]:
         if name in ON_PICTURE or name.endswith(LAMPS):
             found[name] = "power"
         else:
-            found[name] = _change_of_map(one, other) if name == ENVIRONMENT else None
+            found[name] = _change_of_map(one, other, numbers) if name == ENVIRONMENT else None
     return found
 
 
-def _change_of_map(one: Tensor, other: Tensor) -> str | None:
+def _change_of_map(one: Tensor, other: Tensor, numbers: int) -> str | None:
     """How a map (H, W, 3) differs from another one: times a colour, or plus spherical harmonics; None if neither."""
     if one.shape != other.shape:
         return None
     if _explained(one[None], other):
         return "power"
+    if numbers == 1:  # one number adds no harmonics of a choice
+        return None
     basis = torch.cat([one[None], _harmonic_maps(one)])
     some = basis[:, ::FEW, ::FEW], other[::FEW, ::FEW]  # tells most others apart in a tenth of the time
     return "harmonics" if _explained(*some) and _explained(basis, other) else None
@@ -161,6 +180,8 @@ class Span:
     def weights(self, lit: Tensor) -> Tensor:
         """Return (k, 3): the weights with which the maps come nearest to (H, W, 3); differentiable."""
         flat = lit.permute(2, 0, 1).reshape(3, -1, 1)
+        if len(self.maps) == 1:  # it is a multiple of the one map, which one texel of each channel tells
+            return (flat[..., 0].gather(1, self._brightest) / self.maps[0].amax(dim=(0, 1))[:, None].clamp_min(TINY)).T
         found: Tensor = (self._inverse @ flat)[..., 0].T
         return found
 
@@ -168,6 +189,11 @@ class Span:
         """Return the map (H, W, 3) of weights (k, 3)."""
         found: Tensor = torch.einsum("khwc,kc->hwc", self.maps, weights)
         return found
+
+    @cached_property
+    def _brightest(self) -> Tensor:
+        """(3, 1): the brightest texel of the first map in each channel."""
+        return self.maps[0].reshape(-1, 3).argmax(dim=0)[:, None]
 
     @cached_property
     def _inverse(self) -> Tensor:
@@ -253,11 +279,13 @@ class BasisRenderer(PredictingRenderer):
         vars(self).update(vars(copy.copy(renderer)))
         self.products = 0
         with torch.no_grad():
-            self._lights = Lights(renderer, moving or lighting(renderer), self._assembled(u))
+            moving = moving or lighting(renderer)
+            self._lights = Lights(renderer, moving, self._assembled(moving.at_its_brightest(u)))
             self._of_each = [
                 LinearRenderer(renderer, u, seeds.stream(seed, "light", number), tick, light=alone)
                 for number, alone in enumerate(self._lights.alone)
             ]
+        self.non_finite += sum(one.non_finite - renderer.non_finite for one in self._of_each)
 
     @property
     def lights(self) -> int:
