@@ -22,7 +22,16 @@ from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
 from advsearch.engine.answers import Described, Looked, check_truth, facts_of
 from advsearch.engine.budget import Preparation, RenderBudget, verification_ladder
-from advsearch.engine.loading import Controls, PictureSettings, Scene, framed, load_scene, make_renderer, settings_of
+from advsearch.engine.loading import (
+    Controls,
+    PictureSettings,
+    Scene,
+    framed,
+    load_scene,
+    make_renderer,
+    named_camera,
+    settings_of,
+)
 from advsearch.engine.memory import Memory
 from advsearch.engine.naming import AnyModel, load_models, model_name, scene_settings, several
 from advsearch.engine.objective import Wanted, objective_for, task_for
@@ -97,6 +106,7 @@ def attack(
         "object": scene.description.object_name,
         "environment": scene.description.environment_name,
         "up": scene.description.up,
+        "camera": named_camera(scene.description),
         "model": ",".join(map(model_name, several(model))),
         "controls": settings_of(controls),
         "over": settings_of(over),
@@ -168,14 +178,14 @@ def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> t
 def _scene(scene: Scene | str | Path, settings: AttackKeywords) -> Scene:
     """The scene as it was given, or the one that a name and the settings describe."""
     if isinstance(scene, Scene):
-        clash = [name for name in ("set", "environment", "up", "exposure") if settings.get(name) is not None]
+        clash = [name for name in ("set", "environment", "up", "camera", "exposure") if settings.get(name) is not None]
         if clash:
             raise InputError(f"{', '.join(clash)}: belongs to the scene, which is given already; give it to load_scene")
         return scene
     given, lit_by = scene_settings(settings.get("set"), settings.get("exposure")), settings.get("environment")
     if not (lit_by is None or isinstance(lit_by, (str, Path))):
         raise one_only("environment", tuple(lit_by))
-    return load_scene(scene, lit_by, up=settings.get("up"), settings=given)
+    return load_scene(scene, lit_by, up=settings.get("up"), settings=given, camera=settings.get("camera"))
 
 
 def _set_by(scene: Scene, exposure: float | None) -> dict[str, float | str]:
@@ -212,7 +222,7 @@ def _job(config: AttackConfig) -> _Job:
     task, objective = _asked(config, config.task, config.objective)
     policy = make_policy(config.policy_name, **_policy_options(config))
     given = scene_settings(config.set_, config.exposure)
-    scene = load_scene(config.object, config.environment, up=config.up, settings=given)
+    scene = load_scene(config.object, config.environment, up=config.up, settings=given, camera=config.camera)
     model = _model(config.model, config, task)
     return _Job(config, scene, model, task, searched, drawn, objective, policy, True)
 

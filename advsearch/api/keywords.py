@@ -36,6 +36,7 @@ class PictureKeywords(TypedDict, total=False):
 
     environment: Path | Names | None
     up: Literal["y", "z"] | None
+    camera: str | None
     set: Mapping[str, float | str | Sequence[float]] | None
     exposure: float | None
     resolution: int | str | tuple[int, int] | None

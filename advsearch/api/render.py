@@ -34,7 +34,7 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
     shared.check(config.controls)
     controls = shared.given_to(config.controls)
     given = scene_settings(config.set_, config.exposure)
-    scene = load_scene(config.object, config.environment, up=config.up, settings=given)
+    scene = load_scene(config.object, config.environment, up=config.up, settings=given, camera=config.camera)
     task = make_task(config.task)
     (model,), notes = load_models([config.model], task, labels=config.labels, used_threads=config.used_threads)
     rendering = render(

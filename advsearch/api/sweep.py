@@ -11,7 +11,7 @@ from advsearch.api.keywords import SweepKeywords, asks
 from advsearch.config import SweepConfig
 from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.budget import verification_ladder
-from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, settings_of
+from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, named_camera, settings_of
 from advsearch.engine.naming import AnyModel, different, load_models, model_name, scene_settings, several
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.axes import read_axes
@@ -139,6 +139,7 @@ def _described(places: Sequence[NamedScene]) -> dict[str, object]:
         "object": ",".join(dict.fromkeys(place.object for place in places)),
         "environment": ",".join(dict.fromkeys(place.environment for place in places)),
         "up": first.up,
+        "camera": named_camera(first),
         "set": first.given_values if len(places) == 1 else {},
     }
 
@@ -203,7 +204,7 @@ def _places(config: SweepConfig) -> tuple[NamedScene, ...]:
     given = scene_settings(config.set_, config.exposure)
     objects, environments = different(config.objects, "object"), different(config.environments, "environment")
     asked = environments[0] if config.environment else None
-    scenes = {name: load_scene(name, asked, up=config.up, settings=given) for name in objects}
+    scenes = {name: load_scene(name, asked, up=config.up, settings=given, camera=config.camera) for name in objects}
     if asked is None:
         return tuple(NamedScene(name, scene.description.environment_name, scene) for name, scene in scenes.items())
     lights = {asked: scenes[objects[0]].description.environment}

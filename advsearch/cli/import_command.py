@@ -55,7 +55,9 @@ def run(args: argparse.Namespace) -> int:
         "texture": list(whole.base_color.shape[1::-1]),
         "up": None if whole.up is None else whole.up.axis,
     }
-    nodes = [{"name": one.name, "triangles": one.triangles, "size": list(one.size)} for one in found.nodes]
+    nodes = [
+        {"name": one.name, "mesh": one.mesh, "triangles": one.triangles, "size": list(one.size)} for one in found.nodes
+    ]
     if args.json:
         told = {
             "file": args.file,
@@ -70,12 +72,14 @@ def run(args: argparse.Namespace) -> int:
     print(f"{args.file}: {facts['triangles']:,} triangles, a texture of {width} x {height}, {facts['up']} up")
     if nodes:
         rows = [
-            [one.name, f"{one.triangles:,} triangles", " x ".join(f"{side:.3g}" for side in one.size)]
+            [one.name, one.mesh, f"{one.triangles:,} triangles", " x ".join(f"{side:.3g}" for side in one.size)]
             for one in found.nodes
         ]
-        print(output.columns([["node", "", "size"], *rows]))
+        print(output.columns([["node", "in controls", "", "size"], *rows]))
         print(f"One of them as the object, the rest around it: --object '{args.file}#{found.nodes[-1].name}'")
-    for what, names in (("lights", found.lights), ("cameras", found.cameras)):
+        if len(found.nodes) > 1:
+            print(f"Another one moves with it: --control pose,pose:{found.nodes[0].mesh}")
+    for what, names in (("lights", found.lights), ("cameras (--camera NAME)", found.cameras)):
         if names:
             print(f"{what}: {', '.join(names)}")
     for warning in whole.warnings:

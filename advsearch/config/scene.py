@@ -67,6 +67,15 @@ class SceneConfig(Config):
         "axis of an imported object that points up",
         otherwise="as the format says, or else the axis along which it stands best",
     )
+    camera: str | None = setting(
+        None,
+        "scene",
+        "which camera of a scene file sees it",
+        "a name that advsearch import lists, or orbit",
+        metavar="NAME",
+        otherwise="orbit, the one around the object that camera.* describes",
+        min_length=1,
+    )
     set_: dict[str, float | str | tuple[float, ...]] = setting(
         dict,
         "scene",

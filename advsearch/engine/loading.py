@@ -12,7 +12,7 @@ from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
-from advsearch.scene.description import ENVIRONMENT, NO_MAP, SceneDescription, check_meshes, describe
+from advsearch.scene.description import ENVIRONMENT, NO_MAP, ORBIT_CAMERA, SceneDescription, check_meshes, describe
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients.motion import Motion
 from advsearch.scene.leaving_out import EVERYTHING
@@ -118,6 +118,7 @@ def load_scene(
     *,
     up: str | None = None,
     settings: Given | None = None,
+    camera: str | None = None,
 ) -> Scene:
     """Load a scene.
 
@@ -127,11 +128,18 @@ def load_scene(
         up: the up axis of a mesh file, "y" or "z"; by default what its format or else its shape says.
         settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a picture belongs to none of them
             but to what makes it: `resolution` of `attack`, `sweep`, `render` and `Scene.renderer`.
+        camera: name of a camera of a scene file; "orbit" or None for the one around the object.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of range.
     """
-    return Scene(describe(object, environment, given=settings, up=up))
+    described = describe(object, environment, given=settings, up=up)
+    return Scene(described if camera is None else described.seen_by(camera))
+
+
+def named_camera(description: SceneDescription) -> str | None:
+    """Return the camera of a scene file in use, as `load_scene` takes it; None for the one around the object."""
+    return None if description.camera == ORBIT_CAMERA else description.camera
 
 
 def framed(description: SceneDescription, resolution: int | tuple[int, int]) -> SceneDescription:

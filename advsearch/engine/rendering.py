@@ -23,7 +23,7 @@ from advsearch.runs.files import placed_by
 from advsearch.runs.images import write_exr, write_png
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.render import MeshUp, RenderResult, ViewAnswers
-from advsearch.scene.description import SceneDescription
+from advsearch.scene.description import ORBIT_CAMERA, SceneDescription
 from advsearch.scene.formation import ImageFormation, to_8_bit
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER
 from advsearch.tasks import Answer, AnyTask, make_task
@@ -208,6 +208,10 @@ def _turned(description: SceneDescription, around: int | None) -> Iterator[Scene
     if around is None:
         yield description
         return
+    if description.camera != ORBIT_CAMERA:
+        raise InputError(
+            f"around: goes around the object, and `camera` {description.camera} stands still; leave one out"
+        )
     first = description.number("camera.azimuth")
     for number in range(around):
         yield description.with_values(camera__azimuth=(first + 360.0 * number / around) % 360.0)

@@ -96,9 +96,16 @@ class SceneDescription:
 
         Raises:
             UnknownNameError: it has no such camera.
+            InputError: a setting of the camera around the object was given, and another is to see it.
         """
         if camera not in (ORBIT_CAMERA, *self.cameras):
             raise UnknownNameError("camera of the scene", camera, (ORBIT_CAMERA, *self.cameras))
+        idle = sorted(name for name in self.given if name.startswith("camera.") and name != "camera.exposure")
+        if camera != ORBIT_CAMERA and idle:
+            raise InputError(
+                f"`camera={camera}` and `set` {idle[0]} contradict each other: the camera of the file has a place and "
+                "a field of view of its own; leave one of the two out"
+            )
         return replace(self, camera=camera)
 
     @cached_property

@@ -38,6 +38,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "object": ("", "expected the name of an object or a .obj, .ply, .glb, .gltf or .stl file, got ''"),
     "environment": ([], "expected the name of an environment, a .hdr or .exr file, or none, got "),
     "up": ("x", "expected y or z, got x"),
+    "camera": ("", "expected a name that advsearch import lists, or orbit, got ''"),
     "set_": ({"camera.azimuth": math.nan}, "got camera.azimuth=nan"),
     "exposure": (99, "expected a number from -10 to 10, got 99"),
     "resolution": ("4x4", "expected SIDE or HEIGHTxWIDTH, each from 8 to 4096, got 4x4"),
@@ -88,7 +89,7 @@ WRONG: dict[str, tuple[Any, str]] = {
 }
 
 GIVEN: dict[str, Any] = {
-    "object": "mug.obj", "environment": "room.hdr", "up": "y",
+    "object": "mug.obj", "environment": "room.hdr", "up": "y", "camera": "front",
     "set": {"camera.azimuth": 130.0, "camera.target": (0.0, 0.5, 1.0), "material": "felt"},
     "exposure": -1.5, "resolution": (96, 128), "model": "net.pt2,other.pt2", "ensemble": "mean",
     "labels": "labels.json", "task": "detection", "label": "coffee mug,cup",

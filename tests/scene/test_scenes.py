@@ -14,6 +14,7 @@ import trimesh
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
+import advsearch
 from advsearch.cli.main import main
 from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.scene.description import describe
@@ -188,11 +189,41 @@ def test_an_attack_on_a_node_is_verified_and_goes_on_from_its_file(file: Path, t
     )
 
 
+def test_a_camera_of_the_file_is_chosen_by_name(file: Path, tmp_path: Path) -> None:
+    seen: list[bytes] = []
+    for more in ([], ["--camera", "orbit"], ["--camera", "front"]):
+        out = tmp_path / f"{len(seen)}.png"
+        small = ["--resolution", "16", "--spp", "1", "--denoise", "none", "--out", str(out)]
+        assert main(["render", "--object", f"{file}#crate", *small, *more]) == 0
+        seen.append(out.read_bytes())
+    assert seen[0] == seen[1] != seen[2]
+
+
+def test_a_scene_seen_by_a_camera_of_its_file_is_kept_by_its_name(file: Path, tmp_path: Path) -> None:
+    scene = advsearch.load_scene(f"{file}#crate", camera="front")
+    small: Any = {"resolution": 16, "spp": 1, "trials": 6, "label": "ball"}
+    assert advsearch.sweep(scene, grid={"pose.yaw": [0, 90]}, run=tmp_path / "run", **small)
+    assert "camera: front" in (tmp_path / "run" / "run.yaml").read_text()
+
+
+def test_a_camera_that_is_none_or_says_otherwise_is_refused(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = ["sweep", "--object", f"{file}#crate", "--grid", "pose.yaw=0,90", "--label", "ball", "--camera"]
+    for more, words in {
+        ("fronts",): "unknown camera of the scene 'fronts'. Did you mean 'front'? Known: front, orbit.",
+        ("front", "--set", "camera.azimuth=9"): "--camera front and --set camera.azimuth contradict each other",
+        ("front", "--control", "camera", "--samples", "2"): "--control camera: moves along an orbit",
+    }.items():
+        assert main([*asked, *more]) == 2
+        assert words in capsys.readouterr().err
+
+
 def test_import_says_what_was_understood(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["import", str(file), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert [one["name"] for one in told["nodes"]] == ["floor", "the wall", "crate"]
+    assert [one["mesh"] for one in told["nodes"]] == ["floor", "the-wall", "crate"]
     assert [one["triangles"] for one in told["nodes"]] == [12, 12, 12]
     assert (told["lights"], told["cameras"]) == (["bulb"], ["front"])
     assert main(["import", str(file)]) == 0
-    assert f"{file}#crate" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"{file}#crate" in said and "pose:floor" in said and "--camera NAME): front" in said

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -38,7 +38,7 @@ FAR = 1000.0
 """Distance of a directional light, in object sizes."""
 MOST_SURROUNDINGS = 200
 """Meshes and lamps around an object."""
-TAKEN = frozenset(("object", "environment", "ground", "camera"))
+TAKEN = frozenset(("object", "environment", "ground", "camera", "orbit"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,10 +93,11 @@ def import_scene(path: Path, node: str) -> ImportedScene:
             f"{len(others) + len(lamps)}; join some of them in the file"
         )
     frame, names = _frame(own), _Names()
+    called = _mesh_names(header, parts, names)
     surroundings: list[ScenePart] = []
     for number in others:
         group = [part for part in parts if part.node == number]
-        name, place = names.free(header.label(number)), _frame(group)
+        name, place = called[number], _frame(group)
         made = object_of(group, [], path, name, "y")
         notes.extend(made.warnings)
         matrix = np.eye(4)
@@ -107,14 +108,28 @@ def import_scene(path: Path, node: str) -> ImportedScene:
         light = header.lights[header.nodes[index].lamp or 0]
         surroundings.append(_lamp(names.free(light.name or header.label(index)), light, poses[index], frame))
     cameras = {
-        names.free(header.cameras[camera].name or header.label(index)): _camera(header.cameras[camera], pose, frame)
-        for index, pose in poses.items()
-        if (camera := header.nodes[index].camera) is not None and header.cameras[camera].perspective is not None
+        name: _camera(header.cameras[header.nodes[index].camera or 0], poses[index], frame)
+        for index, name in _camera_names(header, poses).items()
     }
     notes.extend(_changed(path, header))
     return ImportedScene(
         object_of(own, notes, path, f"{safe_name(path)}-{clean(node)}", "y"), tuple(surroundings), cameras
     )
+
+
+def _mesh_names(header: Header, parts: Sequence[ImportedPart], names: _Names) -> dict[int, str]:
+    """Names of the nodes with geometry by number, the same whichever of them is the object."""
+    return {number: names.free(header.label(number)) for number in sorted({part.node for part in parts})}
+
+
+def _camera_names(header: Header, nodes: Iterable[int]) -> dict[int, str]:
+    """Names of the cameras with perspective, by the number of their node."""
+    names, found = _Names(), {}
+    for index in sorted(nodes):
+        camera = header.nodes[index].camera
+        if camera is not None and header.cameras[camera].perspective is not None:
+            found[index] = names.free(header.cameras[camera].name or header.label(index))
+    return found
 
 
 @dataclass(frozen=True)
@@ -123,11 +138,13 @@ class NodeContents:
 
     Attributes:
         name: as `import_scene` takes it.
+        mesh: what it is called in names of controls, beside another node.
         triangles: of its own mesh.
         size: of its bounding box in the file's axes and units, (3,).
     """
 
     name: str
+    mesh: str
     triangles: int
     size: tuple[float, float, float]
 
@@ -163,14 +180,14 @@ def contents(path: Path) -> Contents:
     nodes: dict[int, list[ImportedPart]] = {}
     for part in parts:
         nodes.setdefault(part.node, []).append(part)
-    listed = []
+    listed, called = [], _mesh_names(header, parts, _Names())
     for index, group in sorted(nodes.items()):
         places = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in group])
         x, y, z = map(float, np.ptp(places, axis=0))
-        listed.append(NodeContents(header.label(index), sum(len(part.faces) for part in group), (x, y, z)))
+        listed.append(NodeContents(header.label(index), called[index], sum(len(one.faces) for one in group), (x, y, z)))
     lights = tuple(light.name or f"light {index}" for index, light in enumerate(header.lights))
-    cameras = tuple(camera.name or f"camera {index}" for index, camera in enumerate(header.cameras))
-    return Contents(whole, tuple(listed), lights, cameras)
+    cameras = _camera_names(header, dict(_poses(header))).values()
+    return Contents(whole, tuple(listed), lights, tuple(cameras))
 
 
 @dataclass(frozen=True, eq=False)
