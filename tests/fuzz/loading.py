@@ -64,6 +64,16 @@ def load_run(path: Path) -> None:
     show_run(str(path.parent), as_json=False)
 
 
+def load_threedb(path: Path) -> None:
+    """Read a folder of 3DB as `import-3db` does."""
+    from advsearch.engine.sweeps.imported import read_picture
+    from advsearch.runs.threedb import read_threedb
+
+    for one in read_threedb(path.parent):
+        if one.picture is not None:
+            read_picture(one.picture)
+
+
 def misbehave(path: Path) -> None:
     """Do what no loader may, as the file says; the test of the fuzz itself."""
     import subprocess
@@ -91,6 +101,7 @@ LOADERS: dict[str, Callable[[Path], object]] = {
     "labels": load_labels,
     "settings": load_settings,
     "run": load_run,
+    "3db": load_threedb,
     "misbehave": misbehave,
 }
 """Each gets the path of a case's main file, and returns or raises an `AdvsearchError`."""

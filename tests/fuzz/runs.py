@@ -12,6 +12,7 @@ from pathlib import Path
 from advsearch.described import Value
 from advsearch.runs.store import Row, Store
 from advsearch.settings import HEADER
+from fuzz import pictures
 from fuzz.case import Case, Maker, Random
 from fuzz.mutations import as_json, confused, damaged
 
@@ -51,4 +52,28 @@ def folder(random: Random) -> Case:
     return Case(f"run: {name} {what}", "run", "run.yaml", files)
 
 
-MAKERS: tuple[Maker, ...] = (folder,)
+LINE = {
+    "id": "one", "environment": "park", "model": "mug", "is_correct": "True", "loss": 0.25, "prediction": [1, 0],
+    "output_type": "classes", "render_args": {"rotation": 0.5, "on": True, "where": [1.0, 2.0]},
+}  # fmt: skip
+
+
+def threedb(random: Random) -> Case:
+    """A folder of 3DB with one bad file, or an id that leads elsewhere."""
+    what, picture = pictures.picture(random)
+    line = {**LINE, "id": random.choice(("one", "../../outside/secret", "@OUTSIDE@/secret", "a" * 5000, 7, None))}
+    if random.random() < 0.5:
+        what, line = "confused", confused(random, LINE)
+    files = {
+        "details.log": b"\n".join([as_json(LINE), as_json(line)]),
+        "class_maps.json": json.dumps(["cup", "mug"]).encode(),
+        "images/one_rgb.png": picture,
+    }
+    if random.random() < 0.5:
+        name = random.choice(("details.log", "class_maps.json"))
+        what, files[name] = damaged(random, files[name])
+    links = {"images/two_rgb.png": "../../outside/secret.txt"}
+    return Case(f"3db: {what}", "3db", "details.log", files, links)
+
+
+MAKERS: tuple[Maker, ...] = (folder, threedb)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from advsearch.runs.threedb import read_threedb
 from advsearch.viewer import thumbnails
 from advsearch.viewer.sweep_page import write_page
 
-MOST_PIXELS = 1 << 26
+MOST_PIXELS = 1 << 22
 """Of a picture that is read."""
 
 MOST_VALUES = 96
@@ -44,7 +45,7 @@ def import_threedb(folder: Path, run: str | Path | None = None, *, overwrite: bo
         rows: list[Row] = []
         for one in read_threedb(folder):
             if one.picture is not None:
-                thumbnails.keep(kept.path, one.row.step, _picture(one.picture))
+                thumbnails.keep(kept.path, one.row.step, read_picture(one.picture))
             counts.add(one.row)
             rows.append(one.row)
             if len(rows) == AT_ONCE:
@@ -128,16 +129,23 @@ def _listed(names: Sequence[str]) -> str:
     return ",".join(names[:20]) + (f" and {len(names) - 20} more" if len(names) > 20 else "") or "unknown"
 
 
-def _picture(path: Path) -> object:
-    """The picture (H, W, 3) in [0, 1]."""
+def read_picture(path: Path) -> object:
+    """Return the picture (H, W, 3) in [0, 1] in a file.
+
+    Raises:
+        FileFormatError: it is none, or has more than `MOST_PIXELS`.
+    """
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            opened = Image.open(path)
+        with opened as image:
             if image.width * image.height > MOST_PIXELS:
                 raise FileFormatError(
                     f"{path}: expected at most {MOST_PIXELS} pixels, got {image.width} x {image.height}"
                 )
             return np.asarray(image.convert("RGB"), dtype=np.float32) / np.float32(255.0)
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise FileFormatError(f"{path}: expected a picture, got {str(error)[:100]}") from None
