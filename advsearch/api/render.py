@@ -41,6 +41,7 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
         scene,
         model,
         task=task,
+        label=config.label,
         controls=controls,
         around=config.around,
         resolution=config.resolution,
@@ -53,4 +54,4 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
     warnings = [*rendering.warnings, *notes]
     for text in warnings:
         progress.message(text)
-    return rendering.result(out, rendering.save(out), warnings)
+    return rendering.result(out, rendering.save(out), warnings, rendering.save_answers(out))

@@ -16,7 +16,9 @@ HELP = "render a picture of a scene, and say what the model sees in it"
 def text(result: RenderResult) -> str:
     """Return what was written, and the model's answers view by view."""
     height, width = result.size
-    lines = [f"{result.out}: {width} x {height} pixels", ""]
+    lines = [f"{result.out}: {width} x {height} pixels"]
+    lines += [f"{result.answered}: with the answers drawn in"] if result.answered else []
+    lines += [""]
     if len(result.views) == 1:
         rows = [[one.label, _percent(one)] for one in result.views[0].answers]
         return "\n".join([*lines, f"Model {result.model} sees", output.columns(rows)])

@@ -20,7 +20,7 @@ class RenderConfig(SceneConfig):
     """Everything that decides what `render` does: pictures of a scene, and what the model says of them."""
 
     command: ClassVar[str] = "render"
-    without: ClassVar[tuple[str, ...]] = ("label", "run", "overwrite")
+    without: ClassVar[tuple[str, ...]] = ("run", "overwrite")
 
     controls: ControlsByName = setting_as_in(
         SceneConfig,

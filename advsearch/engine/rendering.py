@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,13 @@ from advsearch import seeds
 from advsearch.config.rendering import PICTURE_SPP, PICTURES
 from advsearch.controls import Control, compose
 from advsearch.controls.clean import sentences
+from advsearch.described import Value
 from advsearch.engine.loading import Controls, Scene, as_controls, framed, load_scene, make_renderer
 from advsearch.errors import InputError
 from advsearch.models import Model, load_model
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.contact_sheet import contact_sheet
+from advsearch.report.marks import marked
 from advsearch.runs.files import placed_by
 from advsearch.runs.images import write_exr, write_png
 from advsearch.runs.results.base import Formation
@@ -26,7 +29,7 @@ from advsearch.runs.results.render import MeshUp, RenderResult, ViewAnswers
 from advsearch.scene.description import ORBIT_CAMERA, SceneDescription
 from advsearch.scene.formation import ImageFormation, to_8_bit
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER
-from advsearch.tasks import Answer, AnyTask, make_task
+from advsearch.tasks import Answer, AnyTask, Facts, Mark, make_task
 
 MOST_ANSWERS = 5
 """Answers of the model that are kept of a picture."""
@@ -41,12 +44,14 @@ class View:
         picture: (H, W, 3) display-referred sRGB in [0, 1], rounded to 8 bits: what the model sees.
         linear: (H, W, 3) linear radiance times the gain, before what controls do to the finished picture.
         answers: what the model says, the likeliest first.
+        marks: what shows its answer, and what is true, in the picture; empty where words say it all.
     """
 
     azimuth: float
     picture: Tensor
     linear: Tensor
     answers: tuple[Answer, ...]
+    marks: tuple[Mark, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,19 +100,46 @@ class Rendering:
 
     def sheet(self) -> Any:
         """Return all views side by side, (h, w, 3) float32 sRGB in [0, 1], with azimuth and answers under each."""
-        captions = [[f"azimuth {view.azimuth:g}", *map(_caption, view.answers)] for view in self.views]
-        return contact_sheet([view.picture.numpy() for view in self.views], captions)
+        return contact_sheet([view.picture.numpy() for view in self.views], self._captions)
 
-    def result(self, out: Path, size: tuple[int, int], warnings: Sequence[str]) -> RenderResult:
+    def save_answers(self, path: str | Path) -> Path | None:
+        """Write the picture, or the sheet, with boxes and masks drawn in beside that of `save`, as NAME-answer.png.
+
+        Args:
+            path: of the picture.
+
+        Returns:
+            The file that was written; None where the task draws nothing.
+
+        Raises:
+            StorageError: the file could not be written.
+        """
+        if not any(view.marks for view in self.views):
+            return None
+        drawn = [marked(view.picture.numpy(), view.marks) for view in self.views]
+        file = Path(path).with_name(f"{Path(path).stem}-answer.png")
+        with placed_by("out"):
+            write_png(file, contact_sheet(drawn, self._captions) if len(drawn) > 1 else drawn[0])
+        return file
+
+    @property
+    def _captions(self) -> list[list[str]]:
+        return [[f"azimuth {view.azimuth:g}", *map(_caption, view.answers)] for view in self.views]
+
+    def result(
+        self, out: Path, size: tuple[int, int], warnings: Sequence[str], answered: Path | None = None
+    ) -> RenderResult:
         """Return everything but the pictures.
 
         Args:
             out: the file that was written.
             size: its height and width in pixels.
             warnings: all that were said.
+            answered: the file with the answers drawn in.
         """
         return RenderResult(
             out=str(out),
+            answered=None if answered is None else str(answered),
             size=size,
             object=self.scene.object_name,
             environment=self.scene.environment_name,
@@ -126,6 +158,7 @@ def render(
     model: Model | nn.Module | str | Path = "reference",
     *,
     task: AnyTask = "classification",
+    label: str | None = None,
     controls: Controls = (),
     around: int | None = None,
     resolution: int | tuple[int, int] | None = None,
@@ -141,6 +174,7 @@ def render(
         scene: from `load_scene`, or what that takes.
         model: from `load_model`, or what that takes.
         task: what says the model's answers: a name, a mapping with a `name` and options, or an instance.
+        label: the right answers, for a task that draws what is true; None for the object's own.
         controls: what differs from the scene: names, instances, or a mapping from names to settings. A parameter with
             a range stays where a search would start.
         around: number of views, from azimuths all around the object; None for one, from the scene's own camera.
@@ -167,6 +201,7 @@ def render(
     progress.stage("rendering", around or 1)
     formation = None
     views = []
+    untold: list[str] = []
     for description in _turned(scene.description, around):
         description = framed(description, size)
         space = compose(instances, description)
@@ -175,15 +210,32 @@ def render(
         with torch.no_grad():
             radiance = renderer.radiance(space.start, seeds.stream(seed, "pictures"), spp)
             picture = to_8_bit(space.picture(space.start, formation.display(radiance)))
-            answers = asked.answers(model(picture), MOST_ANSWERS)[0]
+            output = model(picture)
+            answers = asked.answers(output, MOST_ANSWERS)[0]
+            marks: tuple[Mark, ...] = ()
+            if asked.varies:
+                facts = _facts(description, label, partial(renderer.mask, space.start), space.describe(space.start))
+                try:
+                    marks = tuple(asked.marks(output, asked.truth(facts))[0])
+                except InputError as error:
+                    untold = [f"Nothing is drawn into the picture: {error}"]
         azimuth = description.number("camera.azimuth")
-        views.append(View(azimuth, picture, radiance * formation.gain, answers))
+        views.append(View(azimuth, picture, radiance * formation.gain, answers, marks))
         progress.advance(1)
     assert formation is not None
     own = scene.description
-    warnings = (*own.notes, *sentences(space.moved))
+    warnings = (*own.notes, *sentences(space.moved), *untold)
     shown = replace(own, environment_spec=space.environment or own.environment_spec)
     return Rendering(shown, model.name, made.name, formation, spp, tuple(views), warnings)
+
+
+def _facts(
+    description: SceneDescription, label: str | None, look: Callable[[], Tensor], values: Mapping[str, Value]
+) -> Facts:
+    """What a view gives a task to judge by."""
+    said = {**description.values, **{name: one["value"] for name, one in values.items()}}
+    numbers = {name: float(one) for name, one in said.items() if isinstance(one, (int, float))}
+    return Facts(description.object_name, label, description.object.label, lambda: numbers, look)
 
 
 def _caption(answer: Answer) -> str:

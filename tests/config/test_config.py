@@ -296,7 +296,7 @@ CLASHES: tuple[tuple[type[Config], dict[str, Any], str], ...] = (
     (AttackConfig, {"average": 10, "epsilon": "0.1,0.2"}, "average: is not part of a curve"),
     (GapConfig, {"smallest": True}, "smallest: `advsearch gap` has no such setting; leave it out"),
     (RegionConfig, {"spp": 4}, "spp: `advsearch region` has no such setting; leave it out"),
-    (RenderConfig, {"out": "a.png", "label": "cup"}, "label: `advsearch render` has no such setting; leave it out"),
+    (RenderConfig, {"out": "a.png", "run": "it"}, "run: `advsearch render` has no such setting; leave it out"),
     (GapConfig, {"epsilon": "0.1,0.2"}, "epsilon: several make a curve, which only `advsearch attack` draws"),
     (SweepConfig, {"sampler": "random", "grid": {"pose.yaw": "0,90"}}, "sampler: is how `controls` are drawn"),
     (SweepConfig, {"trials": 0, "verify_spp": 8}, "verify_spp: is of the trials, and `trials` is 0"),

@@ -129,10 +129,23 @@ def test_an_answer_that_holds_for_many_conditions(
 def test_a_picture_with_the_answers_beside(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    flags = [*asked[:6], "--denoise", "none", "--spp", "2", "--json", "--out", str(tmp_path / "mug.png")]
+    flags = [*asked, "--denoise", "none", "--spp", "2", "--out", str(tmp_path / "mug.png")]
     found = answer(capsys, "render", "--object", "mug", *flags)
     first = found["views"][0]["answers"][0]
     assert first["label"] == ("cup" if task_of(asked) == "detection" else "background") and first["probability"] > 0.5
+    drawn = read_png(Path(found["answered"]))
+    assert found["answered"] == str(tmp_path / "mug-answer.png")
+    assert (np.abs(drawn - np.array([0, 190, 255]) / 255) < 1 / 255).all(axis=2).sum() > 100, "what is true, in blue"
+    assert read_png(tmp_path / "mug.png").shape[:2] == tuple(found["size"]), "the picture itself is what the model sees"
+
+
+def test_nothing_is_drawn_where_nobody_says_what_is_right(
+    asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    flags = ["--label", "spoon", "--denoise", "none", "--spp", "2", "--json", "--out", str(tmp_path / "mug.png")]
+    found = answer(capsys, "render", "--object", "mug", *asked[:6], *flags)
+    said = [text for text in found["warnings"] if text.startswith("Nothing is drawn into the picture: label")]
+    assert "answered" not in found and len(said) == 1
 
 
 def test_the_first_answers_are_told_where_no_label_fits(asked: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -37,6 +37,9 @@ class RenderResult(Result):
     command: ClassVar[str] = "render"
 
     out: str = Field(description="the file that was written")
+    answered: str | None = Field(
+        default=None, description="that with boxes and masks drawn in; absent where the task draws none"
+    )
     size: tuple[int, int] = Field(description="of the file, [height, width] in pixels")
     object: str
     environment: str
