@@ -30,7 +30,7 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("file", metavar="FILE", help="a .glb, .gltf, .obj, .ply or .stl file")
+    parser.add_argument("file", metavar="FILE", help="a .glb, .gltf, .blend, .obj, .ply or .stl file")
     parser.add_argument("--out", metavar="FILE", help="a picture of all that is in it, from four sides (.png)")
     output.add_flags(parser)
 

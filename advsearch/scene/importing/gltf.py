@@ -32,7 +32,7 @@ def read_header(path: Path, data: bytes) -> Header:
         FileFormatError: the file is not glTF, is shorter than it says, has other types in its header than glTF has,
             refers to what is not there, is over a limit, or needs what is not supported.
     """
-    text = text_of(_json_chunk(path, data) if path.suffix.lower() == ".glb" else data)
+    text = text_of(_json_chunk(path, data) if path.suffix.lower() != ".gltf" else data)
     if text.count(",") + text.count("[") + text.count("{") > files.scaled(MOST_VALUES):
         raise files.too_large(path, f"a glTF header of at most {files.scaled(MOST_VALUES):,} values", "more")
     try:
@@ -72,7 +72,7 @@ def rewritten(path: Path, data: bytes, header: Header) -> bytes:
         }
     )
     text = json.dumps(plain.model_dump(exclude_none=True, exclude_defaults=True)).encode()
-    if path.suffix.lower() != ".glb":
+    if path.suffix.lower() == ".gltf":
         return text
     text += b" " * (-len(text) % 4)
     rest = data[20 + struct.unpack_from("<I", data, 12)[0] : struct.unpack_from("<I", data, 8)[0]]

@@ -10,14 +10,15 @@ import numpy as np
 
 from advsearch.errors import InputError
 from advsearch.scene.assets import Material, ObjectAsset, UpAxis, normalised
-from advsearch.scene.importing.files import read_bytes, safe_name
+from advsearch.scene.importing.blender import read_mesh_bytes
+from advsearch.scene.importing.files import safe_name
 from advsearch.scene.importing.geometry import Soup, assemble, join, repaired
 from advsearch.scene.importing.parts import GLTF, ImportedPart, read_parts
 from advsearch.scene.importing.surfaces import ImportedSurface
 from advsearch.scene.importing.texture import textured
 from advsearch.scene.importing.upright import guess_up
 
-SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl")
+SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".blend")
 """The mesh files that can be imported."""
 
 MOST_WARNINGS = 20
@@ -56,7 +57,7 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
     if up not in (None, "y", "z"):
         raise InputError(f"up axis: expected 'y' or 'z', got {up!r}")
     file = Path(path)
-    parts, notes = read_parts(file, read_bytes(file, "object", SUFFIXES))
+    parts, notes = read_parts(file, read_mesh_bytes(file, "object", SUFFIXES))
     return object_of(parts, notes, file, safe_name(file), up)
 
 

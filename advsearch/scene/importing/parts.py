@@ -31,8 +31,8 @@ from advsearch.scene.importing.surfaces import UNNAMED, ImportedSurface, Surface
 
 Array = npt.NDArray[np.float64]
 
-GLTF = (".glb", ".gltf")
-"""Endings of glTF files, which have conventions of their own: y up, linear colours."""
+GLTF = (".glb", ".gltf", ".blend")
+"""Endings of glTF files, which have conventions of their own: y up, linear colours; and of what is read as glTF."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ def _parse(path: Path, data: bytes, references: References) -> list[tuple[Any, A
     """Run trimesh's parser; return what it found with transforms (4, 4) and nodes, always in the same order."""
     import trimesh
 
-    kind = path.suffix.lower().lstrip(".")
+    kind = path.suffix.lower().lstrip(".").replace("blend", "glb")
     options: dict[str, bool] = {"process": False}
     if kind == "ply":  # with fix_texture, vertices are shuffled and their normals are not
         options["fix_texture"] = _has_face_uvs(path, data)

@@ -19,7 +19,8 @@ import numpy.typing as npt
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.importing import gltf
-from advsearch.scene.importing.files import read_bytes, safe_name, shown
+from advsearch.scene.importing.blender import read_mesh_bytes
+from advsearch.scene.importing.files import safe_name, shown
 from advsearch.scene.importing.geometry import FLAT
 from advsearch.scene.importing.gltf_entries import CameraEntry, Header, Light, Node
 from advsearch.scene.importing.objects import SUFFIXES, object_of
@@ -79,7 +80,7 @@ def import_scene(path: Path, node: str) -> ImportedScene:
         FileFormatError: as for `import_object`.
         InputError: as for `import_object`; several nodes have the name; or there is too much beside the object.
     """
-    data = read_bytes(path, "scene", GLTF)
+    data = read_mesh_bytes(path, "scene", GLTF)
     header = gltf.read_header(path, data)
     parts, notes = read_parts(path, data)
     poses = dict(_poses(header))
@@ -171,7 +172,7 @@ def contents(path: Path) -> Contents:
     Raises:
         FileFormatError, InputError: as for `import_object`.
     """
-    data = read_bytes(path, "object", SUFFIXES)
+    data = read_mesh_bytes(path, "object", SUFFIXES)
     parts, notes = read_parts(path, data)
     whole = object_of(parts, notes, path, safe_name(path), None)
     if path.suffix.lower() not in GLTF:

@@ -1,0 +1,115 @@
+"""Blender files through glTF, written by Blender in a process of its own: an installed one, or the `bpy` package.
+
+Nothing in the file is run: Blender starts with factory settings and a home that is empty, and scripts and drivers are
+off when the file is opened. What glTF cannot hold (node materials, simulations, curves' bevels) Blender's exporter
+leaves out or applies.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from advsearch import files
+from advsearch.errors import FileFormatError
+from advsearch.scene.importing.files import LARGEST_FILE, damaged, looks_like, read_bytes, shown
+
+BLEND = ".blend"
+PROGRAM = "ADVSEARCH_BLENDER"
+"""Variable of the environment: a Blender, or a Python that has `bpy`, in the place of those that are looked for."""
+LONGEST = 120
+"""Seconds that Blender may take, before `advsearch.files.scaled`."""
+BEGINNINGS = (b"BLENDER", b"\x28\xb5\x2f\xfd", b"\x1f\x8b")
+"""How a .blend file begins: as it is, compressed with zstd, or with gzip (before Blender 3.0)."""
+
+EXPORT = """
+import sys
+source, target, most = sys.argv[-3:]
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(most), int(most)))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+except ImportError:
+    pass
+import bpy
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.context.preferences.filepaths.use_scripts_auto_execute = False
+bpy.ops.wm.open_mainfile(filepath=source, load_ui=False, use_scripts=False)
+bpy.ops.export_scene.gltf(
+    filepath=target, export_format="GLB", export_apply=True, export_cameras=True, export_lights=True,
+    export_animations=False,
+)
+"""
+
+
+def read_mesh_bytes(path: Path, what: str, suffixes: tuple[str, ...]) -> bytes:
+    """Return the content of a mesh or scene file, of a Blender file as binary glTF; see `read_bytes`.
+
+    Raises:
+        FileFormatError: as for `read_bytes`; there is no Blender, it can't read the file, or it takes too long.
+    """
+    data = read_bytes(path, what, suffixes)
+    if path.suffix.lower() != BLEND:
+        return data
+    if not data.startswith(BEGINNINGS):
+        raise damaged(path, "a Blender scene", looks_like(data))
+    return _exported(path)
+
+
+def _command(path: Path) -> list[str]:
+    """The program that is given the script behind it, with what makes it run that and nothing else."""
+    program = os.environ.get(PROGRAM) or shutil.which("blender")
+    if program is None and importlib.util.find_spec("bpy") is not None:
+        program = sys.executable
+    runs = shutil.which(program or "")
+    if runs is None:
+        missing = "none is installed" if program is None else f"{PROGRAM} names {program}, which can't be run"
+        raise FileFormatError(
+            f"{path}: Blender has to read it, and {missing}; install Blender so that `blender` is found, or type "
+            f"`python3.11 -m venv bpy && bpy/bin/pip install bpy` and set {PROGRAM}=bpy/bin/python; or export glTF "
+            "(.glb) from Blender and name that"
+        )
+    program = os.path.abspath(runs)
+    if Path(program).name.startswith("python"):
+        return [program, "-I"]
+    return [program, "--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1", "--python"]
+
+
+def _exported(path: Path) -> bytes:
+    """Have the file written as glTF in a folder of its own, and return that."""
+    command = _command(path)
+    with tempfile.TemporaryDirectory(prefix="advsearch-blender-") as folder:
+        script, target = Path(folder) / "export.py", Path(folder) / "scene.glb"
+        script.write_text(EXPORT, "utf-8")
+        names = [str(path.resolve()), str(target), str(files.scaled(LARGEST_FILE))]
+        between = [] if "-I" in command else ["--"]
+        kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
+        try:
+            done = subprocess.run(
+                [*command, str(script), *between, *names],
+                cwd=folder,
+                env={**kept, "HOME": folder, "TMPDIR": folder},
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=files.scaled(LONGEST),
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise FileFormatError(
+                f"{path}: Blender had not read it after {files.scaled(LONGEST)} seconds; export glTF (.glb) from it "
+                f"yourself, or give it longer: {files.FACTOR}=10 in the environment makes all limits ten times as large"
+            ) from None
+        except OSError as error:
+            raise FileFormatError(f"{path}: Blender can't be started ({error.strerror}); check {command[0]}") from error
+        if done.returncode or not target.is_file():
+            said = [line for line in (done.stdout + done.stderr).splitlines() if line.strip()]
+            last = f": {shown(said[-1].strip(), quoted=False)}" if said else ""
+            raise FileFormatError(f"{path}: Blender could not read it{last}; export glTF (.glb) from it yourself")
+        return read_bytes(target, "object", (".glb",))
