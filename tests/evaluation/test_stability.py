@@ -34,7 +34,7 @@ WANTED = {
     "precision": "verdicts bytes ball ten-thousand-steps ten-thousand-turns one-and-two-threads threads-change",
     "noise": "one-sample heavy-tails heavy-tailed",
     "transport": "predicted-4-texels predicted-4096 predicted-epsilon-1 predicted-black predicted-mirror "
-    "predicted-behind-glass predicted-out-of-sight predicted-without-light",
+    "predicted-behind-glass predicted-out-of-sight predicted-without-light predicted-light-out",
 }
 """How the names of the extremes begin that the suite has to have."""
 

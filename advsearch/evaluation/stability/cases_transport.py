@@ -15,6 +15,7 @@ from advsearch.evaluation.stability.scene import small
 from advsearch.scene import library
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
 from advsearch.scene.renderer import Renderer
+from advsearch.scene.transport.lights import BasisRenderer
 from advsearch.scene.transport.renderer import LinearRenderer
 
 GROUP = CaseGroup("transport")
@@ -24,6 +25,7 @@ OFF = 0.15
 """Root mean square error of a predicted change, as a share of the change: noise of the matrix, and light that meets the
 texture twice."""
 _LINEAR = "searches compare the prediction with traced pictures and make the matrix anew"
+_LIGHT = "lights that are dark are rendered alone all the same; a search that is off renders"
 _NOTHING = "a matrix without entries predicts the picture as it is"
 
 
@@ -119,3 +121,24 @@ def without_light() -> Outcome:
     """A black environment."""
     night = EnvironmentAsset("night", np.zeros((16, 32, 3), np.float32))
     return predicted(small("mug", {"texture": {"resolution": 8}}, environment=night))
+
+
+@GROUP.case("predicted-light-out", "A lamp that goes out is predicted, to darkness.", _LIGHT, "light")
+def light_out() -> Outcome:
+    """Basis pictures made while the only lamp shines, used where it does not; and likewise beside an environment."""
+    night = EnvironmentAsset("night", np.zeros((16, 32, 3), np.float32))
+    alone = small("mug", {"light": {"power": [0.0, 12.0]}}, environment=night)
+    beside = small("mug", {"light": {"power": [0.0, 12.0]}})
+    lit, out = torch.ones(1), torch.zeros(1)
+    basis, dark = BasisRenderer(beside, lit, seed=1), BasisRenderer(alone, lit, seed=1)
+    with torch.no_grad():
+        before, after = (beside(one, seed=5, spp=TRACED) for one in (lit, out))
+        change, black = basis(out) - basis(lit), dark(out)
+    _, slope = dark.gradient(lambda picture: picture.square().mean(), out, 0, 1)
+    error = float((change - (after - before)).norm() / (after - before).norm())
+    finite = bool(torch.isfinite(change).all() and torch.isfinite(black).all() and torch.isfinite(slope).all())
+    checks = [
+        Check("error of the predicted change, as a share of it", error, most=OFF),
+        holds("without any light the picture is black", bool((black == 0.0).all())),
+    ]
+    return Outcome(tuple(checks), finite, error, measured={"lights": float(basis.lights)})
