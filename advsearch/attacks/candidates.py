@@ -66,6 +66,13 @@ def admit(pool: tuple[Candidate, ...], new: Candidate, size: int) -> tuple[Candi
     return tuple(sorted((*pool, new), key=_raw, reverse=True)[:size])
 
 
+def with_last(pool: tuple[Candidate, ...], last: Candidate | None, size: int) -> tuple[Candidate, ...]:
+    """Return the pool, of at most `size`, with the last configuration of a search in it, if need be for its worst."""
+    if last is None or any(torch.equal(one.u, last.u) for one in pool):
+        return pool
+    return (*pool[: size - 1], last)
+
+
 def contenders(pool: tuple[Candidate, ...], shared: int) -> tuple[Candidate, ...]:
     """Return the winner so far and those that are not clearly worse, in their order.
 

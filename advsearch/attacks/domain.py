@@ -108,6 +108,8 @@ class Domain:
             nothing.
         exact: whether evaluations are free of noise: equal configurations have equal objectives and gradients, as where
             a matrix predicts the pictures (docs/transport.md).
+        drawn: whether evaluations are free of noise but for the conditions that each draws anew, from a bank
+            (docs/transport.md).
         first: (d,) where a policy should begin, if not at the start; it moves no ball. For wrappers that begin
             several times.
         lower, upper: (d,) float32 bounds; those of an l-infinity ball are cut into them already.
@@ -122,6 +124,7 @@ class Domain:
     gradient_cost: int = 0
     partial_gradients: bool = False
     exact: bool = False
+    drawn: bool = False
     first: Tensor | None = None
     lower: Tensor = field(init=False, repr=False)
     upper: Tensor = field(init=False, repr=False)

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from advsearch.attacks.candidates import Candidate, admit, best, contenders
+from advsearch.attacks.candidates import Candidate, admit, best, contenders, with_last
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import TOLERANCE, Domain
 from advsearch.attacks.ending import Ending
@@ -140,7 +140,9 @@ def search(
        left, and no gradient after which none would be left to use it, so never in the last evaluation.
     2. The `candidates` best distinct configurations are each evaluated `repeats` times more, with new seed indices
        that are the same for all, without gradient. The best by these renders is the answer (see `candidates`). With
-       `candidates=0`, for an objective without noise, the raw best is the answer. Those that are not clearly worse
+       `candidates=0`, for an objective without noise, the raw best is the answer. Where evaluations draw conditions
+       (`Domain.drawn`), the raw best had easy ones, and the last configuration, to which all of them led, takes the
+       place of the worst candidate. Those that are not clearly worse
        than the best by then are rendered again, up to `close` times more (see `candidates.contenders`).
 
     A policy that does not handle discrete choices is wrapped in `Choices` where the domain has some.
@@ -182,6 +184,8 @@ def search(
         with interruptible():
             in_time = math.inf if seconds is None else begun + seconds
             stopped = _explore(log, policy, steps, seed, late or (lambda _: time.perf_counter() >= in_time))
+            if domain.drawn:
+                log.pool = with_last(log.pool, log.last, log.size)
             if candidates:
                 _rank(log, steps, repeats, close)
     except KeyboardInterrupt:
@@ -198,6 +202,7 @@ class _Log:
     on_step: OnStep | None
     size: int
     pool: tuple[Candidate, ...] = ()
+    last: Candidate | None = None
     best: float = math.nan
     records: list[StepRecord] = field(default_factory=list)
     gradients: int = 0
@@ -224,7 +229,7 @@ class _Log:
         elif phase == "search":
             self.best = max(evaluation.objective, self.best) if self.best == self.best else evaluation.objective
             found = Candidate(proposal.u, evaluation.objective, evaluation.success)
-            self.pool = admit(self.pool, found, self.size)
+            self.pool, self.last = admit(self.pool, found, self.size), found
         record = StepRecord(
             step=len(self.records),
             index=index,

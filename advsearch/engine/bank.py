@@ -1,8 +1,9 @@
 """Searches over base colours under conditions that vary by chance, by a matrix of light transport for each of many.
 
-Evaluations draw conditions from the bank. It begins with few. Every `EVERY` evaluations the present configuration is
-traced under conditions that no matrix was made for: while these are clearly better for the model than those in the
-bank, the bank grows by `GROWTH` of what each evaluation draws, and what is new is looked at at once. The oldest
+Evaluations draw conditions from the bank. It begins with few and grows with each evaluation of the first half, by one
+for `GROWTH` that it draws; what is new is looked at at once. The second half is for learning what there is. Every
+`EVERY` evaluations the present configuration is traced under conditions that no matrix was made for: where these are
+not clearly better for the model than those in the bank, the bank does not grow until the next comparison. The oldest
 matrices make room where there is no memory. All of that follows from the seed and from the comparisons after which the
 bank grew, so that a run that goes on makes the same matrices again.
 """
@@ -31,15 +32,16 @@ from advsearch.scene.transport.renderer import MOST_BYTES, LinearRenderer, linea
 
 FIRST = 8
 """Conditions in the bank at first, in what an evaluation draws."""
-GROWTH = 8
+GROWTH = 4
 """An evaluation adds a condition for so many that it draws, while the bank grows."""
-EVERY = 50
+EVERY = 100
 UNSEEN = 16
 """Conditions that a comparison traces, and as many of the bank that it predicts."""
 SURE = 1.0
 """Standard errors by which unseen conditions have to be better for the model."""
-SPP = 8
-"""Samples a pixel of the paths of a condition: many conditions with some noise teach more than few without."""
+SPP, DEPTH = 4, 4
+"""Samples a pixel of the paths of a condition, and segments of the longest: many conditions with some noise and without
+the last light teach more than few that are right."""
 TOGETHER = 16
 """Pictures that the model is asked about at once."""
 SOBOL_MOST = 64
@@ -80,8 +82,8 @@ class Bank(Predictor):
     Attributes:
         problem: what is searched.
         steps: evaluations of a search; what comes after them belongs to the ranking, and is traced.
-        grown: the comparisons, by index of the evaluation, after which the bank grew; may be filled before a search
-            that goes on.
+        grown: the comparisons, by index of the evaluation, after which the bank went on growing; may be filled before a
+            search that goes on.
         keep: told of `grown` whenever there is another one.
         gaps: by how much the objective was larger in the bank than under unseen conditions, by comparison.
     """
@@ -106,7 +108,7 @@ class Bank(Predictor):
 
     @property
     def samples(self) -> int:
-        return FIRST * self.problem.draws * SPP
+        return self._wanted(0) * SPP
 
     @property
     def conditions(self) -> Conditions:
@@ -192,7 +194,8 @@ class Bank(Predictor):
 
     def _wanted(self, index: int) -> int:
         """How many conditions have been collected by the evaluation with this index."""
-        steps = sum(min(max(index - begin + 1, 0), EVERY) for begin in self.grown)
+        index = min(index, self.steps // 2 - 1)
+        steps = sum(min(max(index - begin + 1, 0), EVERY) for begin in (0, *self.grown))
         return FIRST * self.problem.draws + steps * self.problem.draws // GROWTH
 
     def _place(self, number: int) -> Tensor:
@@ -233,7 +236,7 @@ class Bank(Predictor):
         whole = problem.whole(u) if numbers is None else torch.cat([u, numbers])
         names = {name for group in problem.plan.groups for name in self._reached(group.name, group.control)}
         self._made += 1
-        with problem.renderer.scene.shorter(problem.search_depth):
+        with problem.renderer.scene.shorter(min(DEPTH, problem.search_depth or DEPTH)):
             return LinearRenderer(problem.renderer, whole, seed, spp=SPP, quick=True, names=names)
 
     def _reached(self, group: str, control: str) -> frozenset[str]:

@@ -95,8 +95,9 @@ class Searches:
         frames: Frames | None = None,
         seconds: float | None = None,
         domain: Domain | None = None,
+        ranked: bool = True,
     ) -> SearchResult:
-        """Search, reading back what is stored already.
+        """Search, reading back what is stored already; `ranked` renders the best configurations again.
 
         Raises:
             KeyboardInterrupt: the search was interrupted; the result of an interrupted main search is kept before.
@@ -113,10 +114,11 @@ class Searches:
         domain = self.problem.domain if domain is None else domain
         found = search(
             self._evaluator(kind, frames),
-            replace(domain, exact=True) if isinstance(self.findings.transport, Transport) else domain,
+            self._as_evaluated(domain, policy),
             policy,
             steps=steps,
             seed=seed,
+            candidates=4 if ranked else 0,
             close=self.budget.close_looks,
             late=self.memory.clock(kind, steps, seconds),
             on_step=on_step,
@@ -125,6 +127,12 @@ class Searches:
             self.findings.search = self.findings.search or found
             raise KeyboardInterrupt
         return found
+
+    def _as_evaluated(self, domain: Domain, policy: Policy[Any]) -> Domain:
+        """The domain with what is known of the noise of its evaluations."""
+        transport = self.findings.transport
+        drawn = isinstance(transport, Bank) and policy.uses_gradient
+        return replace(domain, exact=isinstance(transport, Transport), drawn=drawn)
 
     def _evaluator(self, kind: str, frames: Frames | None) -> Evaluate:
         """What the evaluations of a search come from: rendered, or predicted; what is stored is read back."""

@@ -20,32 +20,40 @@ CONFIRMED = 40
 def find_smallest(searches: Searches, verifier: Verifier) -> None:
     """Bracket the smallest epsilon; every claim on the way goes through trials with seeds of its own.
 
-    What is verified at the end is the configuration at the upper end of the bracket.
+    On the way the fewest trials that can verify anything are enough where none fails. The upper end is tried again in
+    full, and what is verified at the end is the configuration there.
     """
     problem, budget, findings = searches.problem, searches.budget, searches.findings
     results: list[SearchResult] = []
+    transport = findings.transport if isinstance(findings.transport, Transport) else None
 
     def found(inside: Domain, number: int) -> Tensor:
         searches.begin(
             "search", f"search {number + 1} of at most {ROUNDS}", budget.steps, "`steps` shortens each search"
         )
         kind, seed = f"search {number}" if number else "search", seeds.stream(problem.seed, "smallest", number)
-        results.append(searches.search(kind, searches.policy, budget.steps, seed, domain=inside))
+        ranked = transport is None  # what is predicted has no noise
+        results.append(searches.search(kind, searches.policy, budget.steps, seed, domain=inside, ranked=ranked))
         verifier.begin("trying smaller changes", MOST_CHECKS * budget.trials, at_most=True)
         return results[-1].best_u
 
-    def passes(u: Tensor, check: int) -> bool:
-        failures, allowed = 0, problem.rule.allowed(budget.trials)
-        for number in range(budget.trials):
-            failures += not verifier.trial(f"check {check}", number, u).success
+    def passes(u: Tensor, check: int, few: int = budget.trials) -> bool:
+        """Whether all trials together pass; so `few` do without a failure."""
+        allowed, scores, failures = problem.rule.allowed(budget.trials), list[float](), 0
+        while len(scores) < budget.trials and failures <= allowed and (failures or len(scores) < few):
+            trial = verifier.trial(f"check {check}", len(scores), u)
+            scores.append(trial.score)
+            failures += not trial.success
             verifier.stages.progress.advance(1)
-            if failures > allowed:
-                return False
-        return True
+        if transport is not None:
+            transport.correct(u, scores)
+        return failures <= allowed
+
+    def seems(u: Tensor, check: int) -> bool:
+        return passes(u, check, problem.rule.fewest)
 
     times = -(-CONFIRMED // budget.trials)
-    likely = findings.transport.likely if isinstance(findings.transport, Transport) else None
-    bracket = smallest(found, passes, problem.domain, likely=likely)
+    bracket = smallest(found, seems, problem.domain, likely=None if transport is None else transport.likely)
     if bracket.u is not None:
         most = ATTEMPTS * times * budget.trials
         verifier.begin("checking the smallest change", most, at_most=True)

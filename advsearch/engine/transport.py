@@ -8,9 +8,10 @@ between them is predicted wrongly by more than `BOUND`, the matrix is made anew 
 from __future__ import annotations
 
 import math
+import statistics
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -37,6 +38,10 @@ BOUND = 2.0
 through 40 evaluations, moved the verified margin by 0.1 of 28 logits, for as long as all of them take."""
 CHECK_SPP = 64
 """Samples a pixel of the traced pictures of a comparison."""
+FEWEST_SCORES = 4
+"""Trials whose spread says something."""
+SPREAD = 1.64
+"""Standard deviations under their mean above which 19 of 20 scores lie."""
 Tick = Callable[[int], None]
 Judged = float | Tensor
 
@@ -186,6 +191,7 @@ class Transport(Predictor):
     keep: Callable[[dict[str, list[int]]], None] = lambda renewals: None
     deviations: list[Deviation] = field(default_factory=list)
     seconds: float = 0.0
+    _optimism: float = 0.0
     _start: Linearised | None = None
     _present: dict[str, Linearised] = field(default_factory=dict)
 
@@ -261,9 +267,20 @@ class Transport(Predictor):
         return evaluate
 
     def likely(self, u: Tensor) -> bool:
-        """Whether the picture that is predicted from the start is a success, rounded to 8 bits."""
+        """Whether the picture that is predicted from the start would pass its trials, as far as those of the last
+        configuration tell."""
+        return self._score(u) > self._optimism
+
+    def correct(self, u: Tensor, scores: Sequence[float]) -> None:
+        """Learn from the scores of a configuration's trials how much more than their lower end its prediction says."""
+        if len(scores) >= FEWEST_SCORES and all(map(math.isfinite, scores)):
+            lower = statistics.fmean(scores) - SPREAD * statistics.stdev(scores)
+            self._optimism = self._score(u) - lower
+
+    def _score(self, u: Tensor) -> float:
+        """That of the picture that is predicted from the start, rounded to 8 bits."""
         with torch.no_grad():
-            return self.problem.judge(to_8_bit(self.start(u)), u).success
+            return self.problem.judge(to_8_bit(self.start(u)), u).score
 
     def _compared(self, kind: str, index: int, u: Tensor) -> PredictingRenderer | None:
         """The matrix to predict this evaluation with, compared and made anew where that is due; None gives up."""

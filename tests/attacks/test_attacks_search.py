@@ -27,7 +27,7 @@ from advsearch.attacks import (
     planned_renders,
     search,
 )
-from advsearch.attacks.candidates import Candidate, admit, best, contenders
+from advsearch.attacks.candidates import Candidate, admit, best, contenders, with_last
 from advsearch.errors import InputError
 from advsearch.interrupts import INTERRUPTS
 
@@ -561,6 +561,13 @@ def test_who_is_clearly_worse_is_out() -> None:
     assert contenders((far, leader), 1) == (far, leader), "one difference says nothing of its noise"
     assert contenders((far, lucky), 3) == (far, lucky) and contenders((far,), 3) == (far,)
     assert contenders((leader, replace(close, again=(9.0, *close.again))), 3)[1].again[0] == 9.0, "an older look"
+
+
+def test_the_last_configuration_takes_the_place_of_the_worst_candidate() -> None:
+    one, other, last = (Candidate(torch.tensor([value]), value, False) for value in (3.0, 2.0, 1.0))
+    assert with_last((one, other), last, 2) == (one, last) and with_last((one,), last, 2) == (one, last)
+    assert with_last((one, other), replace(last, u=other.u.clone()), 2) == (one, other)
+    assert with_last((), None, 2) == ()
 
 
 def test_a_clear_decision_takes_no_look_more_and_a_close_one_is_settled() -> None:

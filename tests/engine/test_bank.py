@@ -44,7 +44,7 @@ def test_conditions_are_stratified_and_numbered() -> None:
 
 @pytest.fixture
 def growing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It compares every six evaluations, and grows after each comparison."""
+    """It compares every six evaluations, and goes on growing after each comparison."""
     monkeypatch.setattr(bank, "EVERY", 6)
     monkeypatch.setattr(bank, "UNSEEN", 2)
     monkeypatch.setattr(bank, "SURE", -1e9)
@@ -55,11 +55,12 @@ def growing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("growing")
 def test_a_search_says_what_its_bank_was() -> None:
-    """Six conditions; after the comparisons at 6 and 12 another one every second evaluation: three and three."""
+    """Six conditions, and another one every second evaluation of the first half: three until the comparison at 6, and
+    one after it. That at 12 comes when it grows no more."""
     found = advsearch.attack("mug", **{**SMALL, "baseline": True})
     told, renders = found.summary.transport, found.summary.renders
     assert told is not None and told.used and told.conditions is not None and told.error is not None
-    assert (told.conditions.made, told.conditions.dropped, told.conditions.grown) == (12, 0, 2)
+    assert (told.conditions.made, told.conditions.dropped, told.conditions.grown) == (10, 0, 2)
     assert told.entries and told.bytes and told.seconds and told.conditions.gap is not None
     assert renders["products"] == 2 * 18 * 2 and renders["gradient"] == 0
 
@@ -108,8 +109,8 @@ def test_the_oldest_conditions_make_room(monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(Bank, "_drawn", watched)
     told = advsearch.attack("mug", **SMALL).summary.transport
     assert told is not None and told.conditions is not None and told.bytes is not None
-    assert told.conditions.dropped == 12 - len(kept[-1]) and told.bytes <= 150_000
-    assert kept[-1] == list(range(12 - len(kept[-1]), 12))
+    assert told.conditions.dropped == 10 - len(kept[-1]) and told.bytes <= 150_000
+    assert kept[-1] == list(range(10 - len(kept[-1]), 10))
 
 
 def test_its_pictures_are_those_that_are_traced(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -134,3 +135,12 @@ def test_its_pictures_are_those_that_are_traced(monkeypatch: pytest.MonkeyPatch)
     assert whole is not None and parts is not None and other is not None
     alone = len(made._held) - 1
     torch.testing.assert_close(whole, (parts + other * alone) / (alone + 1), rtol=1e-4, atol=1e-8)
+
+
+@pytest.mark.usefixtures("growing")
+def test_a_bank_that_teaches_enough_stops_growing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where unseen conditions are no better for the model, there are no more after the first comparison."""
+    monkeypatch.setattr(bank, "SURE", 1e9)
+    told = advsearch.attack("mug", **SMALL).summary.transport
+    assert told is not None and told.conditions is not None
+    assert (told.conditions.made, told.conditions.grown) == (9, 0)

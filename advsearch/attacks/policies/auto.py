@@ -42,8 +42,9 @@ into the ascent. One by differences never is: half a number for each, and the su
 REACH = 0.1
 """Length of the ascent's whole step in a box, as a share of half the diagonal: the screen has been everywhere else."""
 
-MOMENTUM = 0.75
-"""Weight of past gradients where none has noise and all point the same way; with noise PGD's own is better."""
+MOMENTUM, MOMENTUM_DRAWN = 0.75, 0.9
+"""Weight of past gradients where none has noise and all point the same way, and where each sees other conditions; with
+noise PGD's own is better."""
 
 CURIOSITY = 2.0
 """How many standard deviations of the surrogate a candidate gets on top of its mean. One does as well without noise;
@@ -253,6 +254,8 @@ def _surrogate(state: AutoState) -> tuple[Surrogate, AutoState]:
 
 def _pgd(domain: Domain) -> PGD:
     """What climbs in a domain."""
+    if domain.drawn:
+        return PGD(momentum=MOMENTUM_DRAWN)
     return PGD(momentum=MOMENTUM) if domain.exact else PGD()
 
 

@@ -33,14 +33,14 @@ def clipped(domain: Domain, gradient: Tensor, lengths: tuple[float, ...]) -> tup
       l-infinity ball, where the step follows the signs, so that this changes how gradients are averaged and no single
       step; `CLIP_L2` in an l2 ball.
     - A gradient that is longer than `CLIP` times the median of the last `MEMORY` is shortened to that.
-    - In a domain that is `exact` nothing is an outlier.
+    - In a domain that is `exact` or `drawn` nothing is an outlier.
 
     Args:
         domain: whose blocks count.
         gradient: (d,) float32, finite.
         lengths: of the gradients before, the latest last.
     """
-    if domain.exact:
+    if domain.exact or domain.drawn:
         return gradient, lengths, NO_COUNTS
     out, cut, shortened = gradient, False, False
     for block, part in domain.parts():

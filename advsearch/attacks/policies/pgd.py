@@ -129,8 +129,8 @@ class PGDState:
 
     @property
     def pace(self) -> float:
-        """The step size now, in units of each block's radius: without noise it falls in a line over the steps."""
-        if not self.domain.exact:
+        """The step size now, in units of each block's radius: where renders bring no noise, it falls in a line."""
+        if not (self.domain.exact or self.domain.drawn):
             return self.step_size
         return self.step_size * max(SLOWEST, 1.0 - self.count / self.steps)
 
@@ -156,7 +156,8 @@ class PGD(Policy[PGDState]):
     In a domain without noise (`Domain.exact`) no gradient is clipped, and the step size falls in a line over the
     planned steps, which came farther than Auto-PGD's rule at every budget that was tried (docs/policies/pgd.md). It is
     halved besides after a window that added less than `GAIN` of what the search has gained; after `ENOUGH` of these in
-    a row there is nothing more to propose.
+    a row there is nothing more to propose. In one whose evaluations draw conditions from a bank (`Domain.drawn`) the
+    step size falls likewise, and no window is looked at: what one gained says what it drew.
 
     An evaluation with the objective -inf sends the search back to its best configuration, which is evaluated again
     and left with half the step size. A gradient of zero leaves the accumulated one in charge; if that is zero too, the
@@ -214,6 +215,8 @@ class PGD(Policy[PGDState]):
             state = replace(state, peak=Peak(evaluation.objective, u, state.direction))
         if math.isnan(state.first):
             state = replace(state, first=evaluation.objective)
+        if state.domain.drawn:
+            return _step(state, u, state.direction)
         state = replace(state, window=state.window.add(evaluation.objective))
         if len(state.window.values) < state.window.length:
             return _step(state, u, state.direction)

@@ -251,6 +251,26 @@ def test_without_noise_the_step_of_pgd_falls_in_a_line_and_nothing_is_clipped() 
     assert noisy.counts.cut > 0
 
 
+def test_over_drawn_conditions_the_step_of_pgd_falls_in_a_line_whatever_they_were() -> None:
+    """Objectives that never gain again, by which it would halve its step and stop without noise, say only which
+    conditions were drawn; and the last configuration is the answer, not the raw best, which had easy ones."""
+    ranking: list[Tensor] = []
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+        if not gradient and index >= STEPS:
+            ranking.append(u)
+            return Evaluation(float(u[0]), None, False)
+        return Evaluation(-float(index), torch.ones(2), False)
+
+    domain = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),), drawn=True)
+    result = search(evaluate, domain, PGD(step_size=0.02), steps=STEPS, seed=0, candidates=3)
+    sizes = [record.step_size for record in result.history]
+    assert sizes == pytest.approx([0.02 * max(0.05, 1 - number / STEPS) for number in range(STEPS)])
+    assert float(result.best_u[0]) == max(float(u[0]) for u in ranking) > 0.55
+    usual = search(evaluate, replace(domain, drawn=False), PGD(step_size=0.02), steps=STEPS, seed=0, candidates=3)
+    assert float(usual.best_u[0]) < 0.55
+
+
 @pytest.mark.parametrize("norm", NORMS)
 @pytest.mark.parametrize("kind", ["linear", "peak outside"])
 def test_without_noise_pgd_stops_at_the_optimum(kind: str, norm: str) -> None:
