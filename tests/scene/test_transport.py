@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -170,6 +171,18 @@ def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.Monke
     found = advsearch.attack("mug", smallest=True, baseline=False, run=None, **SMALL).summary  # type: ignore[arg-type]
     assert found.smallest is not None and found.smallest.epsilon is not None and found.smallest.searches > 1
     assert made == 1 and guesses >= 5
+
+
+def test_a_guess_learns_how_optimistic_a_prediction_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scores of 4 on average, 19 of 20 of them over 3.1; a prediction of 5 was 1.9 too good."""
+    monkeypatch.setattr(searching.Transport, "_score", lambda self, u: float(u))
+    problem: Any = None
+    made = searching.Transport(problem, 1)
+    assert made.likely(torch.tensor(0.1)) and not made.likely(torch.tensor(-0.1))
+    made.correct(torch.tensor(5.0), [3.5, 4.5] * 4)
+    for scores in ([1.0, 2.0], [math.nan] * 6):  # too few to say anything, or none
+        made.correct(torch.tensor(9.0), scores)
+    assert not made.likely(torch.tensor(1.7)) and made.likely(torch.tensor(2.0))
 
 
 def test_a_search_says_what_predicted_its_pictures(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -1,0 +1,46 @@
+"""How many trials the way to the smallest change takes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from advsearch.attacks import Block, Domain, Ending, SearchResult
+from advsearch.attacks.verification import WORST_CASE
+from advsearch.engine.smallest_change import CONFIRMED, find_smallest
+
+
+def test_on_the_way_a_few_trials_do_and_at_the_end_it_is_all() -> None:
+    """What is wrong in every trial passes on 6, what is wrong in none fails on the second, and the end has 40."""
+    domain, tried = Domain(torch.full((2,), 0.5), (Block(2, "linf", 0.4),)), Counter[str]()
+
+    def search(kind: str, policy: Any, steps: int, seed: int, *, domain: Domain, ranked: bool) -> SearchResult:
+        assert ranked, "it was rendered"
+        u = domain.project(torch.ones(2))
+        return SearchResult(u, 1.0, 1.0, 1.0, Ending.FOUND, Ending.FOUND, (), (), 1, 0, 0, 0, 0.0)
+
+    def trial(kind: str, number: int, u: Tensor) -> Any:
+        tried[kind] += 1
+        score = float(u[0]) - 0.6
+        return SimpleNamespace(score=score, success=score > 0.0)
+
+    def said(*_: Any, **__: Any) -> None:
+        pass
+
+    problem = SimpleNamespace(domain=domain, seed=0, rule=WORST_CASE)
+    findings = SimpleNamespace(transport=None, smallest=None, search=None)
+    budget = SimpleNamespace(steps=1, trials=20)
+    searches: Any = SimpleNamespace(
+        problem=problem, budget=budget, findings=findings, policy=None, begin=said, search=search
+    )
+    progress = SimpleNamespace(progress=SimpleNamespace(advance=said))
+    verifier: Any = SimpleNamespace(begin=said, trial=trial, stages=progress)
+    find_smallest(searches, verifier)
+    assert findings.smallest.closed and findings.smallest.confirmed
+    last = [f"check {findings.smallest.checks - one}" for one in (1, 2)]
+    assert sum(tried[kind] for kind in last) == CONFIRMED
+    assert {tried[kind] for kind in tried if kind not in last} == {6, 2}
