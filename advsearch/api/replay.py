@@ -17,7 +17,7 @@ from advsearch.config import AttackConfig, ReplayConfig
 from advsearch.engine.naming import different
 from advsearch.engine.problem import Problem
 from advsearch.engine.replaying import Way, ways_of
-from advsearch.engine.retrial import Condition, Retrials
+from advsearch.engine.retrial import RetrialCondition, Retrials
 from advsearch.engine.rows import verified_rate
 from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
@@ -143,13 +143,13 @@ def _models(config: ReplayConfig, theirs: AttackConfig, summary: AttackSummary) 
     for name in config.models:
         own = AttackConfig.of(theirs, model=name, ensemble=None)
 
-        def condition(own: AttackConfig = own, name: str = name) -> Condition:
-            return Condition(f"model: {name}", problem_from_config(own)[0], _spp(summary), name)
+        def condition(own: AttackConfig = own, name: str = name) -> RetrialCondition:
+            return RetrialCondition(f"model: {name}", problem_from_config(own)[0], _spp(summary), name)
 
         yield Way("model", condition, name)
 
 
-def _row(way: Way, condition: Condition, retrials: Retrials, u: torch.Tensor) -> ReplayRow:
+def _row(way: Way, condition: RetrialCondition, retrials: Retrials, u: torch.Tensor) -> ReplayRow:
     checked = retrials.answer("answer", u, condition)
     counted = count_right(retrials.clean(condition), condition.spp)
     return ReplayRow(

@@ -12,7 +12,7 @@ from torch import Tensor
 from advsearch.controls.corruption.digital import coded
 from advsearch.controls.sensor import through_sensor
 from advsearch.engine.problem import Problem
-from advsearch.engine.retrial import Condition, unchanged
+from advsearch.engine.retrial import RetrialCondition, unchanged
 from advsearch.scene.renderer import MAX_SPP
 
 OWN = "as verified"
@@ -46,7 +46,7 @@ class Way:
     """
 
     name: str
-    condition: Callable[[], Condition]
+    condition: Callable[[], RetrialCondition]
     text: str
 
 
@@ -61,23 +61,25 @@ def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Probl
     renderer = problem.renderer
     scene, formation = renderer.scene, renderer.formation
 
-    def same(count: int = spp, change: Callable[[Tensor, int], Tensor] = unchanged) -> Callable[[str], Condition]:
-        return lambda name: Condition(name, problem, count, "own", change)
+    def same(
+        count: int = spp, change: Callable[[Tensor, int], Tensor] = unchanged
+    ) -> Callable[[str], RetrialCondition]:
+        return lambda name: RetrialCondition(name, problem, count, "own", change)
 
-    def other(**made: object) -> Callable[[str], Condition]:
-        def condition(name: str) -> Condition:
+    def other(**made: object) -> Callable[[str], RetrialCondition]:
+        def condition(name: str) -> RetrialCondition:
             changed = renderer.like(scene.like(**made), **({"sampler": made["sampler"]} if "sampler" in made else {}))
-            return Condition(name, replace(problem, renderer=changed), spp, name)
+            return RetrialCondition(name, replace(problem, renderer=changed), spp, name)
 
         return condition
 
-    def formed(**fields: Any) -> Callable[[str], Condition]:
-        return lambda name: Condition(name, replace(problem, renderer=renderer.like(**fields)), spp, name)
+    def formed(**fields: Any) -> Callable[[str], RetrialCondition]:
+        return lambda name: RetrialCondition(name, replace(problem, renderer=renderer.like(**fields)), spp, name)
 
-    def at(size: tuple[int, int]) -> Callable[[str], Condition]:
-        return lambda name: Condition(name, sized(size), spp, name)
+    def at(size: tuple[int, int]) -> Callable[[str], RetrialCondition]:
+        return lambda name: RetrialCondition(name, sized(size), spp, name)
 
-    def way(name: str, text: str, make: Callable[[str], Condition]) -> Way:
+    def way(name: str, text: str, make: Callable[[str], RetrialCondition]) -> Way:
         return Way(name, lambda: make(text if name == OWN else f"{name}: {text}"), text)
 
     yield way(OWN, OWN, same())

@@ -23,7 +23,7 @@ def unchanged(picture: Tensor, seed: int) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class Condition:
+class RetrialCondition:
     """What an answer is tried under.
 
     Attributes:
@@ -55,7 +55,7 @@ class Retrials:
     """
 
     def __init__(
-        self, conditions: Sequence[Condition], run: RunDirectory, progress: Progress, *, trials: int, seed: int
+        self, conditions: Sequence[RetrialCondition], run: RunDirectory, progress: Progress, *, trials: int, seed: int
     ) -> None:
         self._conditions, self._progress, self._count, self._seed = conditions, progress, trials, seed
         memory = Memory(run)
@@ -65,7 +65,7 @@ class Retrials:
         self._pictures: dict[tuple[Hashable, int, int], Tensor] = {}
         self._pictured = ""
 
-    def clean(self, condition: Condition) -> tuple[Judgement, ...]:
+    def clean(self, condition: RetrialCondition) -> tuple[Judgement, ...]:
         """Try the clean scene under one condition, once."""
         if condition.name not in self._clean:
             self._clean[condition.name] = run_trials(
@@ -77,7 +77,7 @@ class Retrials:
             )
         return self._clean[condition.name]
 
-    def answer(self, kind: str, u: Tensor, condition: Condition) -> Verification:
+    def answer(self, kind: str, u: Tensor, condition: RetrialCondition) -> Verification:
         """Try an answer (d,) under one condition, beside the clean scene; a claim of nothing is never confirmed.
 
         Args:
@@ -97,7 +97,7 @@ class Retrials:
             rule=condition.problem.rule,
         )
 
-    def _trial(self, kind: str, condition: Condition) -> Callable[[Tensor, int, int], Judgement]:
+    def _trial(self, kind: str, condition: RetrialCondition) -> Callable[[Tensor, int, int], Judgement]:
         """Trials of one configuration, one after the other."""
         problem, rows, count = condition.problem, f"{kind} under {condition.name}", 0
 
@@ -114,7 +114,7 @@ class Retrials:
 
         return trial
 
-    def _picture(self, kind: str, condition: Condition, u: Tensor, seed: int) -> Tensor:
+    def _picture(self, kind: str, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
         """The picture of a trial; those of the configuration that is tried now are kept for other conditions."""
         if kind != self._pictured:
             self._pictures.clear()

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from advsearch.attacks import Verification, count_right
 from advsearch.engine.problem import Problem
-from advsearch.engine.retrial import Condition, Retrials
+from advsearch.engine.retrial import RetrialCondition, Retrials
 from advsearch.engine.rows import verified_rate
 from advsearch.progress import Progress
 from advsearch.runs.directory import RunDirectory
@@ -38,7 +38,7 @@ class Transfer:
         spp: int,
         seed: int,
     ) -> None:
-        self._conditions = [Condition(name, one, spp, _size(one)) for name, one in problems.items()]
+        self._conditions = [RetrialCondition(name, one, spp, _size(one)) for name, one in problems.items()]
         self._retrials = Retrials(self._conditions, run, progress, trials=trials, seed=seed)
         self._progress, self._each = progress, trials * len(problems)
 
@@ -61,7 +61,7 @@ class Transfer:
     def _begin(self, title: str) -> None:
         self._progress.stage(title, self._each, hint=f"{self._each} answers; `trials` or `verify_spp` shorten it")
 
-    def _control(self, one: Condition) -> MatrixModel:
+    def _control(self, one: RetrialCondition) -> MatrixModel:
         trials, problem = count_right(self._retrials.clean(one), one.spp), one.problem
         return MatrixModel(
             model=one.name,
