@@ -99,6 +99,7 @@ class SweepKeywords(PictureKeywords, total=False):
     batch: int
     keep_pictures: Literal["all", "wrong", "none"]
     specialise: bool
+    aov: str | None
     trials: int
     verify_spp: int | None
     overwrite: bool

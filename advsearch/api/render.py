@@ -14,6 +14,7 @@ from advsearch.engine.run_settings import RunSettings
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.results.render import RenderResult
+from advsearch.scene.surfaces import aovs_of
 from advsearch.tasks import make_task
 
 
@@ -25,7 +26,9 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
         StorageError: the file could not be written.
     """
     progress = progress or NullProgress()
-    out = writable(config.out, config.around or 1)
+    out, aovs = writable(config.out, config.around or 1), aovs_of(config.aov)
+    if aovs and config.around is not None:
+        raise InputError("aov: is of one view; leave `around` out")
     for spec in (config.object, config.environment, config.model, config.labels):
         if spec is not None and out.exists() and Path(spec).exists() and out.samefile(spec):
             raise InputError(f"out: would replace {spec}, which is read; choose another name")
@@ -49,9 +52,12 @@ def render_from_config(config: RenderConfig, *, progress: Progress | None = None
         denoise=config.denoise,
         sampler=config.pixel_sampler,
         seed=config.seed,
+        aov=bool(aovs),
         progress=progress,
     )
     warnings = [*rendering.warnings, *notes]
     for text in warnings:
         progress.message(text)
+    if aovs:
+        rendering.save_aov(out, aovs)
     return rendering.result(out, rendering.save(out), warnings, rendering.save_answers(out))

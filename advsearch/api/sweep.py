@@ -24,6 +24,7 @@ from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import CONFIG, RunDirectory, check_free, is_run, run_path
 from advsearch.runs.listing import finished
 from advsearch.scene.mitsuba_backend.samplers import next_count
+from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import split_names
 from advsearch.tasks import AnyTask, Task, make_task
 
@@ -88,6 +89,8 @@ def sweep(
     config = SweepConfig(**{**described, **options, "run": None if run is None else str(run)})
     if config.keep_pictures != "none" and config.run is None:
         raise InputError("keep_pictures: expected `run` beside it, the folder that keeps them; name one")
+    if config.aov is not None and config.run is None:
+        raise InputError("aov: expected `run` beside it, the folder that keeps the layers; name one")
     progress = progress or NullProgress()
     resumed = _stopped(config)
     if config.run is not None and resumed is None:
@@ -196,6 +199,7 @@ def _job(
         warnings=tuple(dict.fromkeys(warnings)),
         keep_pictures=config.keep_pictures,
         specialise=config.specialise,
+        aovs=aovs_of(config.aov),
     )
 
 

@@ -48,6 +48,14 @@ class RenderConfig(SceneConfig):
         ge=1,
         le=65536,
     )
+    aov: str | None = setting(
+        None,
+        "picture",
+        "ground truth of each pixel, separated by commas, as layers of an EXR beside the picture",
+        "names among mask, depth, normal, uv, id",
+        otherwise="none",
+        metavar="NAMES",
+    )
     out: str = setting(
         ...,
         "picture",

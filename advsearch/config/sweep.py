@@ -10,6 +10,7 @@ from pydantic import field_validator
 
 from advsearch.config.attack import FEWEST_TRIALS, AttackConfig
 from advsearch.config.derivative import DerivativeConfig
+from advsearch.config.rendering import RenderConfig
 from advsearch.config.scene import ControlsByName, SceneConfig
 from advsearch.settings import Clash, number_or_text, setting, setting_as_in, split_names
 
@@ -93,6 +94,12 @@ class SweepConfig(SceneConfig):
         group="sweep",
         description="predict pictures that differ in light alone",
         switched="render every picture, also those that differ in light alone",
+    )
+    aov: str | None = setting_as_in(
+        RenderConfig,
+        "aov",
+        group="sweep",
+        description="ground truth of each pixel, separated by commas, as layers of an EXR for every configuration",
     )
     spp: int | None = setting_as_in(
         SceneConfig, "spp", group="sweep", description="samples per pixel of a picture", expects="", ge=1, le=65536

@@ -23,12 +23,13 @@ from advsearch.progress import NullProgress, Progress
 from advsearch.report.contact_sheet import contact_sheet
 from advsearch.report.marks import marked
 from advsearch.runs.files import placed_by
-from advsearch.runs.images import write_exr, write_png
+from advsearch.runs.images import write_exr, write_layers, write_png
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.render import MeshUp, RenderResult, ViewAnswers
-from advsearch.scene.description import ORBIT_CAMERA, SceneDescription
+from advsearch.scene.description import OBJECT, ORBIT_CAMERA, SceneDescription
 from advsearch.scene.formation import ImageFormation, to_8_bit
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER
+from advsearch.scene.surfaces import Surfaces
 from advsearch.tasks import Answer, AnyTask, Facts, Mark, make_task
 
 MOST_ANSWERS = 5
@@ -45,6 +46,7 @@ class View:
         linear: (H, W, 3) linear radiance times the gain, before what controls do to the finished picture.
         answers: what the model says, the likeliest first.
         marks: what shows its answer, and what is true, in the picture; empty where words say it all.
+        surfaces: what is seen in each pixel; None where nobody asked.
     """
 
     azimuth: float
@@ -52,6 +54,7 @@ class View:
     linear: Tensor
     answers: tuple[Answer, ...]
     marks: tuple[Mark, ...] = ()
+    surfaces: Surfaces | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +100,23 @@ class Rendering:
             sheet = self.sheet() if len(self.views) > 1 else self.views[0].picture.numpy()
             write_png(file, sheet)
         return sheet.shape[0], sheet.shape[1]
+
+    def save_aov(self, path: str | Path, aovs: Sequence[str]) -> Path:
+        """Write ground truth of the view as layers of one EXR, whole or not at all, and return the path.
+
+        Args:
+            path: of the picture; the layers go beside it, as ``NAME.aov.exr``.
+            aovs: names of `advsearch.scene.surfaces.AOVS`.
+
+        Raises:
+            InputError: `render` was not asked for it.
+            StorageError: the file could not be written.
+        """
+        (surfaces, *others) = [view.surfaces for view in self.views]
+        if surfaces is None or others:
+            raise InputError("aov: expected one view, rendered with `aov`; leave `around` out")
+        with placed_by("out"):
+            return write_layers(Path(path).with_suffix(".aov.exr"), surfaces.layers(aovs, OBJECT), surfaces.notes(aovs))
 
     def sheet(self) -> Any:
         """Return all views side by side, (h, w, 3) float32 sRGB in [0, 1], with azimuth and answers under each."""
@@ -166,6 +186,7 @@ def render(
     denoise: str = "oidn",
     sampler: str = SAMPLER,
     seed: int = 0,
+    aov: bool = False,
     progress: Progress | None = None,
 ) -> Rendering:
     """Render a scene and ask the model what it sees.
@@ -183,6 +204,7 @@ def render(
         denoise: "oidn" or "none".
         sampler: "multijitter" or "independent".
         seed: root of the noise.
+        aov: keep what is seen in each pixel, for `Rendering.save_aov`.
         progress: told how far it is.
 
     Raises:
@@ -220,7 +242,8 @@ def render(
                 except InputError as error:
                     untold = [f"Nothing is drawn into the picture: {error}"]
         azimuth = description.number("camera.azimuth")
-        views.append(View(azimuth, picture, radiance * formation.gain, answers, marks))
+        surfaces = renderer.surfaces(space.start) if aov else None
+        views.append(View(azimuth, picture, radiance * formation.gain, answers, marks, surfaces))
         progress.advance(1)
     assert formation is not None
     own = scene.description

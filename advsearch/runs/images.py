@@ -10,7 +10,7 @@ from __future__ import annotations
 import errno
 import io
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -113,13 +113,36 @@ def write_exr(path: Path, image: Any) -> Path:
     Raises:
         StorageError: the file could not be written.
     """
+    values = np.ascontiguousarray(_picture(_floats(image)))
+    return _write_exr(path, {"Y" if values.ndim == 2 else "RGB": values}, {})
+
+
+def write_layers(path: Path, layers: Mapping[str, Any], notes: Mapping[str, str]) -> Path:
+    """Write several layers as one EXR, whole or not at all, and return the path.
+
+    Args:
+        path: the file.
+        layers: channels (H, W) by name, such as ``normal.X``: numbers in float32, whole numbers as 32 bits.
+        notes: what the values mean, by layer: attributes of the file.
+
+    Raises:
+        StorageError: the file could not be written.
+    """
+    channels = {}
+    for name, layer in layers.items():
+        values = layer.numpy() if hasattr(layer, "numpy") else np.asarray(layer)
+        whole = values.dtype.kind in "iu"
+        channels[name] = np.ascontiguousarray(values.astype(np.uint32 if whole else np.float32))
+    return _write_exr(path, channels, notes)
+
+
+def _write_exr(path: Path, channels: Mapping[str, Any], notes: Mapping[str, str]) -> Path:
     import OpenEXR
 
-    values = np.ascontiguousarray(_picture(_floats(image)))
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **notes}
     with replacing(path) as part:
         try:
-            with OpenEXR.File(header, {"Y" if values.ndim == 2 else "RGB": values}) as file:
+            with OpenEXR.File(header, dict(channels)) as file:
                 file.write(os.fspath(part))
         except RuntimeError as error:
             number = errno.ENOSPC if "No space left" in str(error) else errno.EIO

@@ -30,6 +30,7 @@ from advsearch.scene.gradients.motion import Motion, steps_for
 from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, first_plan
 from advsearch.scene.mitsuba_backend.denoise import Denoiser
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.surfaces import Surfaces
 
 MAX_SPP = 65536
 
@@ -144,10 +145,14 @@ class Renderer:
 
         It is asked for at the middle of each pixel. What controls do to the finished picture moves nothing in it.
         """
+        return self.surfaces(u).seen(OBJECT)
+
+    def surfaces(self, u: Tensor) -> Surfaces:
+        """Return what the camera sees first through the middle of each pixel; as of `mask`."""
         self._check(u, 1)
         with torch.no_grad():
             inputs = self._assembled(u)
-        return self.scene.first_hits({name: inputs[name] for name in inputs if name not in ON_PICTURE}, OBJECT)
+        return self.scene.surfaces({name: inputs[name] for name in inputs if name not in ON_PICTURE})
 
     def gradient(
         self, loss: Callable[[Tensor], Tensor], u: Tensor, seed: int, spp: int, *, free: bool = False

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenEXR
 import pytest
 import samples
 import torch
@@ -160,3 +161,14 @@ def test_a_file_of_ones_own_with_a_network_of_ones_own(
         *("--out", str(tmp_path / "a.png"), "--resolution", "224x224", "--spp", "4"),
     )
     assert {one["label"] for one in found["views"][0]["answers"]} >= {"coffee mug", "cup"}
+
+
+def test_ground_truth_lies_beside_the_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    render(capsys, "--object", "mug", "--out", str(tmp_path / "a.png"), "--aov", "mask,normal")
+    with OpenEXR.File(str(tmp_path / "a.aov.exr"), separate_channels=True) as file:
+        found = {name: one.pixels for name, one in file.channels().items()}
+    assert sorted(found) == ["mask.Y", "normal.X", "normal.Y", "normal.Z"]
+    assert 0.1 < found["mask.Y"].mean() < 0.9
+    assert "leave --around out" in refused(
+        capsys, "--object", "mug", "--out", str(tmp_path / "b.png"), "--aov", "mask", "--around", "2"
+    )

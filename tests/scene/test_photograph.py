@@ -77,7 +77,7 @@ def test_the_object_keeps_light_from_the_floor() -> None:
     scene = describe("ball", room(), given={"camera.elevation": 60.0, "camera.distance": 4.0})
     away = replace(scene, values={**scene.values, **AWAY})
     mitsuba = MitsubaScene(scene, (SIZE, SIZE))
-    seen = mitsuba.first_hits({}, "object")
+    seen = mitsuba.surfaces({}).seen("object")
     ratio = (mitsuba.radiance({}, 0, 64) / MitsubaScene(away, (SIZE, SIZE)).radiance({}, 0, 64)).mean(dim=2)
     near, outline = (
         torch.nn.functional.max_pool2d(seen[None].float(), width, stride=1, padding=width // 2)[0] > 0.0

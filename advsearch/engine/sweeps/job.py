@@ -69,6 +69,7 @@ class Job:
         warnings: on the way.
         keep_pictures: thumbnails that are kept: "all", "wrong" (what any of the models gets wrong) or "none".
         specialise: whether pictures that differ in light alone may be predicted.
+        aovs: layers of ground truth that are kept of every picture of the first model (`scene.surfaces.AOVS`).
     """
 
     object: str
@@ -91,6 +92,7 @@ class Job:
     warnings: tuple[str, ...]
     keep_pictures: Literal["all", "wrong", "none"] = "none"
     specialise: bool = True
+    aovs: tuple[str, ...] = ()
 
     @cached_property
     def sizes(self) -> tuple[tuple[int, int], ...]:

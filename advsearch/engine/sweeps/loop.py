@@ -36,9 +36,11 @@ from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
+from advsearch.runs.images import write_layers
 from advsearch.runs.results.attack import DescribedValue, LinearTransport
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.sweep import SweepSummary, WorstClaim, WorstConfiguration, WorstVerified
+from advsearch.scene.description import OBJECT
 from advsearch.scene.transport.renderer import SPP as BASIS_SPP
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
@@ -52,6 +54,9 @@ NOT_FINITE = "pictures not finite"
 
 PICTURE_SPP = 64
 """Samples a pixel of the picture that is kept, unless verification needed more."""
+
+AOV_FOLDER = "aov"
+"""Folder of a run with the ground truth of each picture, by its number."""
 
 TELL_SECONDS = 0.1
 """Least time between two reports of progress."""
@@ -214,6 +219,10 @@ class Sweep:
             for k, number in enumerate(numbers):
                 if self._is_kept(seen.judgements[model][k] for model in range(self.models)):
                     thumbnails.keep(self.run.path, before + number, seen.pictures[k])
+            if self.job.aovs:
+                for number, surfaces in zip(numbers, view.surfaces(picks), strict=True):
+                    file = self.run.path / AOV_FOLDER / f"{before + number:06d}.exr"
+                    write_layers(file, surfaces.layers(self.job.aovs, OBJECT), surfaces.notes(self.job.aovs))
             self.run.record(*rows)
         self._spend(rows)
         for k in range(len(numbers)):

@@ -18,6 +18,7 @@ from advsearch.engine.sweeps.light import Shown, SweptLight
 from advsearch.engine.sweeps.points import Picks, Points
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.renderer import Renderer
+from advsearch.scene.surfaces import Surfaces
 from advsearch.tasks import Judgement, Mark
 from advsearch.tasks.base import Truth
 
@@ -136,6 +137,11 @@ class SweptScene:
     def picture(self, number: int, u: Tensor, seed: int, spp: int) -> Tensor:
         """The picture (H, W, 3) that one model sees of one configuration."""
         return self._pictures(self.renderers[self._job.sizes[number]], u[None], [seed], spp)[0]
+
+    def surfaces(self, picks: Picks) -> list[Surfaces]:
+        """What is seen in the pixels of pictures that the first model is shown."""
+        size = self._job.sizes[0]
+        return [self.renderers[size].surfaces(u) for u in self.points[size].configurations(picks)]
 
     def marks(self, number: int, u: Tensor, picture: Tensor) -> list[Mark]:
         """What shows the answer of one model to the picture (H, W, 3) of one configuration."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from torch import Tensor
+import torch
 
 from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.surfaces import Surfaces
 
 
-def first_hits(scene: Any, sensor: Any, name: str, resolution: tuple[int, int]) -> Tensor:
-    """Return where a shape is the first that the camera sees, (H, W) bool.
+def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces:
+    """Return the surface in each pixel.
 
     A thin lens is looked through at its middle. What lets light pass and does not shine towards the camera, as a lamp
     that is off, is not seen; haze is no shape.
@@ -18,24 +19,41 @@ def first_hits(scene: Any, sensor: Any, name: str, resolution: tuple[int, int]) 
     Args:
         scene: Mitsuba's.
         sensor: Mitsuba's camera.
-        name: of the shape.
         resolution: (height, width) in pixels.
     """
     mi = mitsuba()
     import drjit as dr
 
     height, width = resolution
-    pixel = dr.arange(mi.UInt32, height * width)
+    count = height * width
+    pixel = dr.arange(mi.UInt32, count)
     place = mi.Point2f((pixel % width + 0.5) / width, (pixel // width + 0.5) / height)
     ray, _ = sensor.sample_ray(0.0, 0.5, place, mi.Point2f(0.5))
-    wanted = mi.ShapePtr(next(shape for shape in scene.shapes() if shape.id() == name))
-    seen, active = dr.zeros(mi.Bool, height * width), dr.full(mi.Bool, True, height * width)
+    eye = mi.Point3f(ray.o)
+    active = dr.full(mi.Bool, True, count)
+    number, face = dr.zeros(mi.UInt32, count), dr.zeros(mi.UInt32, count)
+    depth = dr.full(mi.Float, dr.inf, count)
+    normal, uv = dr.zeros(mi.Normal3f, count), dr.zeros(mi.Point2f, count)
+    shapes = scene.shapes()
     while dr.any(active):
         hit = scene.ray_intersect(ray, active)
         active &= hit.is_valid()
         shining = dr.max(hit.emitter(scene, active).eval(hit, active)) > 0.0
         passes = active & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Null) & ~shining
-        seen |= active & ~passes & (hit.shape == wanted)
+        seen = active & ~passes
+        for place_of, shape in enumerate(shapes, 1):
+            number[seen & (hit.shape == mi.ShapePtr(shape))] = mi.UInt32(place_of)
+        face[seen] = hit.prim_index
+        depth[seen] = dr.norm(hit.p - eye)
+        normal[seen] = mi.Normal3f(hit.sh_frame.n)
+        uv[seen] = mi.Point2f(hit.uv.x, 1.0 - hit.uv.y)  # Mitsuba's rows of a texture begin at the top
         ray, active = hit.spawn_ray(ray.d), passes
-    found: Tensor = seen.torch().reshape(height, width).bool().cpu()
-    return found
+    size = (height, width)
+    return Surfaces(
+        names=tuple(shape.id() for shape in shapes),
+        id=number.torch().reshape(size).long().cpu(),
+        depth=depth.torch().reshape(size).cpu(),
+        normal=torch.stack([one.torch().reshape(size).cpu() for one in normal], dim=-1),
+        uv=torch.stack([one.torch().reshape(size).cpu() for one in uv], dim=-1),
+        face=face.torch().reshape(size).long().cpu(),
+    )

@@ -27,6 +27,7 @@ from advsearch.scene.mitsuba_backend.population import population
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER, next_count
 from advsearch.scene.mitsuba_backend.transport import Paths, collect
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
+from advsearch.scene.surfaces import Surfaces
 
 MAX_DEPTH = 6
 """Longest light path in segments: five bounces off surfaces."""
@@ -166,10 +167,10 @@ class MitsubaScene:
         both = self._render("guides", seed, spp)[..., -6:]
         return both[..., :3].clamp(0.0, 1.0), both[..., 3:6]
 
-    def first_hits(self, inputs: Mapping[str, Tensor], mesh: str) -> Tensor:
-        """Return where a mesh is the first thing that the camera sees, (H, W) bool, by the middle of each pixel."""
+    def surfaces(self, inputs: Mapping[str, Tensor]) -> Surfaces:
+        """Return what the camera sees first through the middle of each pixel."""
         self._apply(inputs)
-        return first_hits(self._scene, self._sensor, mesh, self.resolution)
+        return first_hits(self._scene, self._sensor, self.resolution)
 
     def adjoint(
         self,

@@ -1,0 +1,79 @@
+"""What the camera sees first through the middle of each pixel: ground truth beside a picture, without noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from advsearch.errors import UnknownNameError
+
+AOVS: Mapping[str, str] = {
+    "mask": "1 where the object is seen first, else 0",
+    "depth": "distance from the camera along the ray, object sizes; infinite where there is nothing",
+    "normal": "unit shading normal, world space (z up); 0 where there is nothing",
+    "uv": "texture coordinates, v = 0 at the bottom row of the texture; 0 where there is nothing",
+    "id": "number of the mesh; 0 where there is nothing",
+}
+"""What can be asked for, and what its values mean."""
+
+CHANNELS: Mapping[str, str] = {"mask": "Y", "depth": "Z", "normal": "XYZ", "uv": "UV", "id": "Y"}
+"""The channels of each layer, as EXR calls them."""
+
+
+def aovs_of(text: str | None) -> tuple[str, ...]:
+    """Return the names in a list separated by commas, each once.
+
+    Raises:
+        UnknownNameError: one is not of `AOVS`.
+    """
+    names = dict.fromkeys(part.strip() for part in (text or "").split(",") if part.strip())
+    for name in names:
+        if name not in AOVS:
+            raise UnknownNameError("aov", name, AOVS)
+    return tuple(names)
+
+
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """The surface in each pixel, by the ray through its middle.
+
+    Attributes:
+        names: of the shapes.
+        id: (H, W) int64: 1 for the first of the names and so on, 0 where there is nothing.
+        depth: (H, W) distance from the camera, object sizes; infinite where there is nothing.
+        normal: (H, W, 3) unit shading normal in world space.
+        uv: (H, W, 2) texture coordinates; v = 0 is the bottom row.
+        face: (H, W) int64 number of the triangle in its mesh.
+    """
+
+    names: tuple[str, ...]
+    id: Tensor
+    depth: Tensor
+    normal: Tensor
+    uv: Tensor
+    face: Tensor
+
+    def seen(self, name: str) -> Tensor:
+        """Return where a shape is what is seen, (H, W) bool."""
+        return self.id == self.names.index(name) + 1
+
+    def layers(self, aovs: Sequence[str], mask: str) -> dict[str, Tensor]:
+        """Return the channels (H, W) of a picture with these layers, such as ``normal.X``.
+
+        Args:
+            aovs: names of `AOVS`.
+            mask: the shape of the layer `mask`.
+        """
+        found: dict[str, Tensor] = {}
+        for name in aovs:
+            value = self.seen(mask).float() if name == "mask" else getattr(self, name)
+            planes = value[..., None] if value.ndim == 2 else value
+            found |= {f"{name}.{channel}": planes[..., number] for number, channel in enumerate(CHANNELS[name])}
+        return found
+
+    def notes(self, aovs: Sequence[str]) -> dict[str, str]:
+        """Return what the values of the layers mean, by name."""
+        numbers = ", ".join(f"{number} is {name}" for number, name in enumerate(self.names, 1))
+        return {name: AOVS[name] + (f"; {numbers}" if name == "id" else "") for name in aovs}
