@@ -119,6 +119,6 @@ def hsv_to_rgb(hue: Tensor, saturation: Tensor, value: Tensor) -> Tensor:
 
     Piecewise linear in each argument, so differentiable almost everywhere; a grey has no derivative by hue but zero.
     """
-    sector = torch.remainder(torch.tensor([5.0, 3.0, 1.0], dtype=hue.dtype) + hue / 60.0, 6.0)
+    sector = torch.remainder(torch.tensor([5.0, 3.0, 1.0]).to(hue) + hue / 60.0, 6.0)
     ramp = torch.minimum(sector, 4.0 - sector).clamp(0.0, 1.0)
     return value * (1.0 - saturation * ramp)

@@ -108,7 +108,7 @@ class BoundControl(ABC):
 
     @abstractmethod
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
-        """Map a slice (d,) of u to named scene inputs, by differentiable torch operations.
+        """Map a slice (d,) of u to named scene inputs, by differentiable torch operations, on the device of u.
 
         Args:
             u: (d,) in [0, 1].

@@ -112,12 +112,12 @@ class CameraControl(NumberControl):
 
     def _orbit(self, scene: SceneDescription, values: Values, distance: Tensor) -> Tensor:
         azimuth, elevation, roll = (torch.deg2rad(values[name]) for name in ("azimuth", "elevation", "roll"))
-        zero = torch.zeros(())
+        zero = torch.zeros_like(azimuth)
         outwards = torch.stack([elevation.cos() * azimuth.cos(), elevation.cos() * azimuth.sin(), elevation.sin()])
         left = torch.stack([azimuth.sin(), -azimuth.cos(), zero])
         up = torch.linalg.cross(-outwards, left)
         left, up = roll.cos() * left + roll.sin() * up, roll.cos() * up - roll.sin() * left
-        place = torch.from_numpy(middle(scene)).float() + distance * outwards
+        place = torch.from_numpy(middle(scene)).to(distance) + distance * outwards
         return affine(torch.stack([left, up, -outwards], dim=1), place)
 
 

@@ -123,7 +123,7 @@ class EnvironmentControl(NumberControl):
         return Budget("l2", float(str(self.chosen["epsilon"])) / width)
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        base = self._map(scene, int(values["which"]))
+        base = self._map(scene, int(values["which"])).to(values["rotation"].device)
         turned = turn(base, values["rotation"] - scene.number("environment.rotation"))
         tint = torch.stack([values[f"tint_{color}"] for color in CHANNELS])
         stops = values["exposure"] - scene.number("environment.exposure")
@@ -170,6 +170,6 @@ def turn(radiance: Tensor, degrees: Tensor) -> Tensor:
 def harmonics(coefficients: Tensor, like: Tensor) -> Tensor:
     """Return (H, W, 3) light from 9 coefficients a channel, scaled by the mean of the map `like` (H, W, 3)."""
     height, width = like.shape[:2]
-    basis = real_harmonics(height, width)
+    basis = real_harmonics(height, width).to(coefficients.device)
     mean = like.detach().mean(dim=(0, 1))
     return basis @ coefficients.reshape(9, 3) * mean

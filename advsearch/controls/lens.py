@@ -112,7 +112,7 @@ class LensControl(NumberControl):
         placed = dict(values)
         for axis, name in enumerate(PLACES):
             if self.asked and name not in self.specs:
-                placed[name] = spread(self.dots)[axis]
+                placed[name] = spread(self.dots)[axis].to(values[name].device)
         return placed
 
 
@@ -160,9 +160,9 @@ def _board() -> Tensor:
 
 def _covers(height: int, width: int, values: Mapping[str, Tensor]) -> Tensor:
     """Return (dots, H, W): the opacity of each dot at each pixel's centre."""
-    side = min(height, width)
-    across = (torch.arange(width) + 0.5 - values["x"][:, None] * width) / side
-    down = (torch.arange(height) + 0.5 - values["y"][:, None] * height) / side
+    side, device = min(height, width), values["x"].device
+    across = (torch.arange(width, device=device) + 0.5 - values["x"][:, None] * width) / side
+    down = (torch.arange(height, device=device) + 0.5 - values["y"][:, None] * height) / side
     squared = down[:, :, None] ** 2 + across[:, None, :] ** 2
     distance = squared / values["radius"][:, None, None] ** 2
     falloff = values["falloff"]

@@ -126,4 +126,4 @@ class LightControl(NumberControl):
 
 def ball(place: Tensor, radius: Tensor) -> Tensor:
     """Return the pose (4, 4) of the unit ball at a place (3,) with a radius ()."""
-    return affine(torch.eye(3) * radius, place)
+    return affine(torch.eye(3).to(place) * radius, place)

@@ -249,8 +249,8 @@ class Slot:
             return value.reshape(()) if not parameter.shape else value
         chosen = spec.value if isinstance(spec, Fixed) else spec.values[option_index(len(spec.values), u[self.begin])]
         if isinstance(chosen, str):
-            return scalar(float(parameter.options.index(chosen)))
-        return scalar(chosen) if not parameter.shape else torch.full((self.size,), float(chosen))
+            return scalar(float(parameter.options.index(chosen))).to(u.device)
+        return (scalar(chosen) if not parameter.shape else torch.full((self.size,), float(chosen))).to(u.device)
 
 
 class BoundNumbers(BoundControl):

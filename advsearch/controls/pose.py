@@ -60,6 +60,7 @@ class PoseControl(NumberControl):
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         base, vertices, floor = _standing(self.mesh_in(scene), scene.around.get(self.mesh))
+        base, vertices = (held.to(values["scale"].device) for held in (base, vertices))
         middle = (vertices.amin(dim=0) + vertices.amax(dim=0)) / 2.0
         turned = rotation_vector(values["rotation"]) @ euler(values["yaw"], values["pitch"], values["roll"])
         linear = values["scale"] * turned
@@ -68,7 +69,7 @@ class PoseControl(NumberControl):
         else:
             lowest = floor - middle[2]
         shift = torch.stack([values["x"], values["y"], floor + values["z"] - lowest])
-        translation = shift - linear @ middle + torch.cat([middle[:2], torch.zeros(1)])
+        translation = shift - linear @ middle + torch.cat([middle[:2], middle.new_zeros(1)])
         return {f"{self.mesh}.to_world": affine(linear, translation) @ base}
 
 
@@ -88,7 +89,7 @@ def _standing(mesh: MeshPart, placed: MeshPart | None) -> tuple[Tensor, Tensor, 
 
 def euler(yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
     """Return `Rz(yaw) Ry(pitch) Rx(roll)`, angles in degrees, as a (3, 3) matrix; differentiable."""
-    zero, one = torch.zeros(()), torch.ones(())
+    zero, one = torch.zeros_like(yaw), torch.ones_like(yaw)
     (cz, sz), (cy, sy), (cx, sx) = ((torch.cos(a), torch.sin(a)) for a in map(torch.deg2rad, (yaw, pitch, roll)))
     about_z = torch.stack([cz, -sz, zero, sz, cz, zero, zero, zero, one]).reshape(3, 3)
     about_y = torch.stack([cy, zero, sy, zero, one, zero, -sy, zero, cy]).reshape(3, 3)
@@ -109,6 +110,6 @@ def rotation_vector(degrees: Tensor) -> Tensor:
     sine = torch.where(small, 1.0 - square / 6.0, torch.sin(angle) / angle)
     cosine = torch.where(small, 0.5 - square / 24.0, (1.0 - torch.cos(angle)) / angle.square())
     x, y, z = vector
-    zero = torch.zeros(())
+    zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-    return torch.eye(3) + sine * cross + cosine * (cross @ cross)
+    return torch.eye(3).to(degrees) + sine * cross + cosine * (cross @ cross)

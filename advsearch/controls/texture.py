@@ -219,7 +219,8 @@ class Recoloured(Painter):
         self.group = Group("palette", centres.numel(), ("adjoint", "differences"), budget)
 
     def texels(self, u: Tensor) -> Tensor:
-        return (self._original + self._weights @ (u.reshape(-1, 3) - self._centres)).clamp(0.0, 1.0)
+        original, weights, centres = (held.to(u.device) for held in (self._original, self._weights, self._centres))
+        return (original + weights @ (u.reshape(-1, 3) - centres)).clamp(0.0, 1.0)
 
 
 class Waved(Painter):
@@ -243,9 +244,12 @@ class Waved(Painter):
         self.group = Group("amplitudes", len(self.start), ("adjoint", "simultaneous"))
 
     def texels(self, u: Tensor) -> Tensor:
-        amplitudes = (2.0 * u - 1.0).reshape(self._count, self._count, 3) * self._reach
-        summed = torch.einsum("hm,wn,mnc->hwc", self._down, self._across, amplitudes)
-        return (self._original + self._radius * torch.tanh(summed)).clamp(0.0, 1.0)
+        original, reach, down, across = (
+            held.to(u.device) for held in (self._original, self._reach, self._down, self._across)
+        )
+        amplitudes = (2.0 * u - 1.0).reshape(self._count, self._count, 3) * reach
+        summed = torch.einsum("hm,wn,mnc->hwc", down, across, amplitudes)
+        return (original + self._radius * torch.tanh(summed)).clamp(0.0, 1.0)
 
 
 class BoundTexture(BoundControl):
@@ -270,7 +274,7 @@ class BoundTexture(BoundControl):
         return {f"{self._on}.base_color": srgb_to_linear(self._painter.texels(u))}
 
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
-        change = self._painter.texels(u.detach()) - self._original
+        change = self._painter.texels(u.detach()) - self._original.to(u.device)
         return {
             f"{self.name}.linf": {"value": float(change.abs().max()), "unit": "sRGB"},
             f"{self.name}.rms": {"value": float(change.pow(2).mean().sqrt()), "unit": "sRGB"},

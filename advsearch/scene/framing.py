@@ -42,6 +42,7 @@ def framing_distance(description: SceneDescription, fov: Tensor, aspect: float) 
     """
     offsets = torch.from_numpy(description.object.mesh.vertices.astype(np.float64) - middle(description))
     azimuth, elevation, roll = (float(SETTINGS[name].default or 0.0) for name in DEFAULT_VIEW)
+    offsets = offsets.to(fov.device)
     edge = _tangents(fov, aspect)
     fits = _from_one_side(offsets, camera_axes(azimuth, elevation, roll), edge * FRAME_FILL)
     whole = _from_all_around(offsets, elevation, edge)
@@ -82,13 +83,13 @@ def middle(description: SceneDescription) -> Doubles:
 
 def _tangents(fov: Tensor, aspect: float) -> Tensor:
     """Tangents of half the picture's width and height, (2,)."""
-    shape = torch.tensor([min(1.0, aspect), min(1.0, 1.0 / aspect)], dtype=torch.float64)
+    shape = torch.tensor([min(1.0, aspect), min(1.0, 1.0 / aspect)], dtype=torch.float64, device=fov.device)
     return torch.tan(torch.deg2rad(fov.double()) / 2.0) * shape
 
 
 def _from_one_side(offsets: Tensor, axes: Doubles, tangents: Tensor) -> Tensor:
     """The distance at which every vertex projects inside the tangents, from one direction."""
-    left, up, outwards = offsets.matmul(torch.from_numpy(axes).T).unbind(dim=1)
+    left, up, outwards = offsets.matmul(torch.from_numpy(axes).T.to(offsets)).unbind(dim=1)
     return (outwards + torch.maximum(left.abs() / tangents[0], up.abs() / tangents[1])).max()
 
 

@@ -1,49 +1,72 @@
-"""What is done to a picture or a mesh is done on the device where it lies.
-
-There need be no other device for that: `meta` has shapes without numbers, and mixes with the processor as little.
-"""
+"""Controls make what they give on the device of the search's numbers."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
+from conftest import ROOT
+from elsewhere import ELSEWHERE, Away, elsewhere
 
-from advsearch.controls import make_control
-from advsearch.controls.corruption.control import NAMES, corrupted
-from advsearch.scene.assembly import Assembly
-from advsearch.scene.description import describe
-from advsearch.scene.formation import ImageFormation, to_8_bit
+import advsearch
+from advsearch.controls import CONTROLS, compose, make_control
+from advsearch.controls.corruption.control import NAMES
 
-ELSEWHERE = torch.device("meta")
-PICTURE = torch.zeros(16, 12, 3, device=ELSEWHERE)
-READS = {"shot_noise", "jpeg"}
-"""Corruptions that look at the numbers of a picture, of which `meta` has none."""
+PICTURE = str(ROOT / "scenes/data/objects/book/base_color.png")
+
+FORMS: dict[str, tuple[dict[str, Any], ...]] = {
+    "camera": (
+        {"exposure": [-1, 1]},
+        {"aperture": [0.0, 0.1], "fov": [20, 60]},
+        {"focal_length": [20, 60], "shift_x": [0, 1]},
+    ),
+    "pose": ({}, {"rotation": [-90, 90], "on_ground": "no"}),
+    "texture": tuple({"form": form, "resolution": 16} for form in ("texels", "palette", "waves")),
+    "material": ({}, {"which": ["wood", "steel"], "red": [0.3, 1.0]}),
+    "light": ({}, {"type": "point"}),
+    "environment": ({}, {"which": ["own", "noon"], "harmonics": [-0.1, 0.1]}),
+    "sky": ({}, {"exposure": "fixed", "azimuth": [0, 90]}),
+    "geometry": ({"modes": 4}, {"form": "large-steps"}),
+    "patch": ({"resolution": 4, "azimuth": [0, 360]}, {"picture": PICTURE, "size": [0.2, 0.6]}),
+    "occlusion": ({}, {"which": ["card", "sphere"], "turn": [0, 90]}),
+    "lens": ({}, {"dots": 2, "opacity": [0.2, 0.9]}),
+    "sensor": ({"shot": [0.0, 0.2], "mosaic": [0, 1], "compression": [0, 80], "aberration": [0.0, 0.02]},),
+    "corruption": tuple(
+        {"which": which, "severity": severity} for which in NAMES for severity in ([0.2, 0.9], [3.2, 4.9])
+    ),
+}
+"""Settings under which a control takes all its ways; it is tried with none where it is not here."""
+
+CASES = [
+    pytest.param(kind, given, id=f"{kind}-{number}")
+    for kind in CONTROLS
+    if CONTROLS[kind].__module__.startswith("advsearch.")
+    for number, given in enumerate(FORMS.get(kind, ({},)))
+]
 
 
-@pytest.mark.parametrize("severity", [0.5, 2.5])
-@pytest.mark.parametrize("name", sorted(set(NAMES) - READS))
-def test_a_corrupted_picture_stays_where_it_is(name: str, severity: float) -> None:
-    found = corrupted(PICTURE, name, torch.tensor(severity))
-    assert found.device == ELSEWHERE and found.shape == PICTURE.shape
+@pytest.mark.parametrize(("kind", "given"), CASES)
+def test_what_a_control_gives_lies_where_the_searchs_numbers_do(kind: str, given: dict[str, Any]) -> None:
+    space = compose((make_control(kind, given),), advsearch.load_scene("mug").description)
+    u = (0.25 * space.start + 0.5).clamp(0.0, 1.0)
+    image = torch.full((8, 8, 3), 0.5)
+    expected, seen = space.inputs(u), space.picture(u, image)
+    with elsewhere():
+        moved, away = u.to(ELSEWHERE), image.to(ELSEWHERE)
+        found, picture = space.inputs(moved), space.picture(moved, away)
+        said = space.describe(moved)
+    assert {name for name, one in found.items() if not isinstance(one, Away)} == set()
+    for name, one in found.items():
+        assert isinstance(one, Away) and torch.equal(one.held, expected[name]), name
+    assert isinstance(picture, Away) and torch.equal(picture.held, seen)
+    assert said == space.describe(u)
 
 
-@pytest.mark.parametrize("name", ["lens", "sensor"])
-def test_a_control_of_the_picture_leaves_it_where_it_is(name: str) -> None:
-    bound = make_control(name).bind(describe("mug"))
-    found = bound.picture(bound.start, PICTURE)
-    assert found.device == ELSEWHERE and found.shape == PICTURE.shape
-
-
-def test_a_picture_is_formed_where_its_radiance_is() -> None:
-    assert to_8_bit(ImageFormation().display(PICTURE)).device == ELSEWHERE
-
-
-@pytest.mark.parametrize("given", [("to_world",), ("offsets",), ("to_world", "offsets")])
-def test_a_mesh_moves_on_the_device_of_what_moves_it(given: tuple[str, ...]) -> None:
-    scene = describe("mug")
-    count = len(scene.object.mesh.vertices)
-    made = {"to_world": torch.eye(4, device=ELSEWHERE), "offsets": torch.zeros(count, 3, device=ELSEWHERE)}
-    found = Assembly(scene)({f"object.{name}": made[name] for name in given})
-    assert {name: (one.device, one.shape) for name, one in found.items()} == {
-        f"object.{name}": (ELSEWHERE, (count, 3)) for name in ("vertices", "normals")
-    }
+def test_a_device_refuses_tensors_that_lie_elsewhere() -> None:
+    with elsewhere():
+        here, there = torch.ones(2), torch.ones(2, device=ELSEWHERE)
+        assert isinstance(there, Away) and (there + there).tolist() == [2.0, 2.0]
+        assert isinstance(there.new_tensor([1.0]), Away) and not isinstance(there.cpu(), Away)
+        with pytest.raises(RuntimeError, match="one device"):
+            here + there

@@ -92,12 +92,12 @@ class ContentsControl(NumberControl):
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         vessel = self._vessel(scene)
-        base = _surface(vessel, torch.tensor(0.5))
+        base = _surface(vessel, torch.full_like(values["level"], 0.5))
         inputs = {f"{self.name}.offsets": _surface(vessel, values["level"]) - base}
         if "object.to_world" in so_far:
             inputs[f"{self.name}.to_world"] = so_far["object.to_world"]
         shares = torch.stack([values[name] for name in INGREDIENTS])
-        color = liquid(shares, torch.from_numpy(vessel.color).float())
+        color = liquid(shares, torch.from_numpy(vessel.color).to(shares))
         inputs[f"{self.name}.base_color"] = color.expand(4, 4, 3)
         return inputs
 
@@ -145,8 +145,8 @@ class ContentsControl(NumberControl):
 
     def proportions(self, cuts: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Cut the stick: coordinates in [0, 1] by ingredient to shares that add up to one; differentiable."""
-        bounds = [(torch.tensor(low), torch.tensor(high)) for low, high in (self.bounds[name] for name in INGREDIENTS)]
-        left, shares = torch.tensor(1.0), []
+        bounds = self._bounds(cuts[INGREDIENTS[0]].device)
+        left, shares = torch.ones_like(bounds[0][0]), []
         for number, name in enumerate(INGREDIENTS):
             low, high = self._range(bounds, number, left)
             shares.append(low + (high - low).clamp_min(0.0) * cuts[name])
@@ -155,8 +155,8 @@ class ContentsControl(NumberControl):
 
     def cuts(self, shares: Mapping[str, float]) -> dict[str, float]:
         """Return the coordinates whose shares are nearest to some, one ingredient after the other."""
-        bounds = [(torch.tensor(low), torch.tensor(high)) for low, high in (self.bounds[name] for name in INGREDIENTS)]
-        left, found = torch.tensor(1.0), {}
+        bounds = self._bounds(torch.device("cpu"))
+        left, found = torch.ones_like(bounds[0][0]), {}
         for number, name in enumerate(INGREDIENTS):
             low, high = (float(one) for one in self._range(bounds, number, left))
             share = min(max(shares[name], low), max(low, high))
@@ -164,14 +164,19 @@ class ContentsControl(NumberControl):
             left = left - share
         return found
 
+    def _bounds(self, device: torch.device) -> list[tuple[Tensor, Tensor]]:
+        """The least and the most of every ingredient, each ()."""
+        limits = torch.tensor([self.bounds[name] for name in INGREDIENTS]).to(device)
+        return [(low, high) for low, high in limits]
+
     @staticmethod
     def _range(bounds: list[tuple[Tensor, Tensor]], number: int, left: Tensor) -> tuple[Tensor, Tensor]:
         """What one ingredient may have of what is left, so that those after it can make up one."""
         low, high = bounds[number]
         after = bounds[number + 1 :]
         least, most = (
-            sum((one for one, _ in after), torch.tensor(0.0)),
-            sum((one for _, one in after), torch.tensor(0.0)),
+            sum((one for one, _ in after), torch.zeros_like(left)),
+            sum((one for _, one in after), torch.zeros_like(left)),
         )
         return torch.maximum(low, left - most), torch.minimum(high, left - least)
 
@@ -232,15 +237,15 @@ def liquid(shares: Tensor, vessel: Tensor) -> Tensor:
         vessel: (3,) linear reflectance of the vessel's inside.
     """
     amounts = dict(zip(INGREDIENTS, shares, strict=True))
-    absorbed, scattered = torch.zeros(3), torch.tensor(1e-6)
+    absorbed, scattered = shares.new_zeros(3), shares.new_tensor(1e-6)
     for name, reflectance in REFLECTANCE.items():
-        deep = torch.tensor(reflectance)
+        deep = shares.new_tensor(reflectance)
         absorbed = absorbed + amounts[name] * SCATTERING[name] * (1.0 - deep).square() / (2.0 * deep)
         scattered = scattered + amounts[name] * SCATTERING[name]
     ratio = absorbed / scattered
     milky = 1.0 + ratio - (ratio.square() + 2.0 * ratio + 1e-9).sqrt()
     opacity = 1.0 - torch.exp(-DENSITY * (amounts["milk"] + amounts["coffee"]))
-    return opacity * milky + (1.0 - opacity) * vessel * torch.tensor(WATER)
+    return opacity * milky + (1.0 - opacity) * vessel * shares.new_tensor(WATER)
 
 
 def _surface(vessel: Vessel, level: Tensor) -> Tensor:
@@ -249,16 +254,16 @@ def _surface(vessel: Vessel, level: Tensor) -> Tensor:
     The wall's distance is interpolated between the heights at which it is known, so the vertices are differentiable in
     the level, with kinks at those heights.
     """
-    heights, radii = torch.from_numpy(vessel.heights).float(), torch.from_numpy(vessel.radii).float()
+    heights, radii = torch.from_numpy(vessel.heights).to(level), torch.from_numpy(vessel.radii).to(level)
     place = level * (len(heights) - 1)
     row = int(place.detach().clamp(0, len(heights) - 2))
     radius = torch.lerp(radii[row], radii[row + 1], place - row) * RADIUS
     there = (level / FIRST).clamp(1e-3, 1.0)
     depth = heights[-1] - heights[0]
     height = heights[0] + level * depth - (1.0 - there) * FIRST * depth
-    angle = torch.arange(COLUMNS) * (2.0 * torch.pi / COLUMNS)
+    angle = torch.arange(COLUMNS, device=level.device) * (2.0 * torch.pi / COLUMNS)
     around = torch.stack([torch.cos(angle), torch.sin(angle)], dim=1) * (radius * there)[:, None]
-    flat = torch.cat([torch.zeros(1, 2), around]) + torch.from_numpy(vessel.axis).float()
+    flat = torch.cat([around.new_zeros(1, 2), around]) + torch.from_numpy(vessel.axis).to(level)
     return torch.cat([flat, height.expand(len(flat), 1)], dim=1)
 
 

@@ -81,9 +81,9 @@ def motion_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
 def zoom_blur(image: Tensor, level: Tensor, seed: int) -> Tensor:
     """Average the picture with magnified ones, as of a camera that moves towards the object."""
     (largest,) = at_level(ZOOM, level)
-    zooms = 1.0 + (largest - 1.0) * torch.linspace(0.0, 1.0, ZOOM_STEPS)
+    zooms = 1.0 + (largest - 1.0) * torch.linspace(0.0, 1.0, ZOOM_STEPS, device=level.device)
     matrices = torch.diag_embed((1.0 / zooms)[:, None].expand(-1, 2))
-    theta = torch.cat([matrices, torch.zeros(ZOOM_STEPS, 2, 1)], dim=2).to(image.device)
+    theta = torch.cat([matrices, matrices.new_zeros(ZOOM_STEPS, 2, 1)], dim=2).to(image.device)
     height, width = image.shape[:2]
     grid = F.affine_grid(theta, [ZOOM_STEPS, 3, height, width], align_corners=False)
     copies = planes(image).expand(ZOOM_STEPS, -1, -1, -1)
@@ -125,7 +125,7 @@ def elastic(image: Tensor, severity: Tensor, seed: int) -> Tensor:
     """Shear the picture and wrinkle it; below severity 1 by less."""
     height, width = image.shape[:2]
     if float(severity.detach()) < 1.0:
-        shift = severity * _elastic_shift(height, width, seed, 1)
+        shift = severity * _elastic_shift(height, width, seed, 1).to(severity.device)
     else:
         shift = between(severity, lambda whole: _elastic_shift(height, width, seed, whole))
     return warped(image, scale(image) * shift)

@@ -144,7 +144,7 @@ def corrupted(image: Tensor, which: str, severity: Tensor, seed: int = 0) -> Ten
         return FROM_NOTHING[which](image, severity, seed).clamp(0.0, 1.0)
     if float(severity.detach()) >= 1.0:
         return SMOOTH[which](image, severity, seed).clamp(0.0, 1.0)
-    mildest = SMOOTH[which](image, torch.ones(()), seed).clamp(0.0, 1.0)
+    mildest = SMOOTH[which](image, torch.ones_like(severity), seed).clamp(0.0, 1.0)
     return (image + severity * (mildest - image)).clamp(0.0, 1.0)
 
 

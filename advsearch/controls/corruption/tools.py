@@ -47,17 +47,17 @@ def at_level(table: Sequence[Sequence[float]], level: Tensor) -> tuple[Tensor, .
     Returns:
         n tensors of shape (), the row at the severity; differentiable.
     """
-    rows = torch.tensor(table, dtype=torch.float32)
+    rows = torch.tensor(table, dtype=torch.float32, device=level.device)
     return between(level, lambda whole: rows[whole - 1]).unbind()
 
 
 def between(level: Tensor, make: Callable[[int], Tensor]) -> Tensor:
-    """Mix what `make` returns for the two whole severities around one in [1, 5]; differentiable by the severity."""
+    """Mix what `make` returns for the two whole severities around one in [1, 5], on its device; differentiable."""
     below = min(int(level.detach()), LEVELS - 1)
     share = level - below
     if float(share.detach()) == 0.0 and not share.requires_grad:
-        return make(below)
-    low, high = make(below), make(below + 1)
+        return make(below).to(level.device)
+    low, high = make(below).to(level.device), make(below + 1).to(level.device)
     return low + share * (high - low)
 
 

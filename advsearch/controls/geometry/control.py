@@ -130,7 +130,7 @@ class Moded(Shaper):
         self.group = Group("amplitudes", self._modes.shape[2], ESTIMATORS)
 
     def field(self, u: Tensor) -> Tensor:
-        return self._modes @ (2.0 * u.double() - 1.0)
+        return self._modes.to(u.device) @ (2.0 * u.double() - 1.0)
 
 
 class Pushed(Shaper):
@@ -168,7 +168,7 @@ class BoundGeometry(BoundControl):
         self.start = torch.full((shaper.group.size,), 0.5)
 
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
-        return {self._offsets: self.offsets(u).index_select(0, self._index).float()}
+        return {self._offsets: self.offsets(u).index_select(0, self._index.to(u.device)).float()}
 
     def offsets(self, u: Tensor) -> Tensor:
         """Displacement of each place, (P, 3) float64."""

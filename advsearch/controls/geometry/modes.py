@@ -236,7 +236,8 @@ class Preconditioner:
         once: Tensor = _Solve.apply(pushes, self._factor)  # type: ignore[no-untyped-call]
         smooth: Tensor = _Solve.apply(once, self._factor)  # type: ignore[no-untyped-call]
         flat = smooth.reshape(-1)
-        return (flat - self._rigid @ (self._rigid.T @ flat)).reshape(smooth.shape)
+        rigid = self._rigid.to(flat.device)
+        return (flat - rigid @ (rigid.T @ flat)).reshape(smooth.shape)
 
 
 def _rigid_motions(places: Doubles) -> Doubles:
@@ -253,12 +254,13 @@ class _Solve(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, right: Tensor, factor: Any) -> Tensor:
         ctx.factor = factor
-        return torch.from_numpy(factor.solve(right.detach().numpy()))
+        return torch.from_numpy(factor.solve(right.detach().cpu().numpy())).to(right.device)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, cotangent: Tensor) -> tuple[Tensor, None]:
-        return torch.from_numpy(ctx.factor.solve(np.ascontiguousarray(cotangent.numpy()))), None
+        right = np.ascontiguousarray(cotangent.cpu().numpy())
+        return torch.from_numpy(ctx.factor.solve(right)).to(cotangent.device), None
 
 
 # ---- how far ---------------------------------------------------------------------------------------------------------
@@ -299,14 +301,17 @@ class Limits:
 
     def used(self, field: Tensor) -> Tensor:
         """Return the squares (N,) of how far each bound is used up by `epsilon d` for d (P, 3)."""
+        faces_of, across, walls_of, gaps = (
+            held.to(field.device) for held in (self._faces, self._across, self._walls, self._gaps)
+        )
         # index_select, for its derivative is ten times faster than that of an index
-        corners = [field.index_select(0, corner) for corner in self._faces.T]
+        corners = [field.index_select(0, corner) for corner in faces_of.T]
         first, second = corners[1] - corners[0], corners[2] - corners[0]
-        one = first * self._across[:, :1]
-        other = (second - first * self._across[:, 1:2]) * self._across[:, 2:]
+        one = first * across[:, :1]
+        other = (second - first * across[:, 1:2]) * across[:, 2:]
         faces = (one.square() + other.square()).sum(dim=1) * (self.epsilon / FACE_STRAIN) ** 2
-        apart = field.index_select(0, self._walls[:, 0]) - field.index_select(0, self._walls[:, 1])
-        walls = apart.square().sum(dim=1) * (self.epsilon / WALL_STRAIN / self._gaps).square()
+        apart = field.index_select(0, walls_of[:, 0]) - field.index_select(0, walls_of[:, 1])
+        walls = apart.square().sum(dim=1) * (self.epsilon / WALL_STRAIN / gaps).square()
         return torch.cat([field.square().sum(dim=1), faces, walls])
 
     def held(self, field: Tensor) -> Tensor:
@@ -320,5 +325,5 @@ class Limits:
         """Return the smallest width of a wall or gap after a displacement (P, 3), as a share of what it was."""
         if not len(self._walls):
             return 1.0
-        moved = (self._places + offsets)[self._walls]
+        moved = (self._places + offsets.cpu())[self._walls]
         return float(((moved[:, 0] - moved[:, 1]).norm(dim=1) / self._gaps).min())

@@ -78,10 +78,10 @@ class MaterialControl(NumberControl):
             if self._varies(name):
                 inputs[f"{self.mesh}.{name}"] = _rendered(name, values[name]).reshape(1)
             elif self._names_a_material():
-                inputs[f"{self.mesh}.{name}"] = torch.tensor([float(getattr(own, name))])
+                inputs[f"{self.mesh}.{name}"] = values["which"].new_tensor([float(getattr(own, name))])
         if self._colours():
             tint = torch.stack([values[name] for name in CHANNELS])
-            inputs[self._base_color] = srgb_to_linear(tint) * self._reflectance(scene, which, so_far)
+            inputs[self._base_color] = srgb_to_linear(tint) * self._reflectance(scene, which, so_far).to(tint.device)
         return inputs
 
     def kept_pictures(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:

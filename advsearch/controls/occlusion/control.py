@@ -167,7 +167,7 @@ class OcclusionControl(NumberControl):
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         chosen = self._option(values)
-        camera = so_far.get("camera.to_world", torch.from_numpy(camera_to_world(scene)).float())
+        camera = so_far.get("camera.to_world", torch.from_numpy(camera_to_world(scene)).to(values["turn"]))
         inputs = {f"{self._part(one)}.to_world": _put_away(camera) for one in self._candidates()}
         placed = self.placement(scene, values, so_far)
         if not placed.away:
@@ -268,7 +268,7 @@ class _Seen:
 
 
 def _numpy(inputs: Mapping[str, Tensor], name: str, otherwise: Doubles) -> Doubles:
-    return inputs[name].detach().double().numpy() if name in inputs else otherwise
+    return inputs[name].detach().double().cpu().numpy() if name in inputs else otherwise
 
 
 def _from_camera(world: Doubles, camera: Doubles) -> Doubles:

@@ -310,13 +310,15 @@ class BoundPatch(BoundControl):
     def pixels(self, u: Tensor) -> Tensor:
         """Return the patch (n, n, 3), display-referred sRGB in [0, 1]."""
         if not self._searched:
-            return self._pixels
+            return self._pixels.to(u.device)
         share = u[: self._searched].reshape(self._pixels.shape)
         return self._spec.low + (self._spec.high - self._spec.low) * share
 
     def numbers(self, u: Tensor) -> Mapping[str, Tensor]:
         """Return place, size and rotation, in their units."""
-        return self._numbers.values(u[self._searched :]) if isinstance(self._numbers, BoundNumbers) else self._numbers
+        if isinstance(self._numbers, BoundNumbers):
+            return self._numbers.values(u[self._searched :])
+        return {name: number.to(u.device) for name, number in self._numbers.items()}
 
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         return {BASE_COLOR: self._sticker.paint(so_far.get(BASE_COLOR), self.pixels(u), self.numbers(u))}
@@ -325,7 +327,7 @@ class BoundPatch(BoundControl):
         u = u.detach()
         said: dict[str, Value] = {}
         if self._searched:
-            change = self.pixels(u) - self.pixels(self.start)
+            change = self.pixels(u) - self.pixels(self.start.to(u.device))
             said[f"{self.name}.linf"] = {"value": float(change.abs().max()), "unit": "sRGB"}
             said[f"{self.name}.rms"] = {"value": float(change.square().mean().sqrt()), "unit": "sRGB"}
         if isinstance(self._numbers, BoundNumbers):

@@ -103,18 +103,20 @@ class Sticker:
             pixels: (n, n, 3) sRGB.
             numbers: azimuth, height, size and rotation.
         """
-        base = self._own if base is None else _fitted(base, len(self._own))
+        device = pixels.device
+        base = self._own.to(device) if base is None else _fitted(base, len(self._own))
         size = numbers["size"]
         spot = self._spot(*(float(numbers[name].detach()) for name in ("azimuth", "height", "size")))
-        across = _turned(spot.flat, numbers["rotation"]) / size
+        texels = spot.texels.to(device)
+        across = _turned(spot.flat.to(device), numbers["rotation"]) / size
         edge = (0.5 - across.abs().amax(dim=1)) * size / (EDGE_TEXELS * spot.spacing) + 0.5
-        cover = (spot.cover * _smooth(edge))[:, None]
-        grid = (across * torch.tensor([2.0, -2.0]))[None, None]
+        cover = (spot.cover.to(device) * _smooth(edge))[:, None]
+        grid = (across * across.new_tensor([2.0, -2.0]))[None, None]
         linear = srgb_to_linear(pixels).permute(2, 0, 1)[None]
         color = F.grid_sample(linear, grid, mode="bilinear", padding_mode="border", align_corners=False)[0, :, 0].T
         flat = base.reshape(-1, 3)
-        under = flat.index_select(0, spot.texels)
-        return flat.index_copy(0, spot.texels, under + cover * (color - under)).reshape(base.shape)
+        under = flat.index_select(0, texels)
+        return flat.index_copy(0, texels, under + cover * (color - under)).reshape(base.shape)
 
     def underneath(self) -> Tensor:
         """Return what the object's own texture shows where the patch starts, as a patch (n, n, 3) sRGB."""

@@ -98,20 +98,22 @@ class SkyControl(NumberControl):
     def radiance(self, scene: SceneDescription, values: Values) -> Tensor:
         """Return the map (H, W, 3) of linear radiance at some values; differentiable."""
         ground = scene.ground_color
-        radiance, metered = sky_over(ground)(values["azimuth"], values["elevation"], values["turbidity"])
+        numbers = values["azimuth"], values["elevation"], values["turbidity"]
+        radiance, metered = sky_over(ground, numbers[0].device)(*numbers)
         if self.chosen["exposure"] == "fixed":
             start = self.start_values(scene)
-            metered = metered_at(ground, float(start["elevation"]), float(start["turbidity"]))
+            metered = metered_at(ground, float(start["elevation"]), float(start["turbidity"])).to(radiance.device)
         return radiance * (METERED_IRRADIANCE / metered)
 
 
 @lru_cache(maxsize=4)
-def sky_over(ground: tuple[float, ...]) -> Sky:
+def sky_over(ground: tuple[float, ...], device: torch.device) -> Sky:
     """Return the sky over a ground of an sRGB colour: far away it is made of the same as the ground plane."""
-    return Sky(srgb_to_linear(torch.tensor(ground)))
+    return Sky(srgb_to_linear(torch.tensor(ground)).to(device))
 
 
 @lru_cache(maxsize=16)
 def metered_at(ground: tuple[float, ...], elevation: float, turbidity: float) -> Tensor:
     """Return the metered irradiance () of a sky; the sun's azimuth does not matter."""
-    return sky_over(ground)(torch.tensor(0.0), torch.tensor(elevation), torch.tensor(turbidity))[1]
+    numbers = (torch.tensor(number) for number in (0.0, elevation, turbidity))
+    return sky_over(ground, torch.device("cpu"))(*numbers)[1]

@@ -32,9 +32,10 @@ NEARLY_NOTHING = 1e-12
 
 
 @cache
-def tables() -> tuple[Tensor, Tensor, Tensor]:
-    """Return what the two models interpolate, see `sunsky_tables`; read once per process."""
-    return sunsky_tables()
+def tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what the two models interpolate, see `sunsky_tables`; read once per process and device."""
+    radiance, level, sun = sunsky_tables()
+    return radiance.to(device), level.to(device), sun.to(device)
 
 
 def direction(azimuth: Tensor, elevation: Tensor) -> Tensor:
@@ -70,8 +71,8 @@ def sun_irradiance(elevation: Tensor, turbidity: Tensor) -> Tensor:
     share = float(radians.detach()) / (math.pi / 2.0)
     piece = min(44, int(45.0 * max(0.0, share) ** (1.0 / 3.0)))
     above = radians - (math.pi / 2.0) * (piece / 45.0) ** 3
-    terms = _at_turbidity(tables()[2], turbidity)[piece]
-    limb = torch.tensor([2.0 / (power + 2.0) for power in range(6)])
+    terms = _at_turbidity(tables(radians.device)[2], turbidity)[piece]
+    limb = torch.tensor([2.0 / (power + 2.0) for power in range(6)], device=radians.device)
     powers = torch.stack([above**power for power in range(4)])
     solid_angle = 2.0 * math.pi * (1.0 - math.cos(SUN_APERTURE))
     return (torch.einsum("ckj,k,j->c", terms, powers, limb) * solid_angle * SUN_OVER_SKY).clamp_min(0.0)
@@ -81,14 +82,14 @@ class Sky:
     """Sky maps over one ground.
 
     Args:
-        ground: (3,) linear reflectance of the ground, in [0, 1].
+        ground: (3,) linear reflectance of the ground, in [0, 1]; its device is the maps'.
     """
 
     def __init__(self, ground: Tensor) -> None:
         self.ground = ground
         upper = ROWS // 2
-        elevation = 90.0 - 180.0 * torch.arange(upper) / (ROWS - 1)
-        azimuth = 90.0 - 360.0 * (torch.arange(COLUMNS) + 0.5) / COLUMNS
+        elevation = 90.0 - 180.0 * torch.arange(upper, device=ground.device) / (ROWS - 1)
+        azimuth = 90.0 - 360.0 * (torch.arange(COLUMNS, device=ground.device) + 0.5) / COLUMNS
         rows, columns = torch.meshgrid(elevation, azimuth, indexing="ij")
         self.directions = direction(rows * 0.0 + columns, rows).permute(1, 2, 0).contiguous()
         self.cosines = self.directions[..., 2:3].clamp_min(0.0)
@@ -103,8 +104,8 @@ class Sky:
             elevation: () of the sun, degrees, over 0.
             turbidity: () in `TURBIDITIES`.
         """
-        a, b, c, d, e, f, g, i, h = self._interpolated(tables()[0], elevation, turbidity).unbind(-1)
-        level = self._interpolated(tables()[1], elevation, turbidity)
+        a, b, c, d, e, f, g, i, h = self._interpolated(tables(sun.device)[0], elevation, turbidity).unbind(-1)
+        level = self._interpolated(tables(sun.device)[1], elevation, turbidity)
         cosine = (self.directions @ sun)[..., None]
         angle = angle_between(self.directions, sun)[..., None]
         horizon = 1.0 + a * torch.exp(b / (self.cosines + 0.01))
