@@ -138,7 +138,10 @@ def assert_true_of_fixed_values(
     """Check that a scene with the values that a row names looks as the row's picture, and says the same of itself."""
     if not all(isinstance(control, NumberControl) for control in drawn):
         return
-    named: dict[str, dict[str, Any]] = {control.kind: dict(control.chosen) for control in drawn}
+    named: dict[str, dict[str, Any]] = {
+        control.kind: {one.name: control.chosen[one.name] for one in control.choices if not one.bounds}
+        for control in drawn
+    }
     for name, value in said.items():
         kind, parameter, *number = name.split(".")
         if not number and parameter in {one.name for one in CONTROLS[kind].parameters}:
