@@ -8,7 +8,8 @@ Each figure is the median of turns that are taken one after the other in one pro
   backward pass alone;
 - making the matrix, in rendered steps;
 - the error of a predicted change of the picture within epsilon 0.1 (levels of 255, root mean square): random signs, and
-  the whole texture lighter and darker; beside it how far two traced pictures of as many samples lie apart.
+  the whole texture lighter and darker. The reference is traced without the denoiser, which smooths random signs away,
+  and the same noise is in both of its pictures; beside the error stands what of it is the reference's own noise.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from advsearch.scene.transport.renderer import LinearRenderer  # noqa: E402
 
 EPSILON = 0.1
 SPP = 8
-TRACED = 256
+TRACED, HALVES = 512, 2
 
 
 def main() -> None:
@@ -91,15 +92,23 @@ def times(renderer: Renderer, loss: Callable[[Tensor], Tensor], repeats: int) ->
 def errors(renderer: Renderer) -> None:
     """Print how far predicted changes are off."""
     linear = LinearRenderer(renderer, renderer.start, seed=1)
+    undenoised = renderer.like(denoiser="none")
+
+    def traced(u: Tensor, seed: int) -> Tensor:
+        """Radiance of `TRACED` samples."""
+        return torch.stack([undenoised.radiance(u, 1000 * seed + part, 128) for part in range(TRACED // 128)]).mean(0)
+
     with torch.no_grad():
-        before, other = (renderer(renderer.start, seed=seed, spp=TRACED) for seed in (11, 12))
-        print(f"  two traced pictures of {TRACED} samples lie apart by      {levels(before, other):6.2f} levels")
+        display, start = renderer.formation.display, renderer.start
+        before = [traced(start, half) for half in range(HALVES)]
         for kind in ("signs", "lighter", "darker"):
             u = changed(renderer, kind)
-            change = renderer(u, seed=11, spp=TRACED) - before
-            off = levels(linear(u) - linear(renderer.start), change)
+            after = [traced(u, half) for half in range(HALVES)]
+            halves = [display(one) - display(other) for one, other in zip(after, before, strict=True)]
+            change = display(torch.stack(after).mean(0)) - display(torch.stack(before).mean(0))
+            off, noise = levels(linear(u) - linear(start), change), levels(halves[0], halves[1]) / 2.0
             size = levels(change, torch.zeros_like(change))
-            print(f"  {kind:8s} predicted change off by {off:6.2f} levels, of a change of {size:6.2f}")
+            print(f"  {kind:8s} predicted change off by {off:5.2f} levels (noise {noise:.2f}) of {size:5.2f}")
 
 
 def changed(renderer: Renderer, kind: str) -> Tensor:

@@ -117,7 +117,7 @@ class Bank(Predictor):
 
     @property
     def traced(self) -> int:
-        return self._made + (UNSEEN + 2) * len(self.gaps)
+        return self._made + UNSEEN * len(self.gaps) + sum(one.pictures for one in self.deviations)
 
     def size(self) -> tuple[int, int]:
         return sum(one.renderer.entries for one in self._held), self._bytes

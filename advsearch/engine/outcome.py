@@ -58,8 +58,8 @@ T = TypeVar("T")
 MOST_NUMBERS = 4096
 """Numbers of a distribution that a summary names, at most."""
 
-PICTURE_SPP = 64
-"""Samples a pixel of the pictures that are kept, unless verification needed more."""
+PICTURE_SPP = 16
+"""Samples a pixel of the pictures that are kept, unless verification needed more: they are what the model saw there."""
 
 
 @dataclass(frozen=True)

@@ -193,8 +193,8 @@ class Renderer:
             raise InputError(f"render: expected u of shape {tuple(self.start.shape)}, got {tuple(u.shape)}")
         if not 1 <= spp <= MAX_SPP:
             raise InputError(f"spp: expected 1 to {MAX_SPP} samples a pixel, got {spp}")
-        values = u.detach()
-        if not bool((values >= 0.0).all() & (values <= 1.0).all()):
+        low, high = torch.aminmax(u.detach()) if u.numel() else (u.sum(), u.sum())
+        if not bool((low >= 0.0) & (high <= 1.0)):
             raise InputError("render: expected every entry of u in [0, 1]; project u before you render it")
 
     # ---- from u to the picture --------------------------------------------------------------------------------------

@@ -50,7 +50,7 @@ def growing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bank, "SURE", -1e9)
     monkeypatch.setattr(bank, "FIRST", 3)
     monkeypatch.setattr(bank, "GROWTH", 4)
-    monkeypatch.setattr(transport, "CHECK_SPP", 8)
+    monkeypatch.setattr(transport, "CHANGE_SPP", 4)
 
 
 @pytest.mark.usefixtures("growing")

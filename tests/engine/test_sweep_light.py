@@ -87,7 +87,7 @@ def test_each_pose_has_basis_pictures_of_its_own_and_a_sweep_that_was_stopped_en
 
 
 def test_a_group_whose_prediction_is_off_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(light, "deviation_under_light", lambda *given: Deviation(9.0, 0.0, 2.0))
+    monkeypatch.setattr(light, "deviation_under_light", lambda *given: Deviation(9.0, 0.0, 2.0, pictures=2))
     found = advsearch.sweep("mug", "reference", GRID, **SMALL)
     told, renders = found.summary.transport, found.summary.renders
     assert told is not None and "1 of 1 groups were rendered" in str(told.reason)

@@ -177,7 +177,8 @@ def test_a_prediction_that_is_off_ends_in_rendering_and_goes_on_so(
 ) -> None:
     """Also in a run that was stopped after that."""
     monkeypatch.setattr(searching, "EVERY", 6)
-    monkeypatch.setattr(searching, "deviation_under_light", lambda *given: searching.Deviation(9.0, 0.0, 2.0))
+    off = searching.Deviation(9.0, 0.0, 2.0, pictures=2)
+    monkeypatch.setattr(searching, "deviation_under_light", lambda *given: off)
     settings = {**SEARCH, "deterministic": True}
     whole = advsearch.attack("mug", run=tmp_path / "whole", **settings).summary
     assert whole.transport is not None and "from evaluation 6" in str(whole.transport.reason)

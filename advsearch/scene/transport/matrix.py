@@ -7,11 +7,13 @@ Where camera, meshes and lights stand still, the radiance of a pixel is, to firs
 and J is sparse: a pixel sees few texels directly, in a mirror or through glass (bilinear lookups), and many a little
 (light from the object to the object), for which coarse cells of `COARSE` texels a side are enough. What a pixel sees of
 the texels hardly depends on the colour of the light, so that a row of J is kept as shares of texels, which add up to
-one, times a colour.
+one, times a colour. A matrix that is one of many keeps its shares in 16 bits; one that serves a whole search keeps them
+in 32, by rows and by columns, so that a product with it is one call.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -55,10 +57,12 @@ class ColouredRows:
 
     Args:
         rows, columns: its size.
+        small: keep it in 16 bits a share; it is unpacked for each product.
     """
 
-    def __init__(self, rows: int, columns: int) -> None:
-        self._shape = (rows, columns)
+    def __init__(self, rows: int, columns: int, small: bool) -> None:
+        self._shape, self._small = (rows, columns), small
+        self._both_ways: tuple[Tensor, Tensor] | None = None
         self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
         self._kept: tuple[npt.NDArray[np.float16], npt.NDArray[np.int32], npt.NDArray[np.int32]] | None = None
         self._colours: Floats = np.zeros((rows, 3), dtype=np.float32)
@@ -66,12 +70,16 @@ class ColouredRows:
 
     @property
     def entries(self) -> int:
+        if self._both_ways is not None:
+            return int(self._both_ways[0].values().numel())
         return int(self._sum.nnz) if self._kept is None else len(self._kept[0])
 
     @property
     def bytes(self) -> int:
-        """Memory when it is finished: a share and its column an entry, a beginning and a colour a row."""
-        return 6 * self.entries + (4 + 6) * self._shape[0]
+        """Memory when it is finished: a share and its column an entry, a beginning and a colour a row; a share and its
+        row an entry and a beginning a column as well, where it is kept both ways."""
+        small = 6 * self.entries + (4 + 6) * self._shape[0]
+        return small if self._small else small + 10 * self.entries + 4 * self._shape[1]
 
     def add(self, rows: Ints, columns: Ints, shares: Floats, weights: Floats) -> None:
         """Add entries.
@@ -97,7 +105,11 @@ class ColouredRows:
         sums = np.asarray(self._sum.sum(axis=1)).ravel()
         factors = np.where(sums > 0.0, 1.0 / np.maximum(sums, 1e-30), 0.0)
         shares = self._sum.data * np.repeat(factors, np.diff(self._sum.indptr))
-        self._kept = shares.astype(np.float16), self._sum.indices, self._sum.indptr
+        if self._small:
+            self._kept = shares.astype(np.float16), self._sum.indices, self._sum.indptr
+        else:
+            rows = scipy.sparse.csr_matrix((shares, self._sum.indices, self._sum.indptr), self._shape)
+            self._both_ways = _by_rows(rows), _by_rows(rows.T.tocsr())
         self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
         colours = torch.from_numpy(self._colours).reshape(*picture, 3)
         self._kept_colours = Halves(colours if smooth is None else smooth(colours))
@@ -105,12 +117,19 @@ class ColouredRows:
 
     def times(self, values: Floats) -> Floats:
         """Return the matrix times (columns, 3): (rows, 3)."""
-        found: Floats = (self._shares() @ values) * self._coloured()
-        return found
+        return self._product(values, transposed=False) * self._coloured()
 
     def transposed_times(self, values: Floats) -> Floats:
         """Return the transpose times (rows, 3): (columns, 3)."""
-        found: Floats = self._shares().T @ (values * self._coloured())
+        return self._product(values * self._coloured(), transposed=True)
+
+    def _product(self, values: Floats, *, transposed: bool) -> Floats:
+        """The shares, or their transpose, times (n, 3)."""
+        found: Floats
+        if self._both_ways is not None:
+            found = (self._both_ways[transposed] @ torch.from_numpy(values)).numpy()
+        else:
+            found = (self._shares().T if transposed else self._shares()) @ values
         return found
 
     def _coloured(self) -> Floats:
@@ -128,14 +147,17 @@ class TextureTransport:
     Args:
         picture: height and width in pixels.
         texture: height and width in texels.
+        small: keep it in as little memory as there is room for one of many matrices.
     """
 
-    def __init__(self, picture: tuple[int, int], texture: tuple[int, int]) -> None:
+    def __init__(self, picture: tuple[int, int], texture: tuple[int, int], *, small: bool = False) -> None:
         self._picture, self._texture = picture, texture
         self._cells = (-(-texture[0] // COARSE), -(-texture[1] // COARSE))
+        tall, wide = (_lengths(texels, cells) for texels, cells in zip(texture, self._cells, strict=True))
+        self._in_cell = (tall[:, None] * wide[None, :])[:, :, None]
         pixels = picture[0] * picture[1]
-        self._first = ColouredRows(pixels, texture[0] * texture[1])
-        self._later = ColouredRows(pixels, self._cells[0] * self._cells[1])
+        self._first = ColouredRows(pixels, texture[0] * texture[1], small)
+        self._later = ColouredRows(pixels, self._cells[0] * self._cells[1], small)
 
     @property
     def entries(self) -> int:
@@ -176,16 +198,16 @@ class TextureTransport:
         """Return the transpose of J times (H, W, 3), as (h, w, 3)."""
         flat = cotangent.reshape(-1, 3).numpy()
         near = torch.from_numpy(self._first.transposed_times(flat)).reshape(*self._texture, 3)
-        with torch.enable_grad():
-            probe = torch.zeros(*self._texture, 3, requires_grad=True)
-            pooled = self._pooled(probe)
-        far = torch.from_numpy(self._later.transposed_times(flat)).reshape(pooled.shape)
-        return near + torch.autograd.grad(pooled, probe, far)[0]
+        far = torch.from_numpy(self._later.transposed_times(flat)).reshape(*self._cells, 3) / self._in_cell
+        spread = far[:, None, :, None].expand(-1, COARSE, -1, COARSE, -1)
+        return near + spread.reshape(self._cells[0] * COARSE, -1, 3)[: self._texture[0], : self._texture[1]]
 
     def _pooled(self, texture: Tensor) -> Tensor:
         """The mean of each cell, (ceil(h / COARSE), ceil(w / COARSE), 3)."""
-        planes = texture.permute(2, 0, 1)[None]
-        return functional.avg_pool2d(planes, COARSE, ceil_mode=True, count_include_pad=False)[0].permute(1, 2, 0)
+        below, right = (COARSE * cells - texels for cells, texels in zip(self._cells, self._texture, strict=True))
+        whole = functional.pad(texture, (0, 0, 0, right, 0, below)) if right or below else texture
+        across = whole.reshape(self._cells[0] * COARSE, self._cells[1], COARSE, 3).sum(dim=2)
+        return across.reshape(self._cells[0], COARSE, self._cells[1], 3).sum(dim=1) / self._in_cell
 
 
 class _Product(torch.autograd.Function):
@@ -199,6 +221,19 @@ class _Product(torch.autograd.Function):
     @staticmethod
     def backward(ctx: torch.autograd.function.FunctionCtx, cotangent: Tensor) -> tuple[None, Tensor]:
         return None, ctx.transport.transposed_times(cotangent.contiguous())  # type: ignore[attr-defined]
+
+
+def _by_rows(matrix: scipy.sparse.csr_matrix) -> Tensor:
+    """The same for torch, whose products with it are twice as fast as scipy's."""
+    parts = [torch.from_numpy(part) for part in (matrix.indptr, matrix.indices, matrix.data)]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta")
+        return torch.sparse_csr_tensor(parts[0], parts[1], parts[2], matrix.shape, check_invariants=False)
+
+
+def _lengths(texels: int, cells: int) -> Tensor:
+    """How many texels each cell has along one side, (cells,) float32; the last one may have fewer."""
+    return (texels - COARSE * torch.arange(cells)).clamp(max=COARSE).to(torch.float32)
 
 
 def _bilinear(vertices: Vertices, texture: tuple[int, int], share: float) -> tuple[Ints, Ints, Floats, Floats]:

@@ -108,7 +108,7 @@ class LinearRenderer(PredictingRenderer):
             linear = [name for name in traced if name in (linear_inputs(renderer) if names is None else names)]
             self.there = {name: traced[name].clone() for name in linear}
             self.transports = {
-                name: TextureTransport(self.formation.resolution, (value.shape[0], value.shape[1]))
+                name: TextureTransport(self.formation.resolution, (value.shape[0], value.shape[1]), small=quick)
                 for name, value in self.there.items()
             }
             if self.transports:
