@@ -71,7 +71,7 @@ from advsearch.scene import environments, exposure, library
 from advsearch.scene.description import FRAME_FILL
 from advsearch.scene.importing import objects
 from advsearch.scene.importing.images import TEXTURE_LIMIT
-from advsearch.scene.importing.scenes import split_node
+from advsearch.scene.importing.scenes import MITSUBA_FILE, split_node
 from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
 from advsearch.scene.settings import SETTINGS, resolve
 from advsearch.settings import Config, parse_assignment, read_yaml, settings
@@ -384,7 +384,7 @@ def check_names(config: Config) -> None:
     resolve(config.set_)
     lights = config.environments if isinstance(config, SweepConfig) else (config.lit_by,)
     for name in config.objects:
-        assert name in library.list_objects() or Path(split_node(name)[0]).suffix in objects.SUFFIXES
+        assert name in library.list_objects() or Path(split_node(name)[0]).suffix in (*objects.SUFFIXES, MITSUBA_FILE)
         needs_label = not isinstance(config, RenderConfig) and name not in library.list_objects()
         assert config.label is not None or not needs_label, "a file does not bring a label"
     for name in lights:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -63,9 +63,10 @@ LOADING, PREPARING = "loading the scene and the model", "preparing the scene for
 
 @asks(AttackConfig, AttackKeywords)
 def attack(
-    scene: Scene | str | Path,
+    scene: Scene | str | Path | Mapping[str, object],
     model: AnyModel | Sequence[AnyModel] = "reference",
     *,
+    object: str | None = None,
     task: AnyTask = "classification",
     controls: Controls = ("texture",),
     objective: str | Callable[..., Tensor] | None = None,
@@ -84,6 +85,7 @@ def attack(
     Args:
         scene: from `load_scene`, or what that takes.
         model: from `load_model`, or what that takes; with `ensemble`, several.
+        object: the node or shape that is the object, where `scene` is a file or dictionary that holds several.
         task: what judges the model's output: a name, a mapping with a `name` and options, or an instance.
         controls: what may vary: names, instances, or a mapping from names to settings.
         objective: "margin", "log_odds", "cross_entropy", "dlr", "feature_distance", "score", or a function of (output,
@@ -101,7 +103,7 @@ def attack(
         InputError: anything that the caller can put right; nothing is written then.
     """
     options = {name: value for name, value in settings.items() if value is not None}
-    scene = _scene(scene, settings)
+    scene = _scene(scene, object, settings)
     described = {
         "object": scene.description.object_name,
         "environment": scene.description.environment_name,
@@ -175,17 +177,23 @@ def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> t
     return problem, [*job.loaded[1], *sentences(problem.space.moved)]
 
 
-def _scene(scene: Scene | str | Path, settings: AttackKeywords) -> Scene:
+def _scene(scene: Scene | str | Path | Mapping[str, Any], object: str | None, settings: AttackKeywords) -> Scene:
     """The scene as it was given, or the one that a name and the settings describe."""
     if isinstance(scene, Scene):
         clash = [name for name in ("set", "environment", "up", "camera", "exposure") if settings.get(name) is not None]
+        clash += [] if object is None else ["object"]
         if clash:
             raise InputError(f"{', '.join(clash)}: belongs to the scene, which is given already; give it to load_scene")
         return scene
     given, lit_by = scene_settings(settings.get("set"), settings.get("exposure")), settings.get("environment")
     if not (lit_by is None or isinstance(lit_by, (str, Path))):
         raise one_only("environment", tuple(lit_by))
-    return load_scene(scene, lit_by, up=settings.get("up"), settings=given, camera=settings.get("camera"))
+    up, camera = settings.get("up"), settings.get("camera")
+    if object is not None:
+        return load_scene(object, lit_by, scene=scene, up=up, settings=given, camera=camera)
+    if isinstance(scene, Mapping):
+        raise InputError("object: which shape of the scene is it? Give its id")
+    return load_scene(scene, lit_by, up=up, settings=given, camera=camera)
 
 
 def _set_by(scene: Scene, exposure: float | None) -> dict[str, float | str]:

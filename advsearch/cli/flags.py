@@ -13,10 +13,15 @@ from typing import Any, TypeVar
 
 from advsearch.config import CONFIGS, AttackConfig
 from advsearch.errors import InputError
-from advsearch.settings import Config, Setting, check_once, parse_assignment, settings
+from advsearch.settings import Config, Setting, check_once, parse_assignment, settings, split_names
 
 _NO_SETTINGS = {"code": "--code"}
 """Flags which messages name too and which are no setting of a configuration."""
+
+SCENE = (
+    "a .glb or .gltf file, or a Mitsuba .xml file: the object is one of its nodes or shapes by name, and the rest its "
+    "surroundings (the same as --object FILE#NAME)"
+)
 
 Given = TypeVar("Given", bound=Config)
 
@@ -38,6 +43,8 @@ def add_settings(
             default=argparse.SUPPRESS,
             help=help_text(setting),
         )
+        if setting.field == "object":
+            headings[setting.group].add_argument("--scene", metavar="FILE", default=argparse.SUPPRESS, help=SCENE)
         if setting.form == "switch":
             add(action="store_const", const=not setting.default)
         else:
@@ -60,6 +67,8 @@ def config_from(args: argparse.Namespace, config: type[Given], **otherwise: Any)
         if one.field in args:
             text, read = getattr(args, one.field), READERS.get(one.form)
             data[one.field] = text if read is None else read(text, one.flag)
+    if "scene" in args and isinstance(data.get("object"), str):
+        data["object"] = ",".join(f"{args.scene}#{name}" for name in split_names(data["object"]))
     return config(**data)
 
 

@@ -15,6 +15,7 @@ _EXAMPLES = """examples:
   advsearch import mug.obj
   advsearch import room.glb --json
   advsearch import room.glb --out room.png
+  advsearch import box.xml --json
 """
 VIEWS, SIDE = 4, 192
 """Views of the picture, and the side of each in pixels."""
@@ -30,7 +31,7 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("file", metavar="FILE", help="a .glb, .gltf, .blend, .obj, .ply or .stl file")
+    parser.add_argument("file", metavar="FILE", help="a .glb, .gltf, .blend, .obj, .ply, .stl or Mitsuba's .xml file")
     parser.add_argument("--out", metavar="FILE", help="a picture of all that is in it, from four sides (.png)")
     output.add_flags(parser)
 
@@ -44,8 +45,10 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--out: expected the name of a .png file, got {args.out}")
     with at_work(as_json=True, quiet=False):
         import advsearch
-        from advsearch.scene.importing.scenes import contents
+        from advsearch.scene.importing.scenes import MITSUBA_FILE, contents
 
+        if Path(args.file).suffix.lower() == MITSUBA_FILE:
+            return _mitsuba(args, out)
         found = contents(Path(args.file))
         if out is not None:
             advsearch.render(advsearch.load_scene(found.object), around=VIEWS, resolution=SIDE).save(out)
@@ -83,5 +86,44 @@ def run(args: argparse.Namespace) -> int:
         if names:
             print(f"{what}: {', '.join(names)}")
     for warning in whole.warnings:
+        print(f"Note: {warning}")
+    return 0
+
+
+def _mitsuba(args: argparse.Namespace, out: Path | None) -> int:
+    """Print, and picture as its first camera sees it, what was understood of a Mitsuba scene."""
+    import advsearch
+    from advsearch.scene.mitsuba_backend.files.scene import contents
+
+    found = contents(Path(args.file))
+    warnings: tuple[str, ...] = ()
+    if found.objects:
+        plain = next((name for name in found.objects if name not in found.lights), found.objects[0])
+        scene = advsearch.load_scene(plain, scene=args.file)
+        warnings = scene.description.object.warnings
+        if out is not None:
+            advsearch.render(scene, resolution=2 * SIDE).save(out)
+    elif out is not None:
+        raise InputError(
+            f"{args.file}: no shape of it can be the object, so that it cannot be pictured; leave --out out"
+        )
+    listed = {
+        "objects": list(found.objects),
+        "kept": dict(found.kept),
+        "lights": list(found.lights),
+        "cameras": list(found.cameras),
+    }
+    if args.json:
+        told = {"file": args.file, **listed, "warnings": list(warnings), "out": args.out}
+        output.print_json({"schema": 1, "command": "import", **told})
+        return 0
+    print(f"{args.file}: a Mitsuba scene")
+    for what, names in listed.items():
+        if names:
+            shown = [f"{name} ({names[name]})" if isinstance(names, dict) else name for name in names]
+            print(f"{what}: {', '.join(shown)}")
+    if found.objects:
+        print(f"One of them as the object, the rest around it: --scene {args.file} --object {found.objects[-1]}")
+    for warning in warnings:
         print(f"Note: {warning}")
     return 0

@@ -116,6 +116,7 @@ def load_scene(
     object: str | Path | ObjectAsset,
     environment: str | Path | EnvironmentAsset | None = None,
     *,
+    scene: str | Path | Mapping[str, object] | None = None,
     up: str | None = None,
     settings: Given | None = None,
     camera: str | None = None,
@@ -125,6 +126,8 @@ def load_scene(
     Args:
         object: a bundled name ("mug"), a path to an .obj, .ply or .glb file, or an asset.
         environment: a bundled name, a path to an .hdr or .exr file, an asset; default "studio".
+        scene: the file or, of Mitsuba, the dictionary (`mi.cornell_box()`) in which `object` is a node or the id of a
+            shape; a file may as well be written before it: "scene.glb#chair", "box.xml#large-box".
         up: the up axis of a mesh file, "y" or "z"; by default what its format or else its shape says.
         settings: parameters to fix, e.g. ``{"camera.azimuth": 130.0}``. The size of a picture belongs to none of them
             but to what makes it: `resolution` of `attack`, `sweep`, `render` and `Scene.renderer`.
@@ -133,7 +136,14 @@ def load_scene(
     Raises:
         InputError: a name is unknown, a file cannot be used, or a value is out of range.
     """
-    described = describe(object, environment, given=settings, up=up)
+    if scene is None:
+        described = describe(object, environment, given=settings, up=up)
+    elif not isinstance(object, str):
+        raise InputError(f"object: expected the name of a node or shape of the scene, got {object!r}")
+    elif isinstance(scene, Mapping):
+        described = describe(object, environment, given=settings, up=up, plugins=scene)
+    else:
+        described = describe(f"{scene}#{object}", environment, given=settings, up=up)
     return Scene(described if camera is None else described.seen_by(camera))
 
 
@@ -161,7 +171,7 @@ def make_renderer(
     """Put a described scene, with what the space's controls need in it, into Mitsuba at one size."""
     size = (resolution, resolution) if isinstance(resolution, int) else resolution
     description = space.scene or description
-    if description.environment is None and not description.lamps:
+    if not description.lit:
         raise InputError(
             "environment: the scene has neither a map nor a lamp, so that every picture is black; give it one of the "
             "two, such as `controls=light`"

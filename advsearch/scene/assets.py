@@ -86,6 +86,7 @@ class ObjectAsset:
         source: where it came from, for messages and logs.
         warnings: what the importer had to repair or leave out, one sentence each.
         up: the axis of the file that was taken for up; None for what comes from no file.
+        surface: in place of the principled one, Mitsuba's own dictionary of it; see `advsearch.scene.parts.MeshPart`.
     """
 
     name: str
@@ -96,6 +97,7 @@ class ObjectAsset:
     source: str = ""
     warnings: tuple[str, ...] = ()
     up: UpAxis | None = None
+    surface: Mapping[str, object] | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -19,8 +19,8 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
 from advsearch.scene.importing.objects import import_object
-from advsearch.scene.importing.scenes import ImportedScene, import_scene, split_node
-from advsearch.scene.parts import BallLamp, MeshPart, PlacedCamera, PointLamp, ScenePart
+from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
+from advsearch.scene.parts import BallLamp, MeshPart, PlacedCamera, PluginPart, PointLamp, ScenePart
 from advsearch.scene.photograph import Photograph, photograph_of
 
 Doubles = npt.NDArray[np.float64]
@@ -61,6 +61,7 @@ class SceneDescription:
         aspect: width over height of the picture.
         cameras: those with poses of their own, by name.
         camera: name of the one in use; `ORBIT_CAMERA` for that of the settings.
+        metered: exposure is metered; otherwise a radiance of 1 is the white of the picture, as Mitsuba shows it.
     """
 
     object: ObjectAsset
@@ -76,6 +77,7 @@ class SceneDescription:
     aspect: float = 1.0
     cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)
     camera: str = ORBIT_CAMERA
+    metered: bool = True
 
     def with_part(self, part: ScenePart) -> SceneDescription:
         """Return the scene with one more part.
@@ -114,7 +116,7 @@ class SceneDescription:
         from advsearch.scene.geometry import moved_part, object_to_world
 
         own = self.object
-        under_test = MeshPart(OBJECT, own.mesh, object_to_world(self), own.base_color, self.material)
+        under_test = MeshPart(OBJECT, own.mesh, object_to_world(self), own.base_color, self.material, own.surface)
         return {OBJECT: under_test, **{name: moved_part(one, self.values) for name, one in self.around.items()}}
 
     @property
@@ -126,6 +128,12 @@ class SceneDescription:
     def lamps(self) -> Mapping[str, PointLamp | BallLamp]:
         """Every light beside the environment, by name."""
         return {one.name: one for one in self.parts if isinstance(one, (PointLamp, BallLamp))}
+
+    @property
+    def lit(self) -> bool:
+        """Whether there is anything that shines."""
+        shining = any(part.shines for part in self.parts if isinstance(part, PluginPart))
+        return self.environment is not None or bool(self.lamps) or shining
 
     @property
     def object_name(self) -> str:
@@ -216,7 +224,7 @@ class SceneDescription:
         """Factor from scene radiance to display-linear values: the metered exposure times `camera.exposure`."""
         from advsearch.scene.exposure import metered_gain
 
-        return metered_gain(self) * math.pow(2.0, self.number("camera.exposure"))
+        return (metered_gain(self) if self.metered else 1.0) * math.pow(2.0, self.number("camera.exposure"))
 
 
 def describe(
@@ -225,29 +233,39 @@ def describe(
     *,
     given: settings.Given | None = None,
     up: str | None = None,
+    plugins: Mapping[str, object] | None = None,
 ) -> SceneDescription:
     """Find and read an object and an environment, bundled or from a file.
 
     Args:
-        object_spec: a bundled name, a path to a mesh, an asset, or "scene.glb#chair": a node of a glTF scene, the rest
-            of which stays around it, without the ground plane, and without a map if it has lamps of its own.
+        object_spec: a bundled name, a path to a mesh, an asset, or "scene.glb#chair": a node of a glTF scene, or a
+            shape of a Mitsuba scene (.xml) by its id, the rest of which stays around it, without the ground plane, and
+            without a map if it has lights of its own.
         environment_spec: a bundled name, a path to an .hdr or .exr file, an asset, `NO_MAP` for no map at all, or None
             for the default.
         given: settings to fix, by name.
         up: "y" or "z", the up axis of a mesh file; None takes what its format or else its shape says.
+        plugins: a Mitsuba scene as its loader takes it, in which `object_spec` is the id of a shape.
 
     Raises:
         InputError: a name is unknown, a file cannot be used, or a setting is out of range.
     """
     values = settings.resolve(given or {})
     file, node = split_node(object_spec) if isinstance(object_spec, str) else (object_spec, None)
-    around = ImportedScene(_object(object_spec, up)) if node is None else _scene(Path(str(file)), node, up)
-    lit = any(isinstance(part, PointLamp) for part in around.surroundings)
-    lit_by = environment_spec or (NO_MAP if lit else DEFAULT_ENVIRONMENT)
+    mitsuba = plugins is not None or (node is not None and str(file).lower().endswith(MITSUBA_FILE))
+    if mitsuba:
+        around = _mitsuba(Path(str(file)) if plugins is None else plugins, node or str(object_spec), up, given or {})
+    else:
+        around = ImportedScene(_object(object_spec, up)) if node is None else _scene(Path(str(file)), node, up)
+    shining = (
+        isinstance(part, PointLamp) or (isinstance(part, PluginPart) and part.shines) for part in around.surroundings
+    )
+    lit_by = environment_spec or (NO_MAP if any(shining) else DEFAULT_ENVIRONMENT)
     _check_ground(given or {}, lit_by)
-    if node is not None and not {"ground.size", "ground.kind"} & set(given or {}):
+    if (node is not None or mitsuba) and not {"ground.size", "ground.kind"} & set(given or {}):
         values = {**values, "ground.size": 0.0}
     asked = () if environment_spec is None else (ENVIRONMENT,)
+    orbits = any(name.startswith("camera.") and name != "camera.exposure" for name in given or {})
     described = SceneDescription(
         around.object,
         _environment(lit_by),
@@ -258,6 +276,8 @@ def describe(
         given=frozenset((*(given or {}), *asked)),
         parts=around.surroundings,
         cameras=around.cameras,
+        camera=next(iter(around.cameras), ORBIT_CAMERA) if mitsuba and not orbits else ORBIT_CAMERA,
+        metered=not mitsuba,
     )
     check_meshes(described, values)
     return described
@@ -289,6 +309,18 @@ def _check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) 
             f"`set` ground.kind=photograph and `set` {described[0]} contradict each other: only a table has that; "
             f"leave one of the two out"
         )
+
+
+def _mitsuba(scene: Path | Mapping[str, object], shape: str, up: str | None, given: settings.Given) -> ImportedScene:
+    from advsearch.scene.mitsuba_backend.files.scene import import_plugins
+
+    if up is not None:
+        raise InputError("up: the first camera of a Mitsuba scene says which way is up; leave `up` out")
+    found = import_plugins(scene, shape)
+    idle = [name for name in given if name.startswith("material.")]
+    if found.object.surface is not None and idle:
+        raise InputError(f"`set` {idle[0]}: the object has a surface of Mitsuba's own, without it; leave it out")
+    return found
 
 
 def _scene(path: Path, node: str, up: str | None) -> ImportedScene:

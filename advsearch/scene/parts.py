@@ -8,6 +8,7 @@ it. A part of another kind is a subclass, with a translation registered in `mits
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -18,6 +19,8 @@ from advsearch.scene.assets import Floats, Material, Mesh
 
 Doubles = npt.NDArray[np.float64]
 Triple = tuple[float, float, float]
+BASE_COLOR = "base color"
+"""Stands for the texture in a surface in Mitsuba's words."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +50,15 @@ class MeshPart(ScenePart):
         to_world: (4, 4) its base pose.
         base_color: (h, w, 3) float32 display-referred sRGB.
         material: the rest of the surface.
+        surface: in place of the principled surface, Mitsuba's dictionary of one, with `BASE_COLOR` where the texture
+            goes. What it lacks of the inputs, the part has not.
     """
 
     mesh: Mesh
     to_world: Doubles
     base_color: Floats
     material: Material = field(default_factory=Material)
+    surface: Mapping[str, object] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,4 +141,24 @@ class HazePart(ScenePart):
     """
 
     radius: float
+    volumetric: ClassVar[bool] = True
+
+
+@dataclass(frozen=True, eq=False)
+class PluginPart(ScenePart):
+    """A shape, light or material of a Mitsuba scene as it is.
+
+    Attributes:
+        plugin: its dictionary; transforms are (4, 4) arrays, pictures (H, W, C) ones.
+        shines: it sends out light.
+    """
+
+    plugin: Mapping[str, object] = field(default_factory=dict)
+    shines: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class MediumPart(PluginPart):
+    """One that holds a medium."""
+
     volumetric: ClassVar[bool] = True

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import random
 
-from fuzz import gltf, meshes, models, pictures, runs
+from fuzz import gltf, meshes, mitsuba_scenes, models, pictures, runs
 from fuzz.case import Case, Maker
 
-MAKERS: tuple[Maker, ...] = (*meshes.MAKERS, *gltf.MAKERS, *pictures.MAKERS, *models.MAKERS, *runs.MAKERS)
+MAKERS: tuple[Maker, ...] = (
+    *(*meshes.MAKERS, *gltf.MAKERS, *mitsuba_scenes.MAKERS),
+    *(*pictures.MAKERS, *models.MAKERS, *runs.MAKERS),
+)
 """They take turns, so that any few dozen cases in a row have some of everything."""
 
 

@@ -14,6 +14,16 @@ def load_object(path: Path) -> None:
     advsearch.load_scene(path).renderer("texture", resolution=16)
 
 
+def load_mitsuba(path: Path) -> None:
+    """Read a Mitsuba scene, with its first shape that can be one as the object, and put it into Mitsuba."""
+    import advsearch
+    from advsearch.scene.mitsuba_backend.files.scene import contents
+
+    names = contents(path).objects
+    if names:
+        advsearch.load_scene(names[0], scene=path).renderer("pose", resolution=16)
+
+
 def load_environment(path: Path) -> None:
     """Read an environment and put it into Mitsuba."""
     import advsearch
@@ -95,6 +105,7 @@ def misbehave(path: Path) -> None:
 
 LOADERS: dict[str, Callable[[Path], object]] = {
     "object": load_object,
+    "mitsuba": load_mitsuba,
     "environment": load_environment,
     "picture": load_picture,
     "model": load_model,
@@ -111,12 +122,13 @@ def warm_up(loaders: Iterable[str]) -> None:
     """Import what the loaders need, so that the libraries are not counted as the first case's memory and time."""
     import advsearch
 
-    if {"object", "environment", "picture"} & set(loaders):
+    if {"object", "mitsuba", "environment", "picture"} & set(loaders):
         advsearch.load_scene("book").renderer("texture", resolution=16)
         from PIL import Image
 
         import advsearch.scene.environments
         import advsearch.scene.importing.objects
+        import advsearch.scene.mitsuba_backend.files.scene
 
         Image.init()
     if {"model", "labels"} & set(loaders):

@@ -33,6 +33,8 @@ UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """From y up to z up."""
 BEHIND = np.diag([-1.0, 1.0, -1.0])
 """Cameras of glTF look along -z with +x to the right; ours along +z with +x to the left."""
+MITSUBA_FILE = ".xml"
+"""Ending of Mitsuba's scenes."""
 LUMENS = 683.0
 """Lumens of a watt, as exporters of glTF count: the eye's at 555 nm."""
 FAR = 1000.0
@@ -59,7 +61,9 @@ class ImportedScene:
 
 def split_node(spec: str) -> tuple[str, str | None]:
     """Return the file and the node of ``scene.glb#chair``; None where no node is named."""
-    found = re.fullmatch(rf"(.+({'|'.join(map(re.escape, GLTF))}))#(.*)", spec, re.IGNORECASE | re.DOTALL)
+    found = re.fullmatch(
+        rf"(.+({'|'.join(map(re.escape, (*GLTF, MITSUBA_FILE)))}))#(.*)", spec, re.IGNORECASE | re.DOTALL
+    )
     return (found[1], found[3]) if found and not Path(spec).exists() else (spec, None)
 
 

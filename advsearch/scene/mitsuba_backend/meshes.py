@@ -5,6 +5,7 @@ Mitsuba 3.10 renames these parameters: they stand here and nowhere else.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,9 @@ import numpy.typing as npt
 
 from advsearch.scene.assets import Floats, Material, Mesh
 from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.mitsuba_backend.plugins import loadable
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
+from advsearch.scene.parts import BASE_COLOR
 
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
 """Names of a mesh's parameters: flat arrays of 3, 3 and 2 numbers a vertex, and 3 indices a face."""
@@ -48,6 +51,23 @@ def _texture(linear: Floats) -> Plugin:
     mi = mitsuba()
     bitmap = mi.Bitmap(np.ascontiguousarray(linear, dtype=np.float32))
     return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "bilinear"}
+
+
+def own_surface(surface: Mapping[str, object], base_color: Floats) -> tuple[Plugin, str]:
+    """Return a surface in Mitsuba's words with the texture in its place, and the name of that place ("none": none)."""
+    place = "none"
+
+    def filled(plugin: Mapping[str, object]) -> Plugin:
+        nonlocal place
+        found: Plugin = {}
+        for key, value in plugin.items():
+            if isinstance(value, str) and value == BASE_COLOR:
+                place, found[key] = key, _texture(srgb_to_linear(base_color))
+            else:
+                found[key] = filled(value) if isinstance(value, Mapping) else value
+        return found
+
+    return loadable(filled(surface)), place
 
 
 def mitsuba_mesh(name: str, mesh: Mesh, to_world: npt.NDArray[np.float64], bsdf: Plugin) -> Any:

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from functools import singledispatch
 
 from advsearch.scene.mitsuba_backend.inputs import SceneInput, color, flat, number, point, transform
-from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, mitsuba_mesh, principled
+from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, mitsuba_mesh, own_surface, principled
+from advsearch.scene.mitsuba_backend.plugins import loadable
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
-from advsearch.scene.parts import BallLamp, HazePart, MeshPart, PointLamp, ScenePart
+from advsearch.scene.parts import BallLamp, HazePart, MeshPart, PluginPart, PointLamp, ScenePart
 
 ABSENT = {"type": "uniform", "value": 0.0}
 IDLE_LOBES: Plugin = {name: ABSENT for name in ("clearcoat", "sheen")}
@@ -47,17 +48,24 @@ def mesh_translation(part: MeshPart, lobes: Plugin | None = None) -> Translation
         lobes: further entries of the principled plugin's dictionary, such as `IDLE_LOBES`.
     """
     name, count = part.name, len(part.mesh.vertices)
-    surface = principled(part.base_color, part.material, lobes)
+    surface, color_key = principled(part.base_color, part.material, lobes), "base_color"
+    if part.surface is not None:
+        surface, color_key = own_surface(part.surface, part.base_color)
     inputs = (
         SceneInput(f"{name}.vertices", f"{name}.{POSITIONS}", flat, shape=(count, 3)),
         SceneInput(f"{name}.normals", f"{name}.{NORMALS}", flat, shape=(count, 3)),
-        SceneInput(f"{name}.base_color", f"{name}.*.base_color.data", interior=True),
+        SceneInput(f"{name}.base_color", f"{name}.*.{color_key}.data", interior=True),
         SceneInput(f"{name}.roughness", f"{name}.*.roughness.value", number, True, (1,)),
         SceneInput(f"{name}.metallic", f"{name}.*.metallic.value", number, True, (1,)),
         SceneInput(f"{name}.specular", f"{name}.*.specular", number, True, (1,)),
         SceneInput(f"{name}.clearcoat", f"{name}.*.clearcoat.value", number, True, (1,)),
     )
     return Translation({name: mitsuba_mesh(name, part.mesh, part.to_world, surface)}, inputs)
+
+
+@translation.register
+def _plugin(part: PluginPart) -> Translation:
+    return Translation({part.name: loadable(part.plugin)}, (), {"type": "prbvolpath"} if part.volumetric else {})
 
 
 @translation.register

@@ -27,6 +27,7 @@ from advsearch.scene.mitsuba_backend.population import population
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER, next_count
 from advsearch.scene.mitsuba_backend.transport import Paths, collect
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
+from advsearch.scene.parts import PluginPart
 from advsearch.scene.surfaces import Surfaces
 
 MAX_DEPTH = 6
@@ -94,7 +95,7 @@ class MitsubaScene:
             self._path |= one.integrator
         if "emitters" in leave_out:
             leave_dark_lamps_out(plugins, description.parts)
-        self._scene = mi.load_dict(plugins, optimize=False)
+        self._scene = _loaded(plugins, description)
         self._sensor = self._scene.sensors()[0]
         self._parameters = mi.traverse(self._scene)
         self._integrators: dict[tuple[str, int], Any] = {}
@@ -385,6 +386,21 @@ class MitsubaScene:
         if key not in self._recorded:
             self._recorded[key] = dr.freeze(function)
         return self._recorded[key]
+
+
+def _loaded(plugins: Plugin, description: SceneDescription) -> Any:
+    """Return Mitsuba's scene.
+
+    Raises:
+        InputError: Mitsuba refuses plugins of the user's.
+    """
+    try:
+        with _fewer_warnings():
+            return mitsuba().load_dict(plugins, optimize=False)
+    except RuntimeError as error:
+        if not any(isinstance(part, PluginPart) for part in description.parts):
+            raise
+        raise InputError(f"{description.object_name}: Mitsuba refuses the scene: {error}; change it there") from error
 
 
 @contextmanager

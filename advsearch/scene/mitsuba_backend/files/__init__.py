@@ -1,0 +1,1 @@
+"""Mitsuba's own scenes, from its XML files and Python dictionaries."""

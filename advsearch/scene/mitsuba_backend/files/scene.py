@@ -1,0 +1,337 @@
+"""A shape of a Mitsuba scene as the object, and all the rest around it as it is.
+
+Lengths are in object sizes, so that everything is moved and scaled with the object, as in
+`advsearch.scene.importing.scenes`. Lights whose power is a quantity of lengths are scaled with it, and media too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.importing.files import safe_name
+from advsearch.scene.importing.objects import object_of
+from advsearch.scene.importing.scenes import TAKEN, ImportedScene, clean
+from advsearch.scene.mitsuba_backend.files.shapes import MESHES, mesh_of, surface_of
+from advsearch.scene.mitsuba_backend.files.trusted import trusted
+from advsearch.scene.mitsuba_backend.files.xml import read_scene
+from advsearch.scene.mitsuba_backend.plugins import plain
+from advsearch.scene.mitsuba_backend.variant import Plugin
+from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart
+
+Doubles = npt.NDArray[np.float64]
+
+SHAPES = frozenset(
+    """
+    rectangle cube sphere cylinder disk obj ply serialized instance shapegroup sdfgrid bsplinecurve linearcurve
+    ellipsoids ellipsoidsmesh merge
+    """.split()
+)
+LIGHTS = frozenset(
+    """
+    constant envmap point spot directional projector sunsky timed_sunsky area directionalarea
+    """.split()
+)
+SENSORS = frozenset(
+    """
+    perspective thinlens orthographic radiancemeter irradiancemeter distant batch
+    """.split()
+)
+CAMERAS = frozenset(("perspective", "thinlens"))
+INTEGRATORS = frozenset(
+    """
+    path prb prb_basic prb_projective prbvolpath volpath volpathmis direct aov ptracer depth moment stokes
+    """.split()
+)
+MEDIA = frozenset(("homogeneous", "heterogeneous"))
+Y_TO_Z = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+MOST_PARTS = 2000
+"""Plugins at the top of a scene."""
+DIAGONAL = math.hypot(36.0, 24.0)
+"""Of the film of which Mitsuba's `focal_length` speaks, millimetres."""
+
+
+def read_tree(scene: Path | Mapping[str, object]) -> Plugin:
+    """Return a scene file's dictionary, or a caller's own, with arrays for transforms.
+
+    Raises:
+        FileFormatError: as for `read_scene` and `trusted`.
+        InputError: no scene.
+    """
+    if isinstance(scene, Path):
+        return trusted(scene, read_scene(scene))
+    if scene.get("type") != "scene":
+        raise InputError(f"scene: expected a dictionary of type 'scene', got {scene.get('type')!r}")
+    return plain(scene)
+
+
+def shape_ids(tree: Mapping[str, object]) -> list[str]:
+    """The ids of the shapes of a scene."""
+    return [name for name, one in _plugins(tree) if one["type"] in SHAPES]
+
+
+@dataclass(frozen=True)
+class PluginContents:
+    """What is in a Mitsuba scene, by id.
+
+    Attributes:
+        objects: shapes that can be the object.
+        kept: the rest, which stays as it is: its plugin's name.
+        lights: what shines.
+        cameras: sensors that can be looked through.
+    """
+
+    objects: tuple[str, ...]
+    kept: Mapping[str, str]
+    lights: tuple[str, ...]
+    cameras: tuple[str, ...]
+
+
+def contents(path: Path) -> PluginContents:
+    """Return what is understood of a scene file.
+
+    Raises:
+        FileFormatError: as for `read_tree`.
+    """
+    named = dict(_plugins(read_tree(path)))
+    kinds = {name: str(one["type"]) for name, one in named.items()}
+    objects = tuple(name for name, kind in kinds.items() if kind in MESHES)
+    cameras = tuple(name for name, kind in kinds.items() if kind in CAMERAS)
+    others = {
+        name: kind
+        for name, kind in kinds.items()
+        if name not in (*objects, *cameras) and kind not in INTEGRATORS | SENSORS
+    }
+    return PluginContents(objects, others, tuple(name for name, one in named.items() if _shines(one)), cameras)
+
+
+def _shines(plugin: Mapping[str, object]) -> bool:
+    return any(inner.get("type") in LIGHTS for inner in _all(plugin))
+
+
+def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedScene:
+    """Read a Mitsuba scene.
+
+    The shape becomes a mesh with its own kind of surface, whose base colour, where it has one, becomes a texture.
+    Everything else stays as it is, under its own name. Perspective sensors become cameras. Integrator, sampler and film
+    are those of the house. What is left out is among the object's warnings.
+
+    Args:
+        scene: an XML file, or a dictionary as Mitsuba's loader takes it.
+        wanted: id of the shape that is the object.
+
+    Raises:
+        UnknownNameError: it has no such shape.
+        FileFormatError: as for `read_tree`.
+        InputError: the shape is no mesh and cannot be made one, or the scene is too large.
+    """
+    tree = read_tree(scene)
+    where = scene.name if isinstance(scene, Path) else "scene"
+    ids = shape_ids(tree)
+    if wanted not in ids:
+        raise UnknownNameError(f"shape of {where}", wanted, ids)
+    named = dict(_plugins(tree))
+    if len(named) > MOST_PARTS:
+        raise InputError(f"{where}: expected at most {MOST_PARTS} plugins at the top, got {len(named)}; join meshes")
+    shape = named[wanted]
+    notes = [f"{where}: {one}" for one in _left_out(tree, shape)]
+    bsdf = _bsdf(shape, named)
+    color, surface = surface_of(bsdf)
+    frame = _Frame(shape, wanted, z_up=_is_z_up(named))
+    part = replace(mesh_of(shape, wanted), surface=color)
+    turned = replace(
+        part,
+        vertices=part.vertices @ frame.turn.T,
+        normals=None if part.normals is None else part.normals @ frame.turn.T,
+    )
+    source = scene if isinstance(scene, Path) else Path("scene.xml")
+    made = object_of([turned], notes, source, f"{safe_name(source)}-{clean(wanted)}", "z")
+    around: list[ScenePart] = []
+    cameras: dict[str, PlacedCamera] = {}
+    for name, one in named.items():
+        if name == wanted or one["type"] in INTEGRATORS:
+            continue
+        free = f"{name}-2" if name in TAKEN else name
+        if one["type"] in SENSORS:
+            if one["type"] in CAMERAS:
+                cameras[free] = _camera(one, frame)
+            continue
+        kept = _renamed(frame.moved(one))
+        holds = MediumPart if any(inner.get("type") in MEDIA for inner in _all(kept)) else PluginPart
+        around.append(holds(free, kept, _shines(kept)))
+    return ImportedScene(replace(made, surface=surface), tuple(around), cameras)
+
+
+def _plugins(tree: Mapping[str, object]) -> Iterator[tuple[str, Mapping[str, object]]]:
+    """The plugins at the top of a scene, by name."""
+    return ((name, one) for name, one in tree.items() if isinstance(one, Mapping) and "type" in one)
+
+
+def _all(plugin: Mapping[str, object]) -> Iterator[Mapping[str, object]]:
+    """A plugin and all within it."""
+    yield plugin
+    for inner in plugin.values():
+        if isinstance(inner, Mapping):
+            yield from _all(inner)
+
+
+def _renamed(plugin: Mapping[str, object]) -> Plugin:
+    """A plugin whose references have the names that the house left free."""
+    found = {key: _renamed(value) if isinstance(value, Mapping) else value for key, value in plugin.items()}
+    if found["type"] == "ref" and found["id"] in TAKEN:
+        found["id"] = f"{found['id']}-2"
+    return found
+
+
+def _bsdf(shape: Mapping[str, object], named: Mapping[str, Mapping[str, object]]) -> Mapping[str, object]:
+    """The surface of a shape with what it refers to in its place; Mitsuba's default where it has none."""
+
+    def whole(plugin: Mapping[str, object], depth: int) -> Mapping[str, object]:
+        if plugin["type"] == "ref":
+            name = str(plugin["id"])
+            if name not in named or depth > len(named):
+                raise UnknownNameError("material of the scene", name, list(named))
+            return whole(named[name], depth + 1)
+        return {key: whole(one, depth) if isinstance(one, Mapping) else one for key, one in plugin.items()}
+
+    for inner in shape.values():
+        if isinstance(inner, Mapping) and inner["type"] not in LIGHTS | MEDIA:
+            return whole(inner, 0)
+    return {"type": "diffuse"}
+
+
+def _left_out(tree: Mapping[str, object], shape: Mapping[str, object]) -> Iterator[str]:
+    """Sentences about what is not as it is in the file."""
+    for name, one in _plugins(tree):
+        kind = one["type"]
+        if kind in SENSORS - CAMERAS:
+            yield f"the sensor {name} is left out: a {kind}"
+        elif kind == "thinlens":
+            yield f"the sensor {name} is sharp at all distances: its lens is left out"
+        elif kind in INTEGRATORS - {"path", "prb", "volpath", "prbvolpath", "volpathmis", "prb_projective"}:
+            yield f"the integrator {name} is left out: a {kind}; light takes all paths of up to 6 segments"
+        if kind in SENSORS and any("principal_point" in key for key in one):
+            yield f"the sensor {name} looks along its middle: its principal point is left out"
+    for inner in shape.values():
+        if isinstance(inner, Mapping) and inner["type"] in LIGHTS:
+            yield "the object's own light is left out"
+        if isinstance(inner, Mapping) and inner["type"] in MEDIA:
+            yield "the medium in the object is left out"
+
+
+def _is_z_up(named: Mapping[str, Mapping[str, object]]) -> bool:
+    """Whether the first camera's upper side points along z, and not along y as is usual."""
+    for one in named.values():
+        if one["type"] in SENSORS and "to_world" in one:
+            above = np.asarray(one["to_world"], dtype=np.float64)[:3, 1]
+            return bool(abs(above[2]) > abs(above[1]))
+    return False
+
+
+class _Frame:
+    """From the scene's coordinates to the object's: z up, standing on z = 0, a largest extent of 1."""
+
+    def __init__(self, shape: Mapping[str, object], name: str, *, z_up: bool) -> None:
+        turn = np.eye(4) if z_up else Y_TO_Z
+        part = mesh_of(shape, name)
+        places = part.vertices[part.faces].reshape(-1, 3) @ turn[:3, :3].T
+        low, high = places.min(axis=0), places.max(axis=0)
+        self.turn = turn[:3, :3]
+        self.size = float((high - low).max())
+        if not (math.isfinite(self.size) and self.size > 0.0):
+            raise InputError(f"object {name}: expected a shape of some size, got one of {self.size}")
+        move = np.eye(4)
+        move[:3, 3] = (-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2])
+        self.matrix = np.diag([1.0 / self.size] * 3 + [1.0]) @ move @ turn
+
+    def moved(self, plugin: Mapping[str, object]) -> Plugin:
+        """Return a plugin at the top of a scene in its place."""
+        kind, found = plugin["type"], dict(plugin)
+        if kind == "merge":
+            return {key: self.moved(one) if isinstance(one, Mapping) else one for key, one in found.items()}
+        if kind in SHAPES - {"shapegroup", "merge"}:
+            found["to_world"] = self.matrix @ _matrix(plugin)
+        elif kind in ("constant", "envmap", "sunsky", "timed_sunsky", "directional"):
+            turn = np.eye(4)
+            turn[:3, :3] = self.turn
+            if "direction" in found:
+                found["direction"] = (self.turn @ np.asarray(found["direction"], dtype=np.float64)).tolist()
+            elif kind != "constant":
+                found["to_world"] = turn @ _matrix(plugin)
+        elif kind in ("point", "spot", "projector"):
+            if "position" in found:
+                place = np.asarray(found["position"], dtype=np.float64)
+                found["position"] = (self.matrix[:3, :3] @ place + self.matrix[:3, 3]).tolist()
+            else:
+                found["to_world"] = self.matrix @ _matrix(plugin)
+            power = "irradiance" if kind == "projector" else "intensity"
+            found[power] = _times(found.get(power, 1.0), self.size**-2, str(kind))
+        return {key: self._inside(value) if isinstance(value, Mapping) else value for key, value in found.items()}
+
+    def _inside(self, plugin: Mapping[str, object]) -> Plugin:
+        """Return a plugin within another: media and volumes are scaled."""
+        found = dict(plugin)
+        if plugin["type"] in MEDIA:
+            found["scale"] = float(np.asarray(found.get("scale", 1.0))) * self.size
+        if plugin["type"] in ("gridvolume", "constvolume"):
+            found["to_world"] = self.matrix @ _matrix(plugin)
+        return {key: self._inside(value) if isinstance(value, Mapping) else value for key, value in found.items()}
+
+
+def _matrix(plugin: Mapping[str, object]) -> Doubles:
+    return np.asarray(plugin.get("to_world", np.eye(4)), dtype=np.float64)
+
+
+def _times(value: object, factor: float, kind: str) -> object:
+    """A power times a factor."""
+    if isinstance(value, (int, float)):
+        return float(value) * factor
+    if isinstance(value, Mapping):
+        inner = value.get("value")
+        if value["type"] in ("rgb", "uniform", "srgb", "spectrum") and isinstance(inner, (int, float)):
+            return {**value, "value": float(inner) * factor}
+        if value["type"] == "rgb" and inner is not None:
+            return {**value, "value": (np.asarray(inner, dtype=np.float64) * factor).tolist()}
+        if value["type"] == "spectrum" and isinstance(inner, (list, tuple)):
+            return {**value, "value": [(length, amount * factor) for length, amount in inner]}
+        if value["type"] in ("d65", "blackbody"):
+            return {**value, "scale": float(np.asarray(value.get("scale", 1.0))) * factor}
+        if value["type"] == "bitmap" and isinstance(value.get("bitmap"), np.ndarray):
+            return {**value, "bitmap": np.asarray(value["bitmap"]) * np.float32(factor)}
+    raise InputError(f"{kind} light: expected a power as a number, rgb or spectrum; change it in the scene")
+
+
+def _camera(sensor: Mapping[str, object], frame: _Frame) -> PlacedCamera:
+    matrix = frame.matrix @ _matrix(sensor)
+    matrix[:3, :3] /= np.maximum(np.linalg.norm(matrix[:3, :3], axis=0), 1e-12)
+    film = next((one for one in sensor.values() if isinstance(one, Mapping) and "film" in str(one["type"])), {})
+    width, height = (float(np.asarray(film.get(side, other))) for side, other in (("width", 768), ("height", 576)))
+    axis, degrees = str(sensor.get("fov_axis", "x")), float(np.asarray(sensor.get("fov", 0.0)))
+    if not degrees:
+        length = float(millimetres(str(sensor.get("focal_length", "50mm"))))
+        axis, degrees = "diagonal", 2.0 * math.degrees(math.atan(DIAGONAL / (2.0 * length)))
+    larger, smaller = max(width, height), min(width, height)
+    across = {"x": width, "y": height, "diagonal": math.hypot(width, height), "larger": larger, "smaller": smaller}
+    half = math.tan(math.radians(degrees) / 2.0) * larger / across.get(axis, width)
+    return PlacedCamera(matrix, 2.0 * math.degrees(math.atan(half)))
+
+
+def millimetres(text: str) -> float:
+    """The number of ``50mm``.
+
+    Raises:
+        InputError: there is none.
+    """
+    try:
+        found = float(text.removesuffix("mm"))
+    except ValueError:
+        found = 0.0
+    if not found > 0.0:
+        raise InputError(f"focal_length: expected millimetres, such as 50mm, got {text!r}")
+    return found

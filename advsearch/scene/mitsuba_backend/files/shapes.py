@@ -1,0 +1,163 @@
+"""Shapes of a Mitsuba scene as triangles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import trimesh
+
+from advsearch.errors import InputError
+from advsearch.scene.color import linear_to_srgb
+from advsearch.scene.importing.parts import ImportedPart, read_parts
+from advsearch.scene.importing.surfaces import ImportedSurface
+from advsearch.scene.mitsuba_backend.variant import Plugin
+from advsearch.scene.parts import BASE_COLOR
+
+Doubles = npt.NDArray[np.float64]
+
+SECTIONS = 64
+"""Sides of a round shape."""
+MESHES = ("rectangle", "cube", "sphere", "cylinder", "disk", "obj", "ply")
+"""The shapes that can be the object."""
+COLORS = {
+    "diffuse": "reflectance",
+    "principled": "base_color",
+    "principledthin": "base_color",
+    "plastic": "diffuse_reflectance",
+    "roughplastic": "diffuse_reflectance",
+    "pplastic": "diffuse_reflectance",
+}
+"""Surfaces with a base colour, and its name there."""
+GREY = 0.5
+"""Reflectance where a surface says none: Mitsuba's default."""
+
+
+def mesh_of(shape: Mapping[str, object], name: str) -> ImportedPart:
+    """Return a shape's triangles in its scene, without a surface.
+
+    Raises:
+        InputError: it has none.
+    """
+    kind = str(shape["type"])
+    if kind not in MESHES:
+        raise InputError(f"object {name}: a {kind} cannot be moved; expected a shape of {', '.join(MESHES)}")
+    matrix = np.asarray(shape.get("to_world", np.eye(4)), dtype=np.float64)
+    if kind in ("obj", "ply"):
+        path = Path(str(shape["filename"]))
+        parts, _ = read_parts(path, path.read_bytes())
+        part = _joined(parts)
+    else:
+        part, own = _solid(kind, shape)
+        matrix = matrix @ own
+    vertices = part.vertices @ matrix[:3, :3].T + matrix[:3, 3]
+    mirrored = (np.linalg.det(matrix[:3, :3]) < 0.0) != bool(shape.get("flip_normals"))
+    normals = part.normals
+    if normals is not None:
+        normals = normals @ np.linalg.inv(matrix[:3, :3]) * (-1.0 if shape.get("flip_normals") else 1.0)
+    faces = part.faces[:, ::-1] if mirrored else part.faces
+    return replace(part, vertices=vertices, faces=faces, normals=None if shape.get("face_normals") else normals)
+
+
+def _solid(kind: str, shape: Mapping[str, object]) -> tuple[ImportedPart, Doubles]:
+    """A shape of Mitsuba's around the origin, and its own transform (4, 4) before `to_world`."""
+    own = np.eye(4)
+    if kind == "sphere":
+        found = trimesh.creation.uv_sphere(radius=1.0, count=[SECTIONS // 2, SECTIONS])
+        own[:3, :3] *= _number(shape.get("radius", 1.0))
+        own[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), dtype=np.float64)
+        normals: Doubles | None = np.array(found.vertices)
+    elif kind == "cylinder":  # open at both ends, as Mitsuba's
+        angles = np.arange(SECTIONS) * (2.0 * np.pi / SECTIONS)
+        ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(SECTIONS)], axis=1)
+        here, there = np.arange(SECTIONS), np.roll(np.arange(SECTIONS), -1)
+        faces = np.concatenate(
+            [
+                np.stack([here, there, there + SECTIONS], axis=1),
+                np.stack([here, there + SECTIONS, here + SECTIONS], axis=1),
+            ]
+        )
+        found = trimesh.Trimesh(np.concatenate([ring, ring + np.array([0.0, 0.0, 1.0])]), faces, process=False)
+        normals = np.concatenate([ring, ring])
+        low = np.asarray(shape.get("p0", (0.0, 0.0, 0.0)), dtype=np.float64)
+        high = np.asarray(shape.get("p1", (0.0, 0.0, 1.0)), dtype=np.float64)
+        length = float(np.linalg.norm(high - low))
+        along = (high - low) / max(length, 1e-30)
+        aside = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
+        aside /= np.linalg.norm(aside)
+        radius = _number(shape.get("radius", 1.0))
+        own[:3] = np.stack([aside * radius, np.cross(along, aside) * radius, along * length, low], axis=1)
+    elif kind == "cube":
+        found = trimesh.creation.box((2.0, 2.0, 2.0))
+        normals = None
+    elif kind == "disk":
+        angles = np.arange(SECTIONS) * (2.0 * np.pi / SECTIONS)
+        rim = np.stack([np.cos(angles), np.sin(angles), np.zeros(SECTIONS)], axis=1)
+        here = np.arange(SECTIONS)
+        faces = np.stack([here, np.roll(here, -1), np.full(SECTIONS, SECTIONS)], axis=1)
+        found = trimesh.Trimesh(np.concatenate([rim, np.zeros((1, 3))]), faces, process=False)
+        normals = None
+    else:
+        corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+        found = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+        normals = None
+    vertices, faces = np.array(found.vertices, dtype=np.float64), np.array(found.faces, dtype=np.int64)
+    uvs = vertices[:, :2] / 2.0 + 0.5 if kind == "rectangle" else None
+    return ImportedPart(vertices, faces, normals, uvs, None, ImportedSurface()), own
+
+
+def _number(value: object) -> float:
+    return float(np.asarray(value, dtype=np.float64))
+
+
+def _joined(parts: list[ImportedPart]) -> ImportedPart:
+    """All parts of a file as one; what not all of them have is left out."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    normals, uvs = [part.normals for part in parts], [part.uvs for part in parts]
+    return ImportedPart(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)]),
+        np.concatenate([one for one in normals if one is not None]) if all(n is not None for n in normals) else None,
+        np.concatenate([one for one in uvs if one is not None]) if all(uv is not None for uv in uvs) else None,
+        None,
+        ImportedSurface(),
+    )
+
+
+def surface_of(bsdf: Mapping[str, object]) -> tuple[ImportedSurface, Plugin]:
+    """Return a surface's base colour, and its dictionary with `BASE_COLOR` in the place of it, if it has such a place.
+
+    Only the first base colour is taken out. A texture that is no picture stays where it is.
+    """
+    found = ImportedSurface()
+    taken = False
+
+    def without(plugin: Mapping[str, object]) -> Plugin:
+        nonlocal found, taken
+        key = COLORS.get(str(plugin["type"]))
+        if key is not None and not taken:
+            color = _color(plugin.get(key, GREY))
+            if color is not None:
+                taken, found = True, color
+                return {**plugin, key: BASE_COLOR}
+        return {name: without(value) if isinstance(value, Mapping) else value for name, value in plugin.items()}
+
+    surface = without(bsdf)
+    return found, surface
+
+
+def _color(value: object) -> ImportedSurface | None:
+    """A constant or a picture as a base colour, display-referred."""
+    if isinstance(value, Mapping):
+        picture = value.get("bitmap")
+        if value["type"] == "bitmap" and isinstance(picture, np.ndarray) and picture.ndim == 3 and "to_uv" not in value:
+            return ImportedSurface(texture=linear_to_srgb(np.clip(picture[..., :3], 0.0, 1.0).astype(np.float32)))
+        value = value.get("value") if value["type"] in ("rgb", "uniform", "spectrum", "srgb") else None
+    if isinstance(value, (int, float)):
+        value = [float(value)] * 3
+    if not isinstance(value, (list, tuple, np.ndarray)) or np.shape(value) != (3,):
+        return None
+    return ImportedSurface(color=linear_to_srgb(np.clip(np.array(value, dtype=np.float32), 0.0, 1.0)))

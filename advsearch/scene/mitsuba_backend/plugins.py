@@ -1,0 +1,36 @@
+"""Dictionaries of Mitsuba's plugins between plain data and what its loader takes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
+
+
+def loadable(plugin: Mapping[str, object]) -> Plugin:
+    """Return a dictionary with Mitsuba's transforms for arrays of (4, 4) and its bitmaps for pictures (H, W, C)."""
+    mi = mitsuba()
+
+    def made(value: object) -> object:
+        if isinstance(value, Mapping):
+            return loadable(value)
+        if isinstance(value, np.ndarray):
+            small = value.shape == (4, 4)
+            return mi.ScalarTransform4f(value) if small else mi.Bitmap(np.ascontiguousarray(value, dtype=np.float32))
+        return value
+
+    return {key: made(value) for key, value in plugin.items()}
+
+
+def plain(plugin: Mapping[str, object]) -> Plugin:
+    """Return a dictionary with arrays (4, 4) for Mitsuba's transforms."""
+
+    def made(value: object) -> object:
+        if isinstance(value, Mapping):
+            return plain(value)
+        matrix = getattr(value, "matrix", None)
+        return value if matrix is None else np.array(matrix, dtype=np.float64).reshape(4, 4)
+
+    return {key: made(value) for key, value in plugin.items()}

@@ -1,0 +1,171 @@
+"""Mitsuba's scenes: files and dictionaries with one shape as the object, hostile files, and the picture as it was."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import advsearch
+from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
+from advsearch.scene.mitsuba_backend.files.scene import contents, import_plugins
+from advsearch.scene.mitsuba_backend.files.xml import read_scene
+from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.parts import PluginPart
+
+BOX = """<scene version="3.0.0">
+  <default name="wide" value="40"/>
+  <sensor type="perspective" id="front">
+    <float name="fov" value="$wide"/><string name="fov_axis" value="smaller"/>
+    <transform name="to_world"><lookat origin="0, 0, 3.9" target="0, 0, 0" up="0, 1, 0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="32"/></film>
+  </sensor>
+  <bsdf type="diffuse" id="white"><rgb name="reflectance" value="0.8, 0.7, 0.6"/></bsdf>
+  <shape type="rectangle" id="light">
+    <transform name="to_world"><rotate x="1" angle="90"/><scale value="0.4"/><translate y="0.9"/></transform>
+    <emitter type="area"><rgb name="radiance" value="8, 8, 7"/></emitter>
+  </shape>
+  <shape type="rectangle" id="floor">
+    <transform name="to_world"><rotate x="1" angle="-90"/><translate y="-1"/></transform><ref id="white"/>
+  </shape>
+  <shape type="cube" id="largebox">
+    <transform name="to_world"><scale value="0.3, 0.6, 0.3"/><rotate y="1" angle="18"/><translate y="-0.4"/></transform>
+    <ref id="white"/>
+  </shape>
+  <shape type="sphere" id="ball">
+    <point name="center" x="0.5" y="-0.7" z="0.3"/><float name="radius" value="0.3"/><bsdf type="dielectric"/>
+  </shape>
+</scene>"""
+
+
+@pytest.fixture
+def box(tmp_path: Path) -> Path:
+    path = tmp_path / "box.xml"
+    path.write_text(BOX)
+    return path
+
+
+def test_a_file_is_read_without_mitsuba(box: Path) -> None:
+    scene = read_scene(box)
+    assert scene["front"]["fov"] == 40.0
+    assert scene["white"]["reflectance"] == {"type": "rgb", "value": [0.8, 0.7, 0.6]}
+    np.testing.assert_allclose(scene["floor"]["to_world"] @ (0, 0, 1, 1), (0, 0, 0, 1), atol=1e-9)
+    ahead = scene["front"]["to_world"] @ (0, 0, 1, 0)
+    np.testing.assert_allclose(ahead, (0, 0, -1, 0), atol=1e-9)
+
+
+def test_contents_are_named(box: Path) -> None:
+    found = contents(box)
+    assert found.objects == ("light", "floor", "largebox", "ball")
+    assert dict(found.kept) == {"white": "diffuse"}
+    assert found.lights == ("light",)
+    assert found.cameras == ("front",)
+
+
+def test_the_object_stands_and_the_rest_is_kept(box: Path) -> None:
+    found = import_plugins(box, "largebox")
+    vertices = found.object.mesh.vertices
+    assert np.ptp(vertices, axis=0).max() == pytest.approx(1.0)
+    assert vertices[:, 2].min() == pytest.approx(0.0, abs=1e-6)
+    assert [part.name for part in found.surroundings] == ["white", "light", "floor", "ball"]
+    floor = next(part for part in found.surroundings if part.name == "floor")
+    assert isinstance(floor, PluginPart)
+    matrix = np.asarray(floor.plugin["to_world"])
+    np.testing.assert_allclose((matrix @ (0, 0, 0, 1))[2], 0.0, atol=1e-6)  # the box stands on the floor
+    assert found.object.surface == {"type": "diffuse", "reflectance": "base color"}
+
+
+def test_a_wrong_id_lists_those_there(box: Path) -> None:
+    with pytest.raises(UnknownNameError, match="largebox"):
+        import_plugins(box, "largebix")
+
+
+def _stock(path: Path) -> np.ndarray:
+    """The file's picture by Mitsuba alone, without the first row and column of pixels."""
+    mi = mitsuba()
+    scene = mi.load_file(str(path))
+    return np.array(mi.render(scene, integrator=mi.load_dict({"type": "path", "max_depth": 6}), spp=512))
+
+
+@pytest.mark.parametrize("shape", ["largebox", "floor"])
+def test_the_picture_is_mitsubas_own(box: Path, shape: str) -> None:
+    scene = advsearch.load_scene(f"{box}#{shape}")
+    renderer = scene.renderer("pose", resolution=32, denoise="none")
+    ours = renderer(renderer.start, 0, 512).detach()
+    box.write_text(BOX.replace("</film>", '<rfilter type="box"/></film>'))
+    from advsearch.scene.color import linear_to_srgb
+
+    theirs = torch.from_numpy(linear_to_srgb(np.clip(_stock(box), 0.0, 1.0).astype(np.float32)))
+    assert float((ours - theirs).abs().mean()) < 0.008
+    assert abs(float((ours - theirs).mean())) < 0.001
+
+
+def test_cornell_box_is_attacked_by_id() -> None:
+    found = advsearch.attack(
+        mitsuba().cornell_box(),
+        object="large-box",
+        label="wine glass",
+        controls={"pose": {"yaw": [0, 90]}, "texture": {"resolution": 4}},
+        resolution=16,
+        steps=1,
+        trials=6,
+        verify_spp=4,
+        spp=4,
+        baseline=False,
+        denoise="none",
+    )
+    assert found.summary.object == "large-box"
+
+
+def test_a_dictionary_needs_an_object() -> None:
+    with pytest.raises(InputError, match="which shape"):
+        advsearch.attack(mitsuba().cornell_box())
+
+
+LAUGHS = "".join(f'<default name="v{n}" value="{f"$v{n - 1}" * 10}"/>' for n in range(1, 12))
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ('<!DOCTYPE scene [<!ENTITY a "b">]><scene version="3.0.0"/>', "entities"),
+        (f'<scene version="3.0.0"><default name="v0" value="ha"/>{LAUGHS}</scene>', "letters"),
+        ('<scene version="3.0.0">' + "<bsdf type='diffuse'>" * 60 + "</bsdf>" * 60 + "</scene>", "deep"),
+        ('<scene version="3.0.0"><include filename="box.xml"/></scene>', "include itself"),
+        ('<scene version="3.0.0"><include filename="../secret.xml"/></scene>', "outside"),
+        (
+            '<scene version="3.0.0"><shape type="ply"><string name="filename" value="../a.ply"/></shape></scene>',
+            "which",
+        ),
+        ('<scene version="3.0.0"><bsdf type="../../evil"/></scene>', "no plugin"),
+        ('<scene version="3.0.0"><bsdf type="evil"/></scene>', "no plugin"),
+        (
+            '<scene version="3.0.0"><bsdf type="conductor"><string name="material" value="../x"/></bsdf></scene>',
+            "name of",
+        ),
+        ('<scene version="3.0.0"><shape type="serialized"><string name="filename" value="a"/></shape></scene>', "only"),
+        ('<scene version="0.5.0"/>', "version"),
+        ('<scene version="3.0.0"><float name="a" value="nan"/></scene>', "finite"),
+        ('<scene version="3.0.0"><float name="a" value="$b"/></scene>', "no value"),
+        ('<scene version="3.0.0"><nonsense name="a"/></scene>', "nothing that"),
+        ("<scene", "XML file"),
+    ],
+)
+def test_a_hostile_file_is_refused(tmp_path: Path, text: str, reason: str) -> None:
+    (tmp_path / "secret.xml").write_text('<scene version="3.0.0"/>')
+    folder = tmp_path / "inner"
+    folder.mkdir()
+    path = folder / "box.xml"
+    path.write_text(text)
+    with pytest.raises(FileFormatError, match=reason):
+        contents(path)
+
+
+def test_what_mitsuba_refuses_is_told_in_its_words(box: Path) -> None:
+    box.write_text(
+        BOX.replace('<bsdf type="dielectric"/>', '<bsdf type="dielectric"><float name="oops" value="1"/></bsdf>')
+    )
+    with pytest.raises(AdvsearchError, match="oops"):
+        advsearch.load_scene(f"{box}#largebox").renderer("pose", resolution=16)
