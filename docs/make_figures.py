@@ -23,7 +23,7 @@ from typing import Any, get_args
 
 from pydantic.fields import FieldInfo
 
-from advsearch.cli.flags import help_text
+from advsearch.cli.flags import SCENE, help_text
 from advsearch.cli.main import COMMANDS, _command
 from advsearch.config import CONFIGS, AttackConfig
 from advsearch.controls import OWN
@@ -101,6 +101,7 @@ def flags(record: Record) -> str:
     parts = []
     for group in sorted({one.group: None for one in settings(AttackConfig)}, key=lambda group: group == "run"):
         rows = [_flag_row(one) for one in settings(AttackConfig) if one.group == group]
+        rows += [["`--scene`", SCENE, "", ""]] if group == "scene" else []
         parts.append(f"**{group.capitalize()}**\n\n" + table(FLAG_HEADS, rows))
     return "\n".join(parts)
 
@@ -115,6 +116,7 @@ def own_flags(command: str) -> Callable[[Record], str]:
         known = [one for one in settings(CONFIGS[command]) if one.flag in flags_of(command)]
         as_in_attack = settings(AttackConfig)
         shared = [f"`{one.flag}`" for one in known if one in as_in_attack]
+        shared += ["`--scene`"] if "--scene" in flags_of(command) else []
         left_out = [f"`{one.flag}`" for one in as_in_attack if one.flag not in flags_of(command)]
         few = len(left_out) < 4
         said = f"All flags of `attack` but {', '.join(left_out)}" if few else f"As for `attack`: {', '.join(shared)}"
