@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("--label", default="mug")
     parser.add_argument("--epsilon", type=float, default=0.1)
     parser.add_argument("--seconds", type=float, default=8.0, help="CPU seconds of each search (default 8)")
-    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--seeds", type=int, default=10, help="at least 2 (default 10)")
     args = parser.parse_args()
     description = load_scene(args.object, args.environment).description
     space = make_space([TextureControl(epsilon=args.epsilon)], description)
