@@ -14,7 +14,7 @@ from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.viewer.attack_page import write_report
 from advsearch.viewer.columns import read_columns
-from advsearch.viewer.sweep_page import Shown, page, write_page
+from advsearch.viewer.sweep_page import SweepSource, page, write_page
 from advsearch.viewer.thumbnails import kept_pictures, path_of
 
 INDEX = "index.html"
@@ -57,7 +57,7 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
         return write_text(folder / INDEX, page(sweeps, sources))
 
 
-def _copied(run: Path, folder: Path, number: int) -> Shown:
+def _copied(run: Path, folder: Path, number: int) -> SweepSource:
     """Write rows and thumbnails of a sweep into the folder, and say where they are."""
     rows, pictures = f"rows-{number}.bin", f"pictures-{number}"
     write_bytes(folder / rows, read_columns(run).packed())
@@ -67,4 +67,4 @@ def _copied(run: Path, folder: Path, number: int) -> Shown:
         target = folder / pictures / source.parent.name / source.name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, target)
-    return Shown(run.name, rows, pictures=kept, folder=pictures)
+    return SweepSource(run.name, rows, pictures=kept, folder=pictures)

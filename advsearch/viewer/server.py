@@ -30,7 +30,7 @@ from advsearch.runs import listing, lock
 from advsearch.runs.directory import COLUMNS, HOME, REPORT, is_run
 from advsearch.viewer.columns import read_columns
 from advsearch.viewer.document import document
-from advsearch.viewer.sweep_page import Shown, page, result_of
+from advsearch.viewer.sweep_page import SweepSource, page, result_of
 from advsearch.viewer.thumbnails import kept_pictures, path_of
 
 LOOPBACK = "127.0.0.1"
@@ -296,9 +296,9 @@ _ROUTES: tuple[tuple[str, Answer], ...] = (
 )
 
 
-def _source(name: str, run: Path) -> Shown:
+def _source(name: str, run: Path) -> SweepSource:
     base = f"/runs/{quote(name, safe='')}"
-    return Shown(name, f"{base}/rows", parts=True, pictures=kept_pictures(run), folder=f"{base}/pictures")
+    return SweepSource(name, f"{base}/rows", parts=True, pictures=kept_pictures(run), folder=f"{base}/pictures")
 
 
 def list_page(runs: Mapping[str, Path]) -> str:

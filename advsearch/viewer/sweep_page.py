@@ -1,7 +1,7 @@
 """The page of one or several sweeps: still pictures and tables that need no script, and the explorer over them.
 
 The same page is a file that needs no other (`write_page`), a page of `advsearch dashboard`, and one of a folder that
-any web server serves: only where its rows and pictures come from differs (`Shown`).
+any web server serves: only where its rows and pictures come from differs (`SweepSource`).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ MOST_LISTED = 96
 
 
 @dataclass(frozen=True)
-class Shown:
+class SweepSource:
     """Where the page of a run gets what it shows.
 
     Attributes:
@@ -65,11 +65,11 @@ def write_page(run: Path, summary: SweepSummary) -> Path:
     """
     columns = read_columns(run)
     write_bytes(run / directory.COLUMNS, columns.packed(), durable=False)
-    source = Shown(run.name, columns if len(columns.step) <= MOST_ROWS else None, pictures=kept_pictures(run))
+    source = SweepSource(run.name, columns if len(columns.step) <= MOST_ROWS else None, pictures=kept_pictures(run))
     return write_text(run / directory.REPORT, page([(run, summary)], [source]), durable=False)
 
 
-def page(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[Shown]) -> str:
+def page(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[SweepSource]) -> str:
     """Return the page as HTML.
 
     Args:
@@ -97,7 +97,7 @@ def page(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[Sho
     )
 
 
-def _described(source: Shown, number: int) -> JsonObject:
+def _described(source: SweepSource, number: int) -> JsonObject:
     described: JsonObject = {"name": source.name, "parts": source.parts}
     described["embedded" if isinstance(source.rows, Columns) else "rows"] = (
         f"rows-{number}" if isinstance(source.rows, Columns) else source.rows
