@@ -294,7 +294,7 @@ def test_a_wrong_list_says_what_to_do(values: list[Any], message: str) -> None:
         ("model", InputError, r"`grid` model: several of them are given as a list: `model` a.pt2,b.pt2"),
         ("pose.rotation", InputError, r"`grid` pose.rotation: expected a parameter that is one number or name"),
         ("texture.texels", InputError, r"`grid` texture.texels: expected a parameter that is one number or name"),
-        ("light:9.power", InputError, r"expected a name of letters, digits and _ after the colon, got '9'"),
+        ("light:a b.power", InputError, r"expected a name of letters, digits, - and _ after the colon, got 'a b'"),
     ],
 )
 def test_a_wrong_name_of_an_axis_says_what_to_do(name: str, error: type[InputError], message: str) -> None:
