@@ -12,7 +12,15 @@ from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
-from advsearch.scene.description import ENVIRONMENT, NO_MAP, ORBIT_CAMERA, SceneDescription, check_meshes, describe
+from advsearch.scene.description import (
+    ENVIRONMENT,
+    NO_MAP,
+    ORBIT_CAMERA,
+    SceneDescription,
+    check_ground,
+    check_meshes,
+    describe,
+)
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.gradients.motion import Motion
 from advsearch.scene.leaving_out import EVERYTHING
@@ -67,10 +75,15 @@ class Scene:
         return make_renderer(description, space, resolution, denoise, seed, estimators, sampler=sampler)
 
     def lit_by(self, environment: EnvironmentAsset | None) -> Scene:
-        """Return the scene under another environment that was asked for; None for no map."""
+        """Return the scene under another environment that was asked for; None for no map.
+
+        Raises:
+            InputError: its ground shows a photograph, and there is none.
+        """
         name = NO_MAP if environment is None else environment.name
         own = self.description
         given = own.given | {ENVIRONMENT}
+        check_ground(own.given_values, name)
         return Scene(replace(own, environment=environment, environment_spec=name, given=given))
 
     def __repr__(self) -> str:

@@ -261,7 +261,7 @@ def describe(
         isinstance(part, PointLamp) or (isinstance(part, PluginPart) and part.shines) for part in around.surroundings
     )
     lit_by = environment_spec or (NO_MAP if any(shining) else DEFAULT_ENVIRONMENT)
-    _check_ground(given or {}, lit_by)
+    check_ground(given or {}, lit_by)
     if (node is not None or mitsuba) and not {"ground.size", "ground.kind"} & set(given or {}):
         values = {**values, "ground.size": 0.0}
     asked = () if environment_spec is None else (ENVIRONMENT,)
@@ -295,8 +295,12 @@ def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
             raise UnknownNameError("mesh around the object", mesh, scene.around, f"It stands in `set` {name}.")
 
 
-def _check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -> None:
-    """Refuse what contradicts a ground that shows the environment's photograph."""
+def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -> None:
+    """Refuse what contradicts a ground that shows the environment's photograph.
+
+    Raises:
+        InputError: there is no photograph, or a table is described beside it.
+    """
     if given.get("ground.kind") != settings.PHOTOGRAPH:
         return
     if lit_by == NO_MAP:

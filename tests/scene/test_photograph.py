@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import advsearch
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import EnvironmentAsset
@@ -140,3 +141,8 @@ def test_what_contradicts_it_is_explained() -> None:
         describe("mug", room(), given={"ground.kind": "photograph", "ground.red": 0.5})
     with pytest.raises(UnknownNameError, match=r"unknown ground.kind 'tabel'. Did you mean 'table'"):
         describe("mug", given={"ground.kind": "tabel"})
+
+
+def test_a_sweep_refuses_a_photograph_where_there_is_none() -> None:
+    with pytest.raises(InputError, match=r"ground\.kind=photograph.*no environment map"):
+        advsearch.sweep("mug", environment="studio,none", set={"ground.kind": "photograph"}, trials=0)
