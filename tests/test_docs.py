@@ -54,6 +54,7 @@ from advsearch.config import (
     StabilityConfig,
     SweepConfig,
 )
+from advsearch.config.attack import FEWEST_TRIALS
 from advsearch.controls import CONTROLS, texture
 from advsearch.engine import stages
 from advsearch.engine.loading import as_controls
@@ -282,7 +283,10 @@ MADE_BY_HAND = [
     ("questions.md", f"**Verified** by {TRIALS} fresh renders"),
     ("questions.md", f"until they are within {100 * (smallest.RATIO - 1):.0f} % of each other"),
     ("questions.md", {12: "or twelve searches are done"}[smallest.ROUNDS]),
-    ("questions.md", f"What counts on the way is {TRIALS} trials"),
+    (
+        "questions.md",
+        f"What counts on the way is {FEWEST_TRIALS} trials without a failure, or, after one, {TRIALS} in all",
+    ),
     ("questions.md", f"**Verified** on {TRIALS_OVER} conditions"),
     ("questions.md", f"needs {verification.PASS_PERCENT_OVER} % of those that count"),
     ("questions.md", {8: "in one to eight parameters"}[mapping.MOST]),

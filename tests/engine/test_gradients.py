@@ -528,7 +528,7 @@ def test_naming_one_parameter_searches_only_that() -> None:
         (["pose.yaw", "pose.x"], ["pose.yaw", "pose.x"]),
         ({"pose": {"yaw": 30}}, ["pose.pitch", "pose.roll", "pose.x", "pose.y", "pose.scale"]),
         ({"far": {"kind": "pose", "yaw": [0, 90]}}, ["far.yaw"]),
-        (["pose:near"], [f"near.{name}" for name in ("yaw", "pitch", "roll", "x", "y", "scale")]),
+        (["light:near.power"], ["near.power"]),
     ):
         render = scene.renderer(asked, resolution=16)
         assert [one.name for one in render.plan.groups] == names

@@ -801,7 +801,10 @@ BAD: dict[str, tuple[Callable[[Path], Path], str]] = {
     "missing": (lambda folder: folder / "no.obj", r"no\.obj: no such object file\. Check the path"),
     "missing folder": (lambda f: f / "no" / "no.obj", r"no such object file\. The folder .*no does not exist either\."),
     "empty": (raw("thing.ply", b""), r"thing\.ply: the object file is empty; export or download it again"),
-    "ending": (raw("thing.fbx", b"x"), r"ending in \.obj, \.ply, \.glb, \.gltf, \.stl, got '\.fbx'; convert it"),
+    "ending": (
+        raw("thing.fbx", b"x"),
+        r"ending in \.obj, \.ply, \.glb, \.gltf, \.stl, \.blend, got '\.fbx'; convert it",
+    ),
     "no ending": (raw("thing", b"x"), r"got a name without ending; convert it to one of these"),
     "png as obj": (raw("thing.obj", png()), r"expected a Wavefront OBJ file .*, got a PNG picture; export or download"),
     "png as ply": (raw("thing.ply", png()), r"expected a PLY file with a complete header, got a PNG picture"),
