@@ -36,6 +36,7 @@ from advsearch.engine.memory import Memory
 from advsearch.engine.naming import AnyModel, load_models, model_name, scene_settings, several
 from advsearch.engine.objective import Wanted, objective_for, task_for
 from advsearch.engine.outcome import AttackResult, Question, summarise
+from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.run_settings import RunSettings
@@ -306,6 +307,9 @@ def _problem(job: _Job) -> Problem:
     objective, note = objective_for(job.objective, task, model, renderer, features_seed, config.ensemble)
     if note:
         job.loaded[1].append(note)
+    if config.printable:
+        searched = make_space(job.controls, description)
+        print_terms(searched, searched.start)  # refuses where nothing can be printed
     return Problem(
         renderer,
         space,
@@ -317,6 +321,7 @@ def _problem(job: _Job) -> Problem:
         config.seed,
         searched=len(job.controls),
         draws=config.draws if job.over else 1,
+        printable=config.printable,
     )
 
 

@@ -87,6 +87,7 @@ class AttackKeywords(SearchKeywords, total=False):
     """Of `attack`."""
 
     smallest: bool
+    printable: bool
     ensemble: Literal["mean", "worst"] | None
     overwrite: bool
 

@@ -57,6 +57,7 @@ class AttackConfig(DerivativeConfig):
             "takes several searches; give `steps` for each, and leave `seconds` out",
         ),
         Clash("smallest", lambda one: one.over, "cannot be combined with `over` yet; leave one of them out"),
+        Clash("smallest", lambda one: one.printable, "cannot be combined with `printable`; leave one of them out"),
         Clash("minimise", lambda one: one.is_curve, "has no robust accuracy; name one `object` and one `epsilon`"),
         Clash("minimise", lambda one: one.target, "makes the right answer easier to give; leave `target` out"),
         Clash("minimise", lambda one: one.smallest, "has no smallest change; leave `smallest` out"),
@@ -143,6 +144,9 @@ class AttackConfig(DerivativeConfig):
     )
     minimise: bool = setting(False, "search", "make the object easier to recognise, not harder")
     smallest: bool = setting(False, "search", "find the smallest epsilon at which the model is wrong, up to --epsilon")
+    printable: bool = setting(
+        False, "search", "prefer a texture or a patch that is smooth and of printable colours, at a cost in margin"
+    )
     over: ControlsByName = setting_as_in(
         SceneConfig,
         "controls",

@@ -130,6 +130,11 @@ class BoundControl(ABC):
         """Return pictures worth keeping, by file stem: (h, w, 3) display-referred sRGB in [0, 1]; see `describe`."""
         return {}
 
+    def printed(self, u: Tensor) -> Tensor | None:
+        """Return the searched colours that a printer would print, (h, w, 3) display-referred sRGB in [0, 1], as a
+        differentiable function of u; None without."""
+        return None
+
     def files(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, bytes]:
         """Return other files worth keeping, by name with ending: a mesh as PLY, say; see `describe`."""
         return {}

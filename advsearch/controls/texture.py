@@ -280,6 +280,9 @@ class BoundTexture(BoundControl):
             f"{self.name}.rms": {"value": float(change.pow(2).mean().sqrt()), "unit": "sRGB"},
         }
 
+    def printed(self, u: Tensor) -> Tensor | None:
+        return self._painter.texels(u)
+
     def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         return {self.name: self._painter.texels(u.detach()), f"{self.name}-original": self._original}
 

@@ -16,6 +16,7 @@ from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.smallest import Bracket
 from advsearch.engine.pictures import write_artifacts, write_pictures
+from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.rows import verified_rate
@@ -41,6 +42,7 @@ from advsearch.runs.results.attack import (
     NotFinite,
     PathSegments,
     PredictionError,
+    Printability,
     SearchClaim,
     SearchGradients,
     SmallestEpsilon,
@@ -241,6 +243,7 @@ def _summary(
         policy_verified=_verified(findings.beaten),
         average=_average(findings) if findings.average else None,
         smallest=None if findings.smallest is None else _smallest(findings.smallest, problem),
+        printability=_printability(problem, findings),
         distribution=_distribution(search.distribution, problem) if search and search.distribution else None,
         transport=_transport(findings),
         sample_count=None if count is None else VerificationSamples(spp=count.spp, converged=count.converged),
@@ -262,6 +265,15 @@ def _summary(
         seed=problem.seed,
         command_line=asked.command_line,
     )
+
+
+def _printability(problem: Problem, findings: Findings) -> Printability | None:
+    """The terms of the clean scene and of the answer; None where no search was about them."""
+    if not problem.printable:
+        return None
+    space, domain, search = problem.searched_space, problem.domain, findings.search
+    answer = None if search is None else print_terms(space, domain.project(search.best_u))
+    return Printability(clean=print_terms(space, domain.start), answer=answer)
 
 
 def _alone(values: dict[str, T]) -> T | dict[str, T]:

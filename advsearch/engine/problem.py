@@ -60,6 +60,7 @@ class Problem:
         draws: conditions that one evaluation looks at, where there are any; the objective is their mean.
         search_depth: longest light path in segments of a search's renders; None for the scene's. Verification always
             renders the scene's.
+        printable: whether searches prefer colours that can be printed; see `print_terms`.
         domain: where a search may look: the searched controls.
         conditions: where the others are drawn from; None where there are none.
     """
@@ -75,6 +76,7 @@ class Problem:
     searched: int | None = None
     draws: int = 1
     search_depth: int | None = None
+    printable: bool = False
     domain: Domain = field(init=False)
     conditions: Domain | None = field(init=False)
 

@@ -24,7 +24,8 @@ from advsearch.attacks import (
 from advsearch.engine.bank import Bank
 from advsearch.engine.budget import RenderBudget
 from advsearch.engine.memory import TRANSPORT, Frames, Memory
-from advsearch.engine.problem import Problem
+from advsearch.engine.print_terms import less_print_terms
+from advsearch.engine.problem import OnImage, Problem
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.transport import Transport, reason_against
 from advsearch.report.wording import count
@@ -137,9 +138,14 @@ class Searches:
     def _evaluator(self, kind: str, frames: Frames | None) -> Evaluate:
         """What the evaluations of a search come from: rendered, or predicted; what is stored is read back."""
         transport = self.findings.transport
+
+        def make(tell: OnImage | None) -> Evaluate:
+            made = (self.problem if transport is None else transport).evaluator(kind, tell)
+            return less_print_terms(made, self.problem.searched_space) if self.problem.printable else made
+
         if transport is None:
-            return self.memory.evaluator(kind, lambda tell: self.problem.evaluator(kind, tell), frames)
-        return self.memory.evaluator(kind, lambda tell: transport.evaluator(kind, tell), frames, transport.passed)
+            return self.memory.evaluator(kind, make, frames)
+        return self.memory.evaluator(kind, make, frames, transport.passed)
 
     def begin(self, name: str, title: str, steps: int, shorter: str) -> None:
         """Begin the stage of a search of at most so many steps, and its ranking."""

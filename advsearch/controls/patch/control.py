@@ -334,6 +334,9 @@ class BoundPatch(BoundControl):
             said.update(self._numbers.describe(u[self._searched :]))
         return said
 
+    def printed(self, u: Tensor) -> Tensor | None:
+        return self.pixels(u) if self._searched else None
+
     def artifacts(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         pixels = self.pixels(u.detach())
         return {self.name: enlarged(pixels, -(-PRINT_SIDE // len(pixels))), f"{self.name}-pixels": pixels}

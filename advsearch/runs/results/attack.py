@@ -168,6 +168,20 @@ class LinearTransport(Fields):
     error: PredictionError | None = Field(default=None, description="of the last comparison")
 
 
+class PrintTerms(Fields):
+    """How far colours are from what can be printed, without weights, summed over textures and patches."""
+
+    variation: float = Field(description="mean length of the step from a pixel to its neighbours, in sRGB")
+    off_print: float = Field(description="mean distance in sRGB from the nearest printable colour")
+
+
+class Printability(Fields):
+    """What `printable` was about; the same attack without it tells what it cost in margin."""
+
+    clean: PrintTerms = Field(description="of the clean scene")
+    answer: PrintTerms | None = Field(description="of the answer; null if nothing was searched")
+
+
 class AttackSummary(SceneResult):
     """The worst configuration of a scene that was found, how sure that is, and what it cost."""
 
@@ -192,6 +206,7 @@ class AttackSummary(SceneResult):
     policy_verified: VerifiedRate | None = Field(default=None, description="of the policy's own answer then")
     average: AverageCase | None = Field(default=None, description="only with `average`")
     smallest: SmallestEpsilon | None = Field(default=None, description="only with `smallest`")
+    printability: Printability | None = Field(default=None, description="only with `printable`")
     distribution: AnswerDistribution | None = Field(default=None, description="of a policy that answers with one")
     sample_count: VerificationSamples | None = Field(default=None, description="of the verification")
     transport: LinearTransport | None = Field(

@@ -1,0 +1,80 @@
+"""What `printable` takes from the objective of a search: how rough the colours to be printed are, and how far from ink.
+
+Sharif et al. 2016, *Accessorize to a Crime*, sections 5.2.2 (total variation) and 5.2.3 (the non-printability score).
+Theirs are sums over pixels; these are means, so that a weight means the same at every resolution. Their score is a
+product of distances to all printable colours; here it is the distance to the nearest, which is zero at the same
+colours. Both depend on u alone, so that they hold for rendered and for predicted pictures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advsearch.attacks import Evaluate, Evaluation
+from advsearch.attacks.evaluation import Wanted
+from advsearch.controls import Space
+from advsearch.errors import InputError
+from advsearch.runs.results.attack import PrintTerms
+
+LOW, HIGH, STEP = 0.1, 0.9, 0.2
+"""The printable colours: all 125 of which each channel is 0.1, 0.3, 0.5, 0.7 or 0.9 in sRGB. No printer was measured:
+that ink on paper reaches neither the black, nor the white, nor the pure colours of a screen is all that they say."""
+WEIGHT = 10.0
+"""Of either term, in the objective's unit (logits for a margin) per unit of sRGB."""
+
+
+def variation(colors: Tensor) -> Tensor:
+    """Return the mean length of the step from a pixel (h, w, 3) to its right and lower neighbours, by channel."""
+    padded = F.pad(colors.permute(2, 0, 1)[None], (0, 1, 0, 1), mode="replicate")[0]
+    here = padded[:, :-1, :-1]
+    steps = torch.stack([padded[:, :-1, 1:] - here, padded[:, 1:, :-1] - here])
+    length: Tensor = torch.linalg.vector_norm(steps, dim=0).mean()
+    return length
+
+
+def off_print(colors: Tensor) -> Tensor:
+    """Return the mean Euclidean distance in sRGB of pixels (h, w, 3) from the nearest printable colour."""
+    nearest = (LOW + STEP * ((colors.detach() - LOW) / STEP).round()).clamp(LOW, HIGH)
+    distance: Tensor = torch.linalg.vector_norm(colors - nearest, dim=2).mean()
+    return distance
+
+
+def _terms(space: Space, u: Tensor) -> tuple[Tensor, Tensor]:
+    """Both terms, summed over what is to be printed."""
+    found = [colors for control, part in space.slices(u) if (colors := control.printed(part)) is not None]
+    if not found:
+        raise InputError(
+            "printable: expected a search over the colours of a texture or a patch, got "
+            f"{', '.join(control.name for control in space.controls)}; add `texture` or `patch`, or leave it out"
+        )
+    return torch.stack([variation(one) for one in found]).sum(), torch.stack([off_print(one) for one in found]).sum()
+
+
+def print_terms(space: Space, u: Tensor) -> PrintTerms:
+    """Return both terms of a configuration (d,), without their weight.
+
+    Raises:
+        InputError: nothing that can be printed is searched.
+    """
+    with torch.no_grad():
+        rough, off = _terms(space, u)
+    return PrintTerms(variation=float(rough), off_print=float(off))
+
+
+def less_print_terms(evaluate: Evaluate, space: Space) -> Evaluate:
+    """Return the evaluation whose objective is less by both weighted terms, and its derivative by theirs."""
+
+    def evaluated(u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
+        found = evaluate(u, index=index, gradient=gradient, samples=samples)
+        at = u.detach().clone().requires_grad_()
+        with torch.enable_grad():
+            penalty = WEIGHT * torch.stack(_terms(space, at)).sum()
+            (slope,) = torch.autograd.grad(penalty, at)
+        derivative = None if found.gradient is None else found.gradient - slope
+        return replace(found, objective=found.objective - float(penalty.detach()), gradient=derivative)
+
+    return evaluated
