@@ -53,6 +53,7 @@ class StandInProblem:
     rule: Rule = WORST_CASE
     spp: int = 4
     search_depth: int | None = None
+    printable: bool = False
     seed: int = 3
     draws: int = 1
     plan: StandInPlan = StandInPlan()
