@@ -9,6 +9,7 @@ import numpy as np
 import OpenEXR
 
 from advsearch.config import AttackConfig
+from advsearch.runs.answer import write_answer
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.gap import CurveResult, GapResult
@@ -148,4 +149,12 @@ def make_run(path: Path, summary: AttackSummary = SUMMARY, *, pictures: bool = T
         for step in range(40) if rows else ():
             run.record(Row("search", step, objective=step / 10 - 2), Row("baseline", step, objective=-2.0 - step / 100))
         run.write_summary(summary)
+    return path
+
+
+def make_answered(path: Path, config: AttackConfig, u: np.ndarray) -> Path:
+    """Return the directory of an attack that nobody has made, with a configuration (d,) as its answer."""
+    with RunDirectory.create_for(config.model_copy(update={"run": str(path)})) as run:
+        run.write_summary(attack(run=str(path), object=config.object, controls=list(config.controls)))
+    write_answer(path, np.asarray(u, dtype=np.float32))
     return path

@@ -419,7 +419,7 @@ def check_advsearch(words: list[str], folder: Path) -> None:
         recipe.write_text("object: mug\n", encoding="utf-8")
         check_names(AttackConfig.from_yaml(recipe, dict(parse_assignment(text, text) for text in args.change)))
     if args.command == "export":
-        assert args.format in (None, "print", "3db", *export.FORMATS)
+        assert args.format in (None, "print", "3db", "mitsuba", *export.FORMATS)
 
 
 def check_other(words: list[str]) -> None:

@@ -6,6 +6,7 @@ import argparse
 import io
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,23 @@ from advsearch.cli import output
 from advsearch.cli.screen import output_errors
 from advsearch.errors import InputError
 
-HELP = "write a run's evaluated configurations as a table (CSV, JSON or Parquet), or its texture or patch for printing"
+Written = tuple[dict[str, Any], str]
+"""What to tell of a file, as JSON and in words."""
+
+SUFFIXES = {"pdf": "print", "xml": "mitsuba"}
+"""Formats that are not called as their files end."""
+
+HELP = (
+    "write a run's evaluated configurations as a table (CSV, JSON or Parquet), its texture or patch for printing, or "
+    "its scene for Mitsuba"
+)
 
 _EXAMPLES = """examples:
   advsearch export mug-texture-001
   advsearch export runs/mug-texture-001 --kind search --out search.parquet
   advsearch export mug-sweep-001 --format 3db --out folder
   advsearch export mug-patch-001 --format print --size 95 --out sheets.pdf
+  advsearch export mug-texture-001 --format mitsuba --out folder
 """
 
 
@@ -34,7 +45,8 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         allow_abbrev=False,
     )
     parser.add_argument("run", metavar="RUN", help="a run's name or folder")
-    parser.add_argument("--format", help="csv, json, parquet, 3db or print (default: by the name of --out, or csv)")
+    names = ", ".join([*WRITERS, "csv", "json", "parquet"])
+    parser.add_argument("--format", help=f"{names} (default: by the name of --out, or csv)")
     parser.add_argument("--out", metavar="FILE", help="the file to write (default: standard output)")
     parser.add_argument(
         "--json", action="store_true", help="the same as --format json; with --out, tell what was written"
@@ -46,20 +58,34 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the table."""
+    """Write what was asked for."""
+    out = None if args.out is None else Path(args.out)
+    by_name = "" if out is None else out.suffix.removeprefix(".").lower()
+    format = args.format or SUFFIXES.get(by_name, by_name)
+    for name in ("size", "paper", "icc"):
+        if format != "print" and getattr(args, name) is not None:
+            raise InputError(f"--{name}: belongs to --format print; leave it out")
+    if format not in WRITERS:
+        return _table(args, out, by_name)
+    expected, write = WRITERS[format]
+    if out is None:
+        raise InputError(f"--out: {format} writes {expected}; give its name")
+    if args.kind is not None and format != "3db":
+        raise InputError("--kind: belongs to tables of rows; leave it out")
+    told, text = write(args, out)
+    if args.json:
+        output.print_json({"schema": 1, "command": "export", "format": format, **told, "out": str(out)})
+    else:
+        print(text, file=sys.stderr)
+    return 0
+
+
+def _table(args: argparse.Namespace, out: Path | None, by_name: str) -> int:
+    """Write the rows."""
     from advsearch.runs.directory import PARTS, find_run
     from advsearch.runs.export import FORMATS, export
     from advsearch.runs.store import NAME, Store
 
-    out = None if args.out is None else Path(args.out)
-    if args.format == "print" or (args.format is None and out is not None and out.suffix.lower() == ".pdf"):
-        return _print(args, out)
-    for name in ("size", "paper", "icc"):
-        if getattr(args, name) is not None:
-            raise InputError(f"--{name}: belongs to --format print; leave it out")
-    if args.format == "3db":
-        return _threedb(args, out)
-    by_name = "" if out is None else out.suffix.removeprefix(".").lower()
     otherwise = by_name if by_name in FORMATS else "json" if args.json and out is None else "csv"
     format = args.format or otherwise
     if args.json and out is None and format != "json":
@@ -82,37 +108,27 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _threedb(args: argparse.Namespace, out: Path | None) -> int:
+def _threedb(args: argparse.Namespace, out: Path) -> Written:
     """Write a folder as 3DB does."""
     from advsearch.runs.directory import find_run
     from advsearch.runs.store import NAME, Store
     from advsearch.runs.threedb import write_threedb
     from advsearch.viewer.thumbnails import kept_pictures
 
-    if out is None:
-        raise InputError("--out: 3db writes a folder; give its name")
     folder = find_run(args.run)
     kept = kept_pictures(folder)
     with Store(folder / NAME, read_only=True) as store:
         picture = kept.png_of if kept else lambda _: None
         count = write_threedb(lambda: store.rows(args.kind or "sweep"), out, picture)
-    if args.json:
-        output.print_json({"schema": 1, "command": "export", "rows": count, "format": "3db", "out": str(out)})
-    else:
-        print(f"{count} rows in {out}; look at them with: python -m threedboard {out}", file=sys.stderr)
-    return 0
+    return {"rows": count}, f"{count} rows in {out}; look at them with: python -m threedboard {out}"
 
 
-def _print(args: argparse.Namespace, out: Path | None) -> int:
+def _print(args: argparse.Namespace, out: Path) -> Written:
     """Write the sheets."""
     from advsearch.cli.progress import at_work
 
-    if out is None:
-        raise InputError("--out: print writes a PDF file; give its name")
     if args.size is None:
         raise InputError("--size: how large is the real object? Give its longest side in millimetres: --size 95")
-    if args.kind is not None:
-        raise InputError("--kind: belongs to tables of rows; leave it out")
     with at_work(as_json=True, quiet=False):
         from advsearch.engine.printing import printable
         from advsearch.report.sheets import write_sheets
@@ -124,10 +140,24 @@ def _print(args: argparse.Namespace, out: Path | None) -> int:
         with placed_by("out"), replacing(out) as part:
             pages = write_sheets(part, pieces, title, paper=(args.paper or "a4").lower(), profile=profile)
     sizes = [{"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]} for piece in pieces]
-    if args.json:
-        output.print_json(
-            {"schema": 1, "command": "export", "format": "print", "pages": pages, "pieces": sizes, "out": str(out)}
-        )
-    else:
-        print(f"{pages} pages in {out}; print them at 100 % and measure the square on the first", file=sys.stderr)
-    return 0
+    text = f"{pages} pages in {out}; print them at 100 % and measure the square on the first"
+    return {"pages": pages, "pieces": sizes}, text
+
+
+def _mitsuba(args: argparse.Namespace, out: Path) -> Written:
+    """Write the adversarial scene."""
+    from advsearch.cli.progress import at_work
+
+    with at_work(as_json=True, quiet=False):
+        from advsearch.api.export_scene import write_mitsuba
+
+        notes = write_mitsuba(args.run, out)
+    return {"notes": notes}, " ".join([f"The scene is in {out}.", *notes])
+
+
+WRITERS: dict[str, tuple[str, Callable[[argparse.Namespace, Path], Written]]] = {
+    "3db": ("a folder", _threedb),
+    "print": ("a PDF file", _print),
+    "mitsuba": ("an XML file and what belongs to it, or a new folder for them", _mitsuba),
+}
+"""What is no table, by the word of `--format`: what is written, and how."""

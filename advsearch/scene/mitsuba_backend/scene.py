@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -167,6 +168,28 @@ class MitsubaScene:
         self._apply(inputs)
         both = self._render("guides", seed, spp)[..., -6:]
         return both[..., :3].clamp(0.0, 1.0), both[..., 3:6]
+
+    def write(self, inputs: Mapping[str, Tensor], path: Path, note: str) -> None:
+        """Write the scene with these inputs as XML that stock Mitsuba loads, with meshes and pictures beside it.
+
+        Args:
+            inputs: as in `radiance`.
+            path: of the XML file, in a folder that is there.
+            note: for a comment at the beginning.
+
+        Raises:
+            InputError: something in it is no part of stock Mitsuba.
+        """
+        from advsearch.scene.mitsuba_backend.files.writing import described, write_xml
+
+        self._apply(inputs)
+        description, filter = self._made
+        kind = "volpath" if self.volumetric else "path"
+        integrator = {"type": kind, "max_depth": self.max_depth, "rr_depth": NO_ROULETTE}
+        base = scene_dict(description, self.resolution, filter, self.sampler)
+        plugins = described(base, description, inputs, integrator)
+        meshes = {shape.id(): shape for shape in self._scene.shapes() if shape.is_mesh()}
+        write_xml(path, plugins, {name: one for name, one in meshes.items() if name in plugins}, note)
 
     def surfaces(self, inputs: Mapping[str, Tensor]) -> Surfaces:
         """Return what the camera sees first through the middle of each pixel."""

@@ -53,6 +53,8 @@ def mesh_of(shape: Mapping[str, object], name: str) -> ImportedPart:
     else:
         part, own = _solid(kind, shape)
         matrix = matrix @ own
+    if part.uvs is not None and not shape.get("flip_tex_coords", kind == "obj"):
+        part = replace(part, uvs=part.uvs * (1.0, -1.0) + (0.0, 1.0))  # Mitsuba has row 0 of a picture at v = 0
     vertices = part.vertices @ matrix[:3, :3].T + matrix[:3, 3]
     mirrored = (np.linalg.det(matrix[:3, :3]) < 0.0) != bool(shape.get("flip_normals"))
     normals = part.normals

@@ -1,0 +1,118 @@
+"""The adversarial scene of a run, for other programs."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+import advsearch
+from advsearch.api.attack import problem_from_config
+from advsearch.config import AttackConfig
+from advsearch.engine.problem import Problem
+from advsearch.errors import InputError
+from advsearch.runs.answer import read_answer
+from advsearch.runs.directory import CONFIG, find_run
+from advsearch.runs.files import placed_by, storage_errors, write_text
+from advsearch.runs.summary import attack_of
+from advsearch.scene.assembly import ON_PICTURE
+from advsearch.scene.mitsuba_backend.files.writing import NAME
+
+XML = ".xml"
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """The answer of a run.
+
+    Attributes:
+        folder: of the run.
+        problem: as the run had it.
+        u: (d,) the configuration of the whole space; what varies by chance is as in the clean scene.
+    """
+
+    folder: Path
+    problem: Problem
+    u: Tensor
+
+    @property
+    def on_picture(self) -> list[str]:
+        """The controls that change the finished picture there."""
+        grey = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
+        slices = self.problem.space.slices(self.u)
+        return [control.name for control, part in slices if not torch.equal(control.picture(part, grey), grey)]
+
+
+def answer_of(run: str | Path) -> Answer:
+    """Load a run's scene and its answer.
+
+    Args:
+        run: name or folder of a run of `attack` that has ended.
+
+    Raises:
+        InputError: the run has no answer, or its scene is another one now.
+        FileFormatError: the run did not end, or is of another command.
+    """
+    folder = find_run(run)
+    summary = attack_of(folder)
+    if summary.adversarial is None:
+        raise InputError(f"{folder}: ended with {summary.ending!r}, so that there is no answer to export")
+    problem, _ = problem_from_config(AttackConfig.from_yaml(folder / CONFIG))
+    u = torch.from_numpy(read_answer(folder))
+    if u.shape != problem.domain.start.shape:
+        raise InputError(f"{folder}: the object or advsearch has changed since this run; do the run again")
+    return Answer(folder, problem, problem.whole(u))
+
+
+def write_mitsuba(run: str | Path, out: Path) -> list[str]:
+    """Write the scene of a run's answer as XML with its meshes and pictures beside it.
+
+    Args:
+        run: name or folder of a run of `attack` that has ended.
+        out: a file that ends in .xml, or a folder for `scene.xml`; what is beside it has names that begin with its own.
+
+    Returns:
+        Sentences about how its picture becomes that of the run, and what is no part of it.
+
+    Raises:
+        InputError: the run has no answer, files of these names are there, or stock Mitsuba has no such scene.
+        FileFormatError: the run did not end, or is of another command.
+    """
+    path = out if out.suffix.lower() == XML else out / NAME
+    taken = [path, *path.parent.glob(f"{path.stem}-*")] if path.parent.is_dir() else []
+    there = [one for one in taken if one.exists()]
+    if there or path.parent.is_file():
+        raise InputError(f"out: {(there or [path.parent])[0]} is there already; choose another name")
+    answer = answer_of(run)
+    renderer = answer.problem.renderer
+    inputs = renderer.scene.assembly(renderer.space.inputs(answer.u))
+    on_picture = {name: inputs.pop(name) for name in ON_PICTURE if name in inputs}
+    if "backdrop.color" in on_picture:
+        raise InputError(f"{answer.folder}: a plain background is no part of a Mitsuba scene; export a run without it")
+    gain = renderer.formation.gain
+    if "camera.exposure" in on_picture:
+        gain *= float(torch.exp2(on_picture["camera.exposure"]))
+    height, width = renderer.formation.resolution
+    notes = [
+        f"The sensor has {width} x {height} pixels, and light paths have at most {renderer.scene.max_depth} segments.",
+        f"The run's picture is the sRGB curve of {gain:.9g} times this radiance, cut off at 1.",
+    ]
+    if renderer.formation.denoiser != "none":
+        notes.append("Not in it: the denoiser. Take many samples a pixel.")
+    if answer.on_picture:
+        notes.append(f"Not in it: what {', '.join(answer.on_picture)} did to the finished picture.")
+    if answer.problem.conditions is not None:
+        notes.append("What varied by chance in the run is as in the clean scene.")
+    with placed_by("out"), storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as made:
+            renderer.scene.write(inputs, Path(made) / path.name, " ".join(notes))
+            for one in sorted(Path(made).iterdir()):
+                os.replace(one, path.parent / one.name)
+        text = f"The answer of {answer.folder.name} as a scene for Mitsuba 3 (advsearch {advsearch.__version__}).\n"
+        write_text(path.with_name(f"{path.stem}-README.txt"), "\n".join([text, *notes, ""]), durable=False)
+    return notes

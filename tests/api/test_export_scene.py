@@ -1,0 +1,69 @@
+"""Answers out again: stock Mitsuba renders the adversarial scene of a run as the run did, and so does reading it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from samples import make_answered
+
+import advsearch
+from advsearch.api.export_scene import answer_of
+from advsearch.cli.main import main
+from advsearch.config import AttackConfig
+from advsearch.scene.color import linear_to_srgb
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.mitsuba_backend.variant import mitsuba
+
+CONTROLS = {"texture": {"resolution": 64}, "pose": {}, "light": {}, "camera": {}, "lens": {}}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run over a mug that has been turned, painted and lit anew, before a camera elsewhere."""
+    config = AttackConfig(object="mug", controls=CONTROLS, resolution=32)
+    size = advsearch.load_scene("mug").renderer(CONTROLS, resolution=32).start.numel()
+    u = torch.rand(size, generator=torch.Generator().manual_seed(4))
+    return make_answered(tmp_path_factory.mktemp("runs") / "mug-all-001", config, u.numpy())
+
+
+def test_stock_mitsuba_renders_the_adversarial_scene(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["export", str(run), "--out", str(tmp_path / "scene.xml")]
+    assert main([*command, "--json"]) == 0
+    notes = json.loads(capsys.readouterr().out)["notes"]
+    readme = (tmp_path / "scene-README.txt").read_text("utf-8")
+    assert all(note in readme for note in notes)
+    assert "32 x 32" in notes[0] and "denoiser" in notes[2] and "lens" in notes[3]
+    assert main(command) == 2
+    assert "is there already" in capsys.readouterr().err
+
+    answer = answer_of(run)
+    renderer = answer.problem.renderer.like(denoiser="none")
+    ours, again = (renderer.radiance(answer.u, seed, 128).numpy() for seed in (0, 1))
+    mi = mitsuba()
+    theirs = np.array(mi.render(mi.load_file(str(tmp_path / "scene.xml")), seed=2, spp=128))
+    back = advsearch.load_scene(f"{tmp_path}/scene.xml#object").description
+    read = MitsubaScene(back, (32, 32)).radiance({}, 3, 128).numpy()
+    noise = float(np.abs(ours - again).mean())
+    assert np.abs(ours - renderer.radiance(renderer.start, 0, 128).numpy()).mean() > 5 * noise
+    gain = float(notes[1].partition("curve of ")[2].partition(" ")[0])
+    for other in (theirs, read):
+        assert np.abs(ours - other).mean() < 1.2 * noise
+        assert other.mean() == pytest.approx(ours.mean(), rel=0.01)
+        one, two, shown = (linear_to_srgb(np.float32(np.clip(gain * found, 0, 1))) for found in (ours, again, other))
+        assert np.abs(one - shown).mean() < 1.2 * np.abs(one - two).mean()
+        np.testing.assert_allclose(one, renderer.formation.display(torch.from_numpy(ours)).numpy(), atol=1e-5)
+
+
+@pytest.mark.parametrize(("given", "message"), [([], "give its name"), (["--kind", "search"], "tables of rows")])
+def test_what_is_missing_is_said(
+    run: Path, tmp_path: Path, given: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = ["--out", str(tmp_path / "new")] if given else []
+    assert main(["export", str(run), "--format", "mitsuba", *out, *given]) == 2
+    assert message in capsys.readouterr().err

@@ -1,0 +1,82 @@
+"""Scenes as Mitsuba's XML: what is written is what is read, and a picture on a shape is where Mitsuba has it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import advsearch
+from advsearch.scene.mitsuba_backend.files.writing import write_xml
+from advsearch.scene.mitsuba_backend.files.xml import read_scene
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.mitsuba_backend.variant import mitsuba
+
+
+def test_a_dictionary_written_and_read_is_the_same(tmp_path: Path) -> None:
+    mi = mitsuba()
+    matrix = np.array([[0.1, 0, 0, 1 / 3], [0, 2, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    scene = {
+        "type": "scene",
+        "lamp": {"type": "point", "position": [0.1, 2.0, 1e-7], "intensity": {"type": "rgb", "value": [1.0, 0.3, 0.0]}},
+        "ball": {
+            "type": "sphere",
+            "to_world": mi.ScalarTransform4f(matrix),
+            "flip_normals": True,
+            "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}},
+        },
+    }
+    write_xml(tmp_path / "two.xml", scene, {}, "a -- note")
+    read = read_scene(tmp_path / "two.xml")
+    assert read["lamp"] == scene["lamp"]
+    ball = read["ball"]
+    np.testing.assert_array_equal(ball.pop("to_world"), np.array(mi.ScalarTransform4f(matrix).matrix))
+    assert ball == {"type": "sphere", "flip_normals": True, "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}
+
+
+SQUARE = """v -1 -1 0
+v 1 -1 0
+v 1 1 0
+v -1 1 0
+vt 0 0
+vt 1 0
+vt 1 1
+vt 0 1
+f 1/1 2/2 3/3
+f 1/1 3/3 4/4
+"""
+
+
+@pytest.mark.parametrize("kind", ["rectangle", "obj", "ply", "obj as it is", "ply turned"])
+def test_a_picture_on_a_shape_is_where_mitsuba_has_it(tmp_path: Path, kind: str) -> None:
+    mi = mitsuba()
+    (tmp_path / "square.obj").write_text(SQUARE)
+    mi.load_dict({"type": "obj", "filename": str(tmp_path / "square.obj")}).write_ply(str(tmp_path / "square.ply"))
+    colors = np.linspace(0.1, 0.9, 16 * 8 * 3, dtype=np.float32).reshape(16, 8, 3)
+    mi.Bitmap(colors).write(str(tmp_path / "colors.exr"))
+    picture = {"type": "bitmap", "filename": str(tmp_path / "colors.exr"), "raw": True}
+    surface = {"type": "diffuse", "reflectance": picture}
+    shape: dict[str, Any] = {"type": kind.partition(" ")[0], "bsdf": {"type": "twosided", "bsdf": surface}}
+    if kind != "rectangle":
+        shape["filename"] = str(tmp_path / f"square.{shape['type']}")
+    if " " in kind:
+        shape["flip_tex_coords"] = kind == "ply turned"
+    scene = {
+        "type": "scene",
+        "paths": {"type": "path", "max_depth": 2},
+        "front": {
+            "type": "perspective",
+            "fov": 30.0,
+            "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
+            "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}},
+        },
+        "light": {"type": "constant"},
+        "square": shape,
+    }
+    write_xml(tmp_path / "square.xml", scene, {}, "")
+    theirs = np.array(mi.render(mi.load_file(str(tmp_path / "square.xml")), spp=64))
+    description = advsearch.load_scene(f"{tmp_path}/square.xml#square").description
+    ours = MitsubaScene(description, (16, 16), max_depth=2).radiance({}, 0, 64).numpy()
+    assert np.abs(ours - theirs).mean() < 0.02
