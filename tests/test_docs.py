@@ -38,6 +38,7 @@ from advsearch.attacks import (
 from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
 from advsearch.attacks.policies import pgd
 from advsearch.attacks.verification import WORST_CASE
+from advsearch.cli.export import WRITERS
 from advsearch.cli.flags import config_from
 from advsearch.cli.list import REGISTRIES
 from advsearch.cli.main import COMMANDS, _parse
@@ -419,7 +420,7 @@ def check_advsearch(words: list[str], folder: Path) -> None:
         recipe.write_text("object: mug\n", encoding="utf-8")
         check_names(AttackConfig.from_yaml(recipe, dict(parse_assignment(text, text) for text in args.change)))
     if args.command == "export":
-        assert args.format in (None, "print", "3db", "mitsuba", *export.FORMATS)
+        assert args.format in (None, *WRITERS, *export.FORMATS)
 
 
 def check_other(words: list[str]) -> None:

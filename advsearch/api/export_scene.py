@@ -17,12 +17,14 @@ from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
 from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import CONFIG, find_run
-from advsearch.runs.files import placed_by, storage_errors, write_text
+from advsearch.runs.files import placed_by, storage_errors, write_bytes, write_text
 from advsearch.runs.summary import attack_of
 from advsearch.scene.assembly import ON_PICTURE
+from advsearch.scene.description import OBJECT
+from advsearch.scene.exporting.gltf import PLAIN, glb, posed
 from advsearch.scene.mitsuba_backend.files.writing import NAME
 
-XML = ".xml"
+GLB, XML = ".glb", ".xml"
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +47,13 @@ class Answer:
         grey = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0))
         slices = self.problem.space.slices(self.u)
         return [control.name for control, part in slices if not torch.equal(control.picture(part, grey), grey)]
+
+    @property
+    def inputs(self) -> dict[str, Tensor]:
+        """Those of the scene inside Mitsuba, and what is applied to its picture."""
+        renderer = self.problem.renderer
+        with torch.no_grad():
+            return renderer.scene.assembly(renderer.space.inputs(self.u))
 
 
 def answer_of(run: str | Path) -> Answer:
@@ -89,7 +98,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
         raise InputError(f"out: {(there or [path.parent])[0]} is there already; choose another name")
     answer = answer_of(run)
     renderer = answer.problem.renderer
-    inputs = renderer.scene.assembly(renderer.space.inputs(answer.u))
+    inputs = answer.inputs
     on_picture = {name: inputs.pop(name) for name in ON_PICTURE if name in inputs}
     if "backdrop.color" in on_picture:
         raise InputError(f"{answer.folder}: a plain background is no part of a Mitsuba scene; export a run without it")
@@ -104,7 +113,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     if renderer.formation.denoiser != "none":
         notes.append("Not in it: the denoiser. Take many samples a pixel.")
     if answer.on_picture:
-        notes.append(f"Not in it: what {', '.join(answer.on_picture)} did to the finished picture.")
+        notes.append(f"Not in it: what the control {', '.join(answer.on_picture)} did to the finished picture.")
     if answer.problem.conditions is not None:
         notes.append("What varied by chance in the run is as in the clean scene.")
     with placed_by("out"), storage_errors(path):
@@ -115,4 +124,37 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
                 os.replace(one, path.parent / one.name)
         text = f"The answer of {answer.folder.name} as a scene for Mitsuba 3 (advsearch {advsearch.__version__}).\n"
         write_text(path.with_name(f"{path.stem}-README.txt"), "\n".join([text, *notes, ""]), durable=False)
+    return notes
+
+
+def write_gltf(run: str | Path, out: Path) -> list[str]:
+    """Write the object of a run's answer as binary glTF: displaced and in its pose, with its texture.
+
+    Args:
+        run: name or folder of a run of `attack` that has ended.
+        out: a file that ends in .glb.
+
+    Returns:
+        Sentences about what is not as in the run.
+
+    Raises:
+        InputError: the run has no answer, or the file is called otherwise.
+        FileFormatError: the run did not end, or is of another command.
+    """
+    if out.suffix.lower() != GLB:
+        raise InputError(f"out: expected the name of a .glb file, got {out}")
+    answer = answer_of(run)
+    description = answer.problem.space.scene
+    assert description is not None
+    part = description.meshes[OBJECT]
+    found = posed(part, answer.inputs)
+    with placed_by("out"):
+        write_bytes(out, glb([found]))
+    notes = ["Lengths are in object sizes, y is up, and the texture is rounded to 8 bits."]
+    if part.surface is not None:
+        notes.append("Its surface is one of Mitsuba's own, of which glTF has the base colour only.")
+    elif found.material.specular > PLAIN:
+        notes.append(
+            f"A specular of {found.material.specular:g} is over glTF's largest, {PLAIN:g}, which it has there."
+        )
     return notes

@@ -17,12 +17,12 @@ from advsearch.errors import InputError
 Written = tuple[dict[str, Any], str]
 """What to tell of a file, as JSON and in words."""
 
-SUFFIXES = {"pdf": "print", "xml": "mitsuba"}
+SUFFIXES = {"pdf": "print", "xml": "mitsuba", "glb": "gltf"}
 """Formats that are not called as their files end."""
 
 HELP = (
-    "write a run's evaluated configurations as a table (CSV, JSON or Parquet), its texture or patch for printing, or "
-    "its scene for Mitsuba"
+    "write a run's evaluated configurations as a table (CSV, JSON or Parquet), its texture or patch for printing, its "
+    "scene for Mitsuba, or its object as glTF"
 )
 
 _EXAMPLES = """examples:
@@ -31,6 +31,7 @@ _EXAMPLES = """examples:
   advsearch export mug-sweep-001 --format 3db --out folder
   advsearch export mug-patch-001 --format print --size 95 --out sheets.pdf
   advsearch export mug-texture-001 --format mitsuba --out folder
+  advsearch export mug-texture-001 --format gltf --out mug.glb
 """
 
 
@@ -155,9 +156,21 @@ def _mitsuba(args: argparse.Namespace, out: Path) -> Written:
     return {"notes": notes}, " ".join([f"The scene is in {out}.", *notes])
 
 
+def _gltf(args: argparse.Namespace, out: Path) -> Written:
+    """Write the adversarial object."""
+    from advsearch.cli.progress import at_work
+
+    with at_work(as_json=True, quiet=False):
+        from advsearch.api.export_scene import write_gltf
+
+        notes = write_gltf(args.run, out)
+    return {"notes": notes}, " ".join([f"The object is in {out}.", *notes])
+
+
 WRITERS: dict[str, tuple[str, Callable[[argparse.Namespace, Path], Written]]] = {
     "3db": ("a folder", _threedb),
     "print": ("a PDF file", _print),
     "mitsuba": ("an XML file and what belongs to it, or a new folder for them", _mitsuba),
+    "gltf": ("a .glb file", _gltf),
 }
 """What is no table, by the word of `--format`: what is written, and how."""

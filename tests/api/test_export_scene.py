@@ -8,13 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 from samples import make_answered
+from scipy.spatial import KDTree
 
 import advsearch
 from advsearch.api.export_scene import answer_of
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig
 from advsearch.scene.color import linear_to_srgb
+from advsearch.scene.importing.objects import import_object
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 
@@ -67,3 +70,32 @@ def test_what_is_missing_is_said(
     out = ["--out", str(tmp_path / "new")] if given else []
     assert main(["export", str(run), "--format", "mitsuba", *out, *given]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_the_adversarial_object_is_read_back(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "mug.glb"
+    assert main(["export", str(run), "--out", str(out), "--json"]) == 0
+    assert "8 bits" in json.loads(capsys.readouterr().out)["notes"][0]
+    answer = answer_of(run)
+    inputs, description = answer.inputs, answer.problem.space.scene
+    assert description is not None
+    texture = np.round(linear_to_srgb(inputs["object.base_color"]).numpy() * 255)
+    world, own = inputs["object.vertices"].numpy(), description.meshes["object"]
+
+    read = trimesh.load(out, process=False, force="mesh")
+    np.testing.assert_array_equal(read.vertices[:, [0, 2, 1]] * (1, -1, 1), world)
+    np.testing.assert_array_equal(read.faces, own.mesh.faces)
+    np.testing.assert_allclose(read.visual.uv, own.mesh.uvs, atol=1e-6)
+    np.testing.assert_array_equal(np.array(read.visual.material.baseColorTexture)[..., :3], texture)
+    surface = read.visual.material
+    assert (surface.roughnessFactor, surface.metallicFactor) == (own.material.roughness, own.material.metallic)
+
+    back = import_object(out)
+    np.testing.assert_allclose(back.base_color, texture / 255, atol=1e-6)
+    assert (back.material.roughness, back.material.metallic) == (own.material.roughness, own.material.metallic)
+    size = np.ptp(world, axis=0)
+    corners, middle = (world - world.min(axis=0)) / size.max(), size / (2 * size.max())
+    middle[2] = 0.0
+    there = np.concatenate([back.mesh.vertices + middle, back.mesh.uvs], axis=1)
+    apart, _ = KDTree(there).query(np.concatenate([corners, own.mesh.uvs], axis=1))
+    assert apart.max() < 1e-5

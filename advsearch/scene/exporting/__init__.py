@@ -1,0 +1,1 @@
+"""Scenes for other programs, as data of theirs."""
