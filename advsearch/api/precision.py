@@ -25,7 +25,7 @@ from advsearch.engine.planning import measured_plan, plan_gradients
 from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
 from advsearch.evaluation.precision.fits import UNKNOWN, Theory
-from advsearch.evaluation.precision.gradient import GradientBench, GradientPart, parts_of, theory_of
+from advsearch.evaluation.precision.gradient import GradientBench, GradientPart, matrix_groups, parts_of, theory_of
 from advsearch.evaluation.precision.image import REFERENCE_SAMPLER, PictureBench, variants
 from advsearch.evaluation.precision.machine import machine
 from advsearch.evaluation.precision.objective import ObjectiveBench, curve_of
@@ -185,7 +185,8 @@ class _Measurement:
     def parts(self) -> list[_Part]:
         """Everything, in its order."""
         renderer, _ = self._differentiated
-        divided = parts_of(renderer.plan.groups, linear=self.config.loss == "linear")
+        linear = self.config.loss == "linear"
+        divided = parts_of(renderer.plan.groups, linear=linear, by_matrix=matrix_groups(renderer))
         gradients = [
             _Part(
                 "gradient", f"gradient of {one.name}", SHARES["gradient"] / len(divided), partial(self._gradient, one)

@@ -24,7 +24,8 @@ HELP = "draw error against run time: of the picture, of gradients and of policie
 READING = (
     "Each row is a setting: its error beside a reference of far more samples, with the 95 % interval of that error,\n"
     "and the seconds that one picture or gradient takes. A margin is how far the wrong answer leads the right one, in\n"
-    "logits; a cosine of 1 means that a gradient points the right way."
+    "logits; a cosine of 1 means that a gradient points the right way. With a matrix of light transport, `again` is\n"
+    "what another gradient takes once the first one is there."
 )
 """What the tables show, and how to read them."""
 
@@ -75,15 +76,18 @@ def sentence(one: Recommended, goal: float) -> str:
 
 def _errors(points: Sequence[PrecisionPoint]) -> str:
     margin = any(one.margin_error is not None for one in points)
+    again = any(one.later_seconds is not None for one in points)
     heads = ["control"] * (not margin) + ["estimator", "samples", "error", "95 %"]
-    rows = [[*heads, "margin" if margin else "cosine", "seconds", "repeats"]]
+    rows = [[*heads, "margin" if margin else "cosine", "seconds", *["again"] * again, "repeats"]]
     for one in points:
         cosine = math.nan if one.cosine is None else one.cosine
         beside = _percent(one.error_by("margin_error")) if margin else f"{cosine:.3f}"
         place = ([] if margin else [one.control or ""]) + [one.estimator, str(one.spp)]
         low, high = one.error_by("error").interval
         between = f"{100 * low:.2g} to {100 * high:.2g}" if low == low and one.known else ""
-        rows.append([*place, _percent(one.error_by("error")), between, beside, f"{one.seconds:.3g}", str(one.repeats)])
+        later = [f"{one.seconds if one.later_seconds is None else one.later_seconds:.3g}"] * again
+        seconds = [f"{one.seconds:.3g}", *later]
+        rows.append([*place, _percent(one.error_by("error")), between, beside, *seconds, str(one.repeats)])
     return output.columns(rows)
 
 

@@ -18,17 +18,27 @@ from torch import Tensor
 
 from advsearch import seeds
 from advsearch.engine.gradients import Loss
+from advsearch.engine.transport import WORTH
 from advsearch.runs.results.plan import GainRow, TexelRow
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
+from advsearch.scene.transport.plan import predicting, why_not
+from advsearch.scene.transport.renderer import SPP
 
 ALL = "everything above"
 """Name of the row in which all items are put back together."""
 BOUNCES = "bounces"
 """Name of the row in which paths have their full length."""
-WHAT = {**ITEMS, BOUNCES: "bounces of light beyond the search's longest path", ALL: "all of these"}
+RENDERS = "renders"
+"""Name of the row in which steps render, where a matrix of light transport predicts them."""
+WHAT = {
+    **ITEMS,
+    BOUNCES: "bounces of light beyond the search's longest path",
+    ALL: "all of these",
+    RENDERS: "renders of the steps that light transport predicts",
+}
 """What is left out, in words, for each row."""
 AGREES = 1.2
 """Difference, as a share of what another seed changes, up to which two pictures or gradients agree: 1 is expected where
@@ -41,8 +51,8 @@ REPEATS = 3
 
 def most_gradients(repeats: int = REPEATS) -> int:
     """Return how many gradients `measured_gains` takes at most: with every item put back, with all, with all bounces
-    and with none, twice to compare and then timed."""
-    return (2 + repeats) * (len(ITEMS) + 3)
+    and with none, twice to compare and then timed, and predicted ones."""
+    return (2 + repeats) * (len(ITEMS) + 4)
 
 
 def measured_gains(
@@ -69,8 +79,10 @@ def measured_gains(
         tick: called after each gradient.
 
     Returns:
-        One row for each item, and one for all. What two seeds differ by is the root mean square of both with the item
-        and both without.
+        One row for each item, one for all, and where light transport can predict the pictures of a search one for that
+        too: against a rendered gradient, with a share of the making as large as the shortest search that predicts has,
+        its picture beside one of as many samples as its own.
+        What two seeds differ by is the root mean square of both with the item and both without.
     """
     scene = renderer.scene
     depth = scene.max_depth if depth is None else depth
@@ -85,25 +97,60 @@ def measured_gains(
     noises = [seeds.stream(seed, "round", number) for number in range(repeats)]
     rounds = [[_seconds(each, loss, u, noise, spp, tick) for each in everyone.values()] for noise in noises]
     typical = [statistics.median(times) for times in zip(*rounds, strict=True)]
-    rows = []
-    for number, item in list(enumerate(everyone))[1:]:
-        picture, gradient = (
-            _share(first[number][k] - first[0][k], again[0][k] - first[0][k], again[number][k] - first[number][k])
-            for k in range(2)
-        )
-        noise = _ratio(again[number][0] - first[number][0], again[0][0] - first[0][0])
+    rows = [
+        _row(item, (first[0], again[0], typical[0]), (first[number], again[number], typical[number]))
+        for number, item in list(enumerate(everyone))[1:]
+    ]
+    if why_not(renderer) is None:
+        both = seed, seeds.stream(seed, "another")
+        predicted = [_predicted(renderer, loss, u, noise, spp, tick) for noise in both]
+        seconds = statistics.fmean(one[2] for one in predicted)
+        row = _row(RENDERS, (predicted[0][:2], predicted[1][:2], seconds), (first[0], again[0], typical[0]))
+        with torch.no_grad():  # at few samples the denoiser's own bias is in a rendered picture
+            clean, other = (renderer(u, noise, SPP) for noise in both)
+        apart = _share(clean - predicted[0][0], predicted[1][0] - predicted[0][0], other - clean)
         rows.append(
-            GainRow(
-                item=item,
-                what=WHAT[item],
-                gain=noise**2 * typical[number] / typical[0],
-                picture_difference=picture,
-                gradient_difference=gradient,
-                safe=picture <= AGREES and gradient <= AGREES,
-                seconds=typical[number],
-            )
+            row.model_copy(update={"picture_difference": apart, "safe": max(apart, row.gradient_difference) <= AGREES})
         )
     return rows
+
+
+Found = tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor], float]
+"""The picture and the gradient of one seed, those of another, and the seconds of a gradient."""
+
+
+def _row(item: str, without: Found, having: Found) -> GainRow:
+    """Compare what is found with an item and without it."""
+    (first, again, seconds), (first_with, again_with, seconds_with) = without, having
+    picture, gradient = (
+        _share(first_with[k] - first[k], again[k] - first[k], again_with[k] - first_with[k]) for k in range(2)
+    )
+    noise = _ratio(again_with[0] - first_with[0], again[0] - first[0])
+    return GainRow(
+        item=item,
+        what=WHAT[item],
+        gain=noise**2 * seconds_with / seconds,
+        picture_difference=picture,
+        gradient_difference=gradient,
+        safe=picture <= AGREES and gradient <= AGREES,
+        seconds=seconds_with,
+    )
+
+
+def _predicted(
+    renderer: Renderer, loss: Loss, u: Tensor, seed: int, spp: int, tick: Callable[[], None]
+) -> tuple[Tensor, Tensor, float]:
+    """The picture and the gradient that light transport predicts, and the seconds of a gradient with its share of the
+    making."""
+    begun = time.perf_counter()
+    made = predicting(renderer, u, seed)
+    with torch.no_grad():
+        picture = made(u, seed, spp)
+    ready = time.perf_counter()
+    gradient = made.gradient(loss, u, seed, spp)[1]
+    seconds = time.perf_counter() - ready + (ready - begun) / WORTH
+    tick()
+    return picture, gradient, seconds
 
 
 def _one(

@@ -17,15 +17,15 @@ from advsearch.controls import LightControl, TextureControl
 from advsearch.engine.gradients import inside, smooth_loss
 from advsearch.engine.path_length import BOUND, measured_bounces
 from advsearch.engine.problem import OnImage
-from advsearch.evaluation.leaving_out import ALL, WHAT, measured_gains, resolved_texels
+from advsearch.evaluation.leaving_out import ALL, RENDERS, WHAT, measured_gains, resolved_texels
 from advsearch.scene.leaving_out import EVERYTHING, ITEMS, NOTHING
 from advsearch.scene.renderer import Renderer
 
 SIZE = 40
 
 
-def made(controls: Any, object: str = "mug", environment: str = "studio") -> Renderer:
-    return load_scene(object, environment).renderer(controls, resolution=SIZE, denoise="none")
+def made(controls: Any, object: str = "mug", environment: str = "studio", denoiser: str = "none") -> Renderer:
+    return load_scene(object, environment).renderer(controls, resolution=SIZE, denoise=denoiser)
 
 
 @pytest.mark.parametrize("control", ["texture", "haze"])
@@ -74,7 +74,8 @@ def test_putting_an_item_back_takes_effect(monkeypatch: pytest.MonkeyPatch) -> N
 def test_gains_have_a_row_for_each_item_and_their_proof() -> None:
     renderer = made("texture")
     rows = measured_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=2, repeats=2, depth=4)
-    assert [row.item for row in rows] == [*ITEMS, "bounces", ALL] and {row.item for row in rows} == set(WHAT)
+    assert [row.item for row in rows] == [*ITEMS, "bounces", ALL]  # predicted pictures need the denoiser
+    assert {row.item for row in rows} | {RENDERS} == set(WHAT)
     assert all(row.gain > 0.0 and row.safe for row in rows)
 
 
@@ -83,10 +84,20 @@ def test_what_changes_the_picture_is_not_called_safe(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("advsearch.evaluation.leaving_out.NOTHING", EVERYTHING)
     renderer = made("camera.exposure")
     rows = measured_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=512, repeats=2, depth=2)
-    tracing, bounces, _ = rows
+    tracing, bounces, _ = rows  # no row of predicted pictures: an exposure needs no render
     assert tracing.picture_difference < 1e-5 and tracing.safe  # a recorded kernel rounds otherwise
     assert tracing.gain > 0.0
     assert bounces.item == "bounces" and bounces.picture_difference > 1.0 and not bounces.safe
+
+
+@pytest.mark.slow
+def test_renders_that_are_predicted_have_a_row_beside_the_adjoint(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("advsearch.evaluation.leaving_out.ITEMS", {"tracing": ""})
+    renderer = made("texture", denoiser="oidn")
+    depth = renderer.scene.max_depth
+    rows = measured_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=4, repeats=2, depth=depth)
+    assert [row.item for row in rows] == ["tracing", ALL, "renders"]
+    assert rows[-1].gain > 3.0 and rows[-1].safe  # less noise and less time
 
 
 def test_bounces_are_cut_where_they_are_dark_and_not_where_they_are_seen() -> None:

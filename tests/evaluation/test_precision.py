@@ -17,6 +17,8 @@ from advsearch.api.precision import precision_from_config
 from advsearch.cli.main import main
 from advsearch.cli.precision import answer as precision_text
 from advsearch.config import AttackConfig, PrecisionConfig
+from advsearch.engine.gradients import smooth_loss
+from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError
 from advsearch.evaluation.precision.fits import (
     FURTHEST,
@@ -30,7 +32,7 @@ from advsearch.evaluation.precision.fits import (
     recommend,
     warning_of,
 )
-from advsearch.evaluation.precision.gradient import parts_of
+from advsearch.evaluation.precision.gradient import MATRIX, GradientBench, matrix_groups, parts_of
 from advsearch.evaluation.precision.image import COUNTS, variants
 from advsearch.evaluation.precision.machine import machine
 from advsearch.evaluation.precision.objective import PolicyCurve, SearchMark, curve_of, marks_at, missing, sooner
@@ -434,10 +436,11 @@ def test_a_gradient_is_recommended_in_counts_of_the_runs_sampler() -> None:
     assert rounding(Section("independent"), "gradient")("adjoint", 39) == 39
 
 
-def test_parts_of_a_control_with_other_estimators_have_names_of_their_own() -> None:
-    def group(parameter: str, *valid: str) -> Group:
-        return Group(parameter, 1, valid, control="light")
+def group(parameter: str, *valid: str) -> Group:
+    return Group(parameter, 1, valid, control="light")
 
+
+def test_parts_of_a_control_with_other_estimators_have_names_of_their_own() -> None:
     found = parts_of([group("x", "differences"), group("power", "adjoint", "differences"), group("kind")], linear=True)
     assert [one.name for one in found] == ["light.x", "light.power"]
     assert found[0].estimators == ("differences", "forward")
@@ -445,6 +448,25 @@ def test_parts_of_a_control_with_other_estimators_have_names_of_their_own() -> N
     secant = [group("x", "secant", "differences", "guided")]
     assert parts_of(secant, linear=True)[0].estimators == ("differences", "forward")
     assert "secant" in parts_of(secant, linear=False)[0].estimators
+
+
+def test_a_part_has_a_matrix_where_all_of_its_groups_have_one() -> None:
+    texels, frame = group("texels", "adjoint"), group("frame", "adjoint")
+    assert parts_of([texels, frame], linear=True, by_matrix=[texels.name])[0].estimators == ("adjoint",)
+    assert parts_of([texels], linear=True, by_matrix=[texels.name])[0].estimators == ("adjoint", MATRIX)
+
+
+def test_a_matrix_gives_the_gradient_of_the_adjoint_and_the_next_one_sooner() -> None:
+    renderer = load_scene("mug").renderer("texture", resolution=24, denoise="none")
+    assert matrix_groups(renderer) == {"texture.texels"}
+    assert not matrix_groups(load_scene("mug").renderer("pose", resolution=24))
+    (part,) = parts_of(renderer.plan.groups, linear=True, by_matrix=matrix_groups(renderer))
+    loss = smooth_loss((24, 24))
+    bench = GradientBench(renderer, loss, renderer.start, part)
+    bench.reference = reference_of([part.of(renderer.gradient(loss, renderer.start, seed, 1024)[1]) for seed in (1, 2)])
+    matrix = next(one for one in bench.settings if (one.series, one.spp) == (MATRIX, 256))
+    numbers, seconds = bench.measure(matrix, 1)
+    assert numbers["cosine"] > 0.9 and numbers["later_seconds"] < seconds / 2
 
 
 # ---- policies -------------------------------------------------------------------------------------------------------

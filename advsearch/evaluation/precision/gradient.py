@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from advsearch.evaluation.precision.rounds import TimeBudget, gather, part_sampl
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import BY_ADJOINT, DIRECTIONS
 from advsearch.scene.renderer import Renderer
+from advsearch.scene.transport.renderer import LinearRenderer, linear_inputs
 
 COUNTS = (4, 8, 16, 32, 64, 128, 256)
 BY_COORDINATE = 32
@@ -25,6 +26,10 @@ BY_COORDINATE = 32
 ADJOINT_COST = {"adjoint": 3.0, "material": 60.0}
 """An adjoint takes about as long as so many renders, the kernels that the material form compiles included; any other
 as the dearest of these. It only decides what is measured first."""
+MATRIX = "matrix"
+"""The series of gradients by a matrix of light transport, from as many samples a pixel as its points have."""
+MATRIX_COST = 2.0
+"""Making a matrix takes about as long as so many renders of as many samples."""
 CHECK_SPP = 64
 AGREE = 0.05
 """Relative bias of a reference by an adjoint, beyond the noise, from which it is called biased."""
@@ -59,12 +64,13 @@ class GradientPart:
         return _array(torch.cat([gradient[group.coordinates] for group in self.groups]))
 
 
-def parts_of(groups: Sequence[Group], *, linear: bool) -> list[GradientPart]:
+def parts_of(groups: Sequence[Group], *, linear: bool, by_matrix: Collection[str] = ()) -> list[GradientPart]:
     """Return the parts of a space with the estimators that are valid for them.
 
     Args:
         groups: of the plan.
         linear: whether the loss is linear: differences of the loss are then those of the picture, and left out.
+        by_matrix: names of the groups for which there is a matrix too; see `matrix_groups`.
     """
     sets: dict[tuple[str, tuple[str, ...]], list[Group]] = {}
     for group in groups:
@@ -78,10 +84,18 @@ def parts_of(groups: Sequence[Group], *, linear: bool) -> list[GradientPart]:
             names = f"{members[0].parameter},... ({len(members)})"
         usable = [one for one in valid if one not in EXPENSIVE and not (linear and one == "secant")]
         usable += [one for one in ("forward",) if "differences" in usable and one not in usable]
+        usable += [MATRIX] if all(one.name in by_matrix for one in members) else []
         found.append(
             GradientPart(f"{control}.{names}" if control in several else control, tuple(members), tuple(usable))
         )
     return found
+
+
+def matrix_groups(renderer: Renderer) -> frozenset[str]:
+    """Return the names of the groups that change base colours only, so that a matrix gives their gradient."""
+    linear = linear_inputs(renderer)
+    routes = {group.name: renderer.routes.get(group.name, frozenset()) for group in renderer.plan.groups}
+    return frozenset(name for name, inputs in routes.items() if inputs and inputs <= linear)
 
 
 def theory_of(estimator: str, sampler: str) -> Theory:
@@ -135,12 +149,21 @@ class GradientBench:
             self._by_estimator(budget, seed, on_done)
 
     def measure(self, setting: MeasuredSetting, seed: int) -> tuple[dict[str, float], float]:
-        """Take one gradient and return its error and cosine, and the seconds, the picture itself included."""
+        """Take one gradient and return its error and cosine, and the seconds, the picture itself included; of a matrix
+        its making too, and beside that what another gradient from it takes."""
         begun = time.perf_counter()
-        found = self._estimated(self._renderer, setting.series, seed, setting.spp)
+        later: dict[str, float] = {}
+        if setting.series == MATRIX:
+            made = LinearRenderer(self._renderer, self._u, seed, spp=setting.spp)
+            ready = time.perf_counter()
+            found = self.part.of(made.gradient(self._loss, self._u, seed, setting.spp)[1])
+            later = {"later_seconds": time.perf_counter() - ready}
+        else:
+            found = self._estimated(self._renderer, setting.series, seed, setting.spp)
         seconds = time.perf_counter() - begun
         assert self.reference is not None
-        return {"error": self.reference.relative_error(found), "cosine": self.reference.cosine(found)}, seconds
+        error, cosine = self.reference.relative_error(found), self.reference.cosine(found)
+        return {"error": error, "cosine": cosine, **later}, seconds
 
     def floor(self, setting: MeasuredSetting, measure: str) -> float:
         """The reference's own relative error."""
@@ -165,6 +188,8 @@ class GradientBench:
     # ---- inside -----------------------------------------------------------------------------------------------------
 
     def _cost(self, estimator: str) -> float:
+        if estimator == MATRIX:
+            return 1.0 + MATRIX_COST
         renders = sum(replace(group, estimator=estimator).renders for group in self.part.groups)
         if estimator in BY_ADJOINT:
             return 1.0 + ADJOINT_COST.get(estimator, max(ADJOINT_COST.values()))

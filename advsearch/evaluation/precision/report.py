@@ -180,6 +180,7 @@ def _together(by_measure: Mapping[str, Point], family: str | None) -> PrecisionP
         seconds=last.seconds,
         repeats=last.repeats,
         cosine=last.more.get("cosine"),
+        later_seconds=last.more.get("later_seconds"),
         family=family,
     )
 

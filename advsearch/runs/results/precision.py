@@ -41,6 +41,7 @@ class PrecisionPoint(SettingPlace):
     seconds: float
     repeats: int
     cosine: Number | None = Field(default=None, description="of a gradient with its reference")
+    later_seconds: Number | None = Field(default=None, description="of another gradient from the same matrix")
     family: str | None = Field(default=None, description="what a line of the image is recommended among")
     objective: Number | None = Field(default=None, description="median over searches")
     quartiles: Interval | None = None
