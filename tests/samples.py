@@ -158,3 +158,20 @@ def make_answered(path: Path, config: AttackConfig, u: np.ndarray) -> Path:
         run.write_summary(attack(run=str(path), object=config.object, controls=list(config.controls)))
     write_answer(path, np.asarray(u, dtype=np.float32))
     return path
+
+
+def keep_object(run: Path) -> None:
+    """Put the mug, and the same painted black and white, among what a run has to turn."""
+    from advsearch.runs.directory import OBJECT_FILE
+    from advsearch.scene.exporting.gltf import PosedMesh, web_glb
+    from advsearch.scene.library import load_object
+
+    mug = load_object("mug")
+    squares = np.kron(np.indices((16, 16)).sum(axis=0) % 2, np.ones((8, 8)))[..., None] * np.ones(3)
+    camera = np.eye(4)
+    camera[:3, :3], camera[:3, 3] = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), (3.0, 0.0, 0.5)
+    clean, painted = (
+        PosedMesh("object", mug.mesh, color.astype(np.float32), mug.material) for color in (mug.base_color, squares)
+    )
+    (run / OBJECT_FILE).parent.mkdir(parents=True, exist_ok=True)
+    (run / OBJECT_FILE).write_bytes(web_glb([painted], [clean], camera, "It has fewer faces here."))

@@ -15,7 +15,7 @@ from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.smallest import Bracket
-from advsearch.engine.pictures import write_artifacts, write_pictures
+from advsearch.engine.pictures import write_artifacts, write_object, write_pictures
 from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
@@ -177,6 +177,7 @@ def summarise(
     if run is not None:
         write_pictures(run, problem, findings, linear, {"clean": clean, "adversarial": adversarial}, u)
         write_artifacts(run, artifacts)
+        write_object(run, problem, u)
         for name, data in space.files(u).items():
             write_bytes(run.path / "artifacts" / name, data)
         write_answer(run.path, u.numpy())

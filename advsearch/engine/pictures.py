@@ -1,7 +1,12 @@
-"""The pictures of an attack that a run keeps: as the model sees them, and with its answers drawn into them."""
+"""The pictures of an attack that a run keeps, as the model sees them and with its answers, and the object to turn."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
 from torch import Tensor
 
 from advsearch import seeds
@@ -9,8 +14,19 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings
 from advsearch.report.marks import marked
 from advsearch.runs import images
-from advsearch.runs.directory import RunDirectory
+from advsearch.runs.directory import OBJECT_FILE, RunDirectory
+from advsearch.runs.files import write_bytes
+from advsearch.scene.description import OBJECT
+from advsearch.scene.exporting.gltf import PosedMesh, posed, web_glb
+from advsearch.scene.geometry import camera_to_world
+from advsearch.scene.simpler import simpler
 from advsearch.tasks import Mark
+
+MOST_FACES = 30_000
+"""Faces of the meshes that are kept to turn; of more, as many are shown."""
+
+NEAR = 2.0
+"""How far from the object's middle another mesh may be to be shown with it, in the object's extent."""
 
 
 def write_pictures(
@@ -61,3 +77,37 @@ def write_artifacts(run: RunDirectory, artifacts: dict[str, Tensor]) -> None:
     for name, picture in artifacts.items():
         run.save_image(name, picture, folder="artifacts")
         run.save_exr(name, picture, folder="artifacts")
+
+
+def write_object(run: RunDirectory, problem: Problem, u: Tensor) -> None:
+    """Keep the object, and the meshes beside it that controls move or paint, to turn in a browser.
+
+    Args:
+        run: gets them as a file of binary glTF, before and after.
+        problem: that was attacked.
+        u: (d,) of the answer.
+    """
+    scene, assembly = problem.space.scene, problem.renderer.scene.assembly
+    if scene is None:
+        return
+    with torch.no_grad():
+        after, before = (assembly(problem.space.inputs(problem.whole(at))) for at in (u, problem.domain.start))
+    parts = [part for name, part in scene.meshes.items() if name == OBJECT or any(_of(key) == name for key in after)]
+    fewer = {part.name: simpler(part.mesh, MOST_FACES // len(parts)) for part in parts}
+
+    def shown(inputs: Mapping[str, Tensor]) -> list[PosedMesh]:
+        found = [posed(part, inputs) for part in parts]
+        thing = next(one for one in found if one.name == OBJECT).mesh.vertices
+        middle, reach = thing.mean(axis=0), NEAR * float(np.ptp(thing, axis=0).max())
+        near = [one for one in found if np.abs(one.mesh.vertices.mean(axis=0) - middle).max() < reach]
+        return [replace(one, mesh=left.of(one.mesh)) if (left := fewer[one.name]) else one for one in near]
+
+    camera = after.get("camera.to_world")
+    pose = camera_to_world(scene) if camera is None else camera.double().numpy()
+    cut = [f"{len(part.mesh.faces):,} of {part.name}" for part in parts if fewer[part.name]]
+    note = f"It is shown with fewer faces than it has ({', '.join(cut)})." if cut else ""
+    write_bytes(run.path / OBJECT_FILE, web_glb(shown(after), shown(before), pose, note))
+
+
+def _of(key: str) -> str:
+    return key.partition(".")[0]

@@ -35,6 +35,8 @@ COLUMNS = "columns.bin"
 
 IMAGES = "images"
 ARTIFACTS = "artifacts"
+OBJECT_FILE = f"{ARTIFACTS}/object.glb"
+"""What was attacked, before and after, to turn in a browser."""
 PARTS = "parts"
 """Runs that a study consists of."""
 

@@ -21,6 +21,7 @@ from advsearch.runs.files import write_text
 from advsearch.runs.results.attack import AttackSummary, FoundValue, UsualAnswer
 from advsearch.runs.summary import attack_of
 from advsearch.viewer.document import data_script, data_url, document
+from advsearch.viewer.turning import object_data, object_section, read_object
 
 LARGE_PICTURE = 1_000_000
 """Bytes above which a PNG is put into the page at a smaller size; the file itself stays as it is."""
@@ -48,6 +49,7 @@ class RunData:
         pictures: path inside the run directory to a data URL, sorted.
         curves: kind of evaluation to its objectives in order.
         frames: of the animation of the search, as data URLs.
+        thing: the object to turn, binary glTF; empty where there is none.
     """
 
     path: Path
@@ -56,6 +58,7 @@ class RunData:
     pictures: Mapping[str, str]
     curves: Mapping[str, list[float | None]]
     frames: Sequence[str] = ()
+    thing: bytes = b""
 
 
 def write_report(run: str | Path) -> Path:
@@ -79,6 +82,7 @@ def read_run(path: Path) -> RunData:
         pictures=_read_pictures(path),
         curves=_read_curves(path / store.NAME),
         frames=_read_frames(path / directory.IMAGES / "search.gif"),
+        thing=read_object(path),
     )
 
 
@@ -88,6 +92,7 @@ def page(data: RunData) -> str:
     main = element(
         "main",
         _pictures(data),
+        object_section(data.thing),
         _changes(summary),
         _textures(data),
         _rates(summary),
@@ -96,8 +101,10 @@ def page(data: RunData) -> str:
         _repeat(data),
     )
     footer = f"run {data.path.name}. This page needs no other file."
-    frames = [data_script(_animation(data), "frames")] if data.frames else []
-    return document(wording.title(summary), _header(summary), main, data=frames, script="attack.js", footer=footer)
+    given = [data_script(_animation(data), "frames")] if data.frames else []
+    given += object_data(data.thing)
+    scripts = ["make.js", "attack.js", *(["object.js"] if data.thing else [])]
+    return document(wording.title(summary), _header(summary), main, data=given, scripts=scripts, footer=footer)
 
 
 def _header(summary: AttackSummary) -> Html:

@@ -19,7 +19,7 @@ def document(
     title: str,
     *body: Html | None,
     data: Sequence[Html] = (),
-    script: str = "",
+    scripts: Sequence[str] = (),
     connects: bool = False,
     footer: str = "",
 ) -> str:
@@ -29,13 +29,13 @@ def document(
         title: of the window.
         body: what stands in it, before the footer.
         data: scripts that hold what the script reads.
-        script: a file of the viewer that runs in it; empty for none.
+        scripts: files of the viewer that run in it, one after the other.
         connects: whether it asks its server for rows and pictures; else it cannot ask anybody.
         footer: a sentence at its end.
     """
-    code = asset(script) if script else ""
+    code = "\n".join(map(asset, scripts))
     images, connect = ("data: 'self'", "; connect-src 'self'") if connects else ("data:", "")
-    runs = f"; script-src '{_digest(code)}'" if script else ""
+    runs = f"; script-src '{_digest(code)}'" if code else ""
     policy = f"default-src 'none'; img-src {images}; style-src 'unsafe-inline'{runs}{connect}"
     head = element(
         "head",

@@ -93,7 +93,12 @@ def page(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[Swe
         *(join(_axes(summary), _cost(path, summary)) for path, summary in summaries),
     )
     return document(
-        title, _header(runs), main, data=[data_script(described, "runs"), *data], script="sweep.js", connects=connects
+        title,
+        _header(runs),
+        main,
+        data=[data_script(described, "runs"), *data],
+        scripts=["sweep.js"],
+        connects=connects,
     )
 
 

@@ -16,6 +16,8 @@ import advsearch
 from advsearch.api.export_scene import answer_of
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig
+from advsearch.engine.pictures import write_object
+from advsearch.runs.directory import OBJECT_FILE, RunDirectory
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
@@ -99,3 +101,22 @@ def test_the_adversarial_object_is_read_back(run: Path, tmp_path: Path, capsys: 
     there = np.concatenate([back.mesh.vertices + middle, back.mesh.uvs], axis=1)
     apart, _ = KDTree(there).query(np.concatenate([corners, own.mesh.uvs], axis=1))
     assert apart.max() < 1e-5
+
+
+def test_the_object_to_turn_is_the_answer_and_what_was_before(run: Path, tmp_path: Path) -> None:
+    answer = answer_of(run)
+    with RunDirectory.create_for(AttackConfig(object="mug", run=str(tmp_path / "kept"))) as kept:
+        write_object(kept, answer.problem, answer.u)
+    read = trimesh.load(tmp_path / "kept" / OBJECT_FILE, process=False, force="mesh")
+    world = answer.inputs["object.vertices"].numpy()
+    np.testing.assert_array_equal(read.vertices[: len(world), [0, 2, 1]] * (1, -1, 1), world)
+    header = json.loads(
+        (tmp_path / "kept" / OBJECT_FILE).read_bytes()[20:].partition(b"\0")[0].rpartition(b"}")[0] + b"}"
+    )
+    assert [one["name"] for one in header["scenes"]] == ["adversarial", "clean"]
+    assert len(header["bufferViews"]) == 2 * 2 + 2 + 2  # places, normals and textures differ, the rest is there once
+    camera = next(one["matrix"] for one in header["nodes"] if "camera" in one)
+    x, y, z = answer.inputs["camera.to_world"][:3, 3].tolist()
+    np.testing.assert_allclose(camera[12:15], [x, z, -y], atol=1e-6)
+    away = np.array(camera[12:15]) - read.vertices[: len(world)].mean(axis=0)
+    assert float(np.dot(away, camera[8:11])) > 0.9 * float(np.linalg.norm(away))  # it looks at the object

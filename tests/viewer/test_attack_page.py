@@ -11,7 +11,21 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from samples import ATTACK, AVERAGE, BRACKET, EASIER, FORMATION, GAP, SUMMARY, TARGET, attack, gap, make_run, rated
+from samples import (
+    ATTACK,
+    AVERAGE,
+    BRACKET,
+    EASIER,
+    FORMATION,
+    GAP,
+    SUMMARY,
+    TARGET,
+    attack,
+    gap,
+    keep_object,
+    make_run,
+    rated,
+)
 
 from advsearch.errors import FileFormatError
 from advsearch.report import wording
@@ -20,9 +34,11 @@ from advsearch.report.markup import Html, element, join
 from advsearch.report.phrases import percent
 from advsearch.report.studies import gap_figure
 from advsearch.report.style import CSS
+from advsearch.runs.directory import OBJECT_FILE
 from advsearch.runs.images import read_png
 from advsearch.viewer.attack_page import LARGE_PICTURE, SMALLER_SIDE, write_report
 from advsearch.viewer.document import asset
+from advsearch.viewer.turning import LARGEST, object_section, read_object
 
 VOID = {"meta", "img", "br", "hr", "link"}
 
@@ -127,14 +143,16 @@ def test_the_page_does_not_say_what_was_not_asked(tmp_path: Path) -> None:
 
 
 def test_the_page_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
-    path = write_report(make_run(tmp_path / "run"))
-    text, page = path.read_text(), Page(path.read_text())
-    code = asset("attack.js")
+    run = make_run(tmp_path / "run")
+    keep_object(run)
+    text = write_report(run).read_text()
+    page, code = Page(text), "\n".join(map(asset, ("make.js", "attack.js", "object.js")))
+    assert code in text
     assert not re.search(r"\b(fetch|import|XMLHttpRequest|WebSocket|https?:)", code)
-    assert "//" not in re.sub(r"base64,[A-Za-z0-9+/=]+", "", text.replace(code, ""))
+    assert "//" not in re.sub(r'(base64,|id="object-file">")[A-Za-z0-9+/=]+', "", text.replace(code, ""))
     assert "url(" not in text and "@import" not in text
     assert {tag for tag, _ in page.tags}.isdisjoint({"iframe", "object", "a", "form"})
-    assert [script.get("type") for script in page.all("script")] == ["application/json", None]
+    assert [script.get("type") for script in page.all("script")] == ["application/json", "application/json", None]
     assert page.all("link") == [{"rel": "icon", "href": "data:,"}]
     assert len(page.all("img")) == 7
     assert all(str(image["src"]).startswith("data:image/") for image in page.all("img"))
@@ -464,3 +482,16 @@ def test_where_random_search_won_it_is_said() -> None:
     own = rated(3, margin=-1.25)
     (said,) = [text for text in wording.remarks(attack(answer_from="random", policy_verified=own)) if "random" in text]
     assert "worse configuration than the policy did (3 of 20 with a margin of -1.25)" in said
+
+
+def test_a_damaged_object_is_left_out(tmp_path: Path) -> None:
+    file = tmp_path / OBJECT_FILE
+    assert read_object(tmp_path) == b""
+    keep_object(tmp_path)
+    good = file.read_bytes()
+    assert read_object(tmp_path) == good
+    assert "It has fewer faces here." in str(object_section(good))
+    for data in (b"", b"glTF", b"glTF" + bytes(40), b"GIF89a" * 9, good[:2000], good + bytes(LARGEST)):
+        file.write_bytes(data)
+        assert read_object(tmp_path) == b""
+    assert object_section(b"") is None

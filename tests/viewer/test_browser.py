@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
-from samples import make_run
+from PIL import Image
+from samples import keep_object, make_run
 from stored_sweeps import make_sweep, serving
 
 from advsearch.runs.directory import RunDirectory
@@ -36,7 +39,8 @@ def browser() -> Iterator[Browser]:
     if CHROMIUM is None:
         pytest.skip("there is no Chromium here: apt-get install chromium")
     with playwright.sync_playwright() as started:
-        running = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        drawing = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        running = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *drawing])
         yield running
         running.close()
 
@@ -67,6 +71,7 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def attack(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = make_run(tmp_path_factory.mktemp("runs") / "attack")
+    keep_object(run)
     write_report(run)
     return run
 
@@ -182,6 +187,57 @@ def test_an_attack_is_compared_and_played(browser: Browser, attack: Path) -> Non
         assert page.locator("#search img").get_attribute("src") != first
 
 
+def picture_of(page: Page) -> Any:
+    """What the canvas of the object shows within the ring of the focus, (H, W, 3)."""
+    page.wait_for_timeout(100)  # painted with the next frame
+    shot = Image.open(io.BytesIO(page.locator("#object canvas").screenshot())).convert("RGB")
+    return np.asarray(shot, dtype=float)[8:-8, 8:-8]
+
+
+def test_an_object_is_turned(browser: Browser, attack: Path) -> None:
+    with opened(browser, (attack / "report.html").as_uri()) as page:
+        page.wait_for_selector("#object canvas")
+        canvas = page.locator("#object canvas")
+        first = picture_of(page)
+        assert first.std() > 20.0  # black and white squares, and what is behind
+
+        page.get_by_role("button", name="Clean").click()
+        assert page.get_by_role("button", name="Clean").get_attribute("aria-pressed") == "true"
+        clean = picture_of(page)
+        assert np.abs(clean - first).mean() > 5.0
+        page.get_by_role("button", name="Adversarial").click()
+        np.testing.assert_array_equal(picture_of(page), first)
+
+        canvas.focus()
+        page.keyboard.press("ArrowRight")
+        page.keyboard.press("ArrowUp")
+        assert page.locator("#object [role=status]").inner_text().startswith("turned by 10°, seen from ")
+        turned = picture_of(page)
+        assert np.abs(turned - first).mean() > 2.0
+        page.keyboard.press("Home")
+        np.testing.assert_array_equal(picture_of(page), first)
+        box = canvas.bounding_box()
+        assert box is not None
+        page.mouse.move(box["x"] + 100, box["y"] + 100)
+        page.mouse.down()
+        page.mouse.move(box["x"] + 180, box["y"] + 100, steps=4)
+        page.mouse.up()
+        assert page.locator("#object [role=status]").inner_text().startswith("turned by -40°")
+        dragged, still = picture_of(page), picture_of(page)
+        assert np.abs(dragged - first).mean() > 2.0
+        np.testing.assert_array_equal(still, dragged)  # nothing moves by itself
+
+
+def test_a_browser_without_webgl_has_the_pictures(browser: Browser, attack: Path) -> None:
+    context = browser.new_context()
+    context.add_init_script("HTMLCanvasElement.prototype.getContext = () => null;")
+    page = context.new_page()
+    page.goto((attack / "report.html").as_uri())
+    until(page, lambda: "no WebGL 2" in page.locator("#object").inner_text())
+    assert page.locator("img[data-picture=adversarial]").is_visible()
+    context.close()
+
+
 @pytest.mark.parametrize("width", [390, 1440])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("which", ["sweep", "attack"])
@@ -192,7 +248,7 @@ def test_everybody_can_use_the_pages(
     axe = pytest.importorskip("axe_playwright_python.sync_playwright")
     run: Path = request.getfixturevalue(which)
     with opened(browser, (run / "report.html").as_uri(), width, color_scheme=scheme, bypass_csp=True) as page:
-        page.wait_for_selector("[data-cell]" if which == "sweep" else ".stage")
+        page.wait_for_selector("[data-cell]" if which == "sweep" else "#object canvas")
         found = axe.Axe().run(page).response["violations"]
         assert [
             (one["id"], one["nodes"][0]["html"][:200]) for one in found if one["impact"] in ("serious", "critical")
@@ -206,7 +262,7 @@ def test_without_a_script_there_are_still_pictures(
 ) -> None:
     run: Path = request.getfixturevalue(which)
     with opened(browser, (run / "report.html").as_uri(), java_script_enabled=False) as page:
-        assert not page.locator("#explorer, #compare, #search").filter(visible=True).count()
+        assert not page.locator("#explorer, #compare, #search, #object").filter(visible=True).count()
         assert page.locator("h1").inner_text()
         assert page.locator("details").first.inner_text()
 

@@ -1,4 +1,4 @@
-"""Meshes as binary glTF 2.0 (.glb): y up, one node a mesh, its texture inside as a PNG file of 8 bits.
+"""Meshes as binary glTF 2.0 (.glb): y up, one node a mesh, its texture inside as a PNG or JPEG file of 8 bits.
 
 Materials have the numbers of the principled surface (glTF 2.0, section 3.9, and the extensions KHR_materials_specular
 and KHR_materials_clearcoat): a specular of 0.5 reflects 4 % at normal incidence, as glTF's default does.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import json
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,14 +24,20 @@ from advsearch.scene.assets import Floats, Material, Mesh
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.parts import MeshPart
 
-FLOAT, WHOLE = 5126, 5125
-"""Types of numbers in glTF: float32 and uint32."""
+Doubles = npt.NDArray[np.float64]
+
+FLOAT, WHOLE, SHORT = 5126, 5125, 5123
+"""Types of numbers in glTF: float32, uint32 and uint16."""
 CORNERS, INDICES = 34962, 34963
 """What a part of the buffer is for."""
 COAT_ROUGHNESS = 0.316
 """Of Mitsuba's clearcoat, whose alpha is 0.1: the square root of it."""
 PLAIN = 0.5
 """Specular of a surface whose index of refraction is 1.5."""
+WEB_SIDE, WEB_QUALITY = 1024, 90
+"""Longest side in pixels of a texture in a file for the web, and the quality of its JPEG, from 1 to 95."""
+CAMERA = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}
+"""The camera of such a file: its place counts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +86,36 @@ def _rows(flat: Tensor) -> Floats:
 def glb(meshes: Sequence[PosedMesh]) -> bytes:
     """Return a binary glTF file of some meshes."""
     made = _Buffer()
+    return made.file(_described(made, meshes, _png))
+
+
+def web_glb(answer: Sequence[PosedMesh], clean: Sequence[PosedMesh], camera: Doubles, note: str = "") -> bytes:
+    """Return a small file with two scenes, the answer and "clean": what is the same in both is there once.
+
+    Args:
+        answer: the meshes of the answer.
+        clean: the same before.
+        camera: (4, 4) pose of the camera that sees the answer; it looks along its own +z.
+        note: what a reader has to know, in `asset.extras`.
+    """
+    made, count = _Buffer(), len(answer)
+    header = _described(made, [*answer, *clean], _jpeg)
+    ours = camera[:3].T.astype(np.float32)  # rows: its axes, then its place
+    columns = np.eye(4)
+    columns[:, :3] = _y_up(ours * np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32))  # glTF's look along their -z
+    header["cameras"] = [CAMERA]
+    header["nodes"].append({"name": "camera", "camera": 0, "matrix": columns.ravel().tolist()})
+    first, last = list(range(count)), len(header["nodes"]) - 1
+    header["scenes"] = [
+        {"name": "adversarial", "nodes": [*first, last]},
+        {"name": "clean", "nodes": list(range(count, last))},
+    ]
+    header["asset"] |= {"extras": {"note": note}} if note else {}
+    return made.file(header)
+
+
+def _described(made: _Buffer, meshes: Sequence[PosedMesh], picture: Callable[[Floats], bytes]) -> dict[str, Any]:
+    """Return the header of a file with some meshes in one scene, and put their bytes into the buffer."""
     header: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "advsearch"},
         "extensionsUsed": ["KHR_materials_clearcoat", "KHR_materials_specular"],
@@ -92,6 +128,7 @@ def glb(meshes: Sequence[PosedMesh]) -> bytes:
         "samplers": [{"magFilter": 9729, "minFilter": 9729, "wrapS": 10497, "wrapT": 10497}],
         "images": [],
     }
+    kind = "image/png" if picture is _png else "image/jpeg"
     for number, one in enumerate(meshes):
         mesh = one.mesh
         corners = {
@@ -99,28 +136,30 @@ def glb(meshes: Sequence[PosedMesh]) -> bytes:
             "NORMAL": made.accessor(_y_up(_unit(mesh.normals)), "VEC3"),
             "TEXCOORD_0": made.accessor(np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1), "VEC2"),
         }
-        indices = made.accessor(mesh.faces.reshape(-1).astype(np.uint32), "SCALAR")
+        whole = np.uint32 if len(mesh.vertices) > np.iinfo(np.uint16).max else np.uint16
+        indices = made.accessor(mesh.faces.reshape(-1).astype(whole), "SCALAR")
         header["meshes"].append(
             {"name": one.name, "primitives": [{"attributes": corners, "indices": indices, "material": number}]}
         )
         header["materials"].append(_material(one, number))
-        header["images"].append({"mimeType": "image/png", "bufferView": made.view(_png(one.base_color))})
-    header |= {"accessors": made.accessors, "bufferViews": made.views, "buffers": [{"byteLength": len(made.data)}]}
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    rest = bytes(made.data)
-    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(rest), len(text), 0x4E4F534A)
-    return head + text + struct.pack("<II", len(rest), 0x004E4942) + rest
+        header["images"].append({"mimeType": kind, "bufferView": made.view(picture(one.base_color))})
+    return header
 
 
 class _Buffer:
+    """The bytes of a file and where in them what is; bytes that are there already are not added again."""
+
     def __init__(self) -> None:
         self.data = bytearray()
+        self._known: dict[tuple[bytes, int | None], int] = {}
         self.views: list[dict[str, int]] = []
         self.accessors: list[dict[str, Any]] = []
 
     def view(self, data: bytes, target: int | None = None) -> int:
         """Append some bytes, whole words, and return the number of the view."""
+        if (data, target) in self._known:
+            return self._known[data, target]
+        self._known[data, target] = len(self.views)
         view = {"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data)}
         self.views.append(view if target is None else {**view, "target": target})
         self.data += data + bytes(-len(data) % 4)
@@ -128,10 +167,11 @@ class _Buffer:
 
     def accessor(self, values: npt.NDArray[Any], kind: str, *, bounds: bool = False) -> int:
         """Append an array and return the number of its accessor."""
-        whole = values.dtype == np.uint32
+        kinds = {np.dtype(np.uint32): WHOLE, np.dtype(np.uint16): SHORT}
+        number = kinds.get(values.dtype, FLOAT)
         entry: dict[str, Any] = {
-            "bufferView": self.view(np.ascontiguousarray(values).tobytes(), INDICES if whole else CORNERS),
-            "componentType": WHOLE if whole else FLOAT,
+            "bufferView": self.view(np.ascontiguousarray(values).tobytes(), CORNERS if number == FLOAT else INDICES),
+            "componentType": number,
             "count": len(values),
             "type": kind,
         }
@@ -139,6 +179,15 @@ class _Buffer:
             entry |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
         self.accessors.append(entry)
         return len(self.accessors) - 1
+
+    def file(self, header: dict[str, Any]) -> bytes:
+        """Return the whole file with a header that says all but what is in the buffer."""
+        header |= {"accessors": self.accessors, "bufferViews": self.views, "buffers": [{"byteLength": len(self.data)}]}
+        text = json.dumps(header).encode()
+        text += b" " * (-len(text) % 4)
+        rest = bytes(self.data)
+        head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(rest), len(text), 0x4E4F534A)
+        return head + text + struct.pack("<II", len(rest), 0x004E4942) + rest
 
 
 def _material(one: PosedMesh, texture: int) -> dict[str, Any]:
@@ -176,5 +225,16 @@ def _unit(normals: Floats) -> Floats:
 
 def _png(color: Floats) -> bytes:
     file = io.BytesIO()
-    Image.fromarray(np.uint8(np.clip(color, 0.0, 1.0) * 255.0 + 0.5)).save(file, "PNG")
+    _rounded(color).save(file, "PNG")
     return file.getvalue()
+
+
+def _jpeg(color: Floats) -> bytes:
+    file, picture = io.BytesIO(), _rounded(color)
+    picture.thumbnail((WEB_SIDE, WEB_SIDE))
+    picture.save(file, "JPEG", quality=WEB_QUALITY, subsampling=0)
+    return file.getvalue()
+
+
+def _rounded(color: Floats) -> Image.Image:
+    return Image.fromarray(np.uint8(np.clip(color, 0.0, 1.0) * 255.0 + 0.5))

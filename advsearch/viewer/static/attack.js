@@ -3,16 +3,6 @@
 (() => {
   const PLAYED = 160; // milliseconds a frame
 
-  function make(tag, given = {}, ...children) {
-    const element = document.createElement(tag);
-    for (const [name, value] of Object.entries(given)) {
-      if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
-      else element.setAttribute(name, value);
-    }
-    element.append(...children);
-    return element;
-  }
-
   function compare(place) {
     const [clean, adversarial] = ["clean", "adversarial"].map((name) => document.querySelector(`img[data-picture="${name}"]`));
     if (!clean || !adversarial) return;
