@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,6 +41,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.stages import Attack
+from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
@@ -156,13 +157,22 @@ def attack_from_config(
     return attack_once(config, progress=progress, resumed=resumed)
 
 
-def attack_once(config: AttackConfig, *, progress: Progress | None = None, resumed: Path | None = None) -> AttackResult:
-    """Attack one object with one epsilon, in a run directory; arguments and errors as for `attack_from_config`."""
+def attack_once(
+    config: AttackConfig,
+    *,
+    progress: Progress | None = None,
+    resumed: Path | None = None,
+    clean: CleanMatrix | None = None,
+) -> AttackResult:
+    """Attack one object with one epsilon, in a run directory; arguments and errors as for `attack_from_config`.
+
+    `clean` is shared with attacks whose configurations differ in epsilon alone.
+    """
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
     progress = progress or NullProgress()
     progress.stage(LOADING)
-    job = _job(config)
+    job = replace(_job(config), clean=clean or CleanMatrix())
     return _carry_out(job, progress) if resumed is None else _go_on(job, resumed, progress)
 
 
@@ -221,6 +231,7 @@ class _Job:
     objective: str | Callable[..., Tensor]
     policy: str | Policy[Any]
     keep: bool
+    clean: CleanMatrix = field(default_factory=CleanMatrix)
 
 
 def _job(config: AttackConfig) -> _Job:
@@ -367,7 +378,7 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
     with _directory(job, run) as kept:
         memory = Memory(kept)
         recorder, prepared = Recorder(kept, problem, memory), preparation_of(job.config)
-        attack = Attack(problem, budget_of(job.config), policy, recorder, memory, stages, prepared)
+        attack = Attack(problem, budget_of(job.config), policy, recorder, memory, stages, prepared, clean=job.clean)
         findings = attack.carry_out()
         return summarise(_question(job), problem, findings, recorder, stages, warnings)
 

@@ -20,6 +20,7 @@ from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.naming import different, load_models
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.transfer import Transfer
+from advsearch.engine.transport import CleanMatrix
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.drawing import Figures
@@ -239,8 +240,8 @@ class _Parts:
         self.interrupted = False
         self._most = most
 
-    def attack(self, config: AttackConfig, name: str) -> AttackSummary | None:
-        """Return the summary of one attack, or None if there was an interrupt."""
+    def attack(self, config: AttackConfig, name: str, clean: CleanMatrix | None = None) -> AttackSummary | None:
+        """Return the summary of one attack, or None if there was an interrupt; `clean` as for `attack_once`."""
         if self.interrupted:
             return None
         path = self.run.path / PARTS / name
@@ -250,10 +251,14 @@ class _Parts:
         self.progress.message(f"attack {len(self.names)} of at most {self._most}: {what}")
         if is_run(path) and (path / CONFIG).is_file():
             began = None if finished(path) else AttackConfig.from_yaml(path / CONFIG)
-            summary = attack_once(began, progress=self.progress, resumed=path).summary if began else attack_of(path)
+            summary = (
+                attack_once(began, progress=self.progress, resumed=path, clean=clean).summary
+                if began
+                else attack_of(path)
+            )
         else:
             own = config.model_copy(update={"run": str(path), "overwrite": True})
-            summary = attack_once(own, progress=self.progress).summary
+            summary = attack_once(own, progress=self.progress, clean=clean).summary
         self.warnings += [text for text in summary.warnings if text not in self.warnings]
         self.interrupted = summary.ending == INTERRUPTED
         return None if self.interrupted else summary
@@ -265,13 +270,13 @@ class _Parts:
 def _curve(config: AttackConfig, epsilons: Sequence[float | None], parts: _Parts) -> list[ObjectRow]:
     rows = []
     for place, name in enumerate(different(config.objects, "object")):
-        row = ObjectRow(object=name, clean=None, flips_at=None)
+        row, clean = ObjectRow(object=name, clean=None, flips_at=None), CleanMatrix()
         for epsilon in epsilons:
             label = f"{place:02d}-" + default_name(
                 name, [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")]
             )
             one = AttackConfig.of(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)
-            summary = parts.attack(one, label)
+            summary = parts.attack(one, label, clean)
             if summary is None:
                 break
             row = _seen(name, summary, epsilon)

@@ -27,7 +27,7 @@ from advsearch.engine.memory import TRANSPORT, Frames, Memory
 from advsearch.engine.print_terms import less_print_terms
 from advsearch.engine.problem import OnImage, Problem
 from advsearch.engine.record import Findings, Recorder, Stages
-from advsearch.engine.transport import Transport, reason_against
+from advsearch.engine.transport import CleanMatrix, Transport, reason_against
 from advsearch.report.wording import count
 from advsearch.scene.transport.renderer import TransportTooLargeError
 
@@ -45,6 +45,7 @@ class Searches:
         stages: told which stage runs.
         findings: gets the searches, their pictures and what predicts them.
         specialise: whether pictures may be predicted.
+        clean: the matrix that other attacks share.
     """
 
     problem: Problem
@@ -55,6 +56,7 @@ class Searches:
     stages: Stages
     findings: Findings
     specialise: bool
+    clean: CleanMatrix
 
     def collect_transport(self) -> None:
         """Make the matrix that predicts the pictures of the searches, where there can be one and it pays."""
@@ -64,7 +66,7 @@ class Searches:
             return
         stored, keep = self.memory.note(TRANSPORT), partial(self.memory.set_note, TRANSPORT)
         if problem.conditions is None:
-            findings.transport = Transport(problem, steps, renewals=stored or {}, keep=keep)
+            findings.transport = Transport(problem, steps, renewals=stored or {}, keep=keep, clean=self.clean)
         else:
             findings.transport = Bank(problem, steps, grown=stored or [], keep=keep)
         hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"

@@ -18,7 +18,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.searches import Searches
 from advsearch.engine.smallest_change import find_smallest
-from advsearch.engine.transport import reason_against
+from advsearch.engine.transport import CleanMatrix, reason_against
 from advsearch.engine.verifier import Verifier
 from advsearch.interrupts import interruptible
 from advsearch.report.wording import count
@@ -40,6 +40,7 @@ class Attack:
         stages: told which stage runs.
         preparation: what is measured before.
         findings: filled by `carry_out`.
+        clean: the matrix of light transport that attacks with other budgets share.
     """
 
     problem: Problem
@@ -50,12 +51,14 @@ class Attack:
     stages: Stages
     preparation: Preparation = field(default_factory=Preparation)
     findings: Findings = field(default_factory=Findings)
+    clean: CleanMatrix = field(default_factory=CleanMatrix)
 
     def __post_init__(self) -> None:
         self._asked_spp = self.problem.spp  # a preparation may choose another one for the search
         kept = (self.recorder, self.memory, self.stages, self.findings)
         self._verifier = Verifier(self.problem, self.budget, *kept)
-        self._searches = Searches(self.problem, self.budget, self.policy, *kept, self.preparation.specialise)
+        specialise = self.preparation.specialise
+        self._searches = Searches(self.problem, self.budget, self.policy, *kept, specialise, self.clean)
 
     def carry_out(self) -> Findings:
         """Do everything; what an interrupt leaves undone is missing from the findings."""

@@ -180,6 +180,17 @@ class Linearised:
 
 
 @dataclass
+class CleanMatrix:
+    """The matrix of the clean configuration, for attacks that differ in nothing but their budget of change.
+
+    Attributes:
+        made: None until the first of them needs it.
+    """
+
+    made: Linearised | None = None
+
+
+@dataclass
 class Transport(Predictor):
     """The matrices of a run's searches where nothing varies by chance.
 
@@ -190,6 +201,7 @@ class Transport(Predictor):
             could be, from which on pictures are traced; may be filled before a search that goes on.
         deviations: what the comparisons found, in order.
         keep: told of `renewals` whenever there is another one.
+        clean: where every search begins; made here if it is not there yet.
         seconds: spent on making matrices and on comparing.
     """
 
@@ -197,10 +209,12 @@ class Transport(Predictor):
     steps: int
     renewals: dict[str, list[int]] = field(default_factory=dict)
     keep: Callable[[dict[str, list[int]]], None] = lambda renewals: None
+    clean: CleanMatrix = field(default_factory=CleanMatrix)
     deviations: list[Deviation] = field(default_factory=list)
     seconds: float = 0.0
     _optimism: float = 0.0
     _start: Linearised | None = None
+    _collected: int = 0
     _present: dict[str, Linearised] = field(default_factory=dict)
 
     @property
@@ -236,10 +250,13 @@ class Transport(Predictor):
 
     @property
     def traced(self) -> int:
-        return (1 + self.renewed) * self._pictures + sum(one.pictures for one in self.deviations)
+        return (self._collected + self.renewed) * self._pictures + sum(one.pictures for one in self.deviations)
 
     def prepare(self, tick: Tick = lambda samples: None) -> None:
-        self._start = self._made(self.problem.domain.start, "start", 0, tick)
+        if self.clean.made is None:
+            self.clean.made = self._made(self.problem.domain.start, "start", 0, tick)
+            self._collected = 1
+        self._start = self.clean.made
 
     @property
     def _pictures(self) -> int:

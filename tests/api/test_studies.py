@@ -22,6 +22,7 @@ from advsearch.cli.gap import answer
 from advsearch.cli.main import main
 from advsearch.cli.region import answer as region_text
 from advsearch.config import AttackConfig, GapConfig, RegionConfig
+from advsearch.engine.transport import CleanMatrix
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.listing import finished, listed
@@ -38,7 +39,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[AttackConfig]
     monkeypatch.chdir(tmp_path)
     done: list[AttackConfig] = []
 
-    def attack(config: AttackConfig, *, progress: Any) -> Any:
+    def attack(config: AttackConfig, *, progress: Any, clean: CleanMatrix | None = None) -> Any:
         done.append(config)
         with RunDirectory.create(config.run, overwrite=config.overwrite) as run:
             run.write_config(config)
@@ -107,7 +108,7 @@ def test_a_study_goes_on_with_the_part_at_which_it_was_stopped(
     config = GapConfig(object="mug,bowl", controls="texture,geometry", run="study")
     carry_out: Callable[..., Any] = vars(studies)["attack_once"]
 
-    def stopped(config: AttackConfig, *, progress: Any) -> Any:
+    def stopped(config: AttackConfig, *, progress: Any, clean: CleanMatrix | None = None) -> Any:
         if len(asked) == 2:
             raise KeyboardInterrupt
         return carry_out(config, progress=progress)

@@ -15,7 +15,10 @@ from stand_ins import Impatient, rows
 from torch import Tensor
 
 import advsearch
+from advsearch.api.gap import curve_from_config
+from advsearch.config import AttackConfig
 from advsearch.engine import transport as searching
+from advsearch.runs.summary import attack_of
 from advsearch.scene.mitsuba_backend.transport import Vertices
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport import plan
@@ -180,6 +183,25 @@ def test_the_smallest_budget_is_sought_with_one_matrix(monkeypatch: pytest.Monke
     found = advsearch.attack("mug", smallest=True, baseline=False, run=None, **SMALL).summary  # type: ignore[arg-type]
     assert found.smallest is not None and found.smallest.epsilon is not None and found.smallest.searches > 1
     assert made == 1 and guesses >= 5
+
+
+def test_a_curve_over_epsilon_is_searched_with_one_matrix(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    made, linearised = 0, plan.predicting
+
+    def counted(*given: Any) -> Any:
+        nonlocal made
+        made += 1
+        return linearised(*given)
+
+    monkeypatch.setattr(searching, "predicting", counted)
+    settings: Any = {**SMALL, "baseline": False, "average": 0, "resolution": (SIZE, SIZE)}
+    config = AttackConfig(object="mug", epsilon="0.002,0.004", run=str(tmp_path / "curve"), **settings)
+    found = curve_from_config(config)
+    assert made == 1 and [one.robust for one in found.curve] == [1, 1]
+    alone = advsearch.attack("mug", epsilon=0.004, run=tmp_path / "alone", **settings)
+    shared = attack_of(tmp_path / "curve" / "parts" / found.parts[1])
+    assert made == 2 and alone.summary.verified is not None and shared.verified == alone.summary.verified
+    assert shared.transport is not None and shared.transport.seconds == 0.0
 
 
 def test_a_guess_learns_how_optimistic_a_prediction_was(monkeypatch: pytest.MonkeyPatch) -> None:
