@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from advsearch.api.gap import gap as gap
     from advsearch.api.plan import plan as plan
     from advsearch.api.precision import precision as precision
+    from advsearch.api.recipe import recipe as recipe
     from advsearch.api.region import region as region
     from advsearch.api.render import Rendering as Rendering
     from advsearch.api.render import render as render
@@ -46,6 +47,7 @@ _HOMES = {
     "load_scene": "advsearch.engine.loading",
     "plan": "advsearch.api.plan",
     "precision": "advsearch.api.precision",
+    "recipe": "advsearch.api.recipe",
     "region": "advsearch.api.region",
     "render": "advsearch.api.render",
     "replay": "advsearch.api.replay",

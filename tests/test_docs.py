@@ -48,6 +48,7 @@ from advsearch.config import (
     TRIALS_OVER,
     WAYS,
     AttackConfig,
+    RecipeConfig,
     RegionConfig,
     RenderConfig,
     ReplayConfig,
@@ -63,6 +64,8 @@ from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.axes import read_axes
 from advsearch.evaluation.stability.suite import chosen
 from advsearch.models import loading, reference
+from advsearch.recipes.description import read_recipe
+from advsearch.recipes.parts import planned
 from advsearch.runs import directory, export, store
 from advsearch.runs.results import KEPT
 from advsearch.runs.results.base import Result
@@ -381,6 +384,9 @@ def check_names(config: Config) -> None:
     if isinstance(config, ReplayConfig):
         assert set(config.chosen) <= set(WAYS)
         return
+    if isinstance(config, RecipeConfig):
+        assert config.recipe in ("list", "mine.yaml") or planned(read_recipe(config.recipe), config)
+        return
     assert isinstance(config, SceneConfig)
     over = getattr(config, "over", {})
     shared = RunSettings(getattr(config, "epsilon", None), getattr(config, "norm", None), config.texture_resolution)
@@ -452,6 +458,9 @@ def test_every_yaml_example_is_a_configuration(page: Path, tmp_path: Path) -> No
         named = re.match(r"# (\S+\.yaml)\n", block)  # others on the page may build on it
         path = tmp_path / (named[1] if named else "example.yaml")
         path.write_text(block, encoding="utf-8")
+        if "parts" in read_yaml(path):
+            read_recipe(str(path))
+            continue
         config = CONFIGS[str(read_yaml(path).get("command", "attack"))]
         check_names(config.from_yaml(path))
 

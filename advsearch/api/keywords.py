@@ -133,6 +133,22 @@ class ReplayKeywords(RunKeywords, total=False):
     threads: int | None
 
 
+class RecipeKeywords(RunKeywords, total=False):
+    """Of `recipe`."""
+
+    quick: bool
+    object: Path | Names | None
+    environment: Path | Names | None
+    up: Literal["y", "z"] | None
+    resolution: int | str | tuple[int, int] | None
+    model: Path | Names | None
+    labels: str | Path | None
+    label: str | Mapping[str, str]
+    seed: int
+    threads: int | None
+    deterministic: bool
+
+
 class PlanKeywords(DerivativeKeywords, NamedKeywords, total=False):
     """Of `plan`."""
 

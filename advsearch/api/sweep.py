@@ -237,7 +237,7 @@ def _stopped(config: SweepConfig) -> Path | None:
         return None
     path = run_path(config.run)
     recipe = path / CONFIG
-    same = recipe.is_file() and recipe.read_text(encoding="utf-8") == config.recipe().to_yaml()
+    same = recipe.is_file() and recipe.read_text(encoding="utf-8") == config.to_repeat().to_yaml()
     return path if same and not finished(path) else None
 
 

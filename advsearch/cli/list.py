@@ -1,4 +1,4 @@
-"""`advsearch list`: the names of objects, environments, controls, policies, tasks, objectives and models."""
+"""`advsearch list`: the names of objects, environments, controls, policies, tasks, objectives, models and recipes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from advsearch.cli import output
 
-HELP = "list the objects, environments, controls, policies, tasks, objectives and models that have names"
+HELP = "list the objects, environments, controls, policies, tasks, objectives, models and recipes that have names"
 
 REGISTRIES = {
     "objects": "advsearch.scene.library:list_objects",
@@ -20,6 +20,7 @@ REGISTRIES = {
     "tasks": "advsearch.tasks:TASKS",
     "objectives": "advsearch.attacks.objectives:objective_summaries",
     "models": "advsearch.cli.list:MODELS",
+    "recipes": "advsearch.recipes.description:titles",
 }
 """Where the names of each kind are: a mapping from them, or a function that returns them."""
 

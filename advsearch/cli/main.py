@@ -28,6 +28,7 @@ COMMANDS = {
     "attack": "advsearch.cli.attack",
     "render": "advsearch.cli.render",
     "sweep": "advsearch.cli.sweep",
+    "recipe": "advsearch.cli.recipe",
     "run": "advsearch.cli.run",
     "gap": "advsearch.cli.gap",
     "region": "advsearch.cli.region",

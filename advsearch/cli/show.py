@@ -1,4 +1,4 @@
-"""`advsearch show`: what a run found, what a control can vary, or the options of a policy or a task."""
+"""`advsearch show`: what a run found, what a control can vary, the options of a policy or a task, or a recipe."""
 
 from __future__ import annotations
 
@@ -14,19 +14,22 @@ if TYPE_CHECKING:
     from advsearch.controls import Choice, Parameter
     from advsearch.runs.listing import Listed
 
-HELP = "show what a run found, the parameters of a control, or the options of a policy or a task"
+HELP = "show what a run found, the parameters of a control, the options of a policy or a task, or a recipe"
 
 
 def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
         "show",
-        usage="advsearch show [--json] RUN | control NAME | policy NAME | task NAME",
+        usage="advsearch show [--json] RUN | control NAME | policy NAME | task NAME | recipe NAME",
         help=HELP,
         description=HELP[0].upper() + HELP[1:] + ".",
     )
     parser.add_argument(
-        "what", nargs="+", metavar="WHAT", help="a run's name or folder; or: control NAME, policy NAME, task NAME"
+        "what",
+        nargs="+",
+        metavar="WHAT",
+        help="a run's name or folder; or: control NAME, policy NAME, task NAME, recipe NAME",
     )
     output.add_flags(parser)
 
@@ -38,9 +41,11 @@ def run(args: argparse.Namespace) -> int:
             return _show_control(name, args.json)
         case ["policy" | "task" as kind, name]:
             return _show_options(kind, name, args.json)
+        case ["recipe", name]:
+            return _show_recipe(name, args.json)
         case [name]:
             return show_run(name, args.json)
-    kinds = "control NAME, policy NAME, task NAME"
+    kinds = "control NAME, policy NAME, task NAME, recipe NAME"
     raise InputError(f"expected the name of a run, or one of {kinds}, got {' '.join(args.what)!r}")
 
 
@@ -133,6 +138,17 @@ def _show_options(kind: str, name: str, as_json: bool) -> int:
     print(f"{name}: {first_line(entry)}\n")
     rows = [{"name": one, "type": options[one][0], "default": _cell(defaults[one])} for one in options]
     print(f"options, as in --{kind} '{name}={{OPTION: VALUE}}':\n{_table(rows)}" if rows else "It has no options.")
+    return 0
+
+
+def _show_recipe(name: str, as_json: bool) -> int:
+    from advsearch.recipes.description import read_recipe, text_of
+
+    text = text_of(name)
+    if as_json:
+        output.print_json({"schema": 1, "recipe": name, **read_recipe(name).model_dump(mode="json")})
+    else:
+        print(text, end="")
     return 0
 
 

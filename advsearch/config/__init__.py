@@ -12,6 +12,7 @@ from advsearch.config.checking import CheckConfig, PlanConfig, StabilityConfig
 from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.precision import QUANTITIES, SAMPLERS, PrecisionConfig
 from advsearch.config.questions import FEWEST_SAMPLES, GapConfig, RegionConfig
+from advsearch.config.recipe import RecipeConfig
 from advsearch.config.rendering import RenderConfig
 from advsearch.config.replaying import WAYS, ReplayConfig
 from advsearch.config.scene import AUTO_SHARE, CLOSE_LOOKS, SEARCH_SPP, SceneConfig
@@ -31,6 +32,7 @@ CONFIGS: dict[str, type[Config]] = {
         CheckConfig,
         StabilityConfig,
         PrecisionConfig,
+        RecipeConfig,
     )
 }
 """What the settings of each command are, in the order in which the docs show them."""
@@ -53,6 +55,7 @@ __all__ = [
     "GapConfig",
     "PlanConfig",
     "PrecisionConfig",
+    "RecipeConfig",
     "RegionConfig",
     "RenderConfig",
     "ReplayConfig",

@@ -55,6 +55,7 @@ pre { background: var(--card); border: 1px solid var(--line); border-radius: 4px
   font: 0.86rem/1.5 ui-monospace, SFMono-Regular, Menlo, Consolas, "DejaVu Sans Mono", monospace; margin: 0.5rem 0; }
 pre.wrap { white-space: pre-wrap; overflow-wrap: anywhere; }
 footer { margin-top: 3rem; padding-top: 1rem; padding-bottom: 2.5rem; font-size: 0.88rem; color: var(--soft); }
+.scroll.wide img { min-width: 27rem; }
 @media (max-width: 34rem) { .facts th { width: 7.5rem; } .hide-small, svg.wide { display: none; }
   svg.narrow { display: block; } .scroll th, .scroll td { padding-right: 0.5rem; font-size: 0.88rem; }
   .scroll thead th { white-space: normal; } }

@@ -220,7 +220,7 @@ class RunDirectory:
         What decides the numbers is noted in the store too, so that a file that was edited since is noticed.
         """
         self.store.set_note(BEGUN_WITH, json.dumps(config.deciding()))
-        return write_text(self.path / CONFIG, config.recipe().to_yaml())
+        return write_text(self.path / CONFIG, config.to_repeat().to_yaml())
 
     def record(self, *rows: store.Row) -> None:
         """Add evaluated configurations to the results; they survive a kill when this returns (see `store`).

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 PLACE: Mapping[str, bool | None] = {"run": None, "overwrite": False}
 """The settings that say where a run is kept, not what it does, as a repetition has them."""
 
-FILES = ("object", "environment", "model", "labels")
+FILES = ("object", "environment", "model", "labels", "recipe")
 """The settings that may name files."""
 
 
@@ -152,7 +152,7 @@ class Config(BaseModel):
         """What names a run of this whose place is not said."""
         return (self.command,)
 
-    def recipe(self) -> Self:
+    def to_repeat(self) -> Self:
         """Return what `run.yaml` holds: no place for the run (a repetition gets its own) and files by absolute path."""
         places = {name: _absolute(getattr(self, name)) for name in FILES if name in type(self).model_fields}
         return self.model_copy(update={**places, **PLACE})

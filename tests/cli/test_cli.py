@@ -375,7 +375,7 @@ def test_run_reads_a_file_and_puts_changes_over_it(asked: list[AttackConfig], tm
         (
             "object: mug\ncommand: atack\n",
             [],
-            "unknown command 'atack'. Did you mean 'attack'? Known: attack, check, gap, plan, precision, region, ",
+            "unknown command 'atack'. Did you mean 'attack'? Known: attack, check, gap, plan, precision, recipe, region, ",
         ),
         ("object: mug\n", ["steps"], "change 'steps': expected NAME=VALUE such as camera.azimuth=130, got 'steps'"),
         ("object: mug\n", ["step=3"], "unknown setting 'step'. Did you mean 'steps'"),
@@ -722,6 +722,7 @@ def registries(monkeypatch: pytest.MonkeyPatch) -> None:
     put("advsearch.controls", CONTROLS={"camera": Camera()})
     put("advsearch.attacks", POLICIES={"pgd": Pgd})
     put("advsearch.tasks", TASKS={"classification": Pgd})
+    put("advsearch.recipes.description", titles=lambda: {"backgrounds": "Which are hard?"})
     put("advsearch.attacks.objectives", objective_summaries=lambda: {"margin": "Largest wrong logit."})
 
 
@@ -732,6 +733,7 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
     assert found == {
         "schema": 1, "objects": ["ball", "mug"], "environments": ["studio"], "controls": ["camera"],
         "policies": ["pgd"], "tasks": ["classification"], "objectives": ["margin"], "models": ["reference"],
+        "recipes": ["backgrounds"],
     }  # fmt: skip
     assert main(["list"]) == 0
     out = capsys.readouterr().out

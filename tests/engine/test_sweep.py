@@ -779,7 +779,7 @@ def test_the_recipe_repeats_the_sweep(tmp_path: Path, monkeypatch: pytest.Monkey
     assert "--grid pose.yaw=0:360:6 --grid 'camera.elevation=[5,20,35]'" in config.command_line()
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.obj").touch()
-    assert SweepConfig(object="a.obj,mug").recipe().object == f"{tmp_path / 'a.obj'},mug"
+    assert SweepConfig(object="a.obj,mug").to_repeat().object == f"{tmp_path / 'a.obj'},mug"
 
 
 def test_yaml_does_not_read_a_range_as_a_number_to_the_base_of_60() -> None:

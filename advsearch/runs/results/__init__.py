@@ -10,6 +10,7 @@ from advsearch.runs.results.gap import CurveResult, GapResult
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.plan import PlanResult
 from advsearch.runs.results.precision import PrecisionResult
+from advsearch.runs.results.recipe import RecipeResult
 from advsearch.runs.results.region import RegionResult
 from advsearch.runs.results.replay import ReplayResult
 from advsearch.runs.results.stability import StabilityResult
@@ -25,6 +26,7 @@ KEPT: tuple[type[Result], ...] = (
     PlanResult,
     PrecisionResult,
     StabilityResult,
+    RecipeResult,
 )
 """The results that a run keeps in `summary.json`."""
 

@@ -1,0 +1,175 @@
+"""`recipe`: an experiment that a YAML file describes: runs of the commands there are, and figures of their answers."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from advsearch.api import carry_out
+from advsearch.api.keywords import RecipeKeywords, asks, configured
+from advsearch.config import CONFIGS, RecipeConfig
+from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
+from advsearch.progress import NullProgress, Progress
+from advsearch.recipes.description import Recipe, read_recipe, recipe_of
+from advsearch.recipes.figures import as_table, compute, draw, read_options
+from advsearch.recipes.parts import Planned, listed, made_of, planned
+from advsearch.recipes.table import Answered, Table, rows_of
+from advsearch.runs.directory import CONFIG, IMAGES, PARTS, RunDirectory, is_run
+from advsearch.runs.files import write_bytes
+from advsearch.runs.listing import finished
+from advsearch.runs.results.attack import AttackSummary
+from advsearch.runs.results.base import INTERRUPTED, Result
+from advsearch.runs.results.recipe import RecipeFigure, RecipePart, RecipeResult
+from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.summary import read_result
+from advsearch.settings import read_yaml
+from advsearch.viewer.recipe_page import write_recipe_page
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+NOTE = "recipe"
+"""Under which a run's store keeps the recipe, so that it goes on as it began."""
+
+
+@asks(RecipeConfig, RecipeKeywords)
+def recipe(recipe: str | Path, *, progress: Progress | None = None, **settings: Unpack[RecipeKeywords]) -> RecipeResult:
+    """Carry out a recipe: its runs, its figures, and what they say (docs/recipes.md).
+
+    All other arguments are the settings of `advsearch recipe`. The run is kept, in `run` or under runs/.
+
+    Args:
+        recipe: the name of a bundled recipe, or a YAML file.
+        progress: told how far it is.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    return recipe_from_config(configured(RecipeConfig, recipe=recipe, **settings), progress=progress)
+
+
+def recipe_from_config(
+    config: RecipeConfig, *, progress: Progress | None = None, resumed: Path | None = None
+) -> RecipeResult:
+    """Carry out the recipe that a configuration names; parts that are done are not done again.
+
+    Args:
+        config: what.
+        progress: told how far it is.
+        resumed: folder of the run to go on with.
+
+    Raises:
+        InputError: the recipe has a part or a figure that does not work; nothing is written where that is seen before.
+    """
+    begun = time.perf_counter()
+    described = read_recipe(config.recipe) if resumed is None else None
+    if described is not None:
+        _check(described, config)
+    with RunDirectory.of(config, resumed) as run:
+        if described is None:
+            described = recipe_of(run.store.noted(NOTE) or {}, f"{run.path}: the recipe that it began with")
+        run.store.set_note(NOTE, json.dumps(described.model_dump(mode="json")))
+        results = _carried_out(planned(described, config), run, progress or NullProgress())
+        interrupted = any(one.goes_on for _, one in results)
+        figures = [] if interrupted else list(_figures(described, config, results, run))
+        result = _result(described, config, run, results, figures, time.perf_counter() - begun)
+        run.write_summary(result)
+        write_recipe_page(run.path, result, [as_table(one) for one in figures])
+        return result
+
+
+def _check(described: Recipe, config: RecipeConfig) -> None:
+    """Read everything that a recipe says, so that what is wrong in it is told before anything is rendered."""
+    planned(described, config)
+    for one in described.figures:
+        read_options(one, config.recipe)
+
+
+# ---- the runs -------------------------------------------------------------------------------------------------------
+
+
+def _carried_out(runs: Sequence[Planned], run: RunDirectory, progress: Progress) -> list[tuple[Planned, Result]]:
+    """Carry out the runs that are not done, until one is interrupted; return all that there are."""
+    results: list[tuple[Planned, Result]] = []
+    for number, one in enumerate(runs):
+        path = run.path / PARTS / one.name
+        progress.message(f"run {number + 1} of {len(runs)}: {one.part}, {one.config.object}")
+        if is_run(path) and (path / CONFIG).is_file():
+            done = read_result(path) if finished(path) else _gone_on(path, progress)
+        else:
+            own = one.config.model_copy(update={"run": str(path), "overwrite": True})
+            done = carry_out(own, progress=progress)
+        results.append((one, done))
+        if done.goes_on:
+            break
+    return results
+
+
+def _gone_on(path: Path, progress: Progress) -> Result:
+    kind = CONFIGS[str(read_yaml(path / CONFIG)["command"])]
+    return carry_out(kind.from_yaml(path / CONFIG), progress=progress, resumed=path)
+
+
+# ---- what they come to ----------------------------------------------------------------------------------------------
+
+
+def _figures(
+    described: Recipe, config: RecipeConfig, results: Sequence[tuple[Planned, Result]], run: RunDirectory
+) -> Iterable[RecipeFigure]:
+    """Compute and draw the figures."""
+    rows: list[Answered] = []
+    for one, result in results:
+        if isinstance(result, SweepSummary):
+            rows += rows_of(one.part, run.path / PARTS / one.name, result)
+    table = Table(rows, described.groups)
+    for number, figure in enumerate(described.figures):
+        made = compute(table, *read_options(figure, config.recipe))
+        for suffix, data in draw(made).items():
+            write_bytes(run.path / IMAGES / f"figure-{number + 1}.{suffix}", data)
+        yield made
+
+
+def _result(
+    described: Recipe,
+    config: RecipeConfig,
+    run: RunDirectory,
+    results: Sequence[tuple[Planned, Result]],
+    figures: Sequence[RecipeFigure],
+    seconds: float,
+) -> RecipeResult:
+    settings = made_of(described, config).settings
+    controls = [name for one, _ in results if isinstance(one.config, SceneConfig) for name in one.config.controls]
+    warnings = [text for _, one in results for text in getattr(one, "warnings", ())]
+    return RecipeResult(
+        run=str(run.path),
+        recipe=config.recipe,
+        title=described.title,
+        about=described.about,
+        quick=config.quick,
+        objects=listed(settings["object"]),
+        environment=",".join(listed(settings.get("environment") or DEFAULT_ENVIRONMENT)),
+        model=",".join(listed(settings.get("model") or "reference")),
+        controls=list(dict.fromkeys(controls)),
+        parts=[_part(one, result) for one, result in results],
+        figures=list(figures),
+        ending=INTERRUPTED if any(one.goes_on for _, one in results) else "done",
+        warnings=list(dict.fromkeys(warnings)),
+        seconds={"total": seconds},
+        seed=config.seed,
+        command_line=config.command_line(),
+    )
+
+
+def _part(one: Planned, result: Result) -> RecipePart:
+    assert isinstance(result, (AttackSummary, SweepSummary))
+    return RecipePart(
+        name=one.name,
+        part=one.part,
+        command=one.config.command,
+        object=one.config.object,
+        ending=result.ending,
+        renders=sum(result.renders.values()),
+    )

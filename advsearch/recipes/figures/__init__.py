@@ -1,0 +1,65 @@
+"""The kinds of figures, by the names that recipes call them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import ValidationError
+
+from advsearch.errors import FileFormatError, UnknownNameError
+from advsearch.recipes.figures.bars import BARS
+from advsearch.recipes.figures.base import Kind, Options
+from advsearch.recipes.figures.heat_map import HEAT_MAP
+from advsearch.recipes.table import Table
+from advsearch.report.drawing import Figures, drawn
+from advsearch.runs.results.recipe import RecipeFigure
+
+FIGURES: dict[str, Kind[Any, Any]] = {
+    "bars": BARS,
+    "heat map": HEAT_MAP,
+}
+
+
+def read_options(described: Mapping[str, object], where: str) -> tuple[str, Options]:
+    """Return the kind of a figure, and its options.
+
+    Args:
+        described: as it stands in a recipe, with its kind as `figure`.
+        where: the recipe, for messages.
+
+    Raises:
+        UnknownNameError: there is no such kind.
+        FileFormatError: an option is missing, unknown, or of another kind.
+    """
+    given = dict(described)
+    kind = str(given.pop("figure", ""))
+    if kind not in FIGURES:
+        raise UnknownNameError("figure", kind, FIGURES, f"It stands in {where}.")
+    try:
+        return kind, FIGURES[kind].options(**given)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        what = ".".join(str(one) for one in first["loc"])[:80]
+        raise FileFormatError(f"{where}: figures: {kind}: {what}: {first['msg'][:200]}; see docs/recipes.md") from None
+
+
+def compute(table: Table, kind: str, options: Options) -> RecipeFigure:
+    """Return the numbers of a figure, and what they say.
+
+    Raises:
+        InputError: it needs what the answers do not have.
+    """
+    made: RecipeFigure = FIGURES[kind].compute(table.of(options.of), options)
+    return made
+
+
+def draw(made: RecipeFigure) -> Figures:
+    """Return a figure as files."""
+    kind = FIGURES[made.figure]
+    return drawn(lambda figure: kind.draw(made, figure), kind.size(made))
+
+
+def as_table(made: RecipeFigure) -> tuple[list[str], list[list[str]]]:
+    """Return heads and rows of a figure's numbers."""
+    return FIGURES[made.figure].table(made)

@@ -1,0 +1,125 @@
+"""What every kind of figure is: options, numbers made from the answers, sentences about these, and a drawing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from advsearch.attacks import clopper_pearson
+from advsearch.recipes.table import Table, counted
+from advsearch.report.phrases import percent
+from advsearch.report.wording import interval_text
+from advsearch.runs.results.recipe import NamedCount, RecipeFigure
+
+CONFIDENCE = 0.95
+
+
+class Options(BaseModel):
+    """Options that every figure has.
+
+    Attributes:
+        title: over it; made from the other options where it is empty.
+        of: the parts whose answers it shows; all where none is named.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    title: str = Field(default="", max_length=200)
+    of: tuple[str, ...] = ()
+
+
+Chosen = TypeVar("Chosen", bound=Options)
+Made = TypeVar("Made", bound=RecipeFigure)
+
+
+@dataclass(frozen=True)
+class Kind(Generic[Chosen, Made]):
+    """One kind of figure.
+
+    Attributes:
+        options: that it takes.
+        result: its numbers.
+        compute: makes these from the answers.
+        draw: draws them on a figure of matplotlib.
+        size: of that, width and height in inches.
+        table: heads and rows of the same numbers as a table.
+    """
+
+    options: type[Chosen]
+    result: type[Made]
+    compute: Callable[[Table, Chosen], Made]
+    draw: Callable[[Made, Any], None]
+    size: Callable[[Made], tuple[float, float]]
+    table: Callable[[Made], tuple[list[str], list[list[str]]]]
+
+
+def rate(one: NamedCount) -> str:
+    """Return ``right in 12 of 20 (60 %, 95 % interval 36-81 %)``."""
+    return (
+        f"right in {one.correct} of {one.configurations} "
+        f"({percent(one.accuracy)}, 95 % interval {interval_text(one.interval)})"
+    )
+
+
+def extremes(counts: Sequence[NamedCount], worst: str, best: str, thing: str) -> list[str]:
+    """Return which of several has the lowest accuracy and which the highest, and whether that is more than chance.
+
+    The two were chosen among k for being extreme, so that they are compared by intervals of confidence 1 - 0.05 / k,
+    which hold for all k together (Bonferroni). Where these overlap, no difference is shown.
+
+    Args:
+        counts: of each.
+        worst: what the lowest is called: "Hardest".
+        best: what the highest is called: "easiest".
+        thing: what they are, for several of them: "environments".
+    """
+    known = [one for one in counts if one.configurations]
+    if len(known) < 2:
+        return [f"{one.name}: {rate(one)}." for one in known]
+    low, high = (pick(known, key=lambda one: one.accuracy or 0.0) for pick in (min, max))
+    if low.accuracy == high.accuracy:
+        return [f"All {len(known)} {thing} have the same accuracy, {percent(low.accuracy)}: no difference is shown."]
+    said = f"{worst} {_tied(low, known)}: {rate(low)}; {best} {_tied(high, known)}: {rate(high)}."
+    widened = f"the intervals of the two, widened for having been chosen among {len(known)},"
+    if apart(low, high, len(known)):
+        return [said, f"The difference is shown: {widened} do not overlap."]
+    return [said, f"No difference between the {thing} is shown: {widened} overlap."]
+
+
+def _tied(one: NamedCount, counts: Sequence[NamedCount]) -> str:
+    """``is kitchen``, or where others have the same accuracy ``are kitchen and 2 others``."""
+    others = sum(other.accuracy == one.accuracy for other in counts) - 1
+    return f"are {one.name} and {others} other{'s' if others > 1 else ''}, the first" if others else f"is {one.name}"
+
+
+def apart(low: NamedCount, high: NamedCount, among: int = 1) -> bool:
+    """Return whether the intervals of two rates do not overlap, each widened for a choice among so many."""
+    confidence = 1.0 - (1.0 - CONFIDENCE) / max(among, 1)
+    _, top = clopper_pearson(low.correct, low.configurations, confidence)
+    bottom, _ = clopper_pearson(high.correct, high.configurations, confidence)
+    return top < bottom
+
+
+def counted_by(table: Table, column: str) -> list[NamedCount]:
+    """Return how often the model is right, by what rows have in a column."""
+    return [counted(name, rows) for name, rows in table.by(column).items()]
+
+
+def plural(column: str) -> str:
+    """Return what several values of a column are called: ``environments``, ``values of material.which``."""
+    return f"{column}s" if column in ("object", "environment", "model", "group", "answer") else f"values of {column}"
+
+
+def count_rows(counts: Sequence[NamedCount]) -> list[list[str]]:
+    """Return counts as rows of a table."""
+    return [
+        [one.name, f"{one.correct} of {one.configurations}", percent(one.accuracy), interval_text(one.interval)]
+        for one in counts
+    ]
+
+
+COUNT_HEADS = ["right", "accuracy", "95 % interval"]
+"""Heads of `count_rows` after the first."""

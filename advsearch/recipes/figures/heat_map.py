@@ -1,0 +1,88 @@
+"""The accuracy for each pair of values of two things, as colours with numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from advsearch.recipes.figures.base import Kind, Options, extremes, plural
+from advsearch.recipes.table import Table, count_of
+from advsearch.runs.results.recipe import HeatMapFigure, NamedCount
+
+
+class HeatMapOptions(Options):
+    """Options of a heat map.
+
+    Attributes:
+        rows: what rows differ in: object, environment, model, group, answer or a parameter.
+        columns: what columns differ in.
+    """
+
+    rows: str
+    columns: str
+
+
+def _compute(table: Table, options: HeatMapOptions) -> HeatMapFigure:
+    by_row = {name: Table(rows, table.groups).by(options.columns) for name, rows in table.by(options.rows).items()}
+    rows, columns = list(by_row), list(table.by(options.columns))
+    seen = [[len(by_row[row].get(column, ())) for column in columns] for row in rows]
+    correct = [[sum(one.correct for one in by_row[row].get(column, ())) for column in columns] for row in rows]
+    cells = [
+        count_of(f"{row} with {column}", correct[up][across], seen[up][across])
+        for up, row in enumerate(rows)
+        for across, column in enumerate(columns)
+    ]
+    return HeatMapFigure(
+        figure="heat map",
+        title=options.title or f"Accuracy by {options.rows} and {options.columns}",
+        text=_said(cells, plural(options.rows), plural(options.columns)),
+        row=options.rows,
+        column=options.columns,
+        rows=rows,
+        columns=columns,
+        configurations=seen,
+        correct=correct,
+    )
+
+
+def _said(cells: list[NamedCount], rows: str, columns: str) -> list[str]:
+    known = [one for one in cells if one.configurations]
+    never = [one.name for one in known if one.correct == 0]
+    some = "; ".join(never[:4]) + (" and others" if len(never) > 4 else "")
+    said = [f"In {len(never)} of {len(known)} pairs the model is never right: {some}."] if never else []
+    return [*extremes(cells, "The lowest pair", "the highest", f"pairs of {rows} and {columns}"), *said]
+
+
+def _draw(made: HeatMapFigure, figure: Any) -> None:
+    axes = figure.subplots()
+    shares = [
+        [right / seen if seen else float("nan") for right, seen in zip(*pair, strict=True)]
+        for pair in zip(made.correct, made.configurations, strict=True)
+    ]
+    shown = axes.imshow(shares, cmap="RdBu", vmin=0.0, vmax=1.0, aspect="auto")
+    for up, row in enumerate(shares):
+        for across, share in enumerate(row):
+            if share == share:
+                colour = "white" if abs(share - 0.5) > 0.3 else "black"
+                axes.text(across, up, f"{100 * share:.0f}", ha="center", va="center", color=colour, fontsize=7.5)
+    axes.set_xticks(range(len(made.columns)), made.columns, rotation=35, ha="right", rotation_mode="anchor")
+    axes.set_yticks(range(len(made.rows)), made.rows)
+    axes.set_title(f"{made.title} [%]")
+    figure.colorbar(shown, ax=axes, label="accuracy")
+
+
+def _table(made: HeatMapFigure) -> tuple[list[str], list[list[str]]]:
+    rows = [
+        [name, *(f"{right} of {seen}" for right, seen in zip(correct, configurations, strict=True))]
+        for name, correct, configurations in zip(made.rows, made.correct, made.configurations, strict=True)
+    ]
+    return [made.row, *made.columns], rows
+
+
+HEAT_MAP = Kind(
+    HeatMapOptions,
+    HeatMapFigure,
+    _compute,
+    _draw,
+    lambda made: (2.6 + 0.42 * len(made.columns), 1.7 + 0.28 * len(made.rows)),
+    _table,
+)

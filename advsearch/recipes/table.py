@@ -1,0 +1,149 @@
+"""The answers of a recipe's runs as one table, which its figures are made from."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from advsearch.attacks import clopper_pearson
+from advsearch.errors import InputError
+from advsearch.report.wording import short_name
+from advsearch.runs.results.recipe import NamedCount
+from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.store import NAME, Store
+
+ANSWER, GROUP = "answer", "group"
+"""What the model said, and the group that an object is in, as columns of the table."""
+
+OTHERS = "others"
+"""The group of objects that are in none."""
+
+
+@dataclass(frozen=True)
+class Answered:
+    """What a model said of one picture.
+
+    Attributes:
+        part: of the recipe.
+        values: what the picture shows: object, environment, model, and parameters in their units.
+        units: of the parameters.
+        answer: in words.
+        correct: whether it is right.
+    """
+
+    part: str
+    values: Mapping[str, float | str]
+    units: Mapping[str, str]
+    answer: str
+    correct: bool
+
+
+@dataclass(frozen=True)
+class Table:
+    """All answers of a recipe.
+
+    Attributes:
+        rows: of its sweeps.
+        groups: names of groups, each with the names of objects in it.
+    """
+
+    rows: Sequence[Answered]
+    groups: Mapping[str, Sequence[str]]
+
+    def of(self, parts: Sequence[str]) -> Table:
+        """Return the answers of some parts; of all where none is named."""
+        return Table([row for row in self.rows if not parts or row.part in parts], self.groups)
+
+    def value(self, row: Answered, column: str) -> float | str:
+        """Return what a row has in a column: a value, the answer, or the group of its object.
+
+        Raises:
+            InputError: there is no such column.
+        """
+        if column == ANSWER:
+            return row.answer
+        if column == GROUP:
+            name = str(row.values["object"])
+            return next((group for group, inside in self.groups.items() if name in inside), OTHERS)
+        if column not in row.values:
+            known = ", ".join([*row.values, ANSWER, *([GROUP] if self.groups else [])])
+            raise InputError(f"figures: expected one of {known}, got {column[:60]!r}")
+        return row.values[column]
+
+    def numbers(self, column: str) -> list[float]:
+        """Return what each row has in a column of numbers.
+
+        Raises:
+            InputError: there is no such column, or it has names.
+        """
+        values = [self.value(row, column) for row in self.rows]
+        numbers = [value for value in values if isinstance(value, (int, float))]
+        if len(numbers) < len(values):
+            raise InputError(f"figures: {column}: expected a parameter with numbers, got names")
+        return numbers
+
+    def unit(self, column: str) -> str:
+        """Return the unit of a column; empty where it has none."""
+        return next((row.units.get(column, "") for row in self.rows if column in row.units), "")
+
+    def by(self, column: str) -> dict[str, list[Answered]]:
+        """Return the rows by what they have in a column, in the order in which that first comes; numbers by size."""
+        found: dict[float | str, list[Answered]] = {}
+        for row in self.rows:
+            found.setdefault(self.value(row, column), []).append(row)
+        numbers = all(isinstance(value, (int, float)) for value in found)
+        keys = sorted(found) if numbers else list(found)
+        return {written(key): found[key] for key in keys}
+
+
+def counted(name: str, rows: Iterable[Answered]) -> NamedCount:
+    """Return in how many of some rows the model is right."""
+    right = [row.correct for row in rows]
+    return count_of(name, sum(right), len(right))
+
+
+def count_of(name: str, correct: int, configurations: int) -> NamedCount:
+    """Return a count with its share and the 95 % interval of that."""
+    return NamedCount(
+        name=name,
+        configurations=configurations,
+        correct=correct,
+        accuracy=correct / configurations if configurations else None,
+        interval=clopper_pearson(correct, configurations) if configurations else None,
+    )
+
+
+def most_frequent(rows: Iterable[Answered]) -> list[tuple[str, int]]:
+    """Return the answers with how often each was given, the most frequent first."""
+    return sorted(Counter(row.answer for row in rows).items(), key=lambda one: (-one[1], one[0]))
+
+
+def written(value: float | str) -> str:
+    """Return a value as figures write it; of a file, its name without folder and suffix."""
+    if isinstance(value, str):
+        return Path(short_name(value)).stem if "/" in value else value
+    return f"{value:.4g}"
+
+
+def rows_of(part: str, folder: Path, summary: SweepSummary) -> list[Answered]:
+    """Return the answers that a sweep has stored.
+
+    Args:
+        part: of the recipe.
+        folder: of the run.
+        summary: of it.
+
+    Raises:
+        FileFormatError: the rows cannot be read.
+    """
+    outer = {"object": summary.object, "environment": summary.environment, "model": summary.model}
+    rows = []
+    with Store(folder / NAME, read_only=True) as store:
+        for row in store.rows("sweep"):
+            values = {name: one["value"] for name, one in row.values.items()}
+            named = {name: written(str(values.get(name, of_all))) for name, of_all in outer.items()}
+            units = {name: one["unit"] for name, one in row.values.items() if one["unit"]}
+            rows.append(Answered(part, {**values, **named}, units, row.label or "none", bool(row.correct)))
+    return rows

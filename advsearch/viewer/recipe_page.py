@@ -1,0 +1,80 @@
+"""`report.html` of a recipe: each figure with what it says and its numbers, and the runs that it took."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from advsearch.report import wording
+from advsearch.report.markup import Html, element, join
+from advsearch.runs.directory import IMAGES, PARTS, REPORT
+from advsearch.runs.files import write_text
+from advsearch.runs.results.recipe import RecipeFigure, RecipePart, RecipeResult
+from advsearch.viewer.document import data_url, document
+from advsearch.viewer.study_page import again, facts_table, heading, table
+
+Numbers = tuple[list[str], list[list[str]]]
+"""Heads and rows of a table."""
+
+
+def write_recipe_page(run: Path, result: RecipeResult, tables: Sequence[Numbers]) -> Path:
+    """Write `report.html` into the run of a recipe, and return its path.
+
+    Args:
+        run: its folder.
+        result: of it.
+        tables: the numbers of each figure.
+
+    Raises:
+        StorageError: it could not be written.
+    """
+    what = f"recipe {Path(result.recipe).stem}; {result.model}; {', '.join(map(wording.short_name, result.objects))}"
+    facts = {
+        "Objects": ", ".join(result.objects),
+        "Environments": result.environment.replace(",", ", "),
+        "Models": result.model.replace(",", ", "),
+        "Renders": str(sum(one.renders for one in result.parts)),
+        "Time": wording.seconds_text(result.seconds["total"]),
+        "Seed": str(result.seed),
+    }
+    main = element(
+        "main",
+        element("p", result.about) if result.about else None,
+        *(
+            _section(one, run / IMAGES / f"figure-{number}.png", numbers)
+            for number, (one, numbers) in enumerate(zip(result.figures, tables, strict=True), start=1)
+        ),
+        join(element("h2", "Cost and conditions"), facts_table(facts)),
+        _runs(result.parts),
+        again(result.command_line),
+    )
+    header = heading(what, result.title, [*_cautions(result), *result.warnings])
+    page = document(
+        f"{run.name}, {result.title}", header, main, footer=f"run {run.name}. This page needs no other file."
+    )
+    return write_text(run / REPORT, page, durable=False)
+
+
+def _cautions(result: RecipeResult) -> list[str]:
+    said = ["Made with few and small pictures, to see what comes out; no result."] if result.quick else []
+    return [*said, "Interrupted before its end; there are no figures yet."] if result.goes_on else said
+
+
+def _section(made: RecipeFigure, picture: Path, numbers: Numbers) -> Html:
+    heads, rows = numbers
+    image = None
+    if picture.is_file():
+        alt = " ".join(made.text) or made.title
+        image = element("img", src=data_url(picture.read_bytes(), "image/png"), alt=alt)
+    return join(
+        element("h2", made.title),
+        *(element("p", text) for text in made.text),
+        element("figure", element("div", image, class_="scroll wide")) if image else None,
+        element("details", element("summary", "The numbers"), table(heads, rows)) if rows else None,
+    )
+
+
+def _runs(parts: list[RecipePart]) -> Html:
+    rows = [[one.name, one.command, one.ending, str(one.renders)] for one in parts]
+    listed = table([f"runs in {PARTS}/", "command", "ending", "renders"], rows)
+    return element("details", element("summary", wording.count(len(rows), "run")), listed)

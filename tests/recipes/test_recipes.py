@@ -1,0 +1,231 @@
+"""Recipes: what a file may say, the runs that it comes to, what figures say, and one that is rendered."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import advsearch
+from advsearch.api import carry_out
+from advsearch.api import recipe as carrying_out
+from advsearch.cli.main import main
+from advsearch.config import RecipeConfig
+from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
+from advsearch.recipes.description import Recipe, names, read_recipe, titles
+from advsearch.recipes.figures import FIGURES, as_table, compute, draw, read_options
+from advsearch.recipes.parts import planned
+from advsearch.recipes.table import Answered, Table
+from advsearch.runs.results.recipe import BarsFigure, HeatMapFigure, RecipeResult
+from advsearch.runs.summary import read_result
+
+TINY = """
+title: Is the mug seen?
+settings: {object: [mug, bowl], environment: [studio, noon], resolution: 16, spp: 1}
+parts:
+  views:
+    command: sweep
+    settings: {controls: {camera: {}}, samples: 2, sampler: random, trials: 0}
+figures:
+  - {figure: heat map, rows: object, columns: environment}
+  - {figure: bars, by: environment}
+"""
+
+
+def rows(counts: dict[str, tuple[int, int]], **more: float | str) -> list[Answered]:
+    """Rows with so many right of so many for each environment."""
+    return [
+        answered({"environment": name, "object": "mug", **more}, number < right)
+        for name, (right, of) in counts.items()
+        for number in range(of)
+    ]
+
+
+def answered(values: dict[str, float | str], right: bool) -> Answered:
+    """A row: a mug, or a mug that is taken for a cup."""
+    return Answered("views", values, {}, "mug" if right else "cup", right)
+
+
+def figure(
+    described: dict[str, object], answered: Sequence[Answered], groups: dict[str, list[str]] | None = None
+) -> Any:
+    """The numbers of a figure of these rows."""
+    return compute(Table(answered, groups or {}), *read_options(described, "here"))
+
+
+# ---- what a file may say --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("quick", [False, True])
+def test_every_bundled_recipe_is_one_that_can_be_carried_out(name: str, quick: bool) -> None:
+    described = read_recipe(name)
+    runs = planned(described, RecipeConfig(recipe=name, quick=quick))
+    assert runs and len({one.name for one in runs}) == len(runs)
+    assert len({one.config.seed for one in runs}) == len(runs)
+    assert described.figures and all(read_options(one, name) for one in described.figures)
+    assert titles()[name] == described.title and described.title.endswith("?")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("title: a", "parts: Field required"),
+        ("title: a\nparts: {a: {command: doctor}}", "parts.a.command: expected attack or sweep, got 'doctor'"),
+        ("title: a\nparts: {a: {command: sweep, settings: {run: /x}}}", "'run' is the same for all parts"),
+        ("title: a\nparts: {../a: {command: sweep}}", "expected names of small letters, digits and hyphens"),
+        ("title: a\nparts: {a: {command: sweep}}\nsettings: {overwrite: true}", "'overwrite' is said with the command"),
+        ("title: a\nparts: {a: {command: sweep, around: b}}", "around: expected a part before it, got 'b'"),
+        ("title: a\nparts: {a: {command: sweep, shell: rm}}", "parts.a.shell: Extra inputs are not permitted"),
+        ("title: !!python/object:os.system a\nparts: {}", "expected YAML"),
+        ("- a", "expected settings and values"),
+    ],
+)
+def test_a_hostile_recipe_is_refused_in_one_sentence(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(FileFormatError) as error:
+        read_recipe(str(path))
+    assert message in str(error.value) and str(error.value).isprintable() and len(str(error.value)) < 500
+
+
+@pytest.mark.parametrize(
+    ("change", "kind", "message"),
+    [
+        ({"parts": {"a": {"command": "sweep", "settings": {"stesp": 4}}}}, UnknownNameError, "unknown setting 'stesp'"),
+        (
+            {"parts": {"a": {"command": "sweep", "settings": {"samples": "many"}}}},
+            InputError,
+            "mine: parts: a: samples: expected a whole number",
+        ),
+        ({"settings": {}}, InputError, "object: expected one, since mine names none"),
+        ({"settings": {"object": ["mug"] * 1001}}, InputError, "expected at most 1000 runs, got 1001"),
+        ({"quick": {"parts": {"b": {}}}}, UnknownNameError, "unknown part 'b'"),
+    ],
+)
+def test_what_no_command_takes_is_refused_before_anything_is_done(
+    change: dict[str, Any], kind: type[AdvsearchError], message: str
+) -> None:
+    described = {"title": "a", "settings": {"object": "mug"}, "parts": {"a": {"command": "sweep"}}, **change}
+    with pytest.raises(kind, match=message):
+        planned(Recipe(**described), RecipeConfig(recipe="mine", quick=True))
+
+
+@pytest.mark.parametrize(
+    ("described", "kind", "message"),
+    [
+        ({"figure": "pie"}, UnknownNameError, "unknown figure 'pie'"),
+        ({"figure": "bars"}, FileFormatError, "figures: bars: by: Field required"),
+        ({"figure": "bars", "by": "weather"}, InputError, "figures: expected one of environment, object, answer, got"),
+    ],
+)
+def test_a_figure_that_cannot_be_made_is_refused(
+    described: dict[str, object], kind: type[AdvsearchError], message: str
+) -> None:
+    with pytest.raises(kind, match=message):
+        figure(described, rows({"noon": (1, 2)}))
+
+
+def test_python_code_in_a_file_is_not_imported_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(TINY.replace("spp: 1", "spp: 1, model: 'os.path:join'"))
+    assert main(["recipe", str(path), "--run", str(tmp_path / "run")]) == 2
+    assert "os.path:join, Python code" in capsys.readouterr().err
+    assert not (tmp_path / "run" / "summary.json").exists()
+
+
+# ---- the runs -------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_asked_for_goes_over_the_recipe_and_labels_go_to_their_objects() -> None:
+    parts = {"a": {"command": "sweep", "settings": {"environment": "noon"}}, "b": {"command": "attack"}}
+    described = Recipe(title="a", settings={"object": "mug", "environment": "studio"}, parts=parts)
+    config = RecipeConfig(
+        recipe="mine", object="x/mug.obj,bowl", environment="kitchen,loft", model="m.pt2",
+        label={"mug": "coffee mug,cup", "*": "bowl"}, seed=3,
+    )  # fmt: skip
+    runs = planned(described, config)
+    assert [(one.part, one.config.object, one.config.environment, one.config.label) for one in runs] == [
+        ("a", "x/mug.obj", "noon", "coffee mug,cup"),
+        ("a", "bowl", "noon", "bowl"),
+        *(("b", name, place, label) for name, label in (("x/mug.obj", "coffee mug,cup"), ("bowl", "bowl"))
+          for place in ("kitchen", "loft")),
+    ]  # fmt: skip
+    assert runs[0].name == "a-00-mug" and runs[2].name == "b-00-mug-kitchen"
+    assert all(one.config.model == "m.pt2" for one in runs)
+
+
+def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, run = tmp_path / "mine.yaml", tmp_path / "run"
+    path.write_text(TINY)
+    real, done = carry_out, list[str]()
+
+    def stopping(config: Any, **named: Any) -> Any:
+        if config.object == "bowl" and not done.count("bowl"):
+            done.append("bowl")
+            raise KeyboardInterrupt
+        done.append(config.object)
+        return real(config, **named)
+
+    monkeypatch.setattr(carrying_out, "carry_out", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        advsearch.recipe(path, run=run)
+    path.unlink()  # it goes on as it began
+    result = carrying_out.recipe_from_config(RecipeConfig.from_yaml(run / "run.yaml"), resumed=run)
+    assert done == ["mug", "bowl", "bowl"]
+    assert result.to_dict() == read_result(run).to_dict() and isinstance(read_result(run), RecipeResult)
+    assert [one.renders for one in result.parts] == [4, 4] and result.ending == "done"
+    heat, bars = result.figures
+    assert isinstance(heat, HeatMapFigure) and isinstance(bars, BarsFigure)
+    assert heat.configurations == [[2, 2], [2, 2]] and sum(one.configurations for one in bars.bars) == 8
+    page = (run / "report.html").read_text()
+    assert all(text in page.replace("&nbsp;", " ") for text in (result.title, *heat.text, *bars.text))
+    assert page.count("data:image/png") == 2 and {"figure-1.png", "figure-2.svg"} <= {
+        one.name for one in (run / "images").iterdir()
+    }
+    assert main(["show", str(run), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["figures"][1]["by"] == "environment"
+
+
+# ---- what figures say -----------------------------------------------------------------------------------------------
+
+
+def test_a_difference_is_claimed_where_intervals_are_apart_and_not_where_they_overlap() -> None:
+    shown = figure(
+        {"figure": "bars", "by": "environment"}, rows({"noon": (5, 50), "studio": (45, 50), "loft": (30, 50)})
+    )
+    assert shown.text[0].startswith("Hardest is noon: right in 5 of 50 (10 %, 95 % interval 3-22 %); easiest is studio")
+    assert shown.text[1].startswith("The difference is shown")
+    assert [one.name for one in shown.bars] == ["studio", "loft", "noon"]
+    hidden = figure({"figure": "bars", "by": "environment"}, rows({"noon": (8, 20), "studio": (12, 20)}))
+    assert hidden.text[1].startswith("No difference between the environments is shown")
+    same = figure({"figure": "bars", "by": "environment"}, rows({"noon": (8, 20), "studio": (8, 20)}))
+    assert same.text == ["All 2 environments have the same accuracy, 40 %: no difference is shown."]
+
+
+def test_two_of_many_have_to_be_further_apart_than_two_of_two() -> None:
+    two = {"noon": (6, 20), "studio": (18, 20)}
+    many = {**two, **{f"room {number}": (14, 20) for number in range(18)}}
+    pair, several = (figure({"figure": "bars", "by": "environment"}, rows(one)).text[1] for one in (two, many))
+    assert pair.startswith("The difference is shown") and several.startswith("No difference")
+
+
+@pytest.mark.parametrize("kind", FIGURES)
+def test_every_figure_is_drawn_and_is_a_table(kind: str) -> None:
+    made = figure(EXAMPLES[kind], EXAMPLE_ROWS, {"round": ["mug"]})
+    assert made.figure == kind and made.title and made.text and all(one.endswith(".") for one in made.text)
+    heads, lines = as_table(made)
+    assert lines and all(len(one) == len(heads) for one in lines)
+    assert draw(made)["png"].startswith(b"\x89PNG")
+
+
+EXAMPLE_ROWS = rows({"noon": (2, 6), "studio": (5, 6)})
+EXAMPLES: dict[str, dict[str, object]] = {
+    "bars": {"figure": "bars", "by": "group"},
+    "heat map": {"figure": "heat map", "rows": "object", "columns": "environment"},
+}
