@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from advsearch.engine.loading import Scene as Scene
     from advsearch.engine.loading import load_scene as load_scene
     from advsearch.engine.outcome import AttackResult as AttackResult
-    from advsearch.engine.sweeps.loop import SweepResult as SweepResult
+    from advsearch.engine.sweeps.answer import SweepResult as SweepResult
     from advsearch.models import Model as Model
     from advsearch.models import load_model as load_model
 
@@ -39,7 +39,7 @@ _HOMES = {
     "Model": "advsearch.models",
     "Rendering": "advsearch.api.render",
     "Scene": "advsearch.engine.loading",
-    "SweepResult": "advsearch.engine.sweeps.loop",
+    "SweepResult": "advsearch.engine.sweeps.answer",
     "attack": "advsearch.api.attack",
     "check": "advsearch.api.check",
     "gap": "advsearch.api.gap",

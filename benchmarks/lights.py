@@ -27,7 +27,7 @@ threads.configure()
 from advsearch.api.sweep import job_of  # noqa: E402
 from advsearch.attacks.draws import Seeds  # noqa: E402
 from advsearch.config import SweepConfig  # noqa: E402
-from advsearch.engine.sweeps.loop import KIND  # noqa: E402
+from advsearch.engine.sweeps.batch import KIND  # noqa: E402
 from advsearch.engine.sweeps.swept_scene import SweptScene  # noqa: E402
 from advsearch.tasks import Judgement  # noqa: E402
 

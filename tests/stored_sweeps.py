@@ -47,7 +47,8 @@ def make_sweep(path: Path, *, keep: str = "none", label: str = "mug", ended: boo
                     label="cup" if wrong else label, values=values)
             )  # fmt: skip
             if keep == "all" or (keep == "wrong" and wrong):
-                thumbnails.keep(run.path, step, np.full((16, 16, 3), step / len(points), np.float32))
+                picture = np.full((16, 16, 3), step / len(points), np.float32)
+                thumbnails.keep(run.path, step, thumbnails.thumbnail(picture))
         run.record(*rows)
         if ended:
             right = sum(bool(one.correct) for one in rows)

@@ -65,10 +65,14 @@ RULES = {
     "models": Rule(set(), {"torch", "numpy", "safetensors"}),
     "tasks": Rule({"models"}, {"torch"}),
     "attacks": Rule({"tasks"}, {"torch", "numpy", "scipy", "cma"}),
+    "cluster": Rule({"scene"}, {"yaml", "distributed", "dask"}),
     "engine": Rule(
-        {"scene", "bundled", "controls", "models", "tasks", "attacks", "runs", "report", "viewer", "config", "settings"}
+        {"scene", "bundled", "controls", "models", "tasks", "attacks", "cluster", "runs", "report", "viewer", "config"}
+        | {"settings"}
     ),
-    "evaluation": Rule({"scene", "bundled", "controls", "models", "tasks", "attacks", "engine", "runs", "report"}),
+    "evaluation": Rule(
+        {"scene", "bundled", "controls", "models", "tasks", "attacks", "cluster", "engine", "runs", "report"}
+    ),
     "runs": Rule(
         {"config", "settings"}, {"numpy", "pydantic", "typing_extensions", "imageio", "OpenEXR", "PIL", "pyarrow"}
     ),

@@ -14,9 +14,10 @@ from advsearch.engine.budget import verification_ladder
 from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, named_camera, settings_of
 from advsearch.engine.naming import AnyModel, different, load_models, model_name, scene_settings, several
 from advsearch.engine.run_settings import RunSettings
+from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.engine.sweeps.axes import read_axes
 from advsearch.engine.sweeps.job import Job, NamedScene, check_scenes
-from advsearch.engine.sweeps.loop import SweepResult, carry_out
+from advsearch.engine.sweeps.loop import carry_out
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.options import as_setting

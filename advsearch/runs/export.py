@@ -31,7 +31,7 @@ OWN = (
     *("id", "kind", "step", "seed", "spp", "objective", "success", "correct", "margin"),
     *("label", "label_index", "probability", PAYLOAD),
 )
-AFTER = ("renders", "seconds", "time")
+AFTER = ("renders", "machine", "seconds", "time")
 """Columns of the store before and after the values."""
 
 GROUP = 8192

@@ -87,6 +87,14 @@ MIGRATIONS = (
     -- older rows.
     ALTER TABLE evaluations ADD COLUMN payload_json TEXT;
     """,
+    """
+    -- A step of a kind is there once, whoever writes it how often.
+    DELETE FROM evaluations WHERE id NOT IN (SELECT min(id) FROM evaluations GROUP BY kind, step);
+    DROP INDEX evaluations_kind;
+    CREATE UNIQUE INDEX evaluations_step ON evaluations (kind, step);
+    -- What the row was evaluated on, by its name in the note "machines". NULL for the machine that wrote the row.
+    ALTER TABLE evaluations ADD COLUMN machine TEXT;
+    """,
 )
 """What turns a file of version n into one of version n + 1. Never change one that was released; add another."""
 
@@ -112,8 +120,9 @@ class Row:
         values: parameter to ``{"value": ..., "unit": ...}``.
         seconds: that the evaluation took.
         renders: pictures that it took; None where that was not counted.
+        machine: what it was evaluated on, by its name in the note "machines"; None for the machine that wrote the row.
         time: when it was written, seconds since 1970; set by the store.
-        id: place in the file; set by the store.
+        id: place in the file, from 1; set by the store where it is not given.
     """
 
     kind: str
@@ -131,13 +140,16 @@ class Row:
     values: Mapping[str, Value] = field(default_factory=dict)
     seconds: float | None = None
     renders: int | None = None
+    machine: str | None = None
     time: float | None = None
     id: int | None = None
 
 
 _AS_JSON = ("payload", "values")
 _COLUMNS = tuple(f"{one.name}_json" if one.name in _AS_JSON else one.name for one in fields(Row))
-_INSERT = f"INSERT INTO evaluations ({', '.join(_COLUMNS[:-1])}) VALUES ({', '.join('?' * (len(_COLUMNS) - 1))})"
+_INSERT = (
+    f"INSERT INTO evaluations ({', '.join(_COLUMNS)}) VALUES ({', '.join('?' * len(_COLUMNS))}) ON CONFLICT DO NOTHING"
+)
 
 
 @final
@@ -164,6 +176,8 @@ class Store:
     def append(self, rows: Iterable[Row]) -> None:
         """Add rows in one transaction; they survive a kill of the process when this returns.
 
+        A row whose kind and step are there already changes nothing.
+
         Raises:
             StorageError: the disk is full or can't be written; none of these rows is kept.
         """
@@ -187,11 +201,7 @@ class Store:
         where, given = ("id > ?", (after,)) if kind is None else ("id > ? AND kind = ?", (after, kind))
         with _readable(self.path):
             cursor = self._db.execute(f"SELECT {', '.join(_COLUMNS)} FROM evaluations WHERE {where} ORDER BY id", given)
-        while True:
-            with _readable(self.path):
-                values = cursor.fetchone()
-            if values is None:
-                return
+        while (values := self._next(cursor)) is not None:
             yield _decode(values, self.path)
 
     def count(self, kind: str | None = None) -> int:
@@ -203,6 +213,22 @@ class Store:
     def curve(self, kind: str) -> list[tuple[int, float | None]]:
         """Return (step, objective) of every row of one kind, in the order in which they were written."""
         return [(row.step, row.objective) for row in self.rows(kind)]
+
+    def missing(self, kind: str, count: int) -> Iterator[range]:
+        """Yield the steps from 0 to `count` of which there is no row of a kind, neighbours together."""
+        expected = 0
+        with _readable(self.path):
+            cursor = self._db.execute("SELECT step FROM evaluations WHERE kind = ? ORDER BY step", (kind,))
+        while (found := self._next(cursor)) is not None:
+            if found[0] > expected:
+                yield range(expected, min(found[0], count))
+            expected = found[0] + 1
+        if expected < count:
+            yield range(expected, count)
+
+    def _next(self, cursor: sqlite3.Cursor) -> Any:
+        with _readable(self.path):
+            return cursor.fetchone()
 
     def counts(self) -> dict[str, int]:
         """Return how many rows there are of each kind."""
@@ -368,10 +394,10 @@ _JSON = json.JSONEncoder(allow_nan=False)
 
 
 def _encode(row: Row, stamp: float) -> tuple[Any, ...]:
-    """Return the row's columns but the id. Numbers of numpy and torch become Python's."""
+    """Return the row's columns. Numbers of numpy and torch become Python's."""
     front = [_column(getattr(row, name)) for name in _FRONT]
     payload = None if row.payload is None else _json(row.payload)
-    return (*front, payload, _json(row.values), *(_column(getattr(row, name)) for name in _BACK), stamp)
+    return (*front, payload, _json(row.values), *(_column(getattr(row, name)) for name in _BACK), stamp, row.id)
 
 
 def _column(value: Any) -> Any:

@@ -49,13 +49,13 @@ def path_of(run: Path, number: int) -> Path:
     return run / "images" / FOLDER / f"{number // A_FOLDER:04d}" / f"{number}.jpg"
 
 
-def keep(run: Path, number: int, picture: object) -> None:
+def keep(run: Path, number: int, data: bytes) -> None:
     """Keep the thumbnail of a picture.
 
     Raises:
         StorageError: it cannot be written.
     """
-    write_bytes(path_of(run, number), thumbnail(picture), durable=False)
+    write_bytes(path_of(run, number), data, durable=False)
 
 
 @dataclass(frozen=True)

@@ -49,8 +49,8 @@ def table(run: Path, format: str, kind: str | None = None) -> bytes:
 
 def test_units_stand_in_the_columns_and_vectors_are_spread() -> None:
     names = columns(ROWS)
-    assert names[:3] == ["id", "kind", "step"] and names[-3:] == ["renders", "seconds", "time"]
-    assert names[13:-3] == ["pose.yaw [degrees]", "light.place[0]", "light.place[1]", "material.pattern"]
+    assert names[:3] == ["id", "kind", "step"] and names[-4:] == ["renders", "machine", "seconds", "time"]
+    assert names[13:-4] == ["pose.yaw [degrees]", "light.place[0]", "light.place[1]", "material.pattern"]
 
 
 def test_csv_can_be_read_back(run: Path) -> None:

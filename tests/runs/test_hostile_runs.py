@@ -79,7 +79,7 @@ STORES: dict[str, Callable[[Path], object]] = {
     "a payload that is no JSON": statement("UPDATE evaluations SET payload_json = '{'"),
     "a payload that is nested": statement(f"UPDATE evaluations SET payload_json = '{'[' * 100_000}'"),
     "a payload that is bytes": statement("UPDATE evaluations SET payload_json = x'ff00'"),
-    "a step that is text": statement("UPDATE evaluations SET step = 'one'"),
+    "a step that is text": statement("UPDATE evaluations SET step = 'one' WHERE id = 1"),
     "an objective that is text": statement("UPDATE evaluations SET objective = 'much'"),
     "a label that is bytes": statement("UPDATE evaluations SET label = x'ff'"),
     "text that is not UTF-8": statement("UPDATE evaluations SET label = CAST(x'ff' AS TEXT)"),

@@ -217,6 +217,33 @@ def test_a_sweep_of_version_2_says_what_was_correct_and_an_attack_keeps_its_succ
     assert [row.objective for row in rows] == [1.5, -0.5, None, 2.0]
 
 
+def test_a_step_is_there_once_however_often_it_is_written(tmp_path: Path) -> None:
+    with Store(tmp_path / "results.sqlite") as store:
+        store.append([Row("sweep", 4, label="first", id=5), Row("sweep", 1, id=2)])
+        store.append([Row("sweep", 4, label="late", id=5), Row("sweep", 0, id=1), Row("verification", 4)])
+        assert [(row.id, row.step, row.label) for row in store.rows("sweep")] == [
+            (1, 0, None),
+            (2, 1, None),
+            (5, 4, "first"),
+        ]
+        assert store.count() == 4
+        assert list(store.missing("sweep", 8)) == [range(2, 4), range(5, 8)]
+        assert list(store.missing("sweep", 5)) == [range(2, 4)] and list(store.missing("none", 2)) == [range(2)]
+
+
+def test_a_file_of_version_4_with_a_step_twice_keeps_the_first(tmp_path: Path) -> None:
+    path = tmp_path / "results.sqlite"
+    db = sqlite3.connect(path)
+    db.executescript(f"BEGIN; {' '.join(MIGRATIONS[:4])} PRAGMA user_version = 4; COMMIT;")
+    with db:
+        columns = "kind, step, label, values_json, time"
+        given = [("sweep", 0, "a"), ("sweep", 1, "b"), ("sweep", 1, "c"), ("control", 1, "d")]
+        db.executemany(f"INSERT INTO evaluations ({columns}) VALUES (?, ?, ?, '{{}}', 0)", given)
+    db.close()
+    with Store(path) as store:
+        assert [(row.label, row.machine) for row in store.rows()] == [("a", None), ("b", None), ("d", None)]
+
+
 def test_results_of_another_advsearch_or_none_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "results.sqlite"
     with pytest.raises(FileFormatError, match=r"expected the results of a run, got no such file; check the name"):
@@ -232,7 +259,7 @@ def test_results_of_another_advsearch_or_none_are_refused(tmp_path: Path) -> Non
     with sqlite3.connect(path) as db:
         db.execute("PRAGMA user_version = 99")
     db.close()
-    with pytest.raises(FileFormatError, match=r"expected version 4 of the results, got 99; use a newer advsearch"):
+    with pytest.raises(FileFormatError, match=r"expected version 5 of the results, got 99; use a newer advsearch"):
         Store(path)
 
 
@@ -258,7 +285,7 @@ def codec(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
 @given(values=st.dictionaries(st.text(), JSON, max_size=3), objective=st.floats(), label=st.none() | st.text())
 def test_any_values_come_back(codec: Store, values: dict[str, Any], objective: float, label: str | None) -> None:
     label = None if label is None else label.encode("utf-8", "replace").decode()
-    codec.append([Row("search", 0, objective=objective, label=label, values=values)])
+    codec.append([Row("search", codec.count(), objective=objective, label=label, values=values)])
     found = list(codec.rows())[-1]
     assert found.values == values and found.label == label
     assert found.objective == (objective if math.isfinite(objective) else None)
@@ -673,7 +700,7 @@ COLUMNS = [
     "id", "kind", "step", "seed", "spp", "objective", "success", "correct", "margin", "label", "label_index",
     "probability", "payload",
     "pose.yaw [degrees]", "camera.target[0] [sizes]", "camera.target[1] [sizes]", "backdrop.which",
-    "renders", "seconds", "time",
+    "renders", "machine", "seconds", "time",
 ]  # fmt: skip
 
 

@@ -45,7 +45,7 @@ def import_threedb(folder: Path, run: str | Path | None = None, *, overwrite: bo
         rows: list[Row] = []
         for one in read_threedb(folder):
             if one.picture is not None:
-                thumbnails.keep(kept.path, one.row.step, read_picture(one.picture))
+                thumbnails.keep(kept.path, one.row.step, thumbnails.thumbnail(read_picture(one.picture)))
             counts.add(one.row)
             rows.append(one.row)
             if len(rows) == AT_ONCE:

@@ -1,53 +1,47 @@
-"""The loop of a sweep: render, classify, store, count; batch after batch, in a fixed order.
+"""The loop of a sweep: have batches carried out (`batch`), store and count what comes of them, sum it up.
 
-The order is: scenes (object, environment), then the grid with its last axis fastest, then the draws of a point of the
-grid, then the models. Models are shown the same pictures, so that they can be compared, and one is rendered once.
-A batch is stored in one transaction before the next is begun, and begins at a multiple of its size, so that a sweep
-that was stopped goes on bit for bit as one that was not.
+Configurations are numbered: scenes (object, environment), then the grid with its last axis fastest, then the draws of a
+point of the grid, then the models. Models are shown the same pictures, so that they can be compared, and one is
+rendered once. A batch begins at a multiple of its size and is stored in one transaction, each row in the place of its
+number, so that a sweep that was stopped, or whose batches come in another order, ends bit for bit as one that was not.
 """
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 from advsearch.attacks.draws import Seeds
 from advsearch.attacks.product import batches
+from advsearch.cluster.executor import Done, Executor, InProcess
 from advsearch.described import Value
 from advsearch.engine.pictures import save_marked
 from advsearch.engine.record import Stages
 from advsearch.engine.rows import judgement_of, trial_row
+from advsearch.engine.sweeps.answer import SweepResult
+from advsearch.engine.sweeps.batch import KIND, Batch, Batches
 from advsearch.engine.sweeps.job import Job, check_all
-from advsearch.engine.sweeps.light import Shown, together
+from advsearch.engine.sweeps.light import together
 from advsearch.engine.sweeps.points import Picks, Points
 from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally, rate
-from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.engine.sweeps.worst import check_worst
 from advsearch.interrupts import interruptible
 from advsearch.progress import Progress
-from advsearch.report.drawing import new_axes
-from advsearch.report.notebook import sweep_html
-from advsearch.report.studies import sweep_axes, sweep_figure
+from advsearch.report.studies import sweep_figure
 from advsearch.report.wording import count
 from advsearch.runs import store
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.export import to_pandas
 from advsearch.runs.files import write_bytes
 from advsearch.runs.images import write_layers
 from advsearch.runs.results.attack import DescribedValue, LinearTransport
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.sweep import SweepSummary, WorstClaim, WorstConfiguration, WorstVerified
-from advsearch.scene.description import OBJECT
 from advsearch.scene.transport.renderer import SPP as BASIS_SPP
-from advsearch.tasks import Judgement
+from advsearch.tasks import Answer, Judgement
 from advsearch.viewer import thumbnails
 from advsearch.viewer.sweep_page import write_page
-
-KIND = "sweep"
-"""Rows of the sweep; those of the trials are called "verification"."""
 
 NOT_FINITE = "pictures not finite"
 """The note under which the store keeps that there were some."""
@@ -65,63 +59,6 @@ READ_AT_ONCE = 256
 """Pictures whose places are worked out at once when rows are read back."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class SweepResult:
-    """The answer of a sweep.
-
-    Attributes:
-        summary: what `summary.json` holds.
-        run: the run directory, or None if it was not kept.
-        in_memory: the rows, where there is no run directory.
-    """
-
-    summary: SweepSummary
-    run: Path | None
-    in_memory: tuple[store.Row, ...] = ()
-
-    @property
-    def accuracy(self) -> float | None:
-        """Share of the configurations that the model got right; None where there was none."""
-        return self.summary.accuracy
-
-    def rows(self) -> Iterator[store.Row]:
-        """Yield every configuration with its values and what the model said, in order."""
-        if self.run is None:
-            yield from self.in_memory
-            return
-        with store.Store(self.run / store.NAME, read_only=True) as results:
-            yield from results.rows(KIND)
-
-    def to_pandas(self) -> Any:
-        """Return every configuration as a row of a `pandas.DataFrame`; columns as in an export (docs/runs.md).
-
-        Raises:
-            InputError: pandas is not installed.
-        """
-        return to_pandas(self.rows())
-
-    def plot(self, axes: Any = None) -> Any:
-        """Draw the map over two axes, or the accuracy along the only one, and return the matplotlib axes.
-
-        Args:
-            axes: to draw on; None makes new ones.
-        """
-        axes = new_axes() if axes is None else axes
-        sweep_axes(self.summary, axes)
-        return axes
-
-    def __repr__(self) -> str:
-        right = f"{self.summary.correct} of {self.summary.configurations} right"
-        return f"SweepResult({self.summary.object!r}, {self.summary.model!r}, {right}, run={self._place})"
-
-    def _repr_html_(self) -> str:
-        return sweep_html(self.summary)
-
-    @property
-    def _place(self) -> str:
-        return "None" if self.run is None else repr(str(self.run))
-
-
 class Sweep:
     """One sweep, from its first configuration or from where it was stopped.
 
@@ -129,9 +66,12 @@ class Sweep:
         job: what is swept.
         run: open directory to keep it in, with the rows that are there already; None keeps it in memory.
         progress: told how far it is.
+        executor: carries out batches; None does it here.
     """
 
-    def __init__(self, job: Job, run: RunDirectory | None, progress: Progress) -> None:
+    def __init__(
+        self, job: Job, run: RunDirectory | None, progress: Progress, executor: Executor | None = None
+    ) -> None:
         self.job, self.run, self.stages = job, run, Stages(progress)
         self.stages.begin("setup", "preparing the scenes for rendering")
         self.points, self._shown = check_all(job)
@@ -140,9 +80,10 @@ class Sweep:
         self.samples = job.spp
         self._seeds = Seeds(job.pictures.seed, KIND)
         self._kept: list[store.Row] = []
-        self._view: SweptScene | None = None
+        self._batches = Batches(job, self.per_scene, kept=run is not None)
+        self._executor = InProcess(self._batches) if executor is None else executor
         self._rendered = self._traced = self._predicted = 0
-        self._transport: list[LinearTransport | None] = []
+        self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
         self._not_finite = run is not None and run.store.note(NOT_FINITE) is not None
         self._told, self._untold = 0.0, 0
         objects, environments = (
@@ -155,60 +96,70 @@ class Sweep:
         """Do what is left and return the answer.
 
         Args:
-            first: number of the configuration to begin with; None goes on behind the rows that are stored.
+            first: number of the configuration to begin with; None does those that are not stored.
         """
         tally = self._counted()
-        first = tally.seen if first is None else first
         ending, worst = FINISHED, None
         for text in self.job.warnings:
             self.stages.progress.message(text)
         try:
             with interruptible():
-                self._open(min(first, self.total - 1) // self.models // self.per_scene)
+                left = [range(first, self.total)] if first is not None else self._left()
+                self._batches.open((left[0].start if left else self.total - 1) // self.models // self.per_scene)
                 hint = f"{self.total} answers, pictures of {count(self.samples, 'sample')} a pixel; `resolution`, `spp`"
                 hint += " or fewer points shorten it"
                 if self.run is not None and self.job.keep_pictures != "none":
                     hint += f"; pictures that are kept take {self._pictures_text()}"
                 self.stages.begin("sweep", "rendering and classifying", self.total, hint=hint)
-                self.stages.progress.advance(first)
-                self._go_through(first, tally)
+                self.stages.progress.advance(self.total - sum(map(len, left)))
+                tally = self._go_through(left, tally)
                 worst = self._claimed(tally)
                 if worst is not None:
                     worst = worst.model_copy(update={"verified": self._verified(worst)})
         except KeyboardInterrupt:
             ending = INTERRUPTED
-            if self.run is not None and self.run.store.count(KIND) != tally.seen:
-                tally = self._counted()
+            tally = self._counted()
             worst = self._claimed(tally)
         self.stages.end()
         return self._finish(tally, ending, worst)
 
     # ---- the loop ---------------------------------------------------------------------------------------------------
 
-    def _go_through(self, first: int, tally: Tally) -> None:
-        begin_scene, begin = divmod(first // self.models, self.per_scene)
-        for scene in range(begin_scene, len(self.job.places)):
-            view = self._open(scene)
-            try:
-                for numbers in batches(begin, self.per_scene, self.job.batch):
-                    self._batch(view, numbers, tally)
-            finally:
-                self._transport += [one.summary() for one in view.light.values()]
-            begin = 0
+    def _left(self) -> list[range]:
+        """Numbers of the configurations that are not stored."""
+        return [range(self.total)] if self.run is None else list(self.run.store.missing(KIND, self.total))
 
-    def _batch(self, view: SweptScene, numbers: range, tally: Tally) -> None:
-        """Render, classify and store neighbouring pictures of a scene, then count them."""
-        begun = time.perf_counter()
-        before = view.number * self.per_scene
-        picks = self.points.picks(numbers.start, len(numbers), before)
-        noise = [self._seeds(before + number) for number in numbers]
-        seen = view.look(picks, noise)
-        seconds = (time.perf_counter() - begun) / (len(numbers) * self.models)
+    def _go_through(self, left: Sequence[range], tally: Tally) -> Tally:
+        """Have what is left carried out, store and count it; return the counts."""
+        expected = left[0].start // self.models if left else 0
+        in_order = not left or (len(left) == 1 and left[0].stop == self.total)
+        for done in self._executor.results(self._pieces(left)):
+            in_order, expected = in_order and done.numbers.start >= expected, done.numbers.stop
+            self._take(done, tally)
+        if in_order:
+            return tally
+        self._kept.sort(key=lambda row: row.step)
+        return self._counted()  # sums of margins depend on the order, and so does which of equals is the worst
+
+    def _pieces(self, left: Sequence[range]) -> Iterator[range]:
+        """Yield the pictures of batches, each of one scene."""
+        for part in left:
+            first, last = part.start // self.models, -(-part.stop // self.models)
+            while first < last:
+                scene = first // self.per_scene
+                before = scene * self.per_scene
+                for piece in batches(first - before, min(last - before, self.per_scene), self.job.batch):
+                    yield range(before + piece.start, before + piece.stop)
+                first = before + self.per_scene
+
+    def _take(self, done: Done, tally: Tally) -> None:
+        """Store what came of a batch, and count it."""
+        numbers, batch = done.numbers, done.value if done.value is not None else self._missed(done)
         rows = [
-            self._shown_row(
-                self._row(before + number, model, noise[k], seen.judgements[model][k], seen.values[model][k], seconds),
-                model,
-                seen.shown[model][k],
+            replace(
+                self._row(number, model, batch.judgements[model][k], batch.values[model][k], batch.shown[model][k]),
+                seconds=batch.seconds,
+                machine=done.machine,
             )
             for k, number in enumerate(numbers)
             for model in range(self.models)
@@ -216,24 +167,40 @@ class Sweep:
         if self.run is None:
             self._kept += rows
         else:
-            for k, number in enumerate(numbers):
-                if self._is_kept(seen.judgements[model][k] for model in range(self.models)):
-                    thumbnails.keep(self.run.path, before + number, seen.pictures[k])
-            if self.job.aovs:
-                for number, surfaces in zip(numbers, view.surfaces(picks), strict=True):
-                    file = self.run.path / AOV_FOLDER / f"{before + number:06d}.exr"
-                    write_layers(file, surfaces.layers(self.job.aovs, OBJECT), surfaces.notes(self.job.aovs))
+            for number, data in batch.thumbnails.items():
+                thumbnails.keep(self.run.path, number, data)
+            for number, (layers, notes) in batch.layers.items():
+                write_layers(self.run.path / AOV_FOLDER / f"{number:06d}.exr", layers, notes)
             self.run.record(*rows)
         self._spend(rows)
+        scene = numbers.start // self.per_scene
+        before = scene * self.per_scene
+        picks = self.points.picks(numbers.start - before, len(numbers), before)
         for k in range(len(numbers)):
             for model in range(self.models):
-                self._count(tally, view.number, picks, k, model, seen.judgements[model][k])
-        self._rendered += len(numbers) * len(view.renderers)
-        if view.not_finite and not self._not_finite:
+                self._count(tally, scene, picks, k, model, batch.judgements[model][k])
+        self._rendered += len(numbers) * batch.sizes
+        self._transport[done.worker, scene] = batch.light
+        if batch.not_finite and not self._not_finite:
             self._not_finite = True
             if self.run is not None:
                 self.run.store.set_note(NOT_FINITE, "yes")
         self._tell(len(rows), tally)
+
+    def _missed(self, done: Done) -> Batch:
+        """What stands for a picture that nobody could make."""
+        points, picks, _ = self._find(done.numbers.start * self.models)
+        values = points.values(points.configurations(picks), picks)
+        nothing = Judgement(math.nan, math.nan, right=False, answer=Answer(f"({done.lost})", None, None))
+        return Batch(
+            judgements=[[nothing]] * self.models,
+            values=[values] * self.models,
+            shown=[[(False, 0)]] * self.models,
+            seconds=0.0,
+            light=[],
+            not_finite=False,
+            sizes=0,
+        )
 
     def _pictures_text(self) -> str:
         """What the kept pictures take, said beforehand."""
@@ -243,27 +210,20 @@ class Sweep:
         size = f"{megabytes / 1e3:.1f} GB" if megabytes >= 1e3 else f"{max(megabytes, 0.1):.1f} MB"
         return f"about {size}" if self.job.keep_pictures == "all" else f"at most about {size}"
 
-    def _is_kept(self, seen: Iterable[Judgement]) -> bool:
-        """Whether the thumbnail of a picture of which the models say this is kept."""
-        asked = self.job.keep_pictures
-        return asked == "all" or (asked == "wrong" and not all(one.right for one in seen))
-
     def _row(
-        self, number: int, model: int, seed: int, trial: Judgement, values: dict[str, Value], seconds: float
+        self, number: int, model: int, trial: Judgement, values: dict[str, Value], shown: tuple[bool, int] = (False, 1)
     ) -> store.Row:
-        place = self.job.places[number // self.per_scene]
+        """What is stored of a configuration; a predicted picture has no seed of its own."""
+        place, (predicted, traced) = self.job.places[number // self.per_scene], shown
         lit_by = self.points.lit_by(values)
         named = place.values
         if lit_by is not None:
             named["environment"] = {"value": lit_by, "unit": ""}
         named |= {"model": {"value": self.job.models[model].name, "unit": ""}, **values}
-        row = trial_row(KIND, number * self.models + model, seed, self.samples, trial, named, sought=False)
-        return replace(row, seconds=seconds)
-
-    def _shown_row(self, row: store.Row, model: int, shown: Shown) -> store.Row:
-        """The row with how its picture was made: a predicted one has no seed of its own."""
-        row = replace(row, renders=shown.traced if self._is_first_of_size(model) else 0)
-        return replace(row, seed=None, spp=BASIS_SPP) if shown.predicted else row
+        step = number * self.models + model
+        row = trial_row(KIND, step, self._seeds(number), self.samples, trial, named, sought=False)
+        row = replace(row, id=step + 1, renders=traced if self._is_first_of_size(model) else 0)
+        return replace(row, seed=None, spp=BASIS_SPP) if predicted else row
 
     def _is_first_of_size(self, model: int) -> bool:
         """Whether no model before it is shown the same pictures."""
@@ -276,24 +236,14 @@ class Sweep:
             self.stages.progress.advance(self._untold, accuracy=tally.correct / tally.seen)
             self._told, self._untold = now, 0
 
-    def _open(self, scene: int) -> SweptScene:
-        """The scene with this number; loading it lets the one before go."""
-        if self._view is None or self._view.number != scene:
-            self._view = None
-            self._view = SweptScene(self.job, scene)
-        return self._view
-
     # ---- counting ---------------------------------------------------------------------------------------------------
 
     def _counted(self) -> Tally:
         """Counts of the rows that are stored already, read one after the other."""
         tally = Tally(self._outer, self.job.axes, self._shown)
         self._traced = self._predicted = 0
-        if self.run is None:
-            self._spend(self._kept)
-            return tally
         key, picks = (-1, -1), self.points.picks(0, 0)
-        for row in self.run.store.rows(KIND):
+        for row in self._kept if self.run is None else self.run.store.rows(KIND):
             number, model = divmod(row.step, self.models)
             scene, local = divmod(number, self.per_scene)
             block, place = divmod(local, READ_AT_ONCE)
@@ -325,10 +275,10 @@ class Sweep:
         points, picks, model = self._find(index)
         u = points.configurations(picks)
         values = points.values(u, picks)[0]
-        row = self._row(picks.number, model, self._seeds(picks.number), seen, values, 0.0)
+        row = self._row(picks.number, model, seen, values)
         task, scene = self.job.tasks[model], picks.number // self.per_scene
         if task.varies:
-            truth = self._open(scene).truth(model, u[0], values)
+            truth = self._batches.open(scene).truth(model, u[0], values)
         else:
             truth = self.job.truth(self.job.places[scene], model, values)
         return WorstConfiguration(
@@ -343,7 +293,7 @@ class Sweep:
     def _verified(self, worst: WorstConfiguration) -> WorstVerified | None:
         """What fresh renders say of it; keeps a picture."""
         points, picks, model = self._find(worst.configuration)
-        view = self._open(picks.number // self.per_scene)
+        view = self._batches.open(picks.number // self.per_scene)
         u = points.configurations(picks)[0]
         checked = check_worst(view, self.job, model, u, self.run, self.stages)
         if self.run is not None:
@@ -365,7 +315,7 @@ class Sweep:
     def _finish(self, tally: Tally, ending: str, worst: WorstConfiguration | None) -> SweepResult:
         """Put the summary together and write it."""
         job, seconds = self.job, self.stages.seconds
-        view, checked = self._view, worst.verified if worst else None
+        view, checked = self._batches.view, worst.verified if worst else None
         swept = seconds.get("sweep", 0.0)
         summary = SweepSummary(
             run=None if self.run is None else str(self.run.path),
@@ -392,7 +342,7 @@ class Sweep:
                 "verification": checked.renders if checked else 0,
                 **({"products": self._predicted} if self._predicted else {}),
             },
-            transport=together(self._transport),
+            transport=together([one for light in self._transport.values() for one in light]),
             renders_per_second=self._rendered / swept if self._rendered and swept else None,
             seconds={**seconds, "total": self.stages.total},
             seed=job.pictures.seed,
@@ -421,6 +371,6 @@ class Sweep:
         return remarks
 
 
-def carry_out(job: Job, run: RunDirectory | None, progress: Progress, first: int | None = None) -> SweepResult:
+def carry_out(job: Job, run: RunDirectory | None, progress: Progress, executor: Executor | None = None) -> SweepResult:
     """Sweep, check the worst configuration and write the summary; see `Sweep`."""
-    return Sweep(job, run, progress).carry_out(first)
+    return Sweep(job, run, progress, executor).carry_out()

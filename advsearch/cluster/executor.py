@@ -1,0 +1,113 @@
+"""What carries out index ranges: in this process (`InProcess`), or on workers (`coordinator.Coordinator`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from advsearch.files import JsonObject
+
+Call = Callable[[range], Any]
+"""What carries out one range; a pure function of it."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """What ranges are of, so that another process can carry them out.
+
+    Attributes:
+        function: ``"package.module:function"``; it takes the settings and returns a `Call`.
+        settings: JSON values that decide everything.
+        files: names of those settings that may hold paths, separated by commas. Files go along with the work.
+        threads: processor threads of a worker.
+    """
+
+    function: str
+    settings: JsonObject
+    files: tuple[str, ...] = ()
+    threads: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Done:
+    """What came of one range.
+
+    Attributes:
+        numbers: the range.
+        value: what the call returned; None where nothing came back.
+        worker: who carried it out; empty in this process.
+        machine: what that is, by its name among `Facts.machines`; None where it is like this machine.
+        lost: why nothing came back, in words; only of ranges of one number.
+    """
+
+    numbers: range
+    value: Any
+    worker: str = ""
+    machine: str | None = None
+    lost: str = ""
+
+
+@dataclass
+class Facts:
+    """How the workers did.
+
+    Attributes:
+        workers: that are ready.
+        most: that were ready at once.
+        lost: that went away before they were told to.
+        refused: that cannot do the work, and why, in words.
+        retried: ranges that were given out again.
+        batches: ranges that came back.
+        busy: seconds that workers spent on ranges.
+        loading: seconds that they spent on getting ready.
+        alive: seconds that they were there and ready.
+        machines: name to description of those that are not like this one.
+        link: of a page that shows the workers; empty where there is none.
+    """
+
+    workers: int = 0
+    most: int = 0
+    lost: int = 0
+    refused: int = 0
+    retried: int = 0
+    batches: int = 0
+    busy: float = 0.0
+    loading: float = 0.0
+    alive: float = 0.0
+    machines: Mapping[str, Mapping[str, str]] | None = None
+    link: str = ""
+
+
+class Executor(Protocol):
+    """Carries out ranges."""
+
+    @property
+    def facts(self) -> Facts | None:
+        """How the workers do; None where there are none."""
+
+    def results(self, ranges: Iterable[range]) -> Iterator[Done]:
+        """Carry out ranges, and yield what comes of them, in any order, each once.
+
+        Only a few are taken from `ranges` before their results are asked for.
+
+        Raises:
+            AdvsearchError: what a range raises, or there is nobody who can carry it out.
+        """
+
+
+class InProcess:
+    """Carries out one range after the other in this process.
+
+    Args:
+        call: carries out one.
+    """
+
+    facts: Facts | None = None
+
+    def __init__(self, call: Call) -> None:
+        self._call = call
+
+    def results(self, ranges: Iterable[range]) -> Iterator[Done]:
+        """See `Executor.results`; they come in order."""
+        return (Done(numbers, self._call(numbers)) for numbers in ranges)

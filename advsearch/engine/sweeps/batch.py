@@ -1,0 +1,107 @@
+"""One batch of a sweep: rendered or predicted, shown to the models and judged. Nothing is stored here.
+
+A batch is its numbers: what comes of it depends on them and on the job alone, so it may be carried out anywhere.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from advsearch.attacks.draws import Seeds
+from advsearch.described import Value
+from advsearch.engine.sweeps.job import Job
+from advsearch.engine.sweeps.swept_scene import SweptScene
+from advsearch.runs.results.attack import LinearTransport
+from advsearch.scene.description import OBJECT
+from advsearch.tasks import Judgement
+from advsearch.viewer import thumbnails
+
+KIND = "sweep"
+"""Rows of the sweep, and the stream of their seeds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """What was seen of neighbouring pictures of one scene.
+
+    Attributes:
+        judgements: for each model, of each picture.
+        values: for each model, what is stored of each picture that it was shown.
+        shown: for each model, of each picture, whether it was predicted, and how many were traced for it.
+        seconds: that a configuration took.
+        light: what was predicted of the scene so far by whoever made this, for each size of picture.
+        not_finite: whether a picture had values that are not finite, which were set to 0.
+        sizes: how many pictures of different size there are of each configuration.
+        thumbnails: JPEG files by the number of the picture, where they are kept.
+        layers: ground truth of each picture and notes on it, by the number of the picture, where it is kept.
+    """
+
+    judgements: list[list[Judgement]]
+    values: list[list[dict[str, Value]]]
+    shown: list[list[tuple[bool, int]]]
+    seconds: float
+    light: list[LinearTransport | None]
+    not_finite: bool
+    sizes: int
+    thumbnails: Mapping[int, bytes] = field(default_factory=dict)
+    layers: Mapping[int, tuple[Mapping[str, Any], Mapping[str, str]]] = field(default_factory=dict)
+
+
+class Batches:
+    """Carries out batches of a sweep in this process, and holds the scene of the last one.
+
+    Args:
+        job: what is swept.
+        per_scene: pictures of a scene; the first of the next scene has the next number.
+        kept: whether there is a folder for pictures that are kept.
+    """
+
+    def __init__(self, job: Job, per_scene: int, *, kept: bool) -> None:
+        self._job, self._per_scene, self._kept = job, per_scene, kept
+        self._seeds = Seeds(job.pictures.seed, KIND)
+        self.view: SweptScene | None = None
+
+    def open(self, scene: int) -> SweptScene:
+        """The scene with this number; loading it lets the one before go."""
+        if self.view is None or self.view.number != scene:
+            self.view = None
+            self.view = SweptScene(self._job, scene)
+        return self.view
+
+    def __call__(self, numbers: range) -> Batch:
+        """Carry out the pictures with these numbers, all of one scene."""
+        scene = numbers.start // self._per_scene
+        view, before = self.open(scene), scene * self._per_scene
+        begun = time.perf_counter()
+        points = next(iter(view.points.values()))
+        picks = points.picks(numbers.start - before, len(numbers), before)
+        seen = view.look(picks, [self._seeds(number) for number in numbers])
+        seconds = (time.perf_counter() - begun) / (len(numbers) * len(self._job.models))
+        pictures, layers = {}, {}
+        if self._kept:
+            for k, number in enumerate(numbers):
+                if self._is_kept(judged[k] for judged in seen.judgements):
+                    pictures[number] = thumbnails.thumbnail(seen.pictures[k])
+            if self._job.aovs:
+                for number, surfaces in zip(numbers, view.surfaces(picks), strict=True):
+                    channels = {name: one.numpy() for name, one in surfaces.layers(self._job.aovs, OBJECT).items()}
+                    layers[number] = channels, surfaces.notes(self._job.aovs)
+        return Batch(
+            judgements=seen.judgements,
+            values=seen.values,
+            shown=[[(one.predicted, one.traced) for one in shown] for shown in seen.shown],
+            seconds=seconds,
+            light=[one.summary() for one in view.light.values()],
+            not_finite=view.not_finite,
+            sizes=len(view.renderers),
+            thumbnails=pictures,
+            layers=layers,
+        )
+
+    def _is_kept(self, seen: Any) -> bool:
+        """Whether the thumbnail of a picture of which the models say this is kept."""
+        asked = self._job.keep_pictures
+        return asked == "all" or (asked == "wrong" and not all(one.right for one in seen))
