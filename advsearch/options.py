@@ -1,4 +1,4 @@
-"""Options of what has a name on the command line, a policy or a task: the fields of its dataclass."""
+"""Options of what has a name on the command line: the fields of a policy's or a task's dataclass, Mitsuba's names."""
 
 from __future__ import annotations
 
@@ -15,6 +15,33 @@ FROM_RUN = {"set by": "the run"}
 
 MOST = 1_000_000
 """Of whatever an option counts: no budget has more renders."""
+
+
+BY_KEY = "mitsuba"
+"""The control whose parameters have Mitsuba's names."""
+
+
+def by_key(controls: Mapping[str, object]) -> dict[str, object]:
+    """Return controls with ``{"mitsuba:KEY": RANGE}`` as ``{"mitsuba": {KEY: RANGE}}``, all keys together.
+
+    Raises:
+        InputError: a key has no range, or is given twice.
+    """
+    found, ranges = dict[str, object](), dict[str, object]()
+    for name, given in controls.items():
+        kind, colon, key = str(name).partition(":")
+        if kind != BY_KEY or not colon:
+            found[name] = given
+        elif not key or given is None or given in ({}, ""):
+            raise InputError(f"`controls` {name}: expected a range, as in {BY_KEY}:{key or 'KEY'}=[0.2, 0.8]")
+        else:
+            ranges[key] = given
+    if not ranges:
+        return found
+    together = found.get(BY_KEY) or {}
+    if not isinstance(together, Mapping) or together.keys() & ranges.keys():
+        raise InputError(f"`controls` {BY_KEY}: expected each of Mitsuba's names once, with a range")
+    return {**found, BY_KEY: {**together, **ranges}}
 
 
 def declared_options(kind: type[Any]) -> dict[str, Field[Any]]:

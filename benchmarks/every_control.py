@@ -22,6 +22,8 @@ from advsearch.attacks.ending import Ending
 from advsearch.controls import CONTROLS
 
 MIXTURES = ("pose,light", "camera,environment", "texture,pose", "geometry,material")
+DECLARED = [kind for kind in CONTROLS if CONTROLS[kind].parameters]
+"""Controls that search something when nothing is said."""
 TIE = 0.3
 """Logits by which two verified margins of one configuration can differ."""
 VERIFIED = frozenset(one.value for one in (Ending.FOUND, Ending.NOT_VERIFIED, Ending.BUDGET_SPENT, Ending.STALLED))
@@ -31,7 +33,7 @@ VERIFIED = frozenset(one.value for one in (Ending.FOUND, Ending.NOT_VERIFIED, En
 def main(argv: Sequence[str] | None = None) -> int:
     """Attack, print one row each; returns the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--controls", nargs="+", default=[*CONTROLS, *MIXTURES])
+    parser.add_argument("--controls", nargs="+", default=[*DECLARED, *MIXTURES])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("flags", nargs="*", help="more flags of the attack, after --")
     args = parser.parse_args(argv)

@@ -96,7 +96,7 @@ class Floor:
         holder = MitsubaScene(description, (size, size), leave_out=EVERYTHING - {"tracing"})
         self.scene = holder._scene
         self.path, self.guides = holder._integrator("path"), holder._integrator("guides")
-        self.parameters, self.key = holder._parameters, holder._inputs[BASE_COLOR][0]
+        self.parameters, self.key = holder.parameters, holder.declared[BASE_COLOR][0]
         self.holder, self.spp, self.denoise, self.score = holder, spp, denoise, score
         self.texture = self.mi.TensorXf(self.parameters[self.key])
         self.cotangent = self.mi.TensorXf(torch.full((size, size, 3), 1e-3))

@@ -61,6 +61,10 @@ CONTROLS: Mapping[str, Mapping[str, Any]] = {
     "occlusion": {"occlusion": {"which": ["vase", "banana", "book", "card"], "coverage": [0.0, 0.5]}},
     "geometry": {"geometry": {"epsilon": 0.12}},
     "haze": {"haze": {"density": [0.0, 0.6]}},
+    "mitsuba": {
+        "mitsuba:ground.bsdf.brdf_0.reflectance.value": [0.01, 0.6],
+        "mitsuba:environment.scale": [0.3, 2.0],
+    },
     "sensor": {
         "sensor": {"shot": [0.0, 0.15], "mosaic": [0, 1], "red": [-1, 1], "blue": [-1, 1], "compression": [0, 95]}
     },

@@ -225,6 +225,8 @@ def control(kind: str) -> Callable[[Record], str]:
             for one in declared.parameters
         ]
         heads = ["parameter", "shape", "unit", "allowed", "searched", "default", "derivative", "what"]
+        if not parameters:
+            return "The scene names them: a wrong name is answered with those that are there."
         choices = [[f"`{one.name}`", _shown(one.default), one.description] for one in declared.choices]
         settings_table = "\n" + table(["setting", "default", "what"], choices) if choices else ""
         return table(heads, parameters) + settings_table

@@ -54,6 +54,7 @@ FORMS: dict[str, dict[str, Any]] = {
     "lens": {"dots": 2, "opacity": [0.2, 0.9], "x": [0.1, 0.9]},
     "sensor": {"shot": [0.0, 0.2], "mosaic": [0, 1], "compression": [0, 80]},
     "corruption": {"which": ["fog", "jpeg", "gaussian_noise"], "severity": [0, 5]},
+    "mitsuba": {"ground.bsdf.brdf_0.reflectance.value": [0.1, 0.9]},
 }
 EXCLUSIVE = {frozenset(("sky", "environment"))}
 """Pairs that set the same input and are refused."""
@@ -136,7 +137,7 @@ def assert_true_of_fixed_values(
     scene: advsearch.Scene, drawn: Any, said: dict[str, Any], picture: Tensor, seed: int
 ) -> None:
     """Check that a scene with the values that a row names looks as the row's picture, and says the same of itself."""
-    if not all(isinstance(control, NumberControl) for control in drawn):
+    if not all(isinstance(control, NumberControl) and control.parameters for control in drawn):
         return
     named: dict[str, dict[str, Any]] = {
         control.kind: {one.name: control.chosen[one.name] for one in control.choices if not one.bounds}

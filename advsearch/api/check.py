@@ -179,6 +179,8 @@ def _configurations(config: CheckConfig) -> Iterator[CheckConfig]:
     shared = RunSettings(config.epsilon, config.norm, config.texture_resolution)
     for object, environment in SCENES:
         for control in CONTROLS:
+            if not CONTROLS[control].parameters:
+                continue  # the scene names them
             if control == "contents" and object == "bottle":
                 continue  # a bottle is closed
             if control == "sky" and environment != DEFAULT_ENVIRONMENT:

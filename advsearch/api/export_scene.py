@@ -22,14 +22,14 @@ from advsearch.runs.summary import attack_of
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.description import OBJECT
 from advsearch.scene.exporting.gltf import PLAIN, glb, posed
-from advsearch.scene.mitsuba_backend.files.writing import NAME
+from advsearch.scene.mitsuba_backend.files.writing import NAME, write_scene
 
 GLB, XML = ".glb", ".xml"
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
-    """The answer of a run.
+class AnsweredRun:
+    """A run with its answer.
 
     Attributes:
         folder: of the run.
@@ -56,7 +56,7 @@ class Answer:
             return renderer.scene.assembly(renderer.space.inputs(self.u))
 
 
-def answer_of(run: str | Path) -> Answer:
+def answer_of(run: str | Path) -> AnsweredRun:
     """Load a run's scene and its answer.
 
     Args:
@@ -74,7 +74,7 @@ def answer_of(run: str | Path) -> Answer:
     u = torch.from_numpy(read_answer(folder))
     if u.shape != problem.domain.start.shape:
         raise InputError(f"{folder}: the object or advsearch has changed since this run; do the run again")
-    return Answer(folder, problem, problem.whole(u))
+    return AnsweredRun(folder, problem, problem.whole(u))
 
 
 def write_mitsuba(run: str | Path, out: Path) -> list[str]:
@@ -119,7 +119,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     with placed_by("out"), storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as made:
-            renderer.scene.write(inputs, Path(made) / path.name, " ".join(notes))
+            write_scene(renderer.scene, inputs, Path(made) / path.name, " ".join(notes))
             for one in sorted(Path(made).iterdir()):
                 os.replace(one, path.parent / one.name)
         text = f"The answer of {answer.folder.name} as a scene for Mitsuba 3 (advsearch {advsearch.__version__}).\n"

@@ -18,8 +18,8 @@ from advsearch.settings import Config, settings
 
 Names = str | Sequence[str]
 """Names in a list, or in a text with commas between them."""
-NamedControls = str | Sequence[str] | Mapping[str, Mapping[str, object] | None]
-"""NamedControls by name; a mapping gives each name its settings."""
+NamedControls = str | Sequence[str] | Mapping[str, Mapping[str, object] | Sequence[float] | float | None]
+"""Controls by name; a mapping gives each name its settings, and ``mitsuba:KEY`` a range."""
 Named = str | Mapping[str, object]
 """A name, or a mapping with a `name` and options."""
 

@@ -14,7 +14,7 @@ from advsearch.cli import output
 from advsearch.cli.screen import output_errors
 from advsearch.errors import InputError
 
-Written = tuple[dict[str, Any], str]
+Written = tuple[dict[str, object], str]
 """What to tell of a file, as JSON and in words."""
 
 SUFFIXES = {"pdf": "print", "xml": "mitsuba", "glb": "gltf"}

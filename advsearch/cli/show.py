@@ -108,7 +108,9 @@ def _show_control(name: str, as_json: bool) -> int:
         output.print_json({"schema": 1, "control": name, "parameters": plain(parameters), "choices": plain(choices)})
         return 0
     print(f"{name}: {first_line(control)}")
-    if parameters:
+    if not parameters:
+        print(f"\nThe scene names its parameters: --control {name}:KEY=[low, high]")
+    else:
         print(f"\nparameters, searched or fixed:\n{_table([_of_parameter(one) for one in parameters])}")
     if choices:
         print(f"\nsettings, chosen:\n{_table([_of_choice(one) for one in choices])}")

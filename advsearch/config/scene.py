@@ -10,6 +10,7 @@ from pydantic import JsonValue, field_validator, model_validator
 
 from advsearch.config.named import name_in, read_named
 from advsearch.errors import InputError
+from advsearch.options import by_key
 from advsearch.settings import Clash, Config, check_once, number_or_text, setting, split_names
 
 DEFAULT_ENVIRONMENT = "studio"
@@ -278,7 +279,7 @@ class SceneConfig(Config):
             check_once(names, "controls")
             return {name: {} for name in names}
         if isinstance(names, Mapping):
-            return {name: {} if given is None else given for name, given in names.items()}
+            return {name: {} if given is None else given for name, given in by_key(names).items()}
         return value
 
     @field_validator("estimators", mode="before", check_fields=False)

@@ -15,6 +15,7 @@ from advsearch.controls.clean import Moved, check_prepared
 from advsearch.controls.numbers import NumberControl
 from advsearch.controls.space import Space
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.options import by_key
 from advsearch.registry import Registry
 from advsearch.scene.description import ENVIRONMENT, OBJECT, SceneDescription
 
@@ -35,6 +36,7 @@ OWN = {
     "lens": "LensControl",
     "sensor": "SensorControl",
     "corruption": "CorruptionControl",
+    "mitsuba": "MitsubaControl",
 }
 """The package's own controls: the word on the command line is the module's name, and this is its class."""
 
@@ -69,7 +71,7 @@ def make_control(asked: str, settings: Mapping[str, object] | None = None) -> Co
     control = CONTROLS[kind]
     if parameter is not None:
         given.setdefault(parameter, _default_range(control, parameter))
-    known = [one.name for one in control.choices] + [one.name for one in control.parameters]
+    known = [one.name for one in control.choices] + [one.name for one in control.declared(given)]
     for setting in given:
         if setting not in known:
             raise UnknownNameError(f"setting of control {kind}", setting, known)
@@ -126,10 +128,28 @@ def _default_range(control: type[Control], parameter: str) -> object:
             if one.options:
                 return {"choices": list(one.options)}
             return list(one.search or (one.low, one.high))
+    if not control.parameters:
+        raise InputError(
+            f"`controls` {control.kind}.{parameter}: expected a range, as in {control.kind}:{parameter}=[0.2, 0.8]"
+        )
     raise UnknownNameError(f"parameter of control {control.kind}", parameter, [one.name for one in control.parameters])
 
 
-def gathered(asked: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, object]]:
+def settings_by_name(asked: Mapping[str, object]) -> dict[str, Mapping[str, object]]:
+    """Return the settings of each control, with ranges of Mitsuba's names under one.
+
+    Raises:
+        InputError: one has something else than settings.
+    """
+    found: dict[str, Mapping[str, object]] = {}
+    for name, given in by_key(asked).items():
+        if given is not None and not isinstance(given, Mapping):
+            raise InputError(f"`controls` {name}: expected {{PARAMETER: VALUE}}, got {given!r}")
+        found[name] = given or {}
+    return found
+
+
+def gathered(asked: Mapping[str, object]) -> dict[str, dict[str, object]]:
     """Return settings by control for names as `make_control` takes them.
 
     `camera.azimuth` and `camera.elevation` become one control that searches both.
@@ -138,15 +158,15 @@ def gathered(asked: Mapping[str, Mapping[str, object]]) -> dict[str, dict[str, o
         asked: settings by name; a name may be "kind", "kind:name", "kind.parameter" or "kind:name.parameter".
     """
     found: dict[str, dict[str, object]] = {}
-    for name, given in asked.items():
+    for name, given in settings_by_name(asked).items():
         head, dot, rest = name.partition(".")
         kind = head.partition(":")[0]
         if not dot or kind not in CONTROLS:
-            found.setdefault(name, {}).update(given or {})
+            found.setdefault(name, {}).update(given)
             continue
         parameter, colon, instance = rest.partition(":")
         into = found.setdefault(head + colon + instance, {})
-        into.update({parameter: _default_range(CONTROLS[kind], parameter), **(given or {})})
+        into.update({parameter: _default_range(CONTROLS[kind], parameter), **given})
     return found
 
 
@@ -243,4 +263,5 @@ __all__ = [
     "make_control",
     "make_space",
     "names_of",
+    "settings_by_name",
 ]

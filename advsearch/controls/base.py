@@ -12,7 +12,7 @@ file. `docs/controls/writing.md` has a worked example.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import ClassVar
@@ -29,7 +29,7 @@ from advsearch.scene.gradients.group import WHOLE_RANGE as WHOLE_RANGE
 from advsearch.scene.gradients.group import Budget as Budget
 from advsearch.scene.gradients.group import Group as Group
 from advsearch.scene.parameters import Parameter as Parameter
-from advsearch.scene.parts import MeshPart
+from advsearch.scene.parts import MeshPart, PluginPart
 
 NOTHING: Mapping[str, Tensor] = MappingProxyType({})
 """No scene inputs yet."""
@@ -159,6 +159,16 @@ class Control(ABC):
     of_a_mesh: ClassVar[bool] = False
     name: str
 
+    @classmethod
+    def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
+        """Return the parameters of an instance that is given some settings: those of the class, unless the scene names
+        them.
+
+        Args:
+            settings: names of what is given.
+        """
+        return cls.parameters
+
     @property
     def mesh(self) -> str:
         """Name of the mesh that it is about: the one behind the colon of its name, or else the object."""
@@ -170,6 +180,11 @@ class Control(ABC):
         Raises:
             UnknownNameError: there is none of that name.
         """
+        if self.mesh in {one.name for one in scene.parts if isinstance(one, PluginPart)}:
+            raise InputError(
+                f"`controls` {self.name}: {self.mesh} is around the object in a Mitsuba scene, and stays as it is; "
+                f"make it the object, or vary its numbers by Mitsuba's names, mitsuba:{self.mesh}.KEY=[low, high]"
+            )
         if self.mesh not in scene.meshes:
             raise UnknownNameError(
                 "mesh of the scene", self.mesh, scene.meshes, f"It stands in `controls` {self.name}."

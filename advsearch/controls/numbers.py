@@ -74,7 +74,8 @@ class NumberControl(Control, ABC):
 
     def __init__(self, name: str | None = None, **settings: object) -> None:
         self.name = name or self.kind
-        known = [one.name for one in self.parameters] + [one.name for one in self.choices]
+        own = self.declared(settings)
+        known = [one.name for one in own] + [one.name for one in self.choices]
         for setting in settings:
             if setting not in known:
                 raise UnknownNameError(f"setting of control {self.kind}", setting, known)
@@ -85,7 +86,7 @@ class NumberControl(Control, ABC):
         self.check_choices()
         self.specs = {
             one.name: read(f"{self.name}.{one.name}", one, self._given[one.name])
-            for one in self.parameters
+            for one in own
             if one.name in self._given
         }
         self.asked = any(not isinstance(spec, Fixed) for spec in self.specs.values())

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
-from advsearch.controls import Control, Space, gathered, make_control, make_space
+from advsearch.controls import Control, Space, gathered, make_control, make_space, settings_by_name
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.scene import settings
@@ -29,8 +29,8 @@ from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.settings import Given
 
-Controls = str | Sequence[str | Control] | Mapping[str, Mapping[str, object]]
-"""One control or several, by name or instance; a mapping gives each name its settings."""
+Controls = str | Sequence[str | Control] | Mapping[str, object]
+"""One control or several, by name or instance; a mapping gives each name its settings, and ``mitsuba:KEY`` a range."""
 
 DEFAULT_RESOLUTION = 128
 
@@ -210,7 +210,7 @@ def settings_of(controls: Controls) -> dict[str, dict[str, object]]:
         InputError: not controls at all, or two of one name.
     """
     if isinstance(controls, Mapping):
-        return {name: dict(given or {}) for name, given in controls.items()}
+        return {name: dict(given) for name, given in settings_by_name(controls).items()}
     several = [part.strip() for part in controls.split(",")] if isinstance(controls, str) else list(controls)
     as_controls(several)
     return {

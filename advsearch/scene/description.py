@@ -86,7 +86,12 @@ class SceneDescription:
             InputError: its name is taken.
         """
         if part.name in (OBJECT, "environment", "ground", "camera", *(one.name for one in self.parts)):
-            raise InputError(f"`controls` {part.name}: the scene has something of that name already; choose another")
+            plugins = any(one.name == part.name for one in self.parts if isinstance(one, PluginPart))
+            instead = f", or vary what is there: mitsuba:{part.name}.KEY=[low, high]" if plugins else ""
+            raise InputError(
+                f"`controls` {part.name}: the scene has something of that name already; choose another name, as in "
+                f"light:{part.name}-2{instead}"
+            )
         return replace(self, parts=(*self.parts, part))
 
     def with_values(self, **given: float | None) -> SceneDescription:

@@ -144,6 +144,38 @@ class HazePart(ScenePart):
     volumetric: ClassVar[bool] = True
 
 
+@dataclass(frozen=True)
+class PluginNumber:
+    """A number or a colour in Mitsuba, by Mitsuba's own name.
+
+    Attributes:
+        key: that name: "red.reflectance.value".
+        values: its one or three numbers in the scene as it is.
+        input: the scene input that sets it.
+        valid: the valid ways to differentiate it, preferred first.
+        plain: Mitsuba has it as a plain number, which light paths are traced anew for.
+    """
+
+    key: str
+    values: tuple[float, ...]
+    input: str
+    valid: tuple[str, ...] = ("differences",)
+    plain: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class PluginNumbers(ScenePart):
+    """Numbers and colours of what is in the scene already.
+
+    Takes the inputs of its numbers that begin with `NAME.`, (1,) or (3,) each.
+
+    Attributes:
+        numbers: some of the scene.
+    """
+
+    numbers: tuple[PluginNumber, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class PluginPart(ScenePart):
     """A shape, light or material of a Mitsuba scene as it is.

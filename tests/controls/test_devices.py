@@ -32,6 +32,7 @@ FORMS: dict[str, tuple[dict[str, Any], ...]] = {
     "occlusion": ({}, {"which": ["card", "sphere"], "turn": [0, 90]}),
     "lens": ({}, {"dots": 2, "opacity": [0.2, 0.9]}),
     "sensor": ({"shot": [0.0, 0.2], "mosaic": [0, 1], "compression": [0, 80], "aberration": [0.0, 0.02]},),
+    "mitsuba": ({"ground.bsdf.brdf_0.reflectance.value": [0.1, 0.9]},),
     "corruption": tuple(
         {"which": which, "severity": severity} for which in NAMES for severity in ([0.2, 0.9], [3.2, 4.9])
     ),

@@ -219,7 +219,7 @@ def test_dark_lamps_get_no_samples_and_change_nothing_but_noise() -> None:
 
 def test_lamps_that_shine_or_may_shine_are_sampled() -> None:
     def weights(renderer: Renderer) -> list[float]:
-        parameters = renderer.scene._parameters
+        parameters = renderer.scene.parameters
         return [float(parameters[key]) for key in sorted(parameters.keys()) if key.endswith("sampling_weight")]
 
     assert sorted(weights(two_lamps(0.0)))[:2] == [0.0, 1.0] and min(weights(two_lamps(1.0))) == 1.0

@@ -22,6 +22,7 @@ from advsearch.controls.base import Parameter
 from advsearch.controls.material.patterns import PATTERNS, covering
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed, Number, OneOf
+from advsearch.errors import InputError
 from advsearch.scene.assets import Material, Mesh
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
@@ -57,6 +58,15 @@ class MaterialControl(NumberControl):
         *MATERIAL,
         *colors("of the tint that multiplies the colour; 1 leaves it.", (0.3, 1.0)),
     )
+
+    def prepare(self, scene: SceneDescription) -> SceneDescription:
+        numbers = [name for name in NUMBERS if self._varies(name)]
+        if self.mesh_in(scene).surface is not None and (numbers or self._names_a_material()):
+            raise InputError(
+                f"`controls` {self.name}: the {self.mesh} has a surface of Mitsuba's own; search red, green or blue, "
+                f"or its numbers by Mitsuba's names, mitsuba:{self.mesh}.bsdf.KEY=[low, high]"
+            )
+        return scene
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
         if parameter.name in NUMBERS:

@@ -98,6 +98,11 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
         hint = f"It stands in `grid` {name}; write `grid` CONTROL.PARAMETER=VALUES, such as pose.yaw=0:360:24."
         raise UnknownNameError("control", kind, {*CONTROLS, *instances}, hint)
     known = [one.name for one in control.parameters]
+    if not known:
+        raise InputError(
+            f"`grid` {name}: the scene names what {kind} varies; draw it by chance, with `controls` "
+            f"{kind}:{parameter_name or 'KEY'}=[low, high] and `samples=100`"
+        )
     if not parameter_name:
         raise InputError(
             f"`grid` {name}: expected CONTROL.PARAMETER, got no parameter; choose one of {', '.join(known)}"

@@ -31,6 +31,11 @@ def number(value: Any) -> Any:
     return mitsuba().Float(value.array)
 
 
+def plain_number(value: Any) -> float:
+    """A single number that is the same for all light paths."""
+    return float(value.array[0])
+
+
 def color(value: Any) -> Any:
     """Three numbers: an RGB colour."""
     return mitsuba().Color3f(*_entries(value, 3))

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import singledispatch
 
-from advsearch.scene.mitsuba_backend.inputs import SceneInput, color, flat, number, point, transform
+from advsearch.scene.mitsuba_backend.inputs import SceneInput, color, flat, number, plain_number, point, transform
 from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, mitsuba_mesh, own_surface, principled
 from advsearch.scene.mitsuba_backend.plugins import loadable
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
-from advsearch.scene.parts import BallLamp, HazePart, MeshPart, PluginPart, PointLamp, ScenePart
+from advsearch.scene.parts import BallLamp, HazePart, MeshPart, PluginNumbers, PluginPart, PointLamp, ScenePart
 
 ABSENT = {"type": "uniform", "value": 0.0}
 IDLE_LOBES: Plugin = {name: ABSENT for name in ("clearcoat", "sheen")}
@@ -66,6 +66,22 @@ def mesh_translation(part: MeshPart, lobes: Plugin | None = None) -> Translation
 @translation.register
 def _plugin(part: PluginPart) -> Translation:
     return Translation({part.name: loadable(part.plugin)}, (), {"type": "prbvolpath"} if part.volumetric else {})
+
+
+@translation.register
+def _numbers(part: PluginNumbers) -> Translation:
+    inputs = [
+        SceneInput(
+            one.input,
+            one.key,
+            plain_number if one.plain else color if len(one.values) == 3 else number,
+            "adjoint" in one.valid,
+            (len(one.values),),
+        )
+        for one in part.numbers
+        if one.input.startswith(f"{part.name}.")
+    ]
+    return Translation({}, tuple(inputs))
 
 
 @translation.register

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -21,7 +20,7 @@ from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.dictionary import GROUND_INPUT, camera_inputs, scene_dict
 from advsearch.scene.mitsuba_backend.first_hit import first_hits
-from advsearch.scene.mitsuba_backend.inputs import SceneInput, as_is, as_torch, contiguous, key_of
+from advsearch.scene.mitsuba_backend.inputs import SceneInput, as_is, as_torch, contiguous, key_of, plain_number
 from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS
 from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, leave_dark_lamps_out, mesh_translation, translation
 from advsearch.scene.mitsuba_backend.population import population
@@ -51,7 +50,10 @@ class MitsubaScene:
 
     Attributes:
         assembly: turns the inputs of a space into those of this scene.
+        made: of what scene, and with which filter.
         names: every input that can be set.
+        parameters: Mitsuba's own.
+        declared: for each input the key among them, and what it takes.
         interior: those that the interior adjoint differentiates correctly.
 
     Args:
@@ -76,7 +78,7 @@ class MitsubaScene:
         integrator: str = "prb",
     ) -> None:
         mi = mitsuba()
-        self._made = (description, filter)
+        self.made = (description, filter)
         self.resolution = resolution
         self.sampler = sampler
         self.assembly = Assembly(description)
@@ -98,21 +100,23 @@ class MitsubaScene:
             leave_dark_lamps_out(plugins, description.parts)
         self._scene = _loaded(plugins, description)
         self._sensor = self._scene.sensors()[0]
-        self._parameters = mi.traverse(self._scene)
+        self.parameters = mi.traverse(self._scene)
         self._integrators: dict[tuple[str, int], Any] = {}
         parts = [one for part in translated for one in part.inputs]
         declared = [*camera_inputs(resolution), ENVIRONMENT_INPUT, GROUND_INPUT, *parts]
-        self._inputs = {one.name: (key, one) for one in declared if (key := key_of(self._parameters, one.key))}
-        self.names = frozenset(self._inputs)
-        self.interior = frozenset(name for name, (_, one) in self._inputs.items() if one.interior)
-        self._shapes = frozenset(name for name, (key, _) in self._inputs.items() if _is_of_a_shape(key))
+        self.declared = {one.name: (key, one) for one in declared if (key := key_of(self.parameters, one.key))}
+        self.names = frozenset(self.declared)
+        self.interior = frozenset(name for name, (_, one) in self.declared.items() if one.interior)
+        self._shapes = frozenset(
+            name for name, (key, one) in self.declared.items() if one.write is plain_number or _is_of_a_shape(key)
+        )
         self._unsettled: set[str] = set()
         self._base: dict[str, Any] = {}
         self._applied: dict[str, Tensor] = {}
         self._recorded: dict[tuple[str, int, int], Callable[..., Any]] = {}
         self._recorded_at = (0, 0)
         population.bury()
-        population.add(self, self._scene, self._integrators, self._parameters)
+        population.add(self, self._scene, self._integrators, self.parameters)
         self._every: dict[str, Tensor] = {}
         if "uploads" not in leave_out:
             self._every = {name: self.base(name) for name in sorted(self.names)}
@@ -120,7 +124,7 @@ class MitsubaScene:
     def like(self, **changes: Any) -> MitsubaScene:
         """Return another scene made as this one was, but with another `max_depth`, `sampler`, `integrator`, or
         `leave_out`."""
-        description, filter = self._made
+        description, filter = self.made
         settings = {"max_depth": self.max_depth, "leave_out": self._leave_out, "sampler": self.sampler, **changes}
         other = MitsubaScene(description, self.resolution, filter=filter, **settings)
         for what in ("path", "guides"):
@@ -143,9 +147,9 @@ class MitsubaScene:
 
     def base(self, name: str) -> Tensor:
         """Return the base value of an input, as a fresh torch tensor of the input's shape."""
-        key, one = self._inputs[name]
+        key, one = self.declared[name]
         self._apply({})
-        value = as_torch(self._parameters[key])
+        value = as_torch(self.parameters[key])
         return value if one.shape is None else value.reshape(one.shape)
 
     def radiance(self, inputs: Mapping[str, Tensor], seed: int, spp: int, *, hide: bool = False) -> Tensor:
@@ -169,27 +173,10 @@ class MitsubaScene:
         both = self._render("guides", seed, spp)[..., -6:]
         return both[..., :3].clamp(0.0, 1.0), both[..., 3:6]
 
-    def write(self, inputs: Mapping[str, Tensor], path: Path, note: str) -> None:
-        """Write the scene with these inputs as XML that stock Mitsuba loads, with meshes and pictures beside it.
-
-        Args:
-            inputs: as in `radiance`.
-            path: of the XML file, in a folder that is there.
-            note: for a comment at the beginning.
-
-        Raises:
-            InputError: something in it is no part of stock Mitsuba.
-        """
-        from advsearch.scene.mitsuba_backend.files.writing import described, write_xml
-
+    def held(self, inputs: Mapping[str, Tensor]) -> Any:
+        """Return Mitsuba's scene with these inputs set, until the next call of anything here."""
         self._apply(inputs)
-        description, filter = self._made
-        kind = "volpath" if self.volumetric else "path"
-        integrator = {"type": kind, "max_depth": self.max_depth, "rr_depth": NO_ROULETTE}
-        base = scene_dict(description, self.resolution, filter, self.sampler)
-        plugins = described(base, description, inputs, integrator)
-        meshes = {shape.id(): shape for shape in self._scene.shapes() if shape.is_mesh()}
-        write_xml(path, plugins, {name: one for name, one in meshes.items() if name in plugins}, note)
+        return self._scene
 
     def surfaces(self, inputs: Mapping[str, Tensor]) -> Surfaces:
         """Return what the camera sees first through the middle of each pixel."""
@@ -235,21 +222,21 @@ class MitsubaScene:
             for name, value in tracked.items():
                 dr.enable_grad(value)
                 self._write(name, value)
-            self._parameters.update()
+            self.parameters.update()
             shown = contiguous(cotangent)
             if self._backdrop:
                 shown = torch.cat([shown, torch.zeros_like(shown[..., :1])], dim=-1)
             arriving = mi.TensorXf(shown)
             with _fewer_warnings():
                 self._integrator(method).render_backward(
-                    self._scene, self._parameters, arriving, sensor=self._sensor, seed=seed, spp=spp
+                    self._scene, self.parameters, arriving, sensor=self._sensor, seed=seed, spp=spp
                 )
             found = {name: as_torch(dr.grad(value)).reshape(values[name].shape) for name, value in tracked.items()}
             return {name: found[name] for name in wanted}
         finally:
             for name, value in values.items():
                 self._write(name, mi.TensorXf(contiguous(value)))
-            self._parameters.update()
+            self.parameters.update()
 
     def material_adjoint(
         self, inputs: Mapping[str, Tensor], cotangent: Tensor, seed: int, spp: int, *, meshes: Collection[str]
@@ -270,7 +257,7 @@ class MitsubaScene:
         by_vertices, by_normals = material_adjoint(
             self._scene,
             self._sensor,
-            self._parameters,
+            self.parameters,
             mesh_key=names,
             vertices=[inputs[f"{name}.vertices"] for name in names],
             normals=[inputs[f"{name}.normals"] for name in names],
@@ -298,11 +285,11 @@ class MitsubaScene:
         import drjit as dr
 
         self._apply(inputs)
-        key, spp = self._inputs[name][0], next_count(self.sampler, spp)
+        key, spp = self.declared[name][0], next_count(self.sampler, spp)
         noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
         noise.set_samples_per_wavefront(spp)
         noise.seed(dr.opaque(mi.UInt32, seed), self.resolution[0] * self.resolution[1] * spp)
-        return collect(self._scene, self._parameters, key, noise, self.resolution, depth=self._depth, spp=spp)
+        return collect(self._scene, self.parameters, key, noise, self.resolution, depth=self._depth, spp=spp)
 
     # ---- inside -----------------------------------------------------------------------------------------------------
 
@@ -319,15 +306,15 @@ class MitsubaScene:
         """Set exactly these inputs, everything else at its base value; does nothing for what is set already."""
         mi = mitsuba()
 
-        unknown = [name for name in inputs if name not in self._inputs]
+        unknown = [name for name in inputs if name not in self.declared]
         if unknown:
-            raise InputError(f"the scene has no input {', '.join(unknown)}; it has {', '.join(sorted(self._inputs))}")
+            raise InputError(f"the scene has no input {', '.join(unknown)}; it has {', '.join(sorted(self.declared))}")
         if self._every:
             inputs = {**self._every, **inputs}
             self._applied.clear()
         changed: set[str] = set()
         for name in [name for name in self._applied if name not in inputs]:
-            self._parameters[self._inputs[name][0]] = type(self._base[name])(self._base[name])
+            self.parameters[self.declared[name][0]] = type(self._base[name])(self._base[name])
             del self._applied[name]
             changed.add(name)
         for name, tensor in inputs.items():
@@ -336,20 +323,20 @@ class MitsubaScene:
             if held is not None and held.shape == value.shape and torch.equal(held, value):
                 continue
             if name not in self._base:
-                own = self._parameters[self._inputs[name][0]]
+                own = self.parameters[self.declared[name][0]]
                 self._base[name] = type(own)(own)
             self._write(name, mi.TensorXf(value))
             self._applied[name] = value.clone()
             changed.add(name)
         if changed:
-            self._parameters.update()
+            self.parameters.update()
         if not changed.isdisjoint(self._shapes):
             self._unsettled = {"path", "hidden", "guides"}
             population.changes += 1
 
     def _write(self, name: str, value: Any) -> None:
-        key, one = self._inputs[name]
-        self._parameters[key] = one.write(value)
+        key, one = self.declared[name]
+        self.parameters[key] = one.write(value)
 
     def _integrator(self, method: str) -> Any:
         """Return the integrator of one method for the paths that are rendered now, made on first use."""

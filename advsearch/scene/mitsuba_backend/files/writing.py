@@ -20,12 +20,13 @@ from torch import Tensor
 from advsearch.errors import InputError
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
-from advsearch.scene.mitsuba_backend.dictionary import GROUND
+from advsearch.scene.mitsuba_backend.dictionary import GROUND, scene_dict
 from advsearch.scene.mitsuba_backend.meshes import matt, own_surface, principled
 from advsearch.scene.mitsuba_backend.parts import translation
 from advsearch.scene.mitsuba_backend.plugins import loadable
+from advsearch.scene.mitsuba_backend.scene import NO_ROULETTE, MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
-from advsearch.scene.parts import BallLamp, MeshPart, PluginPart, PointLamp, ScenePart
+from advsearch.scene.parts import BallLamp, MeshPart, PluginNumbers, PluginPart, PointLamp, ScenePart
 
 NAME = "scene.xml"
 
@@ -42,6 +43,27 @@ CAMERA = {
     "aperture": "aperture_radius",
     "focus": "focus_distance",
 }
+
+
+def write_scene(scene: MitsubaScene, inputs: Mapping[str, Tensor], path: Path, note: str) -> None:
+    """Write a scene as XML that stock Mitsuba loads, with meshes and pictures beside it.
+
+    Args:
+        scene: what to write.
+        inputs: as in `MitsubaScene.radiance`.
+        path: of the XML file, in a folder that is there.
+        note: for a comment at the beginning.
+
+    Raises:
+        InputError: something in it is no part of stock Mitsuba.
+    """
+    description, filter = scene.made
+    kind = "volpath" if scene.volumetric else "path"
+    integrator: Plugin = {"type": kind, "max_depth": scene.max_depth, "rr_depth": NO_ROULETTE}
+    base = scene_dict(description, scene.resolution, filter, scene.sampler)
+    plugins = described(base, description, inputs, integrator)
+    meshes = {shape.id(): shape for shape in scene.held(inputs).shapes() if shape.is_mesh()}
+    write_xml(path, plugins, {name: one for name, one in meshes.items() if name in plugins}, note)
 
 
 def described(base: Plugin, description: SceneDescription, inputs: Mapping[str, Tensor], integrator: Plugin) -> Plugin:
@@ -69,10 +91,31 @@ def described(base: Plugin, description: SceneDescription, inputs: Mapping[str, 
         base_color = description.photograph.base.numpy()
         scene[GROUND] = {"type": "ply", "bsdf": matt(left.pop("ground.reflectance", base_color))}
     for part in (description.meshes[OBJECT], *description.parts):
-        scene[part.name] = _part(description.meshes.get(part.name, part), left)
+        if not isinstance(part, PluginNumbers):
+            scene[part.name] = _part(description.meshes.get(part.name, part), left)
+    for part in description.parts:
+        if isinstance(part, PluginNumbers):
+            for one in part.numbers:
+                if one.input in left and _put(scene, one.key.split("."), left[one.input].tolist()):
+                    del left[one.input]
     if left:
         raise InputError(f"out: stock Mitsuba has nothing for {', '.join(sorted(left))}; export another run")
     return scene
+
+
+def _put(plugin: Plugin, key: list[str], values: list[float]) -> bool:
+    """Set a number or colour by Mitsuba's name, where that is the way to it in a dictionary; whether it is."""
+    here, *rest = key
+    if here.startswith("brdf_") and here not in plugin:  # the one surface of two sides
+        here = next((name for name, inner in plugin.items() if isinstance(inner, Mapping)), here)
+    inner = plugin.get(here)
+    if isinstance(inner, Mapping):
+        plugin[here] = dict(inner)
+        return bool(rest) and _put(plugin[here], rest, values)
+    if rest or inner is None:
+        return False
+    plugin[here] = values if len(values) > 1 else values[0]
+    return True
 
 
 def _part(part: ScenePart, left: dict[str, Any]) -> Plugin:

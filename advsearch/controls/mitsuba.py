@@ -1,0 +1,76 @@
+"""The `mitsuba` control: any number or colour of a scene by Mitsuba's own name.
+
+The names are the keys of `mitsuba.traverse` for the scene inside Mitsuba, where the object under test is called
+`object` whatever it was called in a file. Of a colour, each channel is a number of its own in the same range. Whether
+Mitsuba's derivative of a number is right nobody knows beforehand: `advsearch check` compares it with differences, and a
+plan that is measured takes what is nearer to them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from advsearch.controls.base import Parameter
+from advsearch.controls.clean import Moved
+from advsearch.controls.numbers import BoundNumbers, NumberControl, Slot, Values
+from advsearch.controls.values import LARGEST
+from advsearch.errors import InputError
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.mitsuba_backend.keys import plugin_numbers
+from advsearch.scene.parts import PluginNumber, PluginNumbers
+from advsearch.scene.settings import CHANNELS
+
+
+class MitsubaControl(NumberControl):
+    """Anything else in the scene: numbers and colours by Mitsuba's own names."""
+
+    kind: ClassVar[str] = "mitsuba"
+    summary: ClassVar[str] = "Anything else in the scene: numbers and colours by Mitsuba's own names."
+    parameters: ClassVar[tuple[Parameter, ...]] = ()
+
+    def __init__(self, name: str | None = None, **settings: object) -> None:
+        super().__init__(name, **settings)
+        if not self._given:
+            raise InputError(f"`controls` {self.name}: expected Mitsuba's names, as in mitsuba:KEY=[low, high]")
+
+    @classmethod
+    def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
+        return tuple(_parameter(key) for key in settings)
+
+    def prepare(self, scene: SceneDescription) -> SceneDescription:
+        return scene.with_part(PluginNumbers(self.name, plugin_numbers(scene, self.name, tuple(self._given))))
+
+    def bind(self, scene: SceneDescription) -> BoundNumbers:
+        slots: list[Slot] = []
+        for one in self._numbers(scene):
+            for parameter, value in zip(_channels(one), one.values, strict=True):
+                spec = self.specs[one.key]
+                slots.append(Slot(replace(parameter, default=value), spec, 1, sum(slot.width for slot in slots), value))
+        return BoundNumbers(self, scene, tuple(slots))
+
+    def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return {
+            one.input: torch.stack([values[parameter.name] for parameter in _channels(one)])
+            for one in self._numbers(scene)
+        }
+
+    def moved(self, scene: SceneDescription, slots: Sequence[Slot]) -> Iterator[Moved]:
+        return super().moved(scene, [slot for slot in slots if slot.width])
+
+    def _numbers(self, scene: SceneDescription) -> tuple[PluginNumber, ...]:
+        return next(one.numbers for one in scene.parts if isinstance(one, PluginNumbers) and one.name == self.name)
+
+
+def _parameter(key: str, valid: tuple[str, ...] = ("differences",)) -> Parameter:
+    return Parameter(key, (), "1", -LARGEST, LARGEST, "the scene's own", f"Mitsuba's {key}.", estimators=valid)
+
+
+def _channels(one: PluginNumber) -> list[Parameter]:
+    """A parameter for each number."""
+    names = [f"{one.key}.{channel}" for channel in CHANNELS] if len(one.values) > 1 else [one.key]
+    return [_parameter(name, one.valid) for name in names]

@@ -1,0 +1,83 @@
+"""The numbers and colours of a scene by Mitsuba's own names (the keys of `mitsuba.traverse`)."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.description import SceneDescription
+from advsearch.scene.mitsuba_backend.inputs import color, number
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.parts import PluginNumber
+
+SMALL = (8, 8)
+"""Height and width of the picture of a scene that is only asked for its names."""
+BEHIND = ("differences",)
+"""Valid estimators of what Mitsuba has no derivative of."""
+STILL = ("adjoint", *BEHIND)
+"""Of what Mitsuba can differentiate and moves no outline."""
+UNSURE = (*BEHIND, "adjoint")
+"""Of what Mitsuba can differentiate, but for what changes at an outline or all at once."""
+
+
+def plugin_numbers(description: SceneDescription, name: str, keys: tuple[str, ...]) -> tuple[PluginNumber, ...]:
+    """Return some numbers and colours of a scene.
+
+    Args:
+        description: of the scene.
+        name: of the part that they will be in, with which their inputs begin; but for those that the scene has as
+            inputs of another name.
+        keys: Mitsuba's names of them.
+
+    Raises:
+        UnknownNameError: the scene has no such key; the message has near ones.
+        InputError: it is something else than a number or a colour.
+    """
+    found, others = _all(description)
+    for key in keys:
+        if key in others:
+            raise InputError(
+                f"`controls` mitsuba:{key}: expected a number or a colour, and Mitsuba has {others[key]} there; other "
+                "controls may move it, such as pose and texture"
+            )
+        if key not in found:
+            raise UnknownNameError("number or colour in Mitsuba", key, found)
+    return tuple(_named(found[key], name) for key in keys)
+
+
+def _named(one: PluginNumber, name: str) -> PluginNumber:
+    return one if one.input else PluginNumber(one.key, one.values, f"{name}.{one.key}", one.valid, one.plain)
+
+
+@lru_cache(maxsize=1)
+def _all(description: SceneDescription) -> tuple[dict[str, PluginNumber], dict[str, str]]:
+    """Every number and colour of a scene by its key, without inputs but for those that it has; and the type of the
+    rest."""
+    mi, scene = mitsuba(), MitsubaScene(description, SMALL)
+    own = {key: name for name, (key, one) in scene.declared.items() if one.write in (number, color)}
+    found: dict[str, PluginNumber] = {}
+    others: dict[str, str] = {}
+    for key in scene.parameters.keys():
+        value, flags = scene.parameters[key], scene.parameters.flags(key)
+        values = _values(value)
+        if values is None:
+            others[key] = f"a {type(value).__name__}"
+            continue
+        still = flags == mi.ParamFlags.Differentiable.value
+        valid = BEHIND if flags & mi.ParamFlags.NonDifferentiable.value else STILL if still else UNSURE
+        found[key] = PluginNumber(key, values, own.get(key, ""), valid, isinstance(value, float))
+    return found, others
+
+
+def _values(value: Any) -> tuple[float, ...] | None:
+    """The numbers of a parameter; None where it is neither one number nor a colour."""
+    mi = mitsuba()
+    if isinstance(value, float):
+        return (value,)
+    if (isinstance(value, mi.Float) and len(value) == 1) or isinstance(value, mi.Color3f):
+        return tuple(float(one) for one in np.array(value).reshape(-1))
+    return None

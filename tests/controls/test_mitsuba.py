@@ -1,0 +1,125 @@
+"""Numbers and colours by Mitsuba's own names: the picture is Mitsuba's with that value, and gradients are right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import advsearch
+from advsearch.cli.flags import config_from
+from advsearch.cli.main import _parse
+from advsearch.config import AttackConfig
+from advsearch.engine.gradients import smooth_loss
+from advsearch.errors import InputError
+from advsearch.scene.mitsuba_backend.files.writing import write_scene, write_xml
+from advsearch.scene.mitsuba_backend.files.xml import read_scene
+from advsearch.scene.mitsuba_backend.scene import MitsubaScene
+from advsearch.scene.mitsuba_backend.variant import mitsuba
+
+RED, GLOW, WIDE = "red.reflectance.value", "light.emitter.radiance.value", "camera.x_fov"
+SIZE = 16
+
+
+@pytest.fixture(scope="module")
+def box(tmp_path_factory: pytest.TempPathFactory) -> advsearch.Scene:
+    """Mitsuba's Cornell box as a file, with the large box as the object."""
+    path = tmp_path_factory.mktemp("scenes") / "box.xml"
+    write_xml(path, mitsuba().cornell_box(), {}, "")
+    return advsearch.load_scene(f"{path}#large-box")
+
+
+def rendered(scene: advsearch.Scene, controls: dict[str, Any], share: float) -> np.ndarray[Any, Any]:
+    """The radiance at one place in the range of everything, the same noise each time."""
+    renderer = scene.renderer(controls, resolution=SIZE, denoise="none")
+    return renderer.radiance(torch.full_like(renderer.start, share), 1, 32).numpy()
+
+
+def test_the_picture_is_that_of_the_scene_with_the_value(box: advsearch.Scene, tmp_path: Path) -> None:
+    changed = mitsuba().cornell_box()
+    changed["red"]["reflectance"]["value"] = [0.3] * 3
+    changed["light"]["emitter"]["radiance"]["value"] = [5.0] * 3
+    write_xml(tmp_path / "other.xml", changed, {}, "")
+    other = advsearch.load_scene(f"{tmp_path}/other.xml#large-box").description
+    expected = MitsubaScene(other, (SIZE, SIZE)).radiance({}, 1, 32).numpy()
+    controls = {f"mitsuba:{RED}": [0.2, 0.4], f"mitsuba:{GLOW}": [4, 6]}
+    renderer = box.renderer(controls, resolution=SIZE, denoise="none")
+    middle = torch.full_like(renderer.start, 0.5)
+    inputs = renderer.scene.assembly(renderer.space.inputs(middle))
+    found = renderer.scene.radiance(inputs, 1, 32).numpy()
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    write_scene(renderer.scene, inputs, tmp_path / "again.xml", "")
+    out = read_scene(tmp_path / "again.xml")
+    np.testing.assert_allclose(
+        [out["red"]["reflectance"]["value"], out["light"]["emitter"]["radiance"]["value"]],
+        [[0.3] * 3, [5.0] * 3],
+        rtol=1e-6,
+    )
+    assert [group.name for group in renderer.plan.groups][2:4] == [f"mitsuba.{RED}.blue", f"mitsuba.{GLOW}.red"]
+
+
+def test_the_start_is_the_scene_as_it_is(box: advsearch.Scene) -> None:
+    renderer = box.renderer({f"mitsuba:{RED}": [0.0, 1.0]}, resolution=SIZE)
+    np.testing.assert_allclose(renderer.start, [0.570068, 0.0430135, 0.0443706], rtol=1e-5)
+
+
+def test_adjoints_agree_with_differences(box: advsearch.Scene) -> None:
+    controls, loss = {f"mitsuba:{RED}": [0.1, 0.9], f"mitsuba:{GLOW}": [1, 30]}, smooth_loss((SIZE, SIZE))
+    found = []
+    for estimator in ("adjoint", "differences"):
+        renderer = box.renderer(controls, resolution=SIZE, denoise="none", estimators={"*": estimator})
+        found.append(renderer.gradient(loss, torch.full_like(renderer.start, 0.2), 2, 64)[1])
+    assert {group.estimator for group in renderer.plan.groups} == {"differences"}
+    assert float((found[0] - found[1]).norm()) < 0.05 * float(found[1].norm())
+    assert bool((found[0] != 0).all())
+
+
+def test_a_plain_number_changes_recorded_renders(box: advsearch.Scene) -> None:
+    renderer = box.renderer({"mitsuba:camera.near_clip": [0.01, 5.0]}, resolution=SIZE, denoise="none")
+    shown = [float(renderer.radiance(torch.tensor([share]), 1, 16).mean()) for share in (0.0, 0.9, 0.0, 0.9)]
+    assert shown[0] == shown[2] and shown[1] == shown[3] and abs(shown[0] - shown[1]) > 0.1 * shown[0]
+    assert renderer.plan.groups[0].estimator == "differences"
+
+
+def test_bundled_scenes_have_such_names_too() -> None:
+    scene = advsearch.load_scene("mug")
+    ground = "ground.bsdf.brdf_0.reflectance.value"
+    dark, light = (rendered(scene, {f"mitsuba:{ground}": [0.0, 1.0]}, share) for share in (0.0, 1.0))
+    assert light.mean() > 1.2 * dark.mean()
+    roughness = scene.renderer({"mitsuba:object.bsdf.brdf_0.roughness.value": [0.1, 1.0]}, resolution=SIZE)
+    assert set(roughness.space.inputs(roughness.start)) == {"object.roughness"}
+    with pytest.raises(InputError, match=r"two controls set object\.roughness"):
+        both = {"mitsuba:object.bsdf.brdf_0.roughness.value": [0.1, 1.0], "material": {"roughness": [0.1, 1.0]}}
+        scene.renderer(both, resolution=SIZE)
+
+
+@pytest.mark.parametrize(
+    ("controls", "message"),
+    [
+        ({"mitsuba:red.reflektance.value": [0, 1]}, r"Did you mean 'red\.reflectance\.value'"),
+        ({f"mitsuba:{RED}": [0.9, 0.1]}, r"\[0\.9, 0\.1\] is reversed"),
+        ({f"mitsuba:{RED}": "bright"}, "expected a number in 1, got 'bright'"),
+        ({"mitsuba:floor.to_world": [0, 1]}, "expected a number or a colour, and Mitsuba has a AffineTransform4f"),
+        ({f"mitsuba:{RED}": {}}, "expected a range, as in mitsuba:red"),
+        ({f"mitsuba:{RED}": [0, 1], "mitsuba": {RED: [0, 1]}}, "each of Mitsuba's names once"),
+        ({"mitsuba": {}}, "expected Mitsuba's names, as in mitsuba:KEY"),
+        ({f"mitsuba.{RED}": {}}, "expected a range, as in mitsuba:red"),
+        ({"pose:small-box": {}}, r"make it the object, or .* mitsuba:small-box\.KEY=\[low, high\]"),
+        ({"light": {}}, r"as in light:light-2, or vary what is there: mitsuba:light\.KEY"),
+        ({"material": {}}, r"mitsuba:object\.bsdf\.KEY"),
+    ],
+)
+def test_what_cannot_be_varied_is_said(box: advsearch.Scene, controls: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        box.renderer(controls, resolution=SIZE)
+
+
+def test_the_command_line_gathers_ranges_by_key() -> None:
+    words = ["attack", "--scene", "box.xml", "--object", "large-box"]
+    words += ["--control", f"pose,mitsuba:{RED}=[0.1,0.9]", "--control", f"mitsuba:{WIDE}=40"]
+    args = _parse(words, "attack")
+    config = config_from(args, AttackConfig)
+    assert config.controls == {"pose": {}, "mitsuba": {RED: [0.1, 0.9], WIDE: 40}}
