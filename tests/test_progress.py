@@ -110,6 +110,17 @@ def test_the_smallest_change_counts_what_it_says() -> None:
     assert progress.named("trying smaller changes")[0].done > 6
 
 
+def test_the_samples_of_the_smallest_change_are_those_of_the_clean_scene() -> None:
+    """It lies at the decision, where its own margin settles at no count."""
+    problem = Easy()
+    blocks = tuple(block for block in problem.domain.blocks if block.epsilon is not None)
+    problem.domain = type(problem.domain)(torch.full((4,), 0.5), blocks)
+    config = configuration(smallest=True).model_copy(update={"verify_spp": None})
+    _, findings = attacked(config, problem)
+    assert findings.smallest is not None and findings.verification is not None and findings.sample_count is not None
+    assert {row.name for row in findings.sample_count.table} == {"clean"} and findings.spp == 16
+
+
 @dataclass
 class OftenWrong(Easy):
     """Wrong wherever it is moved a little, and in two of three renders where it is not."""

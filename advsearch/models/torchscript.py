@@ -147,7 +147,7 @@ class _Inert:
         self.parts.append(state)
 
 
-class _Reader(pickle._Unpickler):
+class _Unpickler(pickle._Unpickler):
     """Reads a pickle without making anything that it names: every class and every function is an `_Inert`.
 
     It is Python's own slow reader, since the fast one makes room for any number that a pickle gives its memory.
@@ -169,7 +169,7 @@ class _Reader(pickle._Unpickler):
 
 def _check_pickle(archive: Archive, name: str) -> None:
     """Check that a pickle is no deeper than a network, and that the tensors that it names are as large as it says."""
-    reader = _Reader(archive.read(name, LARGEST_PICKLE))
+    reader = _Unpickler(archive.read(name, LARGEST_PICKLE))
     try:
         value = reader.load()
     except Exception as error:  # a damaged pickle raises nearly anything
