@@ -13,6 +13,7 @@ from advsearch.runs.answer import write_answer
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.gap import CurveResult, GapResult
+from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.region import RegionResult
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
@@ -99,6 +100,21 @@ GAP: dict[str, Any] = {
          "margin": 3.25, "renders": {"search": 40}, "run": None},
     ],
 }  # fmt: skip
+MATRIX: dict[str, Any] = {
+    **STUDY, "command": "attack", "run": "runs/mug-texture-003", "objects": ["mug"], "controls": ["texture"],
+    "models": ["reference", "other"], "ensemble": None, "parts": ["reference", "other"],
+    "tested": [
+        {"model": name, "labels": ["mug"], "input_size": [128, 128], "spp": 64, "clean": ATTACK["clean"]["control"]}
+        for name in ("reference", "other")
+    ],
+    "table": [
+        {"attacked": name, "ending": "found", "run": f"parts/{name}", "renders": {"search": 40},
+         "tested": [
+             {"model": other, "ending": "found" if other == name else "budget spent",
+              "verified": rated(20) if other == name else rated(4, 0.057, 0.437)} for other in ("reference", "other")]}
+        for name in ("reference", "other")
+    ],
+}  # fmt: skip
 REGION: dict[str, Any] = {
     **RUN, "schema": 1, "command": "region", "run": "runs/mug-pose-002", "object": "mug", "controls": ["pose"],
     "model": "reference", "task": "classification", "verdict": "wrong", "same": 200, "samples": 200, "rate": 1.0,
@@ -126,6 +142,11 @@ def curve(**changes: Any) -> CurveResult:
 def gap(**changes: Any) -> GapResult:
     """Return a gap's result with other fields."""
     return GapResult.of({**GAP, **changes})
+
+
+def matrix(**changes: Any) -> MatrixResult:
+    """Return the result of several models with other fields."""
+    return MatrixResult.of({**MATRIX, **changes})
 
 
 def region(**changes: Any) -> RegionResult:

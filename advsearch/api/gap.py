@@ -36,7 +36,7 @@ from advsearch.runs.results.matrix import MatrixCell, MatrixModel, MatrixResult,
 from advsearch.runs.summary import attack_of
 from advsearch.scene.library import list_objects, load_object
 from advsearch.tasks import make_task
-from advsearch.viewer.study_page import write_matrix_page
+from advsearch.viewer.pages import write_page
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -140,7 +140,7 @@ def matrix_from_config(
     def result(rows: tuple[list[MatrixModel], list[MatrixRow]], common: StudyResult) -> MatrixResult:
         return MatrixResult(**vars(common), models=list(names), ensemble=config.ensemble, tested=rows[0], table=rows[1])
 
-    found = _study(
+    return _study(
         config,
         lambda parts: _matrix(config, names, parts),
         result,
@@ -149,8 +149,6 @@ def matrix_from_config(
         progress=progress,
         resumed=resumed,
     )
-    write_matrix_page(found)
-    return found
 
 
 # ---- one study ------------------------------------------------------------------------------------------------------
@@ -207,6 +205,7 @@ def _study(
         for suffix, data in figure_of(result).items():
             write_bytes(run.path / "images" / f"{config.command}.{suffix}", data)
         run.write_summary(result)
+        write_page(run.path, result)
         return result
 
 

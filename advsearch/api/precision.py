@@ -42,6 +42,7 @@ from advsearch.runs.results.precision import PrecisionResult, PrecisionSubject
 from advsearch.runs.summary import to_json
 from advsearch.scene.renderer import Renderer
 from advsearch.settings import split_names
+from advsearch.viewer.pages import write_page
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -106,6 +107,7 @@ def precision_from_config(
             report = _measured(config, run, progress)
             report = report.model_copy(update={"figures": _write(run.path / "images", report)})
             run.write_summary(report)
+            write_page(run.path, report)
             return report
     report, folder = _measured(config, None, progress), Path(config.out).expanduser()
     report = report.model_copy(update={"figures": _write(folder, report)})

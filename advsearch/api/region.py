@@ -30,6 +30,7 @@ from advsearch.runs.files import write_bytes
 from advsearch.runs.results.base import INTERRUPTED, CleanScene, Formation, MovedValue
 from advsearch.runs.results.region import AxisRange, BoxSide, GrownRegion, MarginMap, RegionResult
 from advsearch.settings import split_names
+from advsearch.viewer.pages import write_page
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -123,6 +124,7 @@ def region_from_config(
             command_line=config.command_line(),
         )
         run.write_summary(result)
+        write_page(run.path, result)
         return result
 
 

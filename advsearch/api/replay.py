@@ -28,7 +28,7 @@ from advsearch.runs.results.attack import AttackSummary, ControlGroup
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.results.replay import ReplayResult, ReplayRow
 from advsearch.runs.summary import attack_of
-from advsearch.viewer.study_page import write_replay_page
+from advsearch.viewer.pages import write_page
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -109,7 +109,7 @@ def replay_from_config(
             command_line=config.command_line(),
         )
         run.write_summary(result)
-        write_replay_page(result)
+        write_page(run.path, result)
         return result
 
 

@@ -15,6 +15,7 @@ from advsearch.interrupts import interruptible
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import INTERRUPTED, OUT_OF_TIME, Fields, Result
 from advsearch.runs.summary import NAME, read_result
+from advsearch.viewer.pages import write_page
 
 Row = TypeVar("Row")
 Answer = TypeVar("Answer", bound=Result)
@@ -121,4 +122,5 @@ def kept_rows(
         before = read_result(run.path)
         return before if isinstance(before, type(answer)) else answer
     run.write_summary(answer)
+    write_page(run.path, answer)
     return answer

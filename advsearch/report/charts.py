@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from advsearch.report.drawing import drawn
+from advsearch.report.drawing import BLUE, GREY, RED, drawn
 from advsearch.report.markup import Html, element
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 HEIGHT = 300
@@ -26,6 +27,8 @@ MOST_POINTS = 400
 
 COLORS = {"search": "#010101", "baseline": "#020202", "soft": "#030303", "line": "#040404"}
 """Variables of the style sheet, and what stands for them while matplotlib draws."""
+OF_FIGURES = {"search": BLUE, "baseline": RED, "soft": GREY}
+"""The same of the colours that figures have."""
 STYLE: dict[Any, Any] = {
     "font.size": 13.0,
     "legend.fontsize": 13.0,
@@ -99,26 +102,57 @@ def objective_chart(curves: Sequence[Curve], objective: str, zero_means: str = "
         axes.locator_params("x", integer=True)
         figure.legend(loc="outside upper left", ncols=2)
 
-    (file,) = drawn(draw, (width / 72, HEIGHT / 72), ("svg",), STYLE).values()
+    return _chart(draw, width, HEIGHT, f"{objective} over evaluations. {told}")
+
+
+def study_chart(draw: Callable[[Axes], object], words: str, width: int = WIDE, height: int = HEIGHT) -> Html:
+    """Return what `report.studies` draws on axes, without its title and with the page's legend.
+
+    Args:
+        draw: draws on the axes.
+        words: what it shows, to who does not see it.
+        width: in CSS pixels.
+        height: likewise.
+    """
+
+    def on_figure(figure: Figure) -> None:
+        axes = figure.subplots()
+        draw(axes)
+        axes.set_title("")
+        for legend in (*figure.legends, *filter(None, [axes.get_legend()])):
+            legend.remove()
+        columns = 1 if width == NARROW else 2
+        figure.legend(loc="outside upper left", ncols=columns, labelcolor=COLORS["soft"])
+
+    return _chart(on_figure, width, height, words)
+
+
+def _chart(draw: Callable[[Figure], object], width: int, height: int, words: str) -> Html:
+    (file,) = drawn(draw, (width / 72, height / 72), ("svg",), STYLE).values()
     return element(
         "svg",
-        element("title", f"{objective} over evaluations. {told}"),
-        _inline(file.decode("utf-8")),
-        viewBox=f"0 0 {width} {HEIGHT}",
+        element("title", words),
+        _inline(file.decode("utf-8"), f"{width}-"),
+        viewBox=f"0 0 {width} {height}",
         class_="chart wide" if width == WIDE else "chart narrow",
         role="img",
-        aria_label=f"{objective} over evaluations. {told}",
+        aria_label=words,
     )
 
 
-def _inline(file: str) -> Html:
+def _inline(file: str, prefix: str) -> Html:
     """Return what a file in SVG draws: without its head, hundredths of a pixel, names and frames to cut at.
 
-    Names would be there twice in a page of two charts. All that is drawn lies in the frame.
+    All that is drawn lies in the frame. Names that are pointed at, those of markers, stay, behind the prefix: a page of
+    two charts would have them twice.
     """
     shapes = file[file.index("<g ") : file.rindex("</svg>")]
-    needless = r'<defs>.*?</defs>|<!--.*?-->| (?:id|clip-path)="[^"]*"|(?<=\d\.\d)\d+(?=[^<>]*>)'
+    needless = r'<clipPath.*?</clipPath>|<!--.*?-->| clip-path="[^"]*"|(?<=\d\.\d)\d+(?=[^<>]*>)'
     shapes = re.sub(needless, "", shapes, flags=re.DOTALL)
-    for name, color in COLORS.items():
+    pointed = set(re.findall(r'href="#([^"]+)"', shapes))
+    shapes = re.sub(r' id="([^"]*)"', lambda one: f' id="{prefix}{one[1]}"' if one[1] in pointed else "", shapes)
+    shapes = re.sub(r'href="#', f'href="#{prefix}', shapes)
+    shapes = re.sub(r"<defs>\s*</defs>", "", shapes)
+    for name, color in (*COLORS.items(), *OF_FIGURES.items()):
         shapes = shapes.replace(color, f"var(--{name})")
     return Html(shapes)

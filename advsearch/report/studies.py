@@ -9,7 +9,7 @@ from typing import Any
 
 from advsearch.report.drawing import BLUE, GREY, RED, Figures, drawn
 from advsearch.report.wording import short_name
-from advsearch.runs.results.gap import CurveResult, GapResult, GapRow
+from advsearch.runs.results.gap import CurvePoint, CurveResult, GapResult, GapRow
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.region import BoxSide, MarginMap
 from advsearch.runs.results.sweep import AxisRow, SweepMap, SweepSummary
@@ -17,49 +17,52 @@ from advsearch.runs.results.sweep import AxisRow, SweepMap, SweepSummary
 
 def curve_figure(answer: CurveResult) -> Figures:
     """Draw the robust accuracy with its interval over epsilon; nothing where there is one epsilon only."""
-    points = [one for one in answer.curve if one.epsilon is not None and one.accuracy is not None]
-    if len(points) < 2:
-        return {}
+    return _figure(lambda axes: curve_axes(answer, axes), (5.6, 3.6)) if len(_points(answer)) > 1 else {}
 
-    def draw(axes: Any) -> None:
-        at, accuracy = [one.epsilon for one in points], [one.accuracy for one in points]
-        low, high = ([one.interval[end] for one in points] for end in (0, 1))
-        axes.fill_between(at, low, high, color=BLUE, alpha=0.15, linewidth=0, label="95 % interval")
-        axes.plot(at, accuracy, color=BLUE, marker="o", label="robust accuracy")
-        axes.set(xlabel="epsilon", ylabel="robust accuracy", ylim=(-0.02, 1.02))
-        axes.set_title(f"{', '.join(answer.controls)}: {points[0].objects} objects, {answer.model}")
-        axes.grid(True)
-        axes.legend()
 
-    return _figure(draw, (5.6, 3.6))
+def curve_axes(answer: CurveResult, axes: Any) -> None:
+    """Draw a curve on matplotlib axes; nothing where there is no epsilon of which something is known."""
+    points = _points(answer)
+    if not points:
+        return
+    at, accuracy = [one.epsilon for one in points], [one.accuracy for one in points]
+    low, high = ([one.interval[end] for one in points] for end in (0, 1))
+    axes.fill_between(at, low, high, color=BLUE, alpha=0.15, linewidth=0, label="95 % interval")
+    axes.plot(at, accuracy, color=BLUE, marker="o", label="robust accuracy")
+    axes.set(xlabel="epsilon", ylabel="robust accuracy", ylim=(-0.02, 1.02))
+    axes.set_title(f"{', '.join(answer.controls)}: {points[0].objects} objects, {answer.model}")
+    axes.grid(True)
+    axes.legend()
+
+
+def _points(answer: CurveResult) -> list[CurvePoint]:
+    return [one for one in answer.curve if one.epsilon is not None and one.accuracy is not None]
 
 
 def gap_figure(answer: GapResult) -> Figures:
     """Draw, for each object and control, the accuracy on average and of the worst configuration, joined by a line."""
+    size = (6.4, 1.6 + 0.36 * len(answer.table))
+    return _figure(lambda axes: gap_axes(answer, axes), size) if answer.table else {}
+
+
+def gap_axes(answer: GapResult, axes: Any) -> None:
+    """Draw a gap on matplotlib axes; nothing where there are no rows."""
     rows = answer.table
     if not rows:
-        return {}
-
-    def draw(axes: Any) -> None:
-        for place, row in enumerate(reversed(rows)):
-            mean, worst = row.average.accuracy, _worst(row)
-            axes.plot(row.average.interval, [place, place], color=BLUE, alpha=0.35, linewidth=5)
-            axes.plot([worst, mean], [place, place], color=GREY, linewidth=1)
-            first = place == 0
-            axes.plot(
-                mean, place, "o", color=BLUE, ms=4, zorder=4, label="average, with 95 % interval" if first else None
-            )
-            worst_label = (
-                "worst found, verified" if first else None
-            )  # an outline: where the two are equal, both are seen
-            axes.plot(worst, place, "D", color=RED, mfc="none", mew=1.5, ms=9, zorder=3, label=worst_label)
-        axes.set_yticks(range(len(rows)), [f"{row.object}, {row.control}" for row in reversed(rows)])
-        axes.set(xlabel="accuracy", xlim=(-0.03, 1.03), ylim=(-0.6, len(rows) - 0.4))
-        axes.set_title(f"Average and worst case: {answer.model}")
-        axes.grid(True, axis="x")
-        axes.figure.legend(loc="outside lower center", ncols=2)
-
-    return _figure(draw, (6.4, 1.6 + 0.36 * len(rows)))
+        return
+    for place, row in enumerate(reversed(rows)):
+        mean, worst, first = row.average.accuracy, _worst(row), place == 0
+        axes.plot(row.average.interval, [place, place], color=BLUE, alpha=0.35, linewidth=5)
+        axes.plot([worst, mean], [place, place], color=GREY, linewidth=1)
+        label = "average, with 95 % interval" if first else None
+        axes.plot(mean, place, "o", color=BLUE, ms=4, zorder=4, label=label)
+        label = "worst found, verified" if first else None  # an outline: where the two are equal, both are seen
+        axes.plot(worst, place, "D", color=RED, mfc="none", mew=1.5, ms=9, zorder=3, label=label)
+    axes.set_yticks(range(len(rows)), [f"{row.object}, {row.control}" for row in reversed(rows)])
+    axes.set(xlabel="accuracy", xlim=(-0.03, 1.03), ylim=(-0.6, len(rows) - 0.4))
+    axes.set_title(f"Average and worst case: {answer.model}")
+    axes.grid(True, axis="x")
+    axes.figure.legend(loc="outside lower center", ncols=2)
 
 
 def matrix_figure(answer: MatrixResult) -> Figures:

@@ -7,14 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from advsearch.errors import InputError
-from advsearch.runs.directory import REPORT
+from advsearch.runs.directory import PARTS, REPORT
 from advsearch.runs.files import placed_by, write_bytes, write_text
-from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
-from advsearch.viewer.attack_page import write_report
 from advsearch.viewer.columns import read_columns
-from advsearch.viewer.sweep_page import SweepSource, page, write_page
+from advsearch.viewer.pages import write_page
+from advsearch.viewer.sweep_page import SweepSource, page
 from advsearch.viewer.thumbnails import kept_pictures, path_of
 
 INDEX = "index.html"
@@ -24,20 +23,14 @@ def renewed(run: Path) -> Path:
     """Write the page of a run anew and return its path.
 
     Raises:
-        InputError: runs of its command have no page.
         FileFormatError: its results are damaged.
         StorageError: it cannot be written.
     """
-    result = read_result(run)
-    if isinstance(result, SweepSummary):
-        return write_page(run, result)
-    if isinstance(result, AttackSummary):
-        return write_report(run)
-    raise InputError(f"{run}: {result.command} has no page; advsearch show {run} prints what it has")
+    return write_page(run, read_result(run))
 
 
 def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
-    """Write a folder with a page, the rows and the thumbnails of sweeps, or the page of one attack; return the page.
+    """Write a folder with a page, the rows and the thumbnails of sweeps, or the page of another run; return the page.
 
     Raises:
         InputError: the folder is there and not empty, or runs of these commands have no common page.
@@ -50,11 +43,20 @@ def write_bundle(runs: Sequence[Path], folder: Path) -> Path:
     sweeps = [(run, result) for run, result in results if isinstance(result, SweepSummary)]
     with placed_by("bundle"):
         if len(results) == 1 and not sweeps:
-            return write_bytes(folder / INDEX, (renewed(runs[0]).parent / REPORT).read_bytes())
+            return _alone(runs[0], folder)
         if len(sweeps) < len(results):
-            raise InputError("bundle: one attack or several sweeps make a page; give one kind of them")
+            raise InputError("bundle: one run or several sweeps make a page; give one kind of them")
         sources = [_copied(run, folder, number) for number, (run, _) in enumerate(sweeps)]
         return write_text(folder / INDEX, page(sweeps, sources))
+
+
+def _alone(run: Path, folder: Path) -> Path:
+    """Write the page of a run, and those of the attacks that it consists of, which it links to."""
+    for part in sorted((run / PARTS).glob(f"*/{REPORT}")):
+        if part.is_symlink() or part.parent.is_symlink() or not part.is_file():
+            continue
+        write_bytes(folder / part.relative_to(run), part.read_bytes())
+    return write_bytes(folder / INDEX, renewed(run).read_bytes())
 
 
 def _copied(run: Path, folder: Path, number: int) -> SweepSource:

@@ -27,7 +27,7 @@ from advsearch.errors import AdvsearchError, InputError
 from advsearch.files import open_regular
 from advsearch.report.markup import element
 from advsearch.runs import listing, lock
-from advsearch.runs.directory import COLUMNS, HOME, REPORT, is_run
+from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, is_run
 from advsearch.viewer.columns import read_columns
 from advsearch.viewer.document import document
 from advsearch.viewer.sweep_page import SweepSource, page, result_of
@@ -253,6 +253,14 @@ class _Handler(BaseHTTPRequestHandler):
             raise Refused(HTTPStatus.NOT_FOUND, f"{name} has no page yet; advsearch show {name} prints what it has")
         return "text/html; charset=utf-8", report.read_bytes()
 
+    def _part(self, _query: Mapping[str, list[str]], name: str, part: str) -> tuple[str, bytes]:
+        """The page of one of the attacks that a study consists of, where the study's page links to it."""
+        found = next((one for one in (self._run(name) / PARTS).iterdir() if one.name == part), None)
+        report = None if found is None or found.is_symlink() else found / REPORT
+        if report is None or report.is_symlink() or not report.is_file():
+            raise Refused(HTTPStatus.NOT_FOUND, "there is no such attack")
+        return "text/html; charset=utf-8", report.read_bytes()
+
     def _compare(self, query: Mapping[str, list[str]]) -> tuple[str, bytes]:
         names = list(dict.fromkeys(query.get("run", [])))
         if not names:
@@ -292,6 +300,7 @@ _ROUTES: tuple[tuple[str, Answer], ...] = (
     ("/compare/", _Handler._compare),
     ("/runs/([^/]+)/", _Handler._page),
     ("/runs/([^/]+)/rows", _Handler._rows),
+    (f"/runs/([^/]+)/{PARTS}/([^/]+)/{re.escape(REPORT)}", _Handler._part),
     (r"/runs/([^/]+)/pictures/[0-9]+/([0-9]{1,12})\.jpg", _Handler._picture),
 )
 

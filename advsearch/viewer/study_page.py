@@ -1,64 +1,100 @@
-"""`report.html` of a question that took several attacks: a table, and how it came about."""
+"""`report.html` of a question that took several attacks: a figure, tables, the attacks, and how it came about."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
-from advsearch.report import wording
+from advsearch.report import gaps, wording
+from advsearch.report.charts import HEIGHT, NARROW, WIDE, study_chart
 from advsearch.report.markup import Html, element, join
 from advsearch.report.replays import HEADS, replay_rows, replay_text
+from advsearch.report.studies import curve_axes, gap_axes
 from advsearch.report.transfer import matrix_heads, matrix_rows, matrix_text
-from advsearch.runs.directory import REPORT
-from advsearch.runs.files import write_text
+from advsearch.runs.directory import PARTS, REPORT
+from advsearch.runs.results.gap import CurveResult, GapResult, StudyResult
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.replay import ReplayResult
 from advsearch.viewer.document import document
 
+ROW_HEIGHT = 34
+"""Height of a row of the chart of a gap, in CSS pixels."""
 
-def write_matrix_page(result: MatrixResult) -> Path:
-    """Write `report.html` into the run of a matrix, and return its path.
 
-    Raises:
-        StorageError: it could not be written.
-    """
-    run = Path(str(result.run))
-    what = f"{', '.join(result.objects)}; {', '.join(result.controls)}; environment {result.environment}"
+def gap_page(run: Path, result: GapResult) -> str:
+    """Return the page of a gap in the folder `run`."""
+    links = _links(run, [row.run for row in result.table])
+    words = f"Accuracy on average and of the worst configuration. {gaps.gap_text(result)} The table has the numbers."
+    high = 110 + ROW_HEIGHT * len(result.table)
+    note = (
+        "On average: configurations drawn at random from the whole space and budget. Worst: trials of the "
+        f"configuration that the search found, with fresh seeds; {gaps.margin_meaning(result)}. Clopper-Pearson "
+        "intervals."
+    )
+    body = [
+        element("h2", "The worst case beside the average"),
+        _charts(lambda axes: gap_axes(result, axes), words, high) if result.table else None,
+        table(gaps.GAP_HEADS, gaps.gap_rows(result), links),
+        element("p", note, class_="soft"),
+    ]
+    return _study_page(run, result, gaps.gap_text(result), body)
+
+
+def curve_page(run: Path, result: CurveResult) -> str:
+    """Return the page of robust accuracy against epsilon in the folder `run`."""
+    links = _links(run, [row.run for row in result.table])
+    points = [one for one in result.curve if one.epsilon is not None and one.accuracy is not None]
+    told = "; ".join(f"{one.robust} of {one.objects} at {one.epsilon:g}" for one in points)
+    words = f"Robust accuracy over epsilon with 95 % intervals: {told}."
+    rows = gaps.curve_rows(result)
+    note = (
+        "Robust: recognised as it is, and no answer was verified within the epsilon. That is what these attacks found: "
+        "a stronger one may find more. Clopper-Pearson intervals over objects."
+    )
+    body = [
+        element("h2", "Robust accuracy") if rows else None,
+        _charts(lambda axes: curve_axes(result, axes), words, HEIGHT) if len(points) > 1 else None,
+        table(gaps.CURVE_HEADS, rows) if rows else None,
+        element("p", note, class_="soft") if rows else None,
+        element("h2", "The objects, at the last epsilon tried"),
+        table(gaps.OBJECT_HEADS, gaps.object_rows(result), links),
+        element("p", f"{gaps.margin_meaning(result)}.".capitalize(), class_="soft"),
+    ]
+    return _study_page(run, result, gaps.curve_text(result), body)
+
+
+def matrix_page(run: Path, result: MatrixResult) -> str:
+    """Return the page of a matrix in the folder `run`."""
     spp = f", {result.tested[0].spp} samples per pixel" if result.tested else ""
     note = (
         "Successes of the trials, in which the model is wrong on the answer and right on the clean scene with the same "
         "seed, with 95 % Clopper-Pearson intervals; * where that is verified. All models are shown the scene with the "
-        f"same seeds{spp}, rounded to 8 bits."
+        f"same seeds{spp}, rounded to 8 bits. The stronger a cell's colour, the more successes."
     )
     facts = {
         "Models": ", ".join(f"{one.model} ({' x '.join(map(str, one.input_size))})" for one in result.tested),
         "Ensemble": result.ensemble or "",
-        "Policy": result.policy,
-        "Attacks": ", ".join(str(row.run) for row in result.table),
-        "Time": wording.seconds_text(result.seconds["total"]),
-        "Seed": str(result.seed),
     }
-    main = element(
-        "main",
+    rows = matrix_rows(result)
+    before = len(rows) - len(result.table)  # the row of the clean scene
+    rates = {
+        (before + up, 2 + across): cell.verified.rate
+        for up, row in enumerate(result.table)
+        for across, cell in enumerate(row.tested)
+    }
+    links = [""] * before + _links(run, [row.run for row in result.table])
+    body = [
         element("h2", "Attacked on, tested on"),
-        table(matrix_heads(result), matrix_rows(result)),
+        table(matrix_heads(result), rows, links, rates),
         element("p", note, class_="soft"),
-        join(element("h2", "Cost and conditions"), facts_table(facts)),
-        again(result.command_line),
-    )
-    title = f"{', '.join(result.objects)}, {len(result.models)} models"
-    header = heading(what, matrix_text(result), result.warnings)
-    page = document(title, header, main, footer=f"run {run.name}. This page needs no other file.")
-    return write_text(run / REPORT, page, durable=False)
+    ]
+    return _study_page(run, result, matrix_text(result), body, facts)
 
 
-def write_replay_page(result: ReplayResult) -> Path:
-    """Write `report.html` into the run of a replay, and return its path.
-
-    Raises:
-        StorageError: it could not be written.
-    """
-    run = Path(str(result.run))
+def replay_page(run: Path, result: ReplayResult) -> str:
+    """Return the page of a replay in the folder `run`."""
     what = f"answer of {Path(result.answer).name} ({result.answered}); {result.object}, {', '.join(result.controls)}"
     note = (
         "Trials with fresh seeds, the same under every condition, rounded to 8 bits, with 95 % Clopper-Pearson "
@@ -82,8 +118,7 @@ def write_replay_page(result: ReplayResult) -> Path:
         again(result.command_line),
     )
     header = heading(what, replay_text(result), result.warnings)
-    page = document(f"{run.name}, replay", header, main, footer=f"run {run.name}. This page needs no other file.")
-    return write_text(run / REPORT, page, durable=False)
+    return document(f"{run.name}, replay", header, main, footer=f"run {run.name}. This page needs no other file.")
 
 
 # ---- parts ----------------------------------------------------------------------------------------------------------
@@ -103,14 +138,81 @@ def facts_table(facts: Mapping[str, str]) -> Html:
     return element("table", element("tbody", *lines), class_="facts")
 
 
-def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Html:
-    """Return a table whose rows begin with their name."""
+def table(
+    heads: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    links: Sequence[str] = (),
+    shares: Mapping[tuple[int, int], float] | None = None,
+) -> Html:
+    """Return a table whose rows begin with their name.
+
+    Args:
+        heads: of the columns.
+        rows: texts.
+        links: of the rows' names; empty ones and those that are missing lead nowhere.
+        shares: in [0, 1], by row and column: the larger, the stronger the colour of the cell.
+    """
+    lines = []
+    for number, (first, *cells) in enumerate(rows):
+        link = links[number] if number < len(links) else ""
+        name = element("a", first, href=link) if link else first
+        shown = [_cell(text, (shares or {}).get((number, at))) for at, text in enumerate(cells, 1)]
+        lines.append(element("tr", element("th", name, scope="row"), *shown))
     head = element("tr", *(element("th", text, scope="col") for text in heads))
-    lines = [
-        element("tr", element("th", first, scope="row"), *(element("td", cell, class_="number") for cell in cells))
-        for first, *cells in rows
-    ]
     return element("div", element("table", element("thead", head), element("tbody", *lines)), class_="scroll")
+
+
+LONG = 32
+"""Letters of a cell above which its text is broken into lines."""
+
+
+def _cell(text: str, share: float | None) -> Html:
+    if share is None:
+        return element("td", text, class_="number" if len(text) <= LONG else "long")
+    return element("td", text, class_=f"number share share-{round(10 * share)}")
+
+
+def _charts(draw: Callable[[Any], object], words: str, height: int) -> Html:
+    """A chart for a screen, and one for a phone."""
+    return element("div", *(study_chart(draw, words, width, height) for width in (WIDE, NARROW)))
+
+
+def _links(run: Path, parts: Sequence[str | None]) -> list[str]:
+    """Where the pages of the attacks are, seen from that of the study; empty of those that have none."""
+    found = []
+    for part in parts:
+        name = "" if part is None else Path(part).name
+        there = name and (run / PARTS / name / REPORT).is_file()
+        found.append(f"{PARTS}/{quote(name, safe='')}/{REPORT}" if there else "")
+    return found
+
+
+def _study_page(
+    run: Path, result: StudyResult, said: str, body: Sequence[Html | None], facts: Mapping[str, str] | None = None
+) -> str:
+    """The page of several attacks: what is said of them, the attacks and how they came about."""
+    what = f"{', '.join(result.objects)}; {', '.join(result.controls)}; environment {result.environment}"
+    conditions = {
+        "Model": result.model,
+        "Environment": result.environment,
+        **(facts or {}),
+        "Policy": result.policy,
+        "Time": wording.seconds_text(result.seconds["total"]),
+        "Seed": str(result.seed),
+    }
+    links = _links(run, list(result.parts))
+    named = zip(result.parts, links, strict=True)
+    parts = [element("li", element("a", name, href=link) if link else name) for name, link in named]
+    summary = element("summary", f"The attacks ({len(parts)})")
+    main = element(
+        "main",
+        *body,
+        element("details", summary, element("ul", *parts)) if parts else None,
+        join(element("h2", "Cost and conditions"), facts_table(conditions)),
+        again(result.command_line),
+    )
+    title = f"{', '.join(result.objects)}, {result.command}"
+    return document(title, heading(what, said, result.warnings), main, footer=f"run {run.name}")
 
 
 def again(command_line: str) -> Html:

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from PIL import Image
-from samples import keep_object, make_run
+from samples import GAP, gap, keep_object, make_run
 from stored_sweeps import make_sweep, serving
 
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row, Store
 from advsearch.viewer.attack_page import write_report
 from advsearch.viewer.document import asset
+from advsearch.viewer.pages import write_page
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -238,9 +239,27 @@ def test_a_browser_without_webgl_has_the_pictures(browser: Browser, attack: Path
     context.close()
 
 
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory, attack: Path) -> Path:
+    """A gap, of which the first part is the attack."""
+    run = tmp_path_factory.mktemp("runs") / "study"
+    rows = [{**GAP["table"][0], "control": name, "run": f"parts/{name}"} for name in ("pose", "camera")]
+    shutil.copytree(attack, run / "parts" / "pose")
+    write_page(run, gap(table=rows, controls=["pose", "camera"], parts=["pose", "camera"]))
+    return run
+
+
+def test_a_study_leads_to_its_attacks(browser: Browser, study: Path) -> None:
+    with opened(browser, (study / "report.html").as_uri(), 390) as page:
+        assert page.locator("svg.narrow").is_visible() and not page.locator("svg.wide").is_visible()
+        page.get_by_role("link", name="mug").first.click()
+        page.wait_for_selector(".stage")
+        assert page.url.endswith("/parts/pose/report.html")
+
+
 @pytest.mark.parametrize("width", [390, 1440])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("which", ["sweep", "attack"])
+@pytest.mark.parametrize("which", ["sweep", "attack", "study"])
 def test_everybody_can_use_the_pages(
     browser: Browser, request: pytest.FixtureRequest, which: str, scheme: str, width: int
 ) -> None:
@@ -248,7 +267,9 @@ def test_everybody_can_use_the_pages(
     axe = pytest.importorskip("axe_playwright_python.sync_playwright")
     run: Path = request.getfixturevalue(which)
     with opened(browser, (run / "report.html").as_uri(), width, color_scheme=scheme, bypass_csp=True) as page:
-        page.wait_for_selector("[data-cell]" if which == "sweep" else "#object canvas")
+        page.wait_for_selector(
+            {"sweep": "[data-cell]", "attack": "#object canvas", "study": "svg"}[which], state="attached"
+        )
         found = axe.Axe().run(page).response["violations"]
         assert [
             (one["id"], one["nodes"][0]["html"][:200]) for one in found if one["impact"] in ("serious", "critical")

@@ -1,0 +1,99 @@
+"""`report.html` of a run without a page of its own kind: its figures, a table for each list, and what it cost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from advsearch.report import wording
+from advsearch.report.markup import Html, element, join
+from advsearch.runs.directory import IMAGES
+from advsearch.runs.results.base import Fields, Result
+from advsearch.viewer.document import data_url, document
+from advsearch.viewer.study_page import again, facts_table, heading, table
+
+LONG = 24
+"""Rows of a table above which it is folded."""
+
+LARGEST_FIGURE = 2_000_000
+"""Bytes of a figure that the page takes along."""
+
+_ELSEWHERE = (
+    *("run", "object", "objects", "controls", "environment", "ending", "warnings", "seconds", "command_line"),
+    "figures",
+)
+"""Fields that stand in the heading or below, or nowhere."""
+
+
+def result_page(run: Path, result: Result) -> str:
+    """Return the page of what is in the folder `run`."""
+    values = {name: getattr(result, name) for name in type(result).model_fields}
+    named = [values.get("object"), *[", ".join(values.get(one) or ()) for one in ("objects", "controls")]]
+    what = "; ".join(filter(None, [result.command, *map(_text, named)]))
+    tables = [(name, rows) for name, value in values.items() if (rows := _rows(value))]
+    rest = {name: value for name, value in values.items() if name not in _ELSEWHERE and not _rows(value)}
+    plain = {_words(name): _text(value) for name, value in rest.items()}
+    seconds = values.get("seconds")
+    if isinstance(seconds, Mapping):
+        plain["Time"] = wording.seconds_text(seconds.get("total"))
+    main = element(
+        "main",
+        *_figures(run),
+        *(join(element("h2", _words(name)), _folded(rows)) for name, rows in tables),
+        join(element("h2", "Cost and conditions"), facts_table(plain)),
+        again(str(values.get("command_line") or f"advsearch show {run.name}")),
+    )
+    said = result.brief or str(values.get("ending", "done"))
+    header = heading(what, said[:1].upper() + said[1:] + ".", values.get("warnings") or ())
+    return document(
+        f"{run.name}, {result.command}", header, main, footer=f"run {run.name}. This page needs no other file."
+    )
+
+
+def _figures(run: Path) -> Iterable[Html]:
+    for file in sorted((run / IMAGES).glob("*.png")):
+        if file.is_file() and not file.is_symlink() and file.stat().st_size <= LARGEST_FIGURE:
+            alt = f"{_words(file.stem)}: a figure of the numbers in the tables below"
+            picture = element("img", src=data_url(file.read_bytes(), "image/png"), alt=alt)
+            yield element("figure", picture, class_="wide")
+
+
+def _rows(value: object) -> Sequence[Fields]:
+    """The rows of a table, where a value is a list of fields."""
+    if isinstance(value, (list, tuple)) and value and all(isinstance(one, Fields) for one in value):
+        return [one for one in value if isinstance(one, Fields)]
+    return ()
+
+
+def _folded(rows: Sequence[Fields]) -> Html:
+    """A table of what differs or is not empty; a long one is folded."""
+    names = list(dict.fromkeys(name for row in rows for name in type(row).model_fields))
+    lines = [[_text(getattr(row, name, None)) for name in names] for row in rows]
+    filled = [column for column in range(len(names)) if any(line[column] for line in lines)]
+    cells = [[line[column] for column in filled] for line in lines]
+    made = table([_words(names[column]) for column in filled], cells)
+    return made if len(rows) <= LONG else element("details", element("summary", f"{len(rows)} rows"), made)
+
+
+def _text(value: object) -> str:
+    """A value in a cell."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return "" if value != value else wording.number_text(value)
+    if isinstance(value, Fields):
+        return _text({name: getattr(value, name) for name in type(value).model_fields})
+    if isinstance(value, Mapping):
+        return ", ".join(f"{_words(str(name)).lower()} {_text(one)}" for name, one in value.items() if _text(one))
+    if isinstance(value, (list, tuple)):
+        inner = " to " if len(value) == 2 and all(isinstance(one, float) for one in value) else "; "
+        return inner.join(filter(None, map(_text, value)))
+    return str(value)
+
+
+def _words(name: str) -> str:
+    """The name of a field as a heading."""
+    words = name.replace("_", " ").replace("-", " ")
+    return words[:1].upper() + words[1:]

@@ -1,0 +1,140 @@
+"""The pages of studies and of measurements: what is drawn, what the tables say, and where they lead."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError
+from urllib.request import urlopen
+
+import pytest
+from samples import AVERAGE, CURVE, GAP, curve, gap, make_run, matrix, region
+from stored_sweeps import serving
+
+from advsearch.cli.main import main
+from advsearch.config import AttackConfig
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results.base import Result
+from advsearch.runs.results.gap import StudyResult
+from advsearch.runs.results.stability import StabilityResult
+from advsearch.viewer.pages import write_page
+
+ACCURACIES = ((0.01, 7), (0.03, 4), (0.1, 1))
+STABILITY: dict[str, Any] = {
+    "run": "", "ending": "done", "not_run": [], "seconds": {"total": 9.0}, "command_line": "advsearch stability",
+    "rows": [
+        {"case": "ties", "group": "objective", "control": "pose", "finite": True, "relative_error": 0.0125,
+         "ending": "found", "rule": "<b>a tie is not wrong</b>", "status": "ok", "decides": "", "holds": "",
+         "checks": [], "measured": {"condition number": 12.5}, "seconds": 1.5}],
+}  # fmt: skip
+
+
+def make_study(path: Path, result: Result) -> Path:
+    """Make the run of a study, with a page for each of its parts but the last."""
+    with RunDirectory.create_for(AttackConfig(object="mug", run=str(path))) as run:
+        run.write_summary(result)
+    for name in result.parts if isinstance(result, StudyResult) else ():
+        make_run(path / "parts" / name, pictures=False)
+        (path / "parts" / name / "report.html").write_text(f"the attack {name}")
+    write_page(path, result)
+    return path
+
+
+def a_curve() -> Result:
+    """Eight objects at three epsilons."""
+    points = [
+        {"epsilon": epsilon, "objects": 8, "robust": robust, "found": 8 - robust, "already_wrong": 0,
+         "accuracy": robust / 8, "interval": [max(0, robust / 8 - 0.3), min(1, robust / 8 + 0.2)]}
+        for epsilon, robust in ACCURACIES
+    ]  # fmt: skip
+    rows = [{**CURVE["table"][0], "run": "runs/mug/parts/00-mug"}]
+    return curve(curve=points, table=rows, parts=["00-mug", "01-bowl"], objects=["mug", "bowl"])
+
+
+def a_gap() -> Result:
+    """Two controls."""
+    rows = [{**GAP["table"][0], "control": name, "run": f"runs/x/parts/{name}"} for name in ("pose", "camera")]
+    return gap(
+        table=rows, controls=["pose", "camera"], parts=["pose", "camera"], command_line="advsearch gap --object mug"
+    )
+
+
+def got(address: str) -> str:
+    """What a server answers."""
+    with urlopen(address, timeout=20) as answer:
+        return str(answer.read().decode())
+
+
+def text_of(page: str) -> str:
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", page).replace("&nbsp;", " "))
+
+
+def test_a_curve_is_drawn_with_its_intervals_and_leads_to_its_attacks(tmp_path: Path) -> None:
+    page = (make_study(tmp_path / "study", a_curve()) / "report.html").read_text()
+    text = text_of(page)
+    assert "Still recognised: 7 of 8 at epsilon 0.01 and 1 of 8 at epsilon 0.1." in text
+    assert "0.03 4/8 50 % 20-70 % 0" in text
+    chart = page[page.index('class="chart wide"') : page.index('class="chart narrow"')]
+    assert "7 of 8 at 0.01; 4 of 8 at 0.03; 1 of 8 at 0.1" in chart
+    assert chart.count("<use") >= len(ACCURACIES)  # a marker for each, which points at a shape
+    for name in re.findall(r'href="#([^"]+)"', page):
+        assert page.count(f'id="{name}"') == 1
+    links = re.findall(r'<a href="([^"#]+)"', page)
+    assert links == ["parts/00-mug/report.html", "parts/00-mug/report.html", "parts/01-bowl/report.html"]
+    assert all((tmp_path / "study" / link).is_file() for link in links)
+
+
+def test_a_gap_has_the_average_beside_the_worst(tmp_path: Path) -> None:
+    page = (make_study(tmp_path / "study", a_gap()) / "report.html").read_text()
+    text = text_of(page)
+    right = f"{AVERAGE['correct']}/{AVERAGE['configurations']} (75 %)"
+    assert f"mug camera {right} 35-97 % 20/20 3.25 found" in text
+    assert "right in 75 % of random configurations, yet in 2 of 2 cases one is found" in text
+    assert "advsearch gap --object mug" in text
+    assert 'href="parts/camera/report.html"' in page
+
+
+def test_a_matrix_has_a_colour_for_each_share(tmp_path: Path) -> None:
+    page = (make_study(tmp_path / "study", matrix()) / "report.html").read_text()
+    assert re.findall(r'class="number share share-(\d+)"', page) == ["10", "2", "2", "10"]
+    assert 'href="parts/other/report.html"' in page
+
+
+def test_an_attack_without_a_page_has_no_link(tmp_path: Path) -> None:
+    run = make_study(tmp_path / "study", a_gap())
+    (run / "parts" / "camera" / "report.html").unlink()
+    page = write_page(run, a_gap()).read_text()
+    assert "parts/pose/" in page and "parts/camera/" not in page
+
+
+@pytest.mark.parametrize(
+    ("result", "said"),
+    [
+        (StabilityResult.of(STABILITY), ["1 of 1 hold.", "ties objective", "condition number 12.5", "0.0125"]),
+        (region(warnings=["Look out."]), ["Done.", "pose.yaw degrees 10 55.5 30", "0.982 to 1", "Look out."]),
+    ],
+)
+def test_any_result_has_a_page(tmp_path: Path, result: Result, said: list[str]) -> None:
+    run = make_study(tmp_path / "run", result)
+    page = (run / "report.html").read_text()
+    for one in said:
+        assert one in text_of(page), one
+    assert "<b>a tie" not in page and "nan" not in text_of(page)
+    assert "None" not in text_of(page)
+
+
+def test_the_dashboard_and_a_bundle_have_the_pages_of_the_attacks(tmp_path: Path) -> None:
+    run = make_study(tmp_path / "study", a_gap())
+    with serving(run) as server:
+        assert "parts/pose/report.html" in got(f"{server.address}runs/study/")
+        assert got(f"{server.address}runs/study/parts/pose/report.html") == "the attack pose"
+        (run / "parts" / "camera" / "report.html").unlink()
+        (run / "parts" / "camera" / "report.html").symlink_to(run / "run.yaml")
+        for path in ("camera", "none", "..", "%2e%2e", "..%2f..%2fstudy"):
+            with pytest.raises(HTTPError, match="404"):
+                got(f"{server.address}runs/study/parts/{path}/report.html")
+    assert main(["view", str(run), "--bundle", str(tmp_path / "site")]) == 0
+    assert (tmp_path / "site" / "parts" / "pose" / "report.html").read_text() == "the attack pose"
+    assert "parts/pose/report.html" in (tmp_path / "site" / "index.html").read_text()
+    assert not (tmp_path / "site" / "parts" / "camera").exists()
