@@ -48,6 +48,7 @@ from advsearch.config import (
     TRIALS_OVER,
     WAYS,
     AttackConfig,
+    HardenConfig,
     RecipeConfig,
     RegionConfig,
     RenderConfig,
@@ -57,6 +58,7 @@ from advsearch.config import (
     SweepConfig,
 )
 from advsearch.config.attack import FEWEST_TRIALS
+from advsearch.config.hardening import ALL
 from advsearch.controls import CONTROLS, texture
 from advsearch.engine import stages
 from advsearch.engine.loading import as_controls
@@ -395,8 +397,9 @@ def check_names(config: Config) -> None:
     resolve(config.set_)
     lights = config.environments if isinstance(config, SweepConfig) else (config.lit_by,)
     for name in config.objects:
-        assert name in library.list_objects() or Path(split_node(name)[0]).suffix in (*objects.SUFFIXES, MITSUBA_FILE)
-        needs_label = not isinstance(config, RenderConfig) and name not in library.list_objects()
+        suffixes = (*objects.SUFFIXES, MITSUBA_FILE)
+        assert name in (*library.list_objects(), ALL) or Path(split_node(name)[0]).suffix in suffixes
+        needs_label = not isinstance(config, (RenderConfig, HardenConfig)) and name not in library.list_objects()
         assert config.label is not None or not needs_label, "a file does not bring a label"
     for name in lights:
         assert name in library.list_environments() or Path(name).suffix in environments.SUFFIXES
