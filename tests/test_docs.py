@@ -427,7 +427,9 @@ def check_advsearch(words: list[str], folder: Path) -> None:
     if args.command in ("run", "resume"):
         recipe = folder / "run.yaml"
         recipe.write_text("object: mug\n", encoding="utf-8")
-        check_names(AttackConfig.from_yaml(recipe, dict(parse_assignment(text, text) for text in args.change)))
+        of_a_sweep = args.command == "resume" and "-sweep-" in args.run
+        config = SweepConfig if of_a_sweep else AttackConfig
+        check_names(config.from_yaml(recipe, dict(parse_assignment(text, text) for text in args.change)))
     if args.command == "export":
         assert args.format in (None, *WRITERS, *export.FORMATS)
 

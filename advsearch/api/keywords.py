@@ -101,6 +101,7 @@ class SweepKeywords(PictureKeywords, total=False):
     keep_pictures: Literal["all", "wrong", "none"]
     specialise: bool
     aov: str | None
+    surface: bool
     trials: int
     verify_spp: int | None
     overwrite: bool
