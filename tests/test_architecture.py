@@ -78,7 +78,7 @@ RULES = {
     ),
     "report": Rule({"runs", "config", "settings"}, {"numpy", "PIL", "matplotlib"}, HEAVY),
     "viewer": Rule({"runs", "report", "config", "settings"}, {"numpy", "PIL"}, HEAVY),
-    "recipes": Rule({"attacks", "runs", "report", "config", "settings"}, {"numpy", "pydantic"}, HEAVY),
+    "recipes": Rule({"attacks", "runs", "report", "config", "settings"}, {"matplotlib", "pydantic"}, HEAVY),
     "api": Rule(None),
     "cli": Rule(None),
     "": Rule({"api", "engine", "models"}, set()),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -12,21 +13,23 @@ from advsearch.api import carry_out
 from advsearch.api.keywords import RecipeKeywords, asks, configured
 from advsearch.config import CONFIGS, RecipeConfig
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
+from advsearch.controls import CONTROLS
+from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
 from advsearch.recipes.description import Recipe, read_recipe, recipe_of
-from advsearch.recipes.figures import as_table, compute, draw, read_options
+from advsearch.recipes.figures import compute, draw, read_options
 from advsearch.recipes.parts import Planned, listed, made_of, planned
 from advsearch.recipes.table import Answered, Table, rows_of
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, RunDirectory, is_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.listing import finished
-from advsearch.runs.results.attack import AttackSummary
+from advsearch.runs.results.attack import AttackSummary, DescribedValue, FoundValue
 from advsearch.runs.results.base import INTERRUPTED, Result
 from advsearch.runs.results.recipe import RecipeFigure, RecipePart, RecipeResult
 from advsearch.runs.results.sweep import SweepSummary
-from advsearch.runs.summary import read_result
+from advsearch.runs.summary import attack_of, read_result
 from advsearch.settings import read_yaml
-from advsearch.viewer.recipe_page import write_recipe_page
+from advsearch.viewer.pages import write_page
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -77,7 +80,7 @@ def recipe_from_config(
         figures = [] if interrupted else list(_figures(described, config, results, run))
         result = _result(described, config, run, results, figures, time.perf_counter() - begun)
         run.write_summary(result)
-        write_recipe_page(run.path, result, [as_table(one) for one in figures])
+        write_page(run.path, result)
         return result
 
 
@@ -101,11 +104,48 @@ def _carried_out(runs: Sequence[Planned], run: RunDirectory, progress: Progress)
             done = read_result(path) if finished(path) else _gone_on(path, progress)
         else:
             own = one.config.model_copy(update={"run": str(path), "overwrite": True})
+            if one.around is not None:
+                own = _around(own, attack_of(run.path / PARTS / one.around))
             done = carry_out(own, progress=progress)
         results.append((one, done))
         if done.goes_on:
             break
     return results
+
+
+def _around(config: SceneConfig, summary: AttackSummary) -> SceneConfig:
+    """Draw evenly from the distribution that a search answers with: mean and deviation are the same.
+
+    An even distribution of deviation s is sqrt(12) s wide. The ranges end where the search's did, but angles that come
+    round.
+
+    Raises:
+        InputError: the search answers with one configuration, since its policy does or since it searched nothing.
+    """
+    searched = summary.configuration
+    if summary.distribution is None or searched is None:
+        raise InputError(
+            f"{summary.run}: ended with {summary.ending!r} and no distribution to draw from; search with a policy that "
+            "answers with one, such as `policy=nes`"
+        )
+    controls: dict[str, dict[str, object]] = {}
+    for (name, mean), deviation in zip(summary.distribution.mean.items(), summary.distribution.deviation, strict=True):
+        control, _, parameter = name.partition(".")
+        controls.setdefault(control, {})[parameter] = _range(name, mean, searched[name], deviation)
+    return config.model_copy(update={"controls": controls, "sampler": "random"})
+
+
+def _range(name: str, mean: DescribedValue, searched: FoundValue, deviation: float) -> list[float]:
+    control, _, parameter = name.partition(".")
+    declared = next(one for one in CONTROLS[control].parameters if one.name == parameter)
+    low, high, at = (float(value) for value in (searched.low, searched.high, mean.value))  # type: ignore[arg-type]
+    if declared.log:
+        low, high, at = (math.log(value) for value in (low, high, at))
+    wide = math.sqrt(3.0) * deviation * (high - low)
+    ends = [at - wide, at + wide]
+    if not declared.periodic:
+        ends = [min(max(end, low), high) for end in ends]
+    return [math.exp(end) for end in ends] if declared.log else ends
 
 
 def _gone_on(path: Path, progress: Progress) -> Result:
@@ -122,7 +162,7 @@ def _figures(
     """Compute and draw the figures."""
     rows: list[Answered] = []
     for one, result in results:
-        if isinstance(result, SweepSummary):
+        if isinstance(result, (AttackSummary, SweepSummary)):
             rows += rows_of(one.part, run.path / PARTS / one.name, result)
     table = Table(rows, described.groups)
     for number, figure in enumerate(described.figures):

@@ -9,7 +9,7 @@ from itertools import product
 from advsearch import seeds
 from advsearch.config import CONFIGS, RecipeConfig
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
-from advsearch.errors import InputError
+from advsearch.errors import InputError, UnknownNameError
 from advsearch.recipes.description import Part, Recipe, Settings
 from advsearch.runs.directory import default_name
 from advsearch.settings import split_names
@@ -92,6 +92,10 @@ def _config(part: Part, settings: Settings, where: str, config: RecipeConfig, st
         made = CONFIGS[part.command](**{**settings, **own})
     except SettingsError as error:
         raise SettingsError(error.problems, where) from None
+    except UnknownNameError:
+        raise
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
     assert isinstance(made, SceneConfig)
     return made
 

@@ -10,12 +10,21 @@ from pathlib import Path
 from advsearch.attacks import clopper_pearson
 from advsearch.errors import InputError
 from advsearch.report.wording import short_name
+from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.recipe import NamedCount
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import NAME, Store
 
-ANSWER, GROUP = "answer", "group"
-"""What the model said, and the group that an object is in, as columns of the table."""
+ANSWER, GROUP, PART, TRIAL = "answer", "group", "part", "trial"
+"""What the model said, the group that an object is in, the part of the recipe, and which trial of an attack it is."""
+
+TRIALS = {
+    "first control": "clean scene",
+    "control": "clean scene",
+    "verification": "answer",
+    "baseline verification": "random search",
+}
+"""The rows of an attack that are in the table, and what figures call them."""
 
 OTHERS = "others"
 """The group of objects that are in none."""
@@ -45,7 +54,7 @@ class Table:
     """All answers of a recipe.
 
     Attributes:
-        rows: of its sweeps.
+        rows: of its sweeps, and the trials of its attacks.
         groups: names of groups, each with the names of objects in it.
     """
 
@@ -64,11 +73,13 @@ class Table:
         """
         if column == ANSWER:
             return row.answer
+        if column == PART:
+            return row.part
         if column == GROUP:
             name = str(row.values["object"])
             return next((group for group, inside in self.groups.items() if name in inside), OTHERS)
         if column not in row.values:
-            known = ", ".join([*row.values, ANSWER, *([GROUP] if self.groups else [])])
+            known = ", ".join([*row.values, ANSWER, PART, *([GROUP] if self.groups else [])])
             raise InputError(f"figures: expected one of {known}, got {column[:60]!r}")
         return row.values[column]
 
@@ -127,8 +138,8 @@ def written(value: float | str) -> str:
     return f"{value:.4g}"
 
 
-def rows_of(part: str, folder: Path, summary: SweepSummary) -> list[Answered]:
-    """Return the answers that a sweep has stored.
+def rows_of(part: str, folder: Path, summary: AttackSummary | SweepSummary) -> list[Answered]:
+    """Return the answers that a sweep has stored, or the trials of an attack.
 
     Args:
         part: of the recipe.
@@ -141,8 +152,11 @@ def rows_of(part: str, folder: Path, summary: SweepSummary) -> list[Answered]:
     outer = {"object": summary.object, "environment": summary.environment, "model": summary.model}
     rows = []
     with Store(folder / NAME, read_only=True) as store:
-        for row in store.rows("sweep"):
+        for row in store.rows():
+            if row.kind != "sweep" and row.kind not in TRIALS:
+                continue
             values = {name: one["value"] for name, one in row.values.items()}
+            values |= {TRIAL: TRIALS[row.kind]} if row.kind in TRIALS else {}
             named = {name: written(str(values.get(name, of_all))) for name, of_all in outer.items()}
             units = {name: one["unit"] for name, one in row.values.items() if one["unit"]}
             rows.append(Answered(part, {**values, **named}, units, row.label or "none", bool(row.correct)))

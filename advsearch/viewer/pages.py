@@ -10,9 +10,11 @@ from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.gap import CurveResult, GapResult
 from advsearch.runs.results.matrix import MatrixResult
+from advsearch.runs.results.recipe import RecipeResult
 from advsearch.runs.results.replay import ReplayResult
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.viewer import attack_page, study_page, sweep_page
+from advsearch.viewer.recipe_page import recipe_page
 from advsearch.viewer.result_page import result_page
 
 
@@ -40,6 +42,8 @@ def write_page(run: Path, result: Result) -> Path:
             text = study_page.matrix_page(run, result)
         case ReplayResult():
             text = study_page.replay_page(run, result)
+        case RecipeResult():
+            text = recipe_page(run, result)
         case _:
             text = result_page(run, result)
     return write_text(run / REPORT, text, durable=False)

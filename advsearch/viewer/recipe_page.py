@@ -2,32 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
-from advsearch.runs.directory import IMAGES, PARTS, REPORT
-from advsearch.runs.files import write_text
-from advsearch.runs.results.recipe import RecipeFigure, RecipePart, RecipeResult
+from advsearch.report.recipes import figure_table
+from advsearch.runs.directory import IMAGES, PARTS
+from advsearch.runs.results.recipe import AnyFigure, RecipePart, RecipeResult
 from advsearch.viewer.document import data_url, document
 from advsearch.viewer.study_page import again, facts_table, heading, table
 
-Numbers = tuple[list[str], list[list[str]]]
-"""Heads and rows of a table."""
 
-
-def write_recipe_page(run: Path, result: RecipeResult, tables: Sequence[Numbers]) -> Path:
-    """Write `report.html` into the run of a recipe, and return its path.
-
-    Args:
-        run: its folder.
-        result: of it.
-        tables: the numbers of each figure.
-
-    Raises:
-        StorageError: it could not be written.
-    """
+def recipe_page(run: Path, result: RecipeResult) -> str:
+    """Return the page of a recipe in the folder `run`."""
     what = f"recipe {Path(result.recipe).stem}; {result.model}; {', '.join(map(wording.short_name, result.objects))}"
     facts = {
         "Objects": ", ".join(result.objects),
@@ -40,19 +27,15 @@ def write_recipe_page(run: Path, result: RecipeResult, tables: Sequence[Numbers]
     main = element(
         "main",
         element("p", result.about) if result.about else None,
-        *(
-            _section(one, run / IMAGES / f"figure-{number}.png", numbers)
-            for number, (one, numbers) in enumerate(zip(result.figures, tables, strict=True), start=1)
-        ),
+        *(_section(one, run / IMAGES / f"figure-{number}.png") for number, one in enumerate(result.figures, start=1)),
         join(element("h2", "Cost and conditions"), facts_table(facts)),
         _runs(result.parts),
         again(result.command_line),
     )
     header = heading(what, result.title, [*_cautions(result), *result.warnings])
-    page = document(
+    return document(
         f"{run.name}, {result.title}", header, main, footer=f"run {run.name}. This page needs no other file."
     )
-    return write_text(run / REPORT, page, durable=False)
 
 
 def _cautions(result: RecipeResult) -> list[str]:
@@ -60,8 +43,8 @@ def _cautions(result: RecipeResult) -> list[str]:
     return [*said, "Interrupted before its end; there are no figures yet."] if result.goes_on else said
 
 
-def _section(made: RecipeFigure, picture: Path, numbers: Numbers) -> Html:
-    heads, rows = numbers
+def _section(made: AnyFigure, picture: Path) -> Html:
+    heads, rows = figure_table(made)
     image = None
     if picture.is_file():
         alt = " ".join(made.text) or made.title

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,10 @@ from advsearch.cli.main import main
 from advsearch.config import RecipeConfig
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
 from advsearch.recipes.description import Recipe, names, read_recipe, titles
-from advsearch.recipes.figures import FIGURES, as_table, compute, draw, read_options
+from advsearch.recipes.figures import FIGURES, compute, draw, read_options
 from advsearch.recipes.parts import planned
 from advsearch.recipes.table import Answered, Table
+from advsearch.report.recipes import figure_table
 from advsearch.runs.results.recipe import BarsFigure, HeatMapFigure, RecipeResult
 from advsearch.runs.summary import read_result
 
@@ -119,7 +121,11 @@ def test_what_no_command_takes_is_refused_before_anything_is_done(
     [
         ({"figure": "pie"}, UnknownNameError, "unknown figure 'pie'"),
         ({"figure": "bars"}, FileFormatError, "figures: bars: by: Field required"),
-        ({"figure": "bars", "by": "weather"}, InputError, "figures: expected one of environment, object, answer, got"),
+        (
+            {"figure": "bars", "by": "weather"},
+            InputError,
+            "figures: expected one of environment, object, answer, part, got",
+        ),
     ],
 )
 def test_a_figure_that_cannot_be_made_is_refused(
@@ -205,7 +211,7 @@ def test_a_difference_is_claimed_where_intervals_are_apart_and_not_where_they_ov
     hidden = figure({"figure": "bars", "by": "environment"}, rows({"noon": (8, 20), "studio": (12, 20)}))
     assert hidden.text[1].startswith("No difference between the environments is shown")
     same = figure({"figure": "bars", "by": "environment"}, rows({"noon": (8, 20), "studio": (8, 20)}))
-    assert same.text == ["All 2 environments have the same accuracy, 40 %: no difference is shown."]
+    assert same.text == ["All 2 environments have the same share, 40 %: no difference is shown."]
 
 
 def test_two_of_many_have_to_be_further_apart_than_two_of_two() -> None:
@@ -215,17 +221,86 @@ def test_two_of_many_have_to_be_further_apart_than_two_of_two() -> None:
     assert pair.startswith("The difference is shown") and several.startswith("No difference")
 
 
+def test_shape_and_texture_are_told_apart() -> None:
+    """A model that answers by shape, one that answers by texture, and one that answers by neither."""
+    pairs = [(shape, texture) for shape in ("mug", "bowl", "vase") for texture in ("zebra", "brick") for _ in range(20)]
+    said = {
+        "more by shape than by texture": [shape for shape, _ in pairs],
+        "more by texture than by shape": [texture for _, texture in pairs],
+        "no difference is shown": ["cup"] * len(pairs),
+    }
+    for text, answers in said.items():
+        answered = [
+            Answered("a", {"object": shape, "material.which": texture}, {}, answer, shape == answer)
+            for (shape, texture), answer in zip(pairs, answers, strict=True)
+        ]
+        made = figure({"figure": "cues", "classes": {"zebra": ["zebra"]}}, answered)
+        assert any(text in one for one in made.text)
+        assert any(row.textured for row in made.rows) == (answers[0] == "zebra")
+
+
+def test_a_mixture_is_counted_in_the_triangle_that_it_lies_in() -> None:
+    """An answer that is given where most is milk, and nowhere else."""
+    shares = [(a / 9, b / 9, (9 - a - b) / 9) for a in range(10) for b in range(10 - a)]
+    answered = [
+        Answered("a", {"object": "mug", "w": w, "m": m, "c": c}, {}, "bowl" if m > 0.5 else "mug", m <= 0.5)
+        for w, m, c in shares
+    ]
+    made = figure({"figure": "ternary", "shares": ["w", "m", "c"], "side": 3}, answered)
+    bowl = next(one for one in made.answers if one.answer == "bowl")
+    assert sum(cell.configurations for cell in bowl.cells) == len(shares) and len(bowl.cells) == 9
+    assert sum(cell.given for cell in bowl.cells) == bowl.given == 15
+    assert all(corner[1] >= 1 / 3 for cell in bowl.cells if cell.given for corner in cell.corners)
+    assert [one.accuracy for one in bowl.by_most] == [0.0, pytest.approx(15 / bowl.by_most[1].configurations), 0.0]
+
+
+def test_the_mean_corruption_error_is_relative_to_the_first_model() -> None:
+    errors = {"one": {"fog": 4, "jpeg": 2}, "two": {"fog": 8, "jpeg": 1}}
+    answered = [
+        Answered("corrupted", {"object": "mug", "model": model, "corruption.which": which}, {}, "mug", number >= wrong)
+        for model, wrongs in errors.items()
+        for which, wrong in wrongs.items()
+        for number in range(10)
+    ]
+    one, two = figure({"figure": "corruption error"}, answered).models
+    assert one.relative is None and two.relative == pytest.approx((8 / 4 + 1 / 2) / 2 * 100)
+    assert (one.error.correct, one.error.configurations) == (6, 20)
+
+
+def test_a_curve_puts_each_value_in_its_part_of_the_range() -> None:
+    answered = [
+        Answered("a", {"object": "mug", "yaw": float(yaw)}, {"yaw": "degrees"}, "mug", yaw < 180) for yaw in range(361)
+    ]
+    made = figure({"figure": "curve", "along": "yaw", "bins": 4, "range": [0, 360]}, answered)
+    (line,) = made.lines
+    assert [(one.correct, one.configurations) for one in line.bins] == [(90, 90), (90, 90), (0, 90), (0, 91)]
+    assert made.text[0].startswith("Accuracy is lowest where yaw is 180 to 270 degrees (as 1 other): right in 0 of 90")
+
+
 @pytest.mark.parametrize("kind", FIGURES)
 def test_every_figure_is_drawn_and_is_a_table(kind: str) -> None:
     made = figure(EXAMPLES[kind], EXAMPLE_ROWS, {"round": ["mug"]})
     assert made.figure == kind and made.title and made.text and all(one.endswith(".") for one in made.text)
-    heads, lines = as_table(made)
+    heads, lines = figure_table(made)
     assert lines and all(len(one) == len(heads) for one in lines)
     assert draw(made)["png"].startswith(b"\x89PNG")
 
 
-EXAMPLE_ROWS = rows({"noon": (2, 6), "studio": (5, 6)})
+EXAMPLE_ROWS = [
+    replace(
+        row,
+        values={**row.values, "model": "m", "yaw": 10.0 * at, "water": at / 22, "milk": 0.5 - at / 22, "coffee": 0.5},
+    )
+    for at, row in enumerate(rows({"noon": (2, 6), "studio": (5, 6)}))
+]
+MIXTURE = ("water", "milk", "coffee")
 EXAMPLES: dict[str, dict[str, object]] = {
+    "curve": {"figure": "curve", "along": "yaw", "by": "environment", "bins": 3},
+    "points": {"figure": "points", "by": "object", "series": "environment", "names": {"noon": "at noon"}},
+    "answers": {"figure": "answers", "by": "environment"},
+    "cues": {"figure": "cues", "texture": "environment", "classes": {"noon": ["cup"]}},
+    "ternary": {"figure": "ternary", "shares": list(MIXTURE), "normalised": True},
+    "corruption error": {"figure": "corruption error", "which": "environment"},
     "bars": {"figure": "bars", "by": "group"},
     "heat map": {"figure": "heat map", "rows": "object", "columns": "environment"},
 }

@@ -8,9 +8,15 @@ from typing import Any
 from pydantic import ValidationError
 
 from advsearch.errors import FileFormatError, UnknownNameError
+from advsearch.recipes.figures.answers import ANSWERS
 from advsearch.recipes.figures.bars import BARS
 from advsearch.recipes.figures.base import Kind, Options
+from advsearch.recipes.figures.corruptions import CORRUPTION_ERROR
+from advsearch.recipes.figures.cues import CUES
+from advsearch.recipes.figures.curve import CURVE
 from advsearch.recipes.figures.heat_map import HEAT_MAP
+from advsearch.recipes.figures.points import POINTS
+from advsearch.recipes.figures.ternary import TERNARY
 from advsearch.recipes.table import Table
 from advsearch.report.drawing import Figures, drawn
 from advsearch.runs.results.recipe import RecipeFigure
@@ -18,6 +24,12 @@ from advsearch.runs.results.recipe import RecipeFigure
 FIGURES: dict[str, Kind[Any, Any]] = {
     "bars": BARS,
     "heat map": HEAT_MAP,
+    "curve": CURVE,
+    "points": POINTS,
+    "answers": ANSWERS,
+    "cues": CUES,
+    "ternary": TERNARY,
+    "corruption error": CORRUPTION_ERROR,
 }
 
 
@@ -58,8 +70,3 @@ def draw(made: RecipeFigure) -> Figures:
     """Return a figure as files."""
     kind = FIGURES[made.figure]
     return drawn(lambda figure: kind.draw(made, figure), kind.size(made))
-
-
-def as_table(made: RecipeFigure) -> tuple[list[str], list[list[str]]]:
-    """Return heads and rows of a figure's numbers."""
-    return FIGURES[made.figure].table(made)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from advsearch.recipes.figures.base import COUNT_HEADS, Kind, Options, count_rows, counted_by, extremes, plural
+from advsearch.recipes.figures.base import Kind, Options, counted_by, extremes, plural
 from advsearch.recipes.table import Table
 from advsearch.report.drawing import BLUE
 from advsearch.runs.results.recipe import BarsFigure
@@ -52,5 +52,4 @@ BARS = Kind(
     _compute,
     _draw,
     lambda made: (6.0, 1.2 + 0.27 * len(made.bars)),
-    lambda made: ([made.by, *COUNT_HEADS], count_rows(made.bars)),
 )

@@ -45,7 +45,6 @@ class Kind(Generic[Chosen, Made]):
         compute: makes these from the answers.
         draw: draws them on a figure of matplotlib.
         size: of that, width and height in inches.
-        table: heads and rows of the same numbers as a table.
     """
 
     options: type[Chosen]
@@ -53,18 +52,17 @@ class Kind(Generic[Chosen, Made]):
     compute: Callable[[Table, Chosen], Made]
     draw: Callable[[Made, Any], None]
     size: Callable[[Made], tuple[float, float]]
-    table: Callable[[Made], tuple[list[str], list[list[str]]]]
 
 
-def rate(one: NamedCount) -> str:
-    """Return ``right in 12 of 20 (60 %, 95 % interval 36-81 %)``."""
+def rate(one: NamedCount, verb: str = "right") -> str:
+    """Return ``right in 12 of 20 (60 %, 95 % interval 36-81 %)``; `verb` is what is counted."""
     return (
-        f"right in {one.correct} of {one.configurations} "
+        f"{verb} in {one.correct} of {one.configurations} "
         f"({percent(one.accuracy)}, 95 % interval {interval_text(one.interval)})"
     )
 
 
-def extremes(counts: Sequence[NamedCount], worst: str, best: str, thing: str) -> list[str]:
+def extremes(counts: Sequence[NamedCount], worst: str, best: str, thing: str, verb: str = "right") -> list[str]:
     """Return which of several has the lowest accuracy and which the highest, and whether that is more than chance.
 
     The two were chosen among k for being extreme, so that they are compared by intervals of confidence 1 - 0.05 / k,
@@ -75,14 +73,15 @@ def extremes(counts: Sequence[NamedCount], worst: str, best: str, thing: str) ->
         worst: what the lowest is called: "Hardest".
         best: what the highest is called: "easiest".
         thing: what they are, for several of them: "environments".
+        verb: what is counted.
     """
     known = [one for one in counts if one.configurations]
     if len(known) < 2:
-        return [f"{one.name}: {rate(one)}." for one in known]
+        return [f"{one.name}: {rate(one, verb)}." for one in known]
     low, high = (pick(known, key=lambda one: one.accuracy or 0.0) for pick in (min, max))
     if low.accuracy == high.accuracy:
-        return [f"All {len(known)} {thing} have the same accuracy, {percent(low.accuracy)}: no difference is shown."]
-    said = f"{worst} {_tied(low, known)}: {rate(low)}; {best} {_tied(high, known)}: {rate(high)}."
+        return [f"All {len(known)} {thing} have the same share, {percent(low.accuracy)}: no difference is shown."]
+    said = f"{worst} {_tied(low, known)}: {rate(low, verb)}; {best} {_tied(high, known)}: {rate(high, verb)}."
     widened = f"the intervals of the two, widened for having been chosen among {len(known)},"
     if apart(low, high, len(known)):
         return [said, f"The difference is shown: {widened} do not overlap."]
@@ -90,9 +89,9 @@ def extremes(counts: Sequence[NamedCount], worst: str, best: str, thing: str) ->
 
 
 def _tied(one: NamedCount, counts: Sequence[NamedCount]) -> str:
-    """``is kitchen``, or where others have the same accuracy ``are kitchen and 2 others``."""
+    """``is kitchen``, and where others have the same share ``is kitchen (as 2 others)``."""
     others = sum(other.accuracy == one.accuracy for other in counts) - 1
-    return f"are {one.name} and {others} other{'s' if others > 1 else ''}, the first" if others else f"is {one.name}"
+    return f"is {one.name}" + (f" (as {others} other{'s' if others > 1 else ''})" if others else "")
 
 
 def apart(low: NamedCount, high: NamedCount, among: int = 1) -> bool:
@@ -111,15 +110,3 @@ def counted_by(table: Table, column: str) -> list[NamedCount]:
 def plural(column: str) -> str:
     """Return what several values of a column are called: ``environments``, ``values of material.which``."""
     return f"{column}s" if column in ("object", "environment", "model", "group", "answer") else f"values of {column}"
-
-
-def count_rows(counts: Sequence[NamedCount]) -> list[list[str]]:
-    """Return counts as rows of a table."""
-    return [
-        [one.name, f"{one.correct} of {one.configurations}", percent(one.accuracy), interval_text(one.interval)]
-        for one in counts
-    ]
-
-
-COUNT_HEADS = ["right", "accuracy", "95 % interval"]
-"""Heads of `count_rows` after the first."""

@@ -70,19 +70,10 @@ def _draw(made: HeatMapFigure, figure: Any) -> None:
     figure.colorbar(shown, ax=axes, label="accuracy")
 
 
-def _table(made: HeatMapFigure) -> tuple[list[str], list[list[str]]]:
-    rows = [
-        [name, *(f"{right} of {seen}" for right, seen in zip(correct, configurations, strict=True))]
-        for name, correct, configurations in zip(made.rows, made.correct, made.configurations, strict=True)
-    ]
-    return [made.row, *made.columns], rows
-
-
 HEAT_MAP = Kind(
     HeatMapOptions,
     HeatMapFigure,
     _compute,
     _draw,
     lambda made: (2.6 + 0.42 * len(made.columns), 1.7 + 0.28 * len(made.rows)),
-    _table,
 )

@@ -55,7 +55,134 @@ class HeatMapFigure(RecipeFigure):
     correct: list[list[int]]
 
 
-AnyFigure = Annotated[BarsFigure | HeatMapFigure, Field(discriminator="figure")]
+class CurveBin(CountedAnswers):
+    """Answers about configurations with a parameter in a part of its range."""
+
+    low: float
+    high: float
+
+
+class CurveLine(NamedCount):
+    """One line: all answers of a group, and those in each part of the range."""
+
+    bins: list[CurveBin]
+
+
+class CurveFigure(RecipeFigure):
+    """The accuracy along a parameter, for each group."""
+
+    figure: Literal["curve"]
+    along: str = Field(description="the parameter")
+    unit: str
+    by: str | None = Field(description="what the lines differ in; null where there is one")
+    lines: list[CurveLine]
+
+
+class PointsFigure(RecipeFigure):
+    """The accuracy for each value of something, side by side for each of several series."""
+
+    figure: Literal["points"]
+    by: str = Field(description="what the rows differ in")
+    series: str = Field(description="what is side by side")
+    names: list[str] = Field(description="of the series")
+    rows: list[str]
+    counts: list[list[NamedCount]] = Field(description="for each row, each of the series; by the name of the series")
+
+
+class GivenAnswer(NamedCount):
+    """How often an answer was given; `correct` counts how often it was."""
+
+    right: int = Field(description="how often it was a right one")
+
+
+class AnswersRow(NamedCount):
+    """The most frequent answers for one value of something."""
+
+    answers: list[GivenAnswer] = Field(description="the most frequent first")
+
+
+class AnswersFigure(RecipeFigure):
+    """The most frequent answers for each value of something."""
+
+    figure: Literal["answers"]
+    by: str = Field(description="what the rows differ in")
+    rows: list[AnswersRow]
+
+
+class CuesRow(NamedCount):
+    """Answers under one texture: `correct` by shape, `textured` by texture."""
+
+    textured: int = Field(description="how often the answer named the texture")
+
+
+class CuesFigure(RecipeFigure):
+    """Whether the model answers by shape or by texture."""
+
+    figure: Literal["cues"]
+    shape: str = Field(description="what has the shape")
+    texture: str = Field(description="what has the texture")
+    predicted: list[NamedCount] = Field(
+        description="how often an answer is the most frequent one of the other half with the same shape, or texture"
+    )
+    rows: list[CuesRow]
+
+
+class TernaryCell(Fields):
+    """A triangle of a mixture's diagram."""
+
+    corners: list[tuple[float, float, float]] = Field(description="the three shares at each of its corners")
+    configurations: int
+    given: int = Field(description="how often the answer was given in it")
+
+
+class TernaryAnswer(Fields):
+    """Where in a mixture's diagram an answer is given."""
+
+    answer: str
+    given: int
+    by_most: list[NamedCount] = Field(description="how often it is given where most of the mixture is each thing")
+    cells: list[TernaryCell]
+
+
+class TernaryFigure(RecipeFigure):
+    """How often answers are given over a mixture of three things."""
+
+    figure: Literal["ternary"]
+    shares: tuple[str, str, str] = Field(description="the three parameters")
+    normalised: bool = Field(description="whether the colours of each answer end at its own largest share")
+    answers: list[TernaryAnswer]
+
+
+class CorruptionModel(Fields):
+    """The errors of one model under corruptions."""
+
+    model: str
+    clean: NamedCount | None = Field(description="answers without corruption; `correct` counts wrong ones")
+    errors: list[NamedCount] = Field(description="by corruption, over severities; `correct` counts wrong answers")
+    error: NamedCount = Field(description="over all corruptions, each with as many pictures")
+    relative: float | None = Field(
+        description="mean over corruptions of the error over that of the first model, in %; null for that one"
+    )
+
+
+class CorruptionFigure(RecipeFigure):
+    """Errors under corruptions, and the mean corruption error."""
+
+    figure: Literal["corruption error"]
+    models: list[CorruptionModel]
+
+
+AnyFigure = Annotated[
+    BarsFigure
+    | HeatMapFigure
+    | CurveFigure
+    | PointsFigure
+    | AnswersFigure
+    | CuesFigure
+    | TernaryFigure
+    | CorruptionFigure,
+    Field(discriminator="figure"),
+]
 
 
 class RecipeResult(RunResult):

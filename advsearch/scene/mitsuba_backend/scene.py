@@ -178,11 +178,10 @@ class MitsubaScene:
         self._apply(inputs)
         return self._scene
 
-    def surfaces(self, inputs: Mapping[str, Tensor], fineness: int = 1) -> Surfaces:
-        """Return what the camera sees first through the middle of each pixel; arguments as for `Renderer.surfaces`."""
+    def surfaces(self, inputs: Mapping[str, Tensor]) -> Surfaces:
+        """Return what the camera sees first through the middle of each pixel."""
         self._apply(inputs)
-        height, width = self.resolution
-        return first_hits(self._scene, self._sensor, (height * fineness, width * fineness))
+        return first_hits(self._scene, self._sensor, self.resolution)
 
     def adjoint(
         self,

@@ -1,0 +1,109 @@
+"""The accuracy along a parameter, for each of several groups, with 95 % intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from pydantic import Field
+
+from advsearch.errors import InputError
+from advsearch.recipes.figures.base import Kind, Options, extremes, plural
+from advsearch.recipes.table import Answered, Table, count_of, written
+from advsearch.report.drawing import BLUE, GREY, RED
+from advsearch.runs.results.recipe import CurveBin, CurveFigure, CurveLine, NamedCount
+
+COLOURS = (BLUE, RED, "#1f7a45", "#b4540a", "#6b3fa0", GREY)
+MARKS = ("o", "s", "^", "D", "v", "P")
+
+
+class CurveOptions(Options):
+    """Options of a curve.
+
+    Attributes:
+        along: a parameter with numbers.
+        by: what the lines differ in: object, group, model, trial, ...; one line where it is not given.
+        bins: parts of the range.
+        range: its ends; by default the least and the largest value.
+    """
+
+    along: str
+    by: str | None = None
+    bins: int = Field(default=12, ge=1, le=100)
+    range: tuple[float, float] | None = None
+
+
+def _compute(table: Table, options: CurveOptions) -> CurveFigure:
+    values = table.numbers(options.along)
+    low, high = options.range or (min(values, default=0.0), max(values, default=0.0))
+    if not high > low:
+        raise InputError(f"figures: curve: expected values of {options.along} that differ, got {low:g} to {high:g}")
+    edges = [low + (high - low) * number / options.bins for number in range(options.bins + 1)]
+    groups = table.by(options.by) if options.by else {"all": list(table.rows)}
+    lines = [
+        _line(name, rows, Table(rows, table.groups).numbers(options.along), edges) for name, rows in groups.items()
+    ]
+    unit = table.unit(options.along)
+    return CurveFigure(
+        figure="curve",
+        title=options.title or f"Accuracy along {options.along}",
+        text=[one for line in lines for one in _said(line, options.along, unit, len(lines))]
+        + _between(lines, options.by),
+        along=options.along,
+        unit=unit,
+        by=options.by,
+        lines=lines,
+    )
+
+
+def _line(name: str, rows: Sequence[Answered], values: Sequence[float], edges: Sequence[float]) -> CurveLine:
+    low, high, bins = edges[0], edges[-1], len(edges) - 1
+    right, seen = [0] * bins, [0] * bins
+    for row, value in zip(rows, values, strict=True):
+        if low <= value <= high:
+            place = min(int((value - low) / (high - low) * bins), bins - 1)
+            seen[place] += 1
+            right[place] += row.correct
+    counts = [count_of("", *one) for one in zip(right, seen, strict=True)]
+    parts = [
+        CurveBin(low=edges[place], high=edges[place + 1], **one.model_dump(exclude={"name"}))
+        for place, one in enumerate(counts)
+    ]
+    return CurveLine(**count_of(name, sum(right), sum(seen)).model_dump(), bins=parts)
+
+
+def _said(line: CurveLine, along: str, unit: str, lines: int) -> list[str]:
+    counts = [NamedCount(name=_span(one, unit), **one.model_dump(exclude={"low", "high"})) for one in line.bins]
+    whose = f"For {line.name}, accuracy" if lines > 1 else "Accuracy"
+    return extremes(counts, f"{whose} is lowest where {along}", "highest where it", "parts of the range")
+
+
+def _span(one: CurveBin, unit: str) -> str:
+    return f"{written(one.low)} to {written(one.high)}" + (f" {unit}" if unit not in ("", "1", "name") else "")
+
+
+def _between(lines: Sequence[CurveLine], by: str | None) -> list[str]:
+    return (
+        extremes(lines, "Over the whole range the lowest", "the highest", plural(by)) if by and len(lines) > 1 else []
+    )
+
+
+def _draw(made: CurveFigure, figure: Any) -> None:
+    axes = figure.subplots()
+    for number, line in enumerate(made.lines):
+        known = [one for one in line.bins if one.interval and one.accuracy is not None]
+        at = [(one.low + one.high) / 2 for one in known]
+        colour = COLOURS[number % len(COLOURS)]
+        low, high = ([one.interval[end] for one in known if one.interval] for end in (0, 1))
+        axes.fill_between(at, low, high, color=colour, alpha=0.15, linewidth=0)
+        mark = MARKS[number % len(MARKS)]
+        axes.plot(at, [one.accuracy for one in known], color=colour, marker=mark, ms=4, label=line.name)
+    unit = f" [{made.unit}]" if made.unit not in ("", "1", "name") else ""
+    axes.set(xlabel=f"{made.along}{unit}", ylabel="accuracy, with 95 % interval", ylim=(-0.03, 1.03))
+    axes.set_title(made.title)
+    axes.grid(True, axis="y")
+    if len(made.lines) > 1:
+        figure.legend(loc="outside lower center", ncols=min(len(made.lines), 4))
+
+
+CURVE = Kind(CurveOptions, CurveFigure, _compute, _draw, lambda made: (6.0, 3.4))

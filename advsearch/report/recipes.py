@@ -1,0 +1,122 @@
+"""The numbers of a recipe's figures as tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from advsearch.report.phrases import percent
+from advsearch.report.wording import interval_text
+from advsearch.runs.results.recipe import (
+    AnswersFigure,
+    AnyFigure,
+    BarsFigure,
+    CorruptionFigure,
+    CuesFigure,
+    CurveFigure,
+    HeatMapFigure,
+    NamedCount,
+    PointsFigure,
+    TernaryFigure,
+)
+
+Numbers = tuple[list[str], list[list[str]]]
+"""Heads and rows of a table."""
+
+COUNT_HEADS = ["right", "accuracy", "95 % interval"]
+
+
+def figure_table(made: AnyFigure) -> Numbers:
+    """Return the numbers of a figure as a table."""
+    match made:
+        case BarsFigure():
+            return [made.by, *COUNT_HEADS], _counts(made.bars)
+        case HeatMapFigure():
+            return _heat_map(made)
+        case CurveFigure():
+            return _curve(made)
+        case PointsFigure():
+            return _points(made)
+        case AnswersFigure():
+            return _answers(made)
+        case CuesFigure():
+            return _cues(made)
+        case TernaryFigure():
+            return _ternary(made)
+        case CorruptionFigure():
+            return _corruptions(made)
+
+
+def written(value: float) -> str:
+    """Return a number as figures write it."""
+    return f"{value:.4g}"
+
+
+def bare(name: str) -> str:
+    """Return a parameter's name without its control: ``milk`` for ``contents.milk``."""
+    return name.rpartition(".")[2]
+
+
+def _counts(counts: Sequence[NamedCount]) -> list[list[str]]:
+    """Counts as rows of a table, for `COUNT_HEADS` behind the name."""
+    return [
+        [one.name, f"{one.correct} of {one.configurations}", percent(one.accuracy), interval_text(one.interval)]
+        for one in counts
+    ]
+
+
+def _answers(made: AnswersFigure) -> Numbers:
+    rows = [
+        [row.name, one.name, f"{one.correct} of {one.configurations}", interval_text(one.interval), str(one.right)]
+        for row in made.rows
+        for one in row.answers
+    ]
+    return [made.by, "answer", "given in", "95 % interval", "right"], rows
+
+
+def _corruptions(made: CorruptionFigure) -> Numbers:
+    rows = [
+        [model.model, *row]
+        for model in made.models
+        for row in _counts([*([model.clean] if model.clean else []), *model.errors, model.error])
+    ]
+    return ["model", "corruption", "wrong", "error", "95 % interval"], rows
+
+
+def _cues(made: CuesFigure) -> Numbers:
+    rows = [
+        [one.name, f"{one.correct} of {one.configurations}", f"{one.textured} of {one.configurations}"]
+        for one in made.rows
+    ]
+    return [made.texture, "the object", "the texture"], rows
+
+
+def _curve(made: CurveFigure) -> Numbers:
+    rows = []
+    for line in made.lines:
+        counts = [
+            NamedCount(name=f"{written(one.low)} to {written(one.high)}", **one.model_dump(exclude={"low", "high"}))
+            for one in line.bins
+        ]
+        rows += [[line.name, *row] for row in _counts(counts)]
+    return [made.by or "line", made.along, *COUNT_HEADS], rows
+
+
+def _heat_map(made: HeatMapFigure) -> Numbers:
+    rows = [
+        [name, *(f"{right} of {seen}" for right, seen in zip(correct, configurations, strict=True))]
+        for name, correct, configurations in zip(made.rows, made.correct, made.configurations, strict=True)
+    ]
+    return [made.row, *made.columns], rows
+
+
+def _points(made: PointsFigure) -> Numbers:
+    rows = [[name, *row] for name, counts in zip(made.rows, made.counts, strict=True) for row in _counts(counts)]
+    return [made.by, made.series, *COUNT_HEADS], rows
+
+
+def _ternary(made: TernaryFigure) -> Numbers:
+    rows = [
+        [one.answer, str(one.given), *(f"{count.correct} of {count.configurations}" for count in one.by_most)]
+        for one in made.answers
+    ]
+    return ["answer", "given", *(f"where most is {bare(name)}" for name in made.shares)], rows
