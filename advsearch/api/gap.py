@@ -25,13 +25,14 @@ from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.drawing import Figures
 from advsearch.report.studies import curve_figure, gap_figure, matrix_figure
+from advsearch.report.tables import CurveTable, GapTable
 from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, default_name, is_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.listing import finished
 from advsearch.runs.results.attack import AttackSummary, AverageCase
 from advsearch.runs.results.base import INTERRUPTED
-from advsearch.runs.results.gap import CurvePoint, CurveResult, GapResult, GapRow, ObjectRow, StudyResult
+from advsearch.runs.results.gap import CurvePoint, GapRow, ObjectRow, StudyResult
 from advsearch.runs.results.matrix import MatrixCell, MatrixModel, MatrixResult, MatrixRow
 from advsearch.runs.summary import attack_of
 from advsearch.scene.library import list_objects, load_object
@@ -49,7 +50,7 @@ def gap(
     *,
     progress: Progress | None = None,
     **settings: Unpack[GapKeywords],
-) -> GapResult:
+) -> GapTable:
     """Compare the worst configuration with the average, for each object and each control (docs/questions.md).
 
     All other arguments are the settings of `advsearch gap`. The run is kept, in `run` or under runs/.
@@ -68,7 +69,7 @@ def gap(
 
 def curve_from_config(
     config: AttackConfig, *, progress: Progress | None = None, resumed: Path | None = None
-) -> CurveResult:
+) -> CurveTable:
     """Robust accuracy against epsilon, over objects.
 
     The epsilons are tried from the smallest. An object that flips at one of them flips at every larger one, whose ball
@@ -83,9 +84,9 @@ def curve_from_config(
 
     epsilons: Sequence[float | None] = sorted(config.epsilons) or [None]
 
-    def result(rows: list[ObjectRow], common: StudyResult) -> CurveResult:
+    def result(rows: list[ObjectRow], common: StudyResult) -> CurveTable:
         curve = [_accuracy(rows, epsilon) for epsilon in epsilons]
-        return CurveResult(**vars(common), epsilons=list(epsilons), table=rows, curve=curve)
+        return CurveTable(**vars(common), epsilons=list(epsilons), table=rows, curve=curve)
 
     return _study(
         config,
@@ -98,11 +99,11 @@ def curve_from_config(
     )
 
 
-def gap_from_config(config: GapConfig, *, progress: Progress | None = None, resumed: Path | None = None) -> GapResult:
+def gap_from_config(config: GapConfig, *, progress: Progress | None = None, resumed: Path | None = None) -> GapTable:
     """The worst case beside the average, over the same space and budget, for each object and each control."""
 
-    def result(rows: list[GapRow], common: StudyResult) -> GapResult:
-        return GapResult(**vars(common), table=rows)
+    def result(rows: list[GapRow], common: StudyResult) -> GapTable:
+        return GapTable(**vars(common), table=rows)
 
     return _study(
         config,

@@ -22,7 +22,7 @@ from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.rows import verified_rate
 from advsearch.errors import InputError
 from advsearch.report.drawing import new_axes
-from advsearch.report.notebook import attack_html
+from advsearch.report.notebook import attack_html, side_by_side
 from advsearch.report.studies import search_axes
 from advsearch.runs import store
 from advsearch.runs.answer import write_answer
@@ -149,6 +149,9 @@ class AttackResult:
     def _repr_html_(self) -> str:
         pictures = {"clean": self.clean.numpy(), "adversarial": self.adversarial.numpy()}
         return attack_html(self.summary, pictures)
+
+    def _repr_png_(self) -> bytes:
+        return side_by_side([self.clean.numpy(), self.adversarial.numpy()])
 
 
 def summarise(

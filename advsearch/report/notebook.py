@@ -5,9 +5,11 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from advsearch.report import wording
+from advsearch.report.drawing import Figures
 from advsearch.report.markup import Html, element, join
 from advsearch.report.phrases import cells, percent
 from advsearch.report.studies import sweep_figure
@@ -18,6 +20,9 @@ from advsearch.runs.results.sweep import AxisRow, SweepSummary
 
 SHOWN = 224
 """Width of a picture on the page, in pixels."""
+
+GAP = 4
+"""White between pictures, in pixels."""
 
 MOST_ROWS = 24
 """Values of an axis that are listed; of more, none."""
@@ -31,7 +36,9 @@ def attack_html(summary: AttackSummary, pictures: Mapping[str, ArrayLike]) -> st
         pictures: name to (H, W, 3) sRGB in [0, 1].
     """
     shown = [
-        element("figure", _picture(png_bytes(image), SHOWN), element("figcaption", name), style="display:inline-block")
+        element(
+            "figure", _picture(png_bytes(image), SHOWN, name), element("figcaption", name), style="display:inline-block"
+        )
         for name, image in pictures.items()
     ]
     rows = [["", "answer", "probability", "rate", "95 % interval"]]
@@ -56,8 +63,21 @@ def sweep_html(summary: SweepSummary) -> str:
     for name in dict.fromkeys(row.axis for row in summary.axes):
         mine = [row for row in summary.axes if row.axis == name]
         rows += [axis_cells(row) for row in mine] if len(mine) <= MOST_ROWS else []
-    drawn = _picture(figure["png"], 2 * SHOWN) if figure else None
+    drawn = _picture(figure["png"], 2 * SHOWN, "the numbers of the table") if figure else None
     return element("div", element("p", f"{total} ({rate})."), drawn, _table(rows) if len(rows) > 1 else None)
+
+
+def study_html(said: str, figure: Figures, tables: Sequence[Sequence[Sequence[str]]]) -> str:
+    """Return what a study says, its figure if it has one, and its tables, each of which begins with its heads."""
+    drawn = _picture(figure["png"], 2 * SHOWN, "the numbers of the table") if figure else None
+    return element("div", element("p", said), drawn, *map(_table, tables))
+
+
+def side_by_side(pictures: Sequence[ArrayLike]) -> bytes:
+    """Return pictures (H, W, 3) sRGB in [0, 1] beside each other as a PNG."""
+    arrays = [np.asarray(one, dtype=np.float32) for one in pictures]
+    gap = np.ones((len(arrays[0]), GAP, 3), np.float32)
+    return png_bytes(np.concatenate([part for one in arrays for part in (one, gap)][:-1], axis=1))
 
 
 def axis_cells(row: AxisRow) -> list[str]:
@@ -77,8 +97,8 @@ def _rate(what: str, number: int, trials: int, interval: Interval) -> list[str]:
     return [f"{what} in {number} of {trials}", wording.interval_text(interval)]
 
 
-def _picture(png: bytes, width: int) -> Html:
-    return element("img", src=f"data:image/png;base64,{base64.b64encode(png).decode()}", width=width)
+def _picture(png: bytes, width: int, alt: str) -> Html:
+    return element("img", src=f"data:image/png;base64,{base64.b64encode(png).decode()}", width=width, alt=alt)
 
 
 def _table(rows: Sequence[Sequence[str]]) -> Html:

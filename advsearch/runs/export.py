@@ -88,12 +88,33 @@ def to_pandas(rows: Iterable[Row]) -> Any:
     Raises:
         InputError: pandas is not installed.
     """
+    pandas, listed = _pandas(), list(rows)
+    return pandas.DataFrame([record(row) for row in listed], columns=columns(listed))
+
+
+def table_to_pandas(rows: Sequence[JsonObject]) -> Any:
+    """Return a table of a result as a `pandas.DataFrame`: a column for each value, named ``average.accuracy``.
+
+    Raises:
+        InputError: pandas is not installed.
+    """
+    pandas, flat = _pandas(), [dict(_leaves(row)) for row in rows]
+    return pandas.DataFrame(flat, columns=list(dict.fromkeys(name for row in flat for name in row)))
+
+
+def _leaves(values: JsonObject, before: str = "") -> Iterator[tuple[str, JsonValue]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{before}{name}.")
+        else:
+            yield before + name, value
+
+
+def _pandas() -> Any:
     try:
-        pandas = importlib.import_module("pandas")
+        return importlib.import_module("pandas")
     except ImportError:
         raise InputError("to_pandas: needs pandas; pip install pandas, or export the run as csv or parquet") from None
-    listed = list(rows)
-    return pandas.DataFrame([record(row) for row in listed], columns=columns(listed))
 
 
 def _records(rows: Iterable[Row]) -> Iterator[JsonObject]:

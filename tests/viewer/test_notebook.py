@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
+import sys
+from types import SimpleNamespace
 from typing import Any
 
 import matplotlib as mpl
@@ -10,9 +13,12 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from matplotlib.figure import Figure
-from samples import sweep
+from PIL import Image
+from samples import CURVE, GAP, sweep
 
+from advsearch.report.notebook import side_by_side
 from advsearch.report.studies import search_axes, sweep_axes
+from advsearch.report.tables import CurveTable, GapTable
 
 NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
 
@@ -34,6 +40,7 @@ def test_the_notebook_of_the_docs_runs(monkeypatch: pytest.MonkeyPatch) -> None:
         assert len(plt.get_fignums()) == 2
         for shown in ("table", "result"):
             assert "<img" in names[shown]._repr_html_()
+            assert names[shown]._repr_png_().startswith(b"\x89PNG")
     finally:
         plt.close("all")
 
@@ -56,3 +63,43 @@ def test_a_sweep_without_axes_draws_nothing() -> None:
     axes = Figure().subplots()
     sweep_axes(sweep(axes=[], cells=None), axes)
     assert not axes.has_data()
+
+
+@pytest.mark.parametrize(
+    ("table", "rows", "said"),
+    [
+        (GapTable.of(GAP), {"object": "mug", "average.accuracy": 0.75, "worst.successes": 20}, "right in 75 %"),
+        (CurveTable.of(CURVE), {"epsilon": 0.01, "robust": 3, "accuracy": 0.75}, "Still recognised: 3 of 4"),
+    ],
+)
+def test_a_study_is_shown(
+    table: GapTable | CurveTable, rows: dict[str, Any], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def frame(data: list[dict[str, Any]], columns: list[str]) -> list[dict[str, Any]]:
+        assert set(rows) <= set(columns)
+        return data
+
+    monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=frame))
+    assert rows.items() <= table.to_pandas()[0].items()
+    page, drawn = table._repr_html_(), Figure().subplots()
+    assert said in page and "<td>mug</td>" in page and "<script" not in page
+    table.plot(drawn)
+    assert drawn.has_data()
+
+
+def test_a_figure_is_a_picture_and_what_has_none_says_so() -> None:
+    points = [{**CURVE["curve"][0], "epsilon": epsilon} for epsilon in (0.01, 0.1)]
+    several = CurveTable.of({**CURVE, "curve": points})
+    for table in (GapTable.of(GAP), several):
+        png = table._repr_png_()
+        assert png is not None and png.startswith(b"\x89PNG")
+        assert "<img" in table._repr_html_()
+    assert CurveTable.of(CURVE)._repr_png_() is None
+    assert GapTable.of({**GAP, "table": []})._repr_png_() is None
+
+
+def test_pictures_stand_side_by_side() -> None:
+    with Image.open(io.BytesIO(side_by_side([np.zeros((8, 8, 3)), np.full((8, 8, 3), 0.5)]))) as shown:
+        values = np.asarray(shown)
+    assert values.shape == (8, 20, 3)
+    assert (values[:, :8] == 0).all() and (values[:, 8:12] == 255).all() and (values[:, 12:] == 128).all()

@@ -10,7 +10,7 @@ from typing import Any
 from advsearch.engine.sweeps.batch import KIND
 from advsearch.report.drawing import new_axes
 from advsearch.report.notebook import sweep_html
-from advsearch.report.studies import sweep_axes
+from advsearch.report.studies import sweep_axes, sweep_figure
 from advsearch.runs import store
 from advsearch.runs.export import to_pandas
 from advsearch.runs.results.sweep import SweepSummary
@@ -67,6 +67,9 @@ class SweepResult:
 
     def _repr_html_(self) -> str:
         return sweep_html(self.summary)
+
+    def _repr_png_(self) -> bytes | None:
+        return sweep_figure(self.summary).get("png")
 
     @property
     def _place(self) -> str:
