@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from advsearch.api.attack import attack as attack
     from advsearch.api.check import check as check
     from advsearch.api.gap import gap as gap
+    from advsearch.api.harden import harden as harden
     from advsearch.api.plan import plan as plan
     from advsearch.api.precision import precision as precision
     from advsearch.api.recipe import recipe as recipe
@@ -43,6 +44,7 @@ _HOMES = {
     "attack": "advsearch.api.attack",
     "check": "advsearch.api.check",
     "gap": "advsearch.api.gap",
+    "harden": "advsearch.api.harden",
     "load_model": "advsearch.models",
     "load_scene": "advsearch.engine.loading",
     "plan": "advsearch.api.plan",

@@ -30,6 +30,7 @@ from advsearch.controls import OWN
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import END, Fields, Result
 from advsearch.runs.results.gap import CurveResult, GapResult
+from advsearch.runs.results.harden import HardenResult
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.region import RegionResult
 from advsearch.runs.results.replay import ReplayResult
@@ -433,6 +434,7 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("questions.md", "replay-fields"): result_fields(ReplayResult),
     ("questions.md", "gap-fields"): result_fields(GapResult),
     ("questions.md", "region-fields"): result_fields(RegionResult),
+    ("harden.md", "harden-fields"): result_fields(HardenResult),
     ("stability.md", "case-fields"): result_fields(CaseRow),
     ("reference-model.md", "reference"): reference,
 }

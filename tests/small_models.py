@@ -77,3 +77,18 @@ def hard() -> Model:
 def strange() -> Model:
     """One that knows no mug."""
     return advsearch.load_model(Blue(0.1), labels=["cat", "dog"], input_size=SIDE, name="strange")
+
+
+class Colours(nn.Module):
+    """Fourteen classes by what the mean colours of sixteen squares add up to; its weights come from a seed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(4)
+            self.hidden, self.last = nn.Linear(48, 24), nn.Linear(24, 14)
+
+    def forward(self, x: Tensor) -> Tensor:
+        squares = nn.functional.adaptive_avg_pool2d(x, 4).flatten(1)
+        logits: Tensor = self.last(self.hidden(squares).relu())
+        return logits

@@ -48,6 +48,7 @@ from advsearch.config import (
     TRIALS_OVER,
     WAYS,
     AttackConfig,
+    HardenConfig,
     RecipeConfig,
     RegionConfig,
     RenderConfig,
@@ -57,6 +58,7 @@ from advsearch.config import (
     SweepConfig,
 )
 from advsearch.config.attack import FEWEST_TRIALS
+from advsearch.config.hardening import ALL
 from advsearch.controls import CONTROLS, texture
 from advsearch.engine import stages
 from advsearch.engine.loading import as_controls
@@ -395,8 +397,9 @@ def check_names(config: Config) -> None:
     resolve(config.set_)
     lights = config.environments if isinstance(config, SweepConfig) else (config.lit_by,)
     for name in config.objects:
-        assert name in library.list_objects() or Path(split_node(name)[0]).suffix in (*objects.SUFFIXES, MITSUBA_FILE)
-        needs_label = not isinstance(config, RenderConfig) and name not in library.list_objects()
+        suffixes = (*objects.SUFFIXES, MITSUBA_FILE)
+        assert name in (*library.list_objects(), ALL) or Path(split_node(name)[0]).suffix in suffixes
+        needs_label = not isinstance(config, (RenderConfig, HardenConfig)) and name not in library.list_objects()
         assert config.label is not None or not needs_label, "a file does not bring a label"
     for name in lights:
         assert name in library.list_environments() or Path(name).suffix in environments.SUFFIXES
@@ -424,7 +427,9 @@ def check_advsearch(words: list[str], folder: Path) -> None:
     if args.command in ("run", "resume"):
         recipe = folder / "run.yaml"
         recipe.write_text("object: mug\n", encoding="utf-8")
-        check_names(AttackConfig.from_yaml(recipe, dict(parse_assignment(text, text) for text in args.change)))
+        of_a_sweep = args.command == "resume" and "-sweep-" in args.run
+        config = SweepConfig if of_a_sweep else AttackConfig
+        check_names(config.from_yaml(recipe, dict(parse_assignment(text, text) for text in args.change)))
     if args.command == "export":
         assert args.format in (None, *WRITERS, *export.FORMATS)
 

@@ -8,9 +8,9 @@ import pytest
 import reference_calibration as calibration
 import reference_training as training
 import torch
-from reference_augmentation import Augmentation
 from torch import Tensor
 
+from advsearch.engine.hardening.augmentation import Augmentation
 from advsearch.errors import InputError
 from advsearch.models import reference
 

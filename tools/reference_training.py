@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from reference_augmentation import Augmentation
 from reference_calibration import Images, as_floats
 from safetensors import torch as safetensors
 from torch import Tensor, nn
 
+from advsearch.engine.hardening.augmentation import Augmentation
 from advsearch.errors import InputError, ModelError
 from advsearch.files import JsonValue
 from advsearch.models.reference import INPUT_SIZE, RECORD, WEIGHTS, ReferenceNet, build

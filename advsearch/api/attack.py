@@ -188,6 +188,24 @@ def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> t
     return problem, [*job.loaded[1], *sentences(problem.space.moved)]
 
 
+def problem_of(config: AttackConfig, scene: Scene, model: Model) -> Problem:
+    """Return the problem of a configuration on a scene and a model that are there, in place of those that it names.
+
+    Raises:
+        InputError: as for `attack_from_config`.
+    """
+    return _problem(_given(config, scene, model))
+
+
+def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
+    """Attack a model on a scene that are there, in place of those that the configuration names; nothing is kept.
+
+    Raises:
+        InputError: as for `attack_from_config`.
+    """
+    return _carry_out(_given(config, scene, model), NullProgress())
+
+
 def _scene(scene: Scene | str | Path | Mapping[str, Any], object: str | None, settings: AttackKeywords) -> Scene:
     """The scene as it was given, or the one that a name and the settings describe."""
     if isinstance(scene, Scene):
@@ -245,6 +263,14 @@ def _job(config: AttackConfig) -> _Job:
     scene = load_scene(config.object, config.environment, up=config.up, settings=given, camera=config.camera)
     model = _model(config.model, config, task)
     return _Job(config, scene, model, task, searched, drawn, objective, policy, True)
+
+
+def _given(config: AttackConfig, scene: Scene, model: Model) -> _Job:
+    """Find what a configuration names besides its scene and its model."""
+    searched, drawn = _controls(config, config.controls, config.over)
+    task, objective = _asked(config, config.task, config.objective)
+    policy = make_policy(config.policy_name, **_policy_options(config))
+    return _Job(config, scene, (model, []), task, searched, drawn, objective, policy, False)
 
 
 def _controls(

@@ -101,6 +101,7 @@ class SweepKeywords(PictureKeywords, total=False):
     keep_pictures: Literal["all", "wrong", "none"]
     specialise: bool
     aov: str | None
+    surface: bool
     trials: int
     verify_spp: int | None
     overwrite: bool
@@ -112,6 +113,45 @@ class GapKeywords(SearchKeywords, NamedKeywords, total=False):
     objective: str | None
     policy: Named
     over: NamedControls
+
+
+class HardenKeywords(RunKeywords, total=False):
+    """Of `harden`."""
+
+    environment: Path | Names | None
+    set: Mapping[str, float | str | Sequence[float]] | None
+    exposure: float | None
+    resolution: int | str | tuple[int, int] | None
+    labels: str | Path | None
+    texture_resolution: int | None
+    denoise: Literal["oidn", "none"]
+    pixel_sampler: Literal["independent", "multijitter"]
+    seed: int
+    threads: int | None
+    deterministic: bool
+    controls: NamedControls
+    spp: int | Literal["auto"] | None
+    epsilon: float | Mapping[str, float] | None
+    norm: Literal["linf", "l2"] | None
+    specialise: bool
+    object: Names
+    held_out: Names | None
+    held_out_environment: Names | None
+    objective: str | None
+    policy: Named
+    steps: int
+    step_size: float | None
+    verify_spp: int | None
+    trials: int | None
+    layers: Literal["all", "last"]
+    rounds: int
+    scenes: int
+    views: int
+    epochs: int
+    rate: float
+    clean_loss: float
+    measured: int
+    quick: bool
 
 
 class RegionKeywords(PictureKeywords, NamedKeywords, total=False):

@@ -92,6 +92,8 @@ def sweep(
         raise InputError("keep_pictures: expected `run` beside it, the folder that keeps them; name one")
     if config.aov is not None and config.run is None:
         raise InputError("aov: expected `run` beside it, the folder that keeps the layers; name one")
+    if config.surface and config.run is None:
+        raise InputError("surface: expected `run` beside it, the folder that keeps the map; name one")
     progress = progress or NullProgress()
     resumed = _stopped(config)
     if config.run is not None and resumed is None:
@@ -201,6 +203,7 @@ def _job(
         keep_pictures=config.keep_pictures,
         specialise=config.specialise,
         aovs=aovs_of(config.aov),
+        surface=config.surface,
     )
 
 

@@ -42,6 +42,7 @@ COMMANDS = {
     "plan": "advsearch.cli.plan",
     "stability": "advsearch.cli.stability",
     "precision": "advsearch.cli.precision",
+    "harden": "advsearch.cli.harden",
     "import": "advsearch.cli.import_command",
     "import-3db": "advsearch.cli.import_3db",
     "list": "advsearch.cli.list",

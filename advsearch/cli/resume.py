@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from advsearch.cli import output
@@ -13,6 +15,7 @@ HELP = "go on with a run that was stopped, where it was stopped"
 _EXAMPLES = """examples:
   advsearch resume mug-texture-001
   advsearch resume mug-plan-001 seconds=600
+  advsearch resume mug-sweep-001 surface=true
 """
 
 
@@ -45,9 +48,17 @@ def run(args: argparse.Namespace) -> int:
     path, changes = find_run(args.run), changes_in(args.change)
     if not (path / CONFIG).is_file():
         raise InputError(f"{path}: expected a run with its {CONFIG}, got none; it was stopped before it began")
-    if finished(path):
+    if finished(path) and not _adds(path, changes):
         from advsearch.cli.show import show_run
 
         print(f"advsearch: {path} is done already", file=sys.stderr)
         return show_run(str(path), args.json)
     return carry_out(command_in(path / CONFIG), path / CONFIG, changes, args, resumed=path)
+
+
+def _adds(path: Path, changes: Mapping[str, object]) -> bool:
+    """Whether the changes ask for what the rows of a run that is done still give: the map of a sweep's surface."""
+    from advsearch.cli.run import command_in
+    from advsearch.runs.directory import CONFIG
+
+    return changes.get("surface") is True and command_in(path / CONFIG) == "sweep"

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 HELP = "do what a YAML file describes: a run.yaml repeats its run"
 
-COMMANDS = ("attack", "sweep", "recipe", "gap", "region", "precision", "check", "plan", "stability")
+COMMANDS = ("attack", "sweep", "recipe", "gap", "region", "precision", "check", "plan", "stability", "harden")
 """What the `command` of a file may say."""
 
 

@@ -9,6 +9,7 @@ from advsearch.cli.output import columns
 from advsearch.cli.question import QuestionCommand
 from advsearch.report import wording
 from advsearch.report.phrases import answer_text, margin_text, percent
+from advsearch.report.surface_words import surface_sentences
 
 if TYPE_CHECKING:
     from advsearch.runs.results.sweep import AxisRow, SweepSummary, WorstConfiguration
@@ -27,7 +28,7 @@ MOST_ROWS = 24
 def answer(summary: SweepSummary) -> str:
     """Return accuracy in total and by axis, the worst configuration and the cost."""
     facts = [[name, text] for name, text in _facts(summary).items() if text]
-    parts = [_verdict(summary), *_tables(summary), columns(facts)]
+    parts = [_verdict(summary), *_tables(summary), "\n".join(_surface(summary)), columns(facts)]
     return "\n\n".join(part for part in parts if part) + "".join(f"\n\nNote: {text}" for text in summary.warnings)
 
 
@@ -70,6 +71,13 @@ def _table(name: str, rows: Sequence[AxisRow]) -> str:
     return f"{title}\n{columns(lines)}"
 
 
+def _surface(summary: SweepSummary) -> list[str]:
+    """Which parts of the surface go with wrong answers, where that was asked for."""
+    if summary.surface is None:
+        return []
+    return ["What is seen of the surface when the model is wrong:", *surface_sentences(summary.surface)]
+
+
 def _bar(share: float) -> str:
     filled = round(share * BAR)
     return "#" * filled + "." * (BAR - filled)
@@ -88,6 +96,7 @@ def _facts(summary: SweepSummary) -> dict[str, str]:
         "": _said(worst, summary.task) if worst else "",
         "renders": f"{summary.renders['sweep']}" + (f", {speed:.3g} a second" if speed else ""),
         "time": wording.seconds_text(summary.seconds["total"]),
+        "map of the surface": f"{summary.run}/images/surface.png" if summary.surface else "",
         "kept in": summary.run or "",
     }
 
@@ -115,5 +124,6 @@ COMMAND = QuestionCommand(
         "sweep --object mug --grid pose.yaw=0:360:24 --grid camera.elevation=5:60:8",
         "sweep --object mug,bowl --environment studio,noon --grid camera.azimuth=0,90,180,270",
         "sweep --object mug --control pose,camera --samples 1000",
+        "sweep --object mug --control pose --samples 200 --surface",
     ),
 )

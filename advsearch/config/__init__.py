@@ -10,6 +10,7 @@ from __future__ import annotations
 from advsearch.config.attack import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.config.checking import CheckConfig, PlanConfig, StabilityConfig
 from advsearch.config.derivative import DerivativeConfig
+from advsearch.config.hardening import HardenConfig
 from advsearch.config.precision import QUANTITIES, SAMPLERS, PrecisionConfig
 from advsearch.config.questions import FEWEST_SAMPLES, GapConfig, RegionConfig
 from advsearch.config.recipe import RecipeConfig
@@ -33,6 +34,7 @@ CONFIGS: dict[str, type[Config]] = {
         StabilityConfig,
         PrecisionConfig,
         RecipeConfig,
+        HardenConfig,
     )
 }
 """What the settings of each command are, in the order in which the docs show them."""
@@ -53,6 +55,7 @@ __all__ = [
     "CheckConfig",
     "DerivativeConfig",
     "GapConfig",
+    "HardenConfig",
     "PlanConfig",
     "PrecisionConfig",
     "RecipeConfig",

@@ -22,6 +22,7 @@ class SweepConfig(SceneConfig):
     """Everything that decides what `sweep` does: the average case over a grid, over random draws, or both."""
 
     command: ClassVar[str] = "sweep"
+    free: ClassVar[tuple[str, ...]] = (*SceneConfig.free, "surface")
     several: ClassVar[tuple[str, ...]] = ("object", "environment", "model")
     clashes: ClassVar[tuple[Clash, ...]] = (
         *SceneConfig.clashes,
@@ -101,6 +102,7 @@ class SweepConfig(SceneConfig):
         group="sweep",
         description="ground truth of each pixel, separated by commas, as layers of an EXR for every configuration",
     )
+    surface: bool = setting(False, "sweep", "map which parts of the object's surface, when seen, go with wrong answers")
     spp: int | None = setting_as_in(
         SceneConfig, "spp", group="sweep", description="samples per pixel of a picture", expects="", ge=1, le=65536
     )

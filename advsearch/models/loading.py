@@ -58,9 +58,10 @@ def load_model(
     Options left at None take what the model says of itself, else the defaults named here.
 
     Args:
-        spec: ``"reference"`` (the bundled classifier); a path to a `torch.export` archive (.pt2) or to TorchScript;
-            ``"package.module:callable"``, which returns an `nn.Module` or a `Model`, with ``"@weights.safetensors"`` if
-            wanted; ``"torchvision:NAME@weights.safetensors"``; an `nn.Module` (copied, its weights shared); a `Model`.
+        spec: ``"reference"`` (the bundled classifier), with ``"@weights.safetensors"`` if wanted; a path to a
+            `torch.export` archive (.pt2) or to TorchScript; ``"package.module:callable"``, which returns an `nn.Module`
+            or a `Model`, with ``"@weights.safetensors"`` if wanted; ``"torchvision:NAME@weights.safetensors"``; an
+            `nn.Module` (copied, its weights shared); a `Model`.
         labels: the label names in index order, or a label file (see `read_labels`). Default "class 0", "class 1", ...
         name: what to call it in messages and results.
         input_size: (height, width) in pixels, or one number; default 224.
@@ -130,8 +131,9 @@ def _find(spec: object) -> Source | Model:
     if not isinstance(spec, str):
         raise InputError(f"model: expected a name, a path, an nn.Module or a Model, got {_described(spec)}. {FORMS}")
     text = spec.strip()
-    if text == "reference":
-        return reference.load()
+    network, weights = imported.split_weights(text)
+    if network == "reference":
+        return reference.load(weights=weights)
     source = text.partition(":")[0].lower()
     if ":" in text and source in SOURCES:
         return SOURCES[source](text)

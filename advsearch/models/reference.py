@@ -21,7 +21,7 @@ from advsearch.errors import ModelError
 from advsearch.models.model import Model
 from advsearch.models.preprocessing import Preprocessing
 from advsearch.models.probe import probe
-from advsearch.models.source import source_of
+from advsearch.models.source import load_weights, source_of
 
 INPUT_SIZE = (128, 128)
 STEM = 24
@@ -138,15 +138,26 @@ def data_folder() -> Path:
     return Path(str(resources.files("advsearch.models").joinpath("data")))
 
 
-def load(folder: Path | None = None) -> Model:
+def load(folder: Path | None = None, weights: Path | None = None) -> Model:
     """Return the model "reference" with its labels.
 
     Args:
         folder: where the two files are; default the package's own.
+        weights: a safetensors file of other weights of the network; default those of the folder.
 
     Raises:
         ModelError: they are missing, damaged, or do not fit this version's network.
+        FileFormatError: `weights` is missing or is not safetensors.
     """
+    net, labels = network(folder, weights)
+    source = source_of(folded(net), "reference" if weights is None else f"reference@{weights}")
+    bare = Model(source.module, source.name, (), Preprocessing(INPUT_SIZE))
+    return probe(bare, labels, "labels of the reference model")
+
+
+def network(folder: Path | None = None, weights: Path | None = None) -> tuple[ReferenceNet, tuple[str, ...]]:
+    """Return the network with its weights, which can be trained further, and the labels; arguments and errors as for
+    `load`."""
     folder = folder or data_folder()
     try:
         record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
@@ -161,6 +172,6 @@ def load(folder: Path | None = None) -> Model:
         net.load_state_dict(state)
     except RuntimeError as error:
         raise ModelError(f"the weights in {folder / WEIGHTS} are of another network; {REMEDY}") from error
-    source = source_of(folded(net), "reference")
-    bare = Model(source.module, source.name, (), Preprocessing(INPUT_SIZE))
-    return probe(bare, labels, "labels of the reference model")
+    if weights is not None:
+        load_weights(net, weights, "reference")
+    return net, labels

@@ -14,7 +14,7 @@ import json
 import os
 import struct
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, final
@@ -23,12 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from advsearch.errors import FileFormatError
-from advsearch.files import parse_json
+from advsearch.files import open_regular, parse_json
 from advsearch.runs.files import storage_errors
 from advsearch.runs.results.base import Fields, Payload
 from advsearch.runs.results.render import ClassAnswer
 
 NAME = "replay.bin"
+
+LARGEST = 1 << 38
+"""Most bytes of a log that is read by others."""
 
 _START = struct.Struct("<4sIII")
 _MAGIC = b"ADVr"
@@ -164,6 +167,26 @@ class ReplayLog:
             self._places[entry.kind, entry.number] = place
             place = self._file.tell()
         return place
+
+
+def entries(path: Path, place: int = 0) -> Iterator[tuple[Entry, int]]:
+    """Yield the whole entries of a log that somebody else may be writing, each with the place behind it.
+
+    Args:
+        path: the file; nothing is yielded where there is none.
+        place: where to begin, in bytes.
+
+    Raises:
+        FileFormatError: it is no ordinary file, or holds something else.
+    """
+    try:
+        file = open_regular(path, "what a search was told", LARGEST)
+    except FileNotFoundError:
+        return
+    with file:
+        while (entry := _read(file, place)) is not None:
+            place = file.tell()
+            yield entry, place
 
 
 def _read(file: BinaryIO, place: int) -> Entry | None:

@@ -52,7 +52,7 @@ def pixels_near(corners: Doubles, shape: tuple[int, int], miss: float = MISS) ->
     return face[span], row[span], column
 
 
-def weights_at(corners: Doubles, row: Ints, column: Ints) -> Doubles:
+def weights_at(corners: Doubles, row: Ints | Doubles, column: Ints | Doubles) -> Doubles:
     """Return the barycentric weights (N, 3) of pixel centres in triangles (N, 3, 2); NaN where one has no area."""
     (ax, ay), (bx, by), (cx, cy) = (corners[:, number].T for number in range(3))
     with np.errstate(all="ignore"):

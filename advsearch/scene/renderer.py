@@ -147,12 +147,17 @@ class Renderer:
         """
         return self.surfaces(u).seen(OBJECT)
 
-    def surfaces(self, u: Tensor) -> Surfaces:
-        """Return what the camera sees first through the middle of each pixel; as of `mask`."""
+    def surfaces(self, u: Tensor, fineness: int = 1) -> Surfaces:
+        """Return what the camera sees first through the middle of each pixel; as of `mask`.
+
+        Args:
+            u: (d,) in [0, 1].
+            fineness: into how many parts each side of a pixel is cut, to be looked at each.
+        """
         self._check(u, 1)
         with torch.no_grad():
             inputs = self._assembled(u)
-        return self.scene.surfaces({name: inputs[name] for name in inputs if name not in ON_PICTURE})
+        return self.scene.surfaces({name: inputs[name] for name in inputs if name not in ON_PICTURE}, fineness)
 
     def gradient(
         self, loss: Callable[[Tensor], Tensor], u: Tensor, seed: int, spp: int, *, free: bool = False

@@ -30,6 +30,7 @@ from advsearch.runs import listing, lock
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, is_run
 from advsearch.viewer.columns import read_columns
 from advsearch.viewer.document import document
+from advsearch.viewer.following import START, following_page, goes_on, progress
 from advsearch.viewer.sweep_page import SweepSource, page, result_of
 from advsearch.viewer.thumbnails import kept_pictures, path_of
 
@@ -249,9 +250,17 @@ class _Handler(BaseHTTPRequestHandler):
         if listing.described(run, counts=False).command == "sweep":
             return "text/html; charset=utf-8", page([(run, result_of(run))], [_source(name, run)]).encode()
         report = run / REPORT
-        if report.is_symlink() or not report.is_file():
-            raise Refused(HTTPStatus.NOT_FOUND, f"{name} has no page yet; advsearch show {name} prints what it has")
+        if report.is_symlink():
+            raise Refused(HTTPStatus.NOT_FOUND, f"{name} has no page; advsearch show {name} prints what it has")
+        if goes_on(run):
+            return "text/html; charset=utf-8", following_page(name, run).encode()
         return "text/html; charset=utf-8", report.read_bytes()
+
+    def _progress(self, query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
+        after = query.get("after", [START])[0]
+        if not re.fullmatch(r"[0-9]{1,15}-[0-9]{1,15}", after):
+            raise Refused(HTTPStatus.BAD_REQUEST, "after: expected the id of a row and a place")
+        return "application/json", progress(self._run(name), after)
 
     def _part(self, _query: Mapping[str, list[str]], name: str, part: str) -> tuple[str, bytes]:
         """The page of one of the attacks that a study consists of, where the study's page links to it."""
@@ -300,6 +309,7 @@ _ROUTES: tuple[tuple[str, Answer], ...] = (
     ("/compare/", _Handler._compare),
     ("/runs/([^/]+)/", _Handler._page),
     ("/runs/([^/]+)/rows", _Handler._rows),
+    ("/runs/([^/]+)/progress", _Handler._progress),
     (f"/runs/([^/]+)/{PARTS}/([^/]+)/{re.escape(REPORT)}", _Handler._part),
     (r"/runs/([^/]+)/pictures/[0-9]+/([0-9]{1,12})\.jpg", _Handler._picture),
 )

@@ -18,9 +18,10 @@ from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
 from advsearch.report.notebook import axis_cells
 from advsearch.report.phrases import percent
+from advsearch.report.surface_words import difference_text, surface_sentences, wrong_text
 from advsearch.runs import directory
 from advsearch.runs.files import write_bytes, write_text
-from advsearch.runs.results.sweep import AxisRow, SweepSummary
+from advsearch.runs.results.sweep import AxisRow, SurfaceTable, SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.viewer.columns import Columns, read_columns
 from advsearch.viewer.document import data_script, data_url, document
@@ -90,6 +91,7 @@ def page(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[Swe
         "main",
         element("div", id="explorer", hidden="hidden") if sources else _too_many(runs),
         *(_still(path, summary) for path, summary in summaries),
+        *(_surface(path, summary) for path, summary in summaries),
         *(join(_axes(summary), _cost(path, summary)) for path, summary in summaries),
     )
     return document(
@@ -157,6 +159,39 @@ def _still(path: Path, summary: SweepSummary) -> Html:
     )
 
 
+def _surface(path: Path, summary: SweepSummary) -> Html:
+    """Which parts of the surface go with wrong answers, where that was asked for."""
+    if summary.surface is None:
+        return Html("")
+    said = surface_sentences(summary.surface)
+    figure = _figure(path / "images" / "surface.png", " ".join(said))
+    tables = [_parts(table) for table in summary.surface.tables if table.strongest]
+    return join(
+        element("h2", "The surface that was seen"),
+        element("div", figure, class_="pictures") if figure else element("p", " ".join(said)),
+        *tables,
+    )
+
+
+def _parts(table: SurfaceTable) -> Html:
+    """The parts of one table that are told most clearly."""
+    heads = ("middle (u, v)", "place (x, y, z)", "face", "wrong where seen", "wrong where not", "difference", "p")
+    cells = [
+        (
+            f"{one.u:.3f}, {one.v:.3f}",
+            ", ".join(f"{x:.3g}" for x in one.place),
+            str(one.face),
+            wrong_text(one.seen),
+            wrong_text(one.hidden),
+            difference_text(one),
+            f"{one.p:.2g}",
+        )
+        for one in table.strongest
+    ]
+    what = f"{table.part.capitalize()}s of {table.object} that are told most clearly, {wording.short_name(table.model)}"
+    return element("details", element("summary", what), _grid(heads, cells))
+
+
 def _axes_text(summary: SweepSummary) -> str:
     names = list(dict.fromkeys(row.axis for row in summary.axes))
     return " and ".join(names[:2]) or "all configurations"
@@ -190,9 +225,14 @@ def _axes(summary: SweepSummary) -> Html:
 
 def _table(rows: Sequence[AxisRow]) -> Html:
     heads = ("value", "configurations", "right", "accuracy", "95 % interval")
+    return _grid(heads, [axis_cells(row)[1:] for row in rows])
+
+
+def _grid(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Html:
+    """A table whose first column names its rows."""
     lines = [
         element("tr", element("th", first, scope="row"), *(element("td", cell) for cell in rest))
-        for _, first, *rest in map(axis_cells, rows)
+        for first, *rest in rows
     ]
     head = element("thead", element("tr", *(element("th", text, scope="col") for text in heads)))
     return element("div", element("table", head, element("tbody", *lines)), class_="scroll")

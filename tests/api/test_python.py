@@ -24,7 +24,9 @@ def test_dir_lists_the_public_names() -> None:
     assert set(dir(advsearch)) == {*advsearch.__all__, "__version__"}
 
 
-QUESTIONS = ("attack", "sweep", "gap", "region", "replay", "recipe", "plan", "check", "precision", "stability")
+QUESTIONS = (
+    *("attack", "sweep", "gap", "region", "replay", "recipe", "plan", "check", "precision", "stability", "harden"),
+)
 
 
 @pytest.mark.parametrize("name", QUESTIONS)
@@ -34,16 +36,8 @@ def test_signatures_have_every_setting_as_it_is_declared(name: str) -> None:
     assert not [one for one in parameters.values() if one.kind is one.VAR_KEYWORD]
     names = {one.field.removesuffix("_"): one for one in declared if not one.required}
     assert set(names) <= set(parameters)
-    assert set(parameters) - set(names) <= {
-        "scene",
-        "object",
-        "answer",
-        "recipe",
-        "model",
-        "grid",
-        "resume",
-        "progress",
-    }
+    own = {"scene", "object", "answer", "recipe", "model", "grid", "resume", "progress", "optimiser", "beside"}
+    assert set(parameters) - set(names) <= own
     written = vars(importlib.import_module("advsearch.api.keywords"))[f"{name.capitalize()}Keywords"]
     inner = inspect.signature(function.__wrapped__).parameters
     assert set(get_type_hints(written)) == set(names) - set(inner)

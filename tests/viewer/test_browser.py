@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 from PIL import Image
 from samples import GAP, gap, keep_object, make_run
-from stored_sweeps import make_sweep, serving
+from stored_sweeps import described, make_sweep, serving
 
+from advsearch.config import AttackConfig
 from advsearch.runs.directory import RunDirectory
+from advsearch.runs.replay import Entry, LoggedEvaluation
 from advsearch.runs.store import Row, Store
 from advsearch.viewer.attack_page import write_report
 from advsearch.viewer.document import asset
@@ -173,6 +175,45 @@ def test_a_sweep_that_goes_on_is_followed(browser: Browser, tmp_path: Path) -> N
             page.wait_for_selector("[data-cell]")
             held.record(Row("sweep", 24, correct=False, margin=9.0, label="vase", values=last.values))
             until(page, lambda: "vase" in page.locator(".gallery").inner_text())
+
+
+def test_an_attack_that_goes_on_is_followed_step_by_step(browser: Browser, tmp_path: Path) -> None:
+    path = tmp_path / "going"
+
+    def evaluated(run: RunDirectory, number: int) -> None:
+        facts = LoggedEvaluation(
+            index=number, u="", objective="0x1p+0", success=False, non_finite=0, cost=1, seconds=0.1
+        )
+        picture = np.full((8, 8, 3), 25 * number, np.uint8)
+        run.replay.append(Entry("search", number, facts, {"picture": picture}))
+        values = {"pose.yaw": described(10.0 * number, "degrees")}
+        run.record(Row("search", number, objective=float(number), label="vase" if number > 5 else "mug", values=values))
+
+    with RunDirectory.create_for(AttackConfig(object="mug", run=str(path))) as run, serving(path) as server:
+        for number in range(5):
+            evaluated(run, number)
+        with opened(browser, f"{server.address}runs/going/", 390) as page:
+            page.wait_for_selector("#follow img")
+            status = page.locator("#search .status")
+            assert status.inner_text() == "step 4, objective 4.00, answer mug"
+            evaluated(run, 6 - 1)
+            evaluated(run, 6)
+            until(page, lambda: status.inner_text() == "step 6, objective 6.00, answer vase")
+            assert "pose.yaw\t60 degrees" in page.locator("#follow table").inner_text()
+            assert "objective over 7 steps" in str(page.locator("svg.along").get_attribute("aria-label"))
+            page.get_by_label("step of the search").fill("2")
+            evaluated(run, 7)
+            until(page, lambda: "8 of search" in page.locator("#state").inner_text())
+            assert status.inner_text() == "step 2, objective 2.00, answer mug"  # whoever looks back is not interrupted
+            page.get_by_role("button", name="Play").click()
+            until(page, lambda: status.inner_text().startswith("step 4"))
+            page.get_by_role("button", name="Stop").click()
+            stopped = status.inner_text()
+            page.wait_for_timeout(400)
+            assert status.inner_text() == stopped
+            (path / "report.html").write_text("<link rel=icon href=data:,><h1>what came out</h1>")
+            run.finish()
+            until(page, lambda: page.locator("h1").inner_text() == "what came out")
 
 
 def test_an_attack_is_compared_and_played(browser: Browser, attack: Path) -> None:

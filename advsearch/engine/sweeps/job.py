@@ -70,6 +70,7 @@ class Job:
         keep_pictures: thumbnails that are kept: "all", "wrong" (what any of the models gets wrong) or "none".
         specialise: whether pictures that differ in light alone may be predicted.
         aovs: layers of ground truth that are kept of every picture of the first model (`scene.surfaces.AOVS`).
+        surface: whether it is counted which parts of the surface, when seen, go with wrong answers.
     """
 
     object: str
@@ -93,6 +94,7 @@ class Job:
     keep_pictures: Literal["all", "wrong", "none"] = "none"
     specialise: bool = True
     aovs: tuple[str, ...] = ()
+    surface: bool = False
 
     @cached_property
     def sizes(self) -> tuple[tuple[int, int], ...]:

@@ -26,6 +26,7 @@ from advsearch.engine.sweeps.job import Job, check_all
 from advsearch.engine.sweeps.light import together
 from advsearch.engine.sweeps.points import Picks, Points
 from advsearch.engine.sweeps.summary import FINISHED, INTERRUPTED, Tally, rate
+from advsearch.engine.sweeps.surface import map_surface
 from advsearch.engine.sweeps.worst import check_worst
 from advsearch.interrupts import interruptible
 from advsearch.progress import Progress
@@ -37,7 +38,7 @@ from advsearch.runs.files import write_bytes
 from advsearch.runs.images import write_layers
 from advsearch.runs.results.attack import DescribedValue, LinearTransport
 from advsearch.runs.results.base import Formation
-from advsearch.runs.results.sweep import SweepSummary, WorstClaim, WorstConfiguration, WorstVerified
+from advsearch.runs.results.sweep import SurfaceMap, SweepSummary, WorstClaim, WorstConfiguration, WorstVerified
 from advsearch.scene.transport.renderer import SPP as BASIS_SPP
 from advsearch.tasks import Answer, Judgement
 from advsearch.viewer import thumbnails
@@ -86,6 +87,7 @@ class Sweep:
         self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
         self._not_finite = run is not None and run.store.note(NOT_FINITE) is not None
         self._told, self._untold = 0.0, 0
+        self._surface: SurfaceMap | None = None
         objects, environments = (
             list(dict.fromkeys(getattr(place, name) for place in job.places)) for name in ("object", "environment")
         )
@@ -116,6 +118,10 @@ class Sweep:
                 worst = self._claimed(tally)
                 if worst is not None:
                     worst = worst.model_copy(update={"verified": self._verified(worst)})
+                if self.job.surface and self.run is not None:
+                    self.stages.begin("surface", "tracing the surface that was seen", self.total)
+                    rows = self.run.store.rows(KIND)
+                    self._surface = map_surface(self.job, rows, self._batches.open, self.run, self.stages.progress)
         except KeyboardInterrupt:
             ending = INTERRUPTED
             tally = self._counted()
@@ -343,6 +349,7 @@ class Sweep:
                 **({"products": self._predicted} if self._predicted else {}),
             },
             transport=together([one for light in self._transport.values() for one in light]),
+            surface=self._surface,
             renders_per_second=self._rendered / swept if self._rendered and swept else None,
             seconds={**seconds, "total": self.stages.total},
             seed=job.pictures.seed,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -138,10 +138,17 @@ class SweptScene:
         """The picture (H, W, 3) that one model sees of one configuration."""
         return self._pictures(self.renderers[self._job.sizes[number]], u[None], [seed], spp)[0]
 
-    def surfaces(self, picks: Picks) -> list[Surfaces]:
-        """What is seen in the pixels of pictures that the first model is shown."""
-        size = self._job.sizes[0]
-        return [self.renderers[size].surfaces(u) for u in self.points[size].configurations(picks)]
+    def surfaces(self, picks: Picks, size: tuple[int, int] | None = None, fineness: int = 1) -> Iterator[Surfaces]:
+        """What is seen in the pixels of pictures, one after the other.
+
+        Args:
+            picks: n of them.
+            size: (height, width) of the pictures; None for those that the first model is shown.
+            fineness: parts of each side of a pixel.
+        """
+        size = size or self._job.sizes[0]
+        for u in self.points[size].configurations(picks):
+            yield self.renderers[size].surfaces(u, fineness)
 
     def marks(self, number: int, u: Tensor, picture: Tensor) -> list[Mark]:
         """What shows the answer of one model to the picture (H, W, 3) of one configuration."""

@@ -7,6 +7,7 @@ from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.check import CheckResult
 from advsearch.runs.results.gap import CurveResult, GapResult
+from advsearch.runs.results.harden import HardenResult
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.plan import PlanResult
 from advsearch.runs.results.precision import PrecisionResult
@@ -27,6 +28,7 @@ KEPT: tuple[type[Result], ...] = (
     PrecisionResult,
     StabilityResult,
     RecipeResult,
+    HardenResult,
 )
 """The results that a run keeps in `summary.json`."""
 

@@ -76,6 +76,45 @@ class WorstConfiguration(Fields):
     verified: WorstVerified | None = Field(description="null where it was not rendered again")
 
 
+class SurfacePart(Fields):
+    """A part of an object's surface, and the answers by whether it was seen."""
+
+    face: int = Field(description="number of the triangle in its middle")
+    u: float = Field(description="its middle, across the map")
+    v: float = Field(description="its middle, up the map, whose bottom row is 0")
+    place: tuple[float, float, float] = Field(description="its middle, in the mesh's coordinates, z up")
+    seen: CountedAnswers = Field(description="pictures that see it")
+    hidden: CountedAnswers = Field(description="the other ones")
+    difference: float = Field(description="share of wrong answers where it is seen, less that where it is not")
+    interval: Interval = Field(description="of that difference, 95 %, for the part by itself")
+    p: float = Field(description="how likely it is that by chance any part stands out as far")
+
+
+class SurfaceTable(Fields):
+    """What goes with wrong answers on the surface of one object, for one model."""
+
+    object: str
+    model: str
+    part: str = Field(description="what is counted: a `cell` of the map, or a `face`")
+    unwrapped: bool = Field(description="whether the map is a new one, and not that of the object's texture")
+    seen: int = Field(description="how many were seen at all")
+    compared: int = Field(description="how many were seen often enough, and hidden often enough")
+    worse: int = Field(description="how many of these go with wrong answers, told from chance")
+    better: int = Field(description="likewise, with right answers")
+    strongest: list[SurfacePart] = Field(
+        description="those told most clearly, none close to another; `worse` ones first"
+    )
+
+
+class SurfaceMap(Fields):
+    """Which parts of the surface, when seen, go with wrong answers."""
+
+    file: str = Field(description="the counts, in the folder")
+    cells: int = Field(description="along each side of the map")
+    least: int = Field(description="pictures with and without a part that a comparison takes")
+    tables: list[SurfaceTable] = Field(description="for every object, model and kind of part")
+
+
 class SweepSummary(CountedAnswers, RunResult):
     """How often the model is right over configurations that were not searched for."""
 
@@ -103,6 +142,10 @@ class SweepSummary(CountedAnswers, RunResult):
     transport: LinearTransport | None = Field(
         default=None,
         description="whether [basis pictures](transport.md#light) predicted pictures; absent where no light moves",
+    )
+    surface: SurfaceMap | None = Field(
+        default=None,
+        description="which parts of the [surface](#the-surface), when seen, go with wrong answers; absent unless asked",
     )
     renders_per_second: float | None = Field(description="pictures of the sweep; null where nothing was rendered now")
     warnings: list[str] = Field(description="sentences that a reader has to know")

@@ -19,7 +19,7 @@ def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces
     Args:
         scene: Mitsuba's.
         sensor: Mitsuba's camera.
-        resolution: (height, width) in pixels.
+        resolution: (height, width) in pixels, which need not be the camera's own.
     """
     mi = mitsuba()
     import drjit as dr

@@ -178,10 +178,11 @@ class MitsubaScene:
         self._apply(inputs)
         return self._scene
 
-    def surfaces(self, inputs: Mapping[str, Tensor]) -> Surfaces:
-        """Return what the camera sees first through the middle of each pixel."""
+    def surfaces(self, inputs: Mapping[str, Tensor], fineness: int = 1) -> Surfaces:
+        """Return what the camera sees first through the middle of each pixel; arguments as for `Renderer.surfaces`."""
         self._apply(inputs)
-        return first_hits(self._scene, self._sensor, self.resolution)
+        height, width = self.resolution
+        return first_hits(self._scene, self._sensor, (height * fineness, width * fineness))
 
     def adjoint(
         self,

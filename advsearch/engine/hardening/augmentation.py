@@ -1,4 +1,4 @@
-"""Random changes of training images, a batch at a time, cheap on a CPU, from an explicit generator."""
+"""Random changes of training images, a batch at a time, cheap on a CPU, from an explicit generator; differentiable."""
 
 from __future__ import annotations
 

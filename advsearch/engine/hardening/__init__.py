@@ -1,0 +1,1 @@
+"""Making a model better: what it is trained on, how, and what it is measured on."""

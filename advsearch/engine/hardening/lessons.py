@@ -1,0 +1,179 @@
+"""What a model is trained on: plain renders of scenes, and the worst configurations of them that short searches find.
+
+Where light arrives linearly (textures, patches), a lesson holds a matrix of light transport of one view, which says the
+picture of any texture and its derivative without rendering: its adversarial texture is searched further each time that
+the lesson comes up (warm starts: Zheng et al. 2020, arXiv 1912.11969). A texture that several views share is one of
+expectation over transformation (EOT, Athalye et al. 2018). Everything else is rendered at random configurations, of
+which the one that is worst for the model as it is counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advsearch import seeds
+from advsearch.engine.problem import Problem
+from advsearch.models import Model
+from advsearch.scene.formation import to_8_bit
+from advsearch.scene.transport.plan import why_not
+from advsearch.scene.transport.renderer import LinearRenderer
+
+SPP, DEPTH = 4, 4
+"""Samples a pixel of a lesson's paths and pictures, and segments of the longest: many lessons with some noise teach
+more than few without."""
+STEP = 0.5
+"""A step of an adversarial texture, as a share of its budget."""
+TOGETHER = 32
+"""Pictures that a model is asked about at once."""
+
+
+@dataclass(eq=False)
+class Lesson:
+    """One scene under conditions that were drawn for it.
+
+    Attributes:
+        right: indices of the right classes.
+        plain: (H, W, 3) its picture as it is, sRGB in [0, 1].
+        worst: (H, W, 3) the worst picture that is known.
+    """
+
+    right: tuple[int, ...]
+    plain: Tensor
+    worst: Tensor
+
+
+@dataclass(eq=False)
+class Disguise:
+    """An adversarial texture, of one view or shared by several.
+
+    Attributes:
+        u: (d,) where it is.
+    """
+
+    u: Tensor
+
+
+@dataclass(eq=False)
+class TextureLesson(Lesson):
+    """A lesson whose pictures a matrix says.
+
+    Attributes:
+        problem: whose searched space the texture belongs to.
+        linear: says the pictures.
+        numbers: conditions that it was made for.
+        texture: the adversarial one.
+    """
+
+    problem: Problem
+    linear: LinearRenderer
+    numbers: Tensor
+    texture: Disguise
+
+    def picture(self, u: Tensor) -> Tensor:
+        """Return the picture (H, W, 3) of a texture, with a graph."""
+        inputs = self.problem.searched_space.inputs(u)
+        return self.linear.shown({name: inputs[name] for name in self.linear.there}, torch.cat([u, self.numbers]))
+
+
+@dataclass(eq=False)
+class RenderedLesson(Lesson):
+    """A lesson whose pictures were rendered.
+
+    Attributes:
+        pictures: (N, H, W, 3) at random configurations.
+    """
+
+    pictures: Tensor
+
+
+def lessons(problem: Problem, views: int, tries: int, seed: int, *, shared: bool = False) -> list[Lesson]:
+    """Draw lessons from one scene whose view and light vary by chance.
+
+    Args:
+        problem: with the searched controls, and conditions.
+        views: how many; each has conditions of its own.
+        tries: random configurations of each, where no matrix says its pictures.
+        seed: root of the draws.
+        shared: let all views have one adversarial texture.
+    """
+    varying = [one.name for one in problem.space.controls[problem.searched :]]
+    linear, found = why_not(problem.renderer, varying) is None, list[Lesson]()
+    right = tuple(int(index) for index in problem.truth())
+    common = _begun(problem, seed)
+    with torch.no_grad(), problem.renderer.scene.shorter(DEPTH):
+        for number in range(views):
+            own = seeds.stream(seed, "lesson", number)
+            whole = problem.whole(problem.domain.start, own)
+            numbers = whole[problem.domain.dim :]
+            if linear:
+                made = LinearRenderer(problem.renderer, whole, own, spp=SPP, quick=True)
+                plain = made(whole)
+                texture = common if shared else _begun(problem, own)
+                found.append(TextureLesson(right, plain, plain, problem, made, numbers, texture))
+            else:
+                drawn = problem.domain.sample(torch.Generator().manual_seed(own), tries)
+                shown = [problem.renderer(torch.cat([u, numbers]), seed=own, spp=SPP) for u in drawn]
+                plain = problem.renderer(whole, seed=own, spp=SPP)
+                found.append(RenderedLesson(right, plain, shown[0], torch.stack(shown)))
+    return found
+
+
+def _begun(problem: Problem, seed: int) -> Disguise:
+    return Disguise(problem.domain.sample(torch.Generator().manual_seed(seed), extreme=True)[0])
+
+
+def surprise(logits: Tensor, right: Sequence[tuple[int, ...]]) -> Tensor:
+    """Return (N,): the negative logarithm of the probability that logits (N, C) give to the right classes of each."""
+    found = F.log_softmax(logits, dim=1)
+    return torch.stack([-row[list(of)].logsumexp(dim=0) for row, of in zip(found, right, strict=True)])
+
+
+def unchanged(images: Tensor) -> Tensor:
+    """Return images as they are."""
+    return images
+
+
+def harder(
+    chosen: Sequence[Lesson], model: Model, steps: int = 1, change: Callable[[Tensor], Tensor] = unchanged
+) -> None:
+    """Make the worst pictures of lessons worse for a model: further steps of their textures, or another choice among
+    what was rendered.
+
+    Args:
+        chosen: lessons.
+        model: that gets them wrong.
+        steps: of each texture.
+        change: what happens to as many pictures (N, H, W, 3) as there are lessons before the model sees them.
+    """
+    for begin in range(0, len(chosen), TOGETHER):
+        part = chosen[begin : begin + TOGETHER]
+        _ascend([one for one in part if isinstance(one, TextureLesson)], model, steps, change)
+        for one in part:
+            if isinstance(one, RenderedLesson):
+                with torch.no_grad():
+                    loss = surprise(model(one.pictures), [one.right] * len(one.pictures))
+                one.worst = one.pictures[int(loss.argmax())]
+
+
+def _ascend(chosen: Sequence[TextureLesson], model: Model, steps: int, change: Callable[[Tensor], Tensor]) -> None:
+    """Steps uphill of textures; views that share one add up."""
+    if not chosen:
+        return
+    textures = list(dict.fromkeys(one.texture for one in chosen))
+    for _ in range(steps):
+        leaves = {texture: texture.u.clone().requires_grad_() for texture in textures}
+        pictures = torch.stack([one.picture(leaves[one.texture]) for one in chosen])
+        loss = surprise(model(change(pictures)), [one.right for one in chosen]).sum()
+        slopes = torch.autograd.grad(loss, list(leaves.values()))
+        domains = {one.texture: one.problem.domain for one in chosen}
+        for texture, slope in zip(textures, slopes, strict=True):
+            domain = domains[texture]
+            texture.u = domain.project(texture.u + STEP * domain.steepest(texture.u, slope))
+    with torch.no_grad():
+        for one in chosen:
+            one.worst = to_8_bit(one.picture(one.texture.u))

@@ -1,0 +1,112 @@
+"""What a model is trained on and what it is measured on: objects and environments of two splits that share nothing.
+
+Of a bundled object every split draws instances of its own (proportions, texture, material) from seeds of its own; a
+file is one object, and its split has to be said.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from advsearch import seeds
+from advsearch.bundled.objects import OBJECTS
+from advsearch.engine.loading import Scene, load_scene
+from advsearch.errors import InputError
+from advsearch.scene.assets import ObjectAsset
+from advsearch.scene.settings import Given
+
+TRAINING, VALIDATION, HELD_OUT = "training", "validation", "held out"
+"""The splits: what the weights are fitted to, what chooses among them, and what is measured in the end."""
+
+ELEVATION = (8.0, 55.0)
+FIELD = (25.0, 45.0)
+GROUND = (0.1, 0.9)
+"""Ranges from which scenes draw the camera's elevation and field of view in degrees, and the ground's colour (sRGB)."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """One side of the split.
+
+    Attributes:
+        name: `TRAINING`, `VALIDATION` or `HELD_OUT`.
+        objects: names of bundled objects, or files.
+        environments: names or files.
+        seed: root of its draws.
+    """
+
+    name: str
+    objects: tuple[str, ...]
+    environments: tuple[str, ...]
+    seed: int
+
+    def scene(self, number: int, given: Given | None = None) -> tuple[str, Scene]:
+        """Return the scene with this number, and the name of its object; the objects take turns.
+
+        An object in a file that brings no label is called as the file: ``coffee-mug.glb`` is a "coffee mug".
+
+        Args:
+            number: from 0; equal numbers are equal scenes.
+            given: parameters that are fixed in every scene.
+        """
+        name = self.objects[number % len(self.objects)]
+        rng = np.random.default_rng([seeds.stream(self.seed, f"{self.name} scene", number)])
+        made = OBJECTS[name].generate(rng) if name in OBJECTS else Path(name)
+        environment = self.environments[int(rng.integers(len(self.environments)))]
+        ground = np.clip(rng.uniform(*GROUND) + rng.normal(0.0, 0.05, 3), 0.02, 0.98)
+        drawn = {
+            "camera.azimuth": rng.uniform(0.0, 360.0),
+            "camera.elevation": rng.uniform(*ELEVATION),
+            "camera.fov": rng.uniform(*FIELD),
+            "environment.rotation": rng.uniform(0.0, 360.0),
+            **dict(zip(("ground.red", "ground.green", "ground.blue"), ground, strict=True)),
+        }
+        settings = {**{key: float(value) for key, value in drawn.items()}, **(given or {})}
+        scene = load_scene(made, environment, settings=settings)
+        own = scene.description
+        if own.object.label is None:
+            label = Path(name).stem.replace("-", " ").replace("_", " ")
+            scene = Scene(replace(own, object=replace(own.object, label=label)))
+        return name, scene
+
+    def scenes(self, count: int, given: Given | None = None) -> Iterator[tuple[str, Scene]]:
+        """Yield the first `count` scenes."""
+        return (self.scene(number, given) for number in range(count))
+
+
+def fingerprint(asset: ObjectAsset) -> str:
+    """Return what is equal for equal shapes with equal textures."""
+    found = hashlib.sha256()
+    for part in (asset.mesh.vertices, asset.mesh.faces, asset.base_color):
+        found.update(np.ascontiguousarray(part).tobytes())
+    return found.hexdigest()
+
+
+def check_disjoint(splits: Mapping[Split, Sequence[Scene]]) -> None:
+    """Refuse splits that share an object, by its geometry and texture, or measure in an environment of the training.
+
+    Args:
+        splits: each with the scenes that it consists of.
+
+    Raises:
+        InputError: they share something; it is named.
+    """
+    owner: dict[str, str] = {}
+    for split, scenes in splits.items():
+        for one in scenes:
+            asset = one.description.object
+            other = owner.setdefault(fingerprint(asset), split.name)
+            if other != split.name:
+                raise InputError(
+                    f"held_out: {asset.name} is in the {other} split and in the {split.name} one; name other objects"
+                )
+    held = [split for split in splits if split.name == HELD_OUT]
+    taught = {name for split in splits if split.name != HELD_OUT for name in split.environments}
+    both = sorted({name for split in held for name in split.environments} & taught)
+    if both:
+        raise InputError(f"held_out_environment: {', '.join(both)} is an environment of the training too; name others")

@@ -1,0 +1,128 @@
+"""`harden` as a whole: a small network, pictures of 32 x 32, and a stand-in for the attacks of the measurement."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import advsearch
+from advsearch.api import harden as hardening
+from advsearch.cli.harden import answer
+from advsearch.cli.main import main
+from advsearch.config import AttackConfig, HardenConfig
+from advsearch.config.hardening import QUICK
+from advsearch.engine.hardening.training import Course
+from advsearch.engine.loading import Scene
+from advsearch.errors import InputError
+from advsearch.models import Model
+from advsearch.models.reference import load
+from advsearch.progress import NullProgress
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.summary import read_result
+
+SMALL: dict[str, Any] = {
+    "object": "ball,book", "model": "small_models:Colours", "resolution": 32, "texture_resolution": 16, "epsilon": 0.03,
+    "rounds": 2, "scenes": 1, "views": 1, "epochs": 1, "measured": 2, "threads": 1,
+}  # fmt: skip
+
+
+@pytest.fixture
+def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, int]]:
+    """Objects and steps of the attacks of a measurement; their stand-in finds an answer for books."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "labels.json").write_text(json.dumps(list(load().labels)))
+    done: list[tuple[str, int]] = []
+
+    def attacked(config: AttackConfig, scene: Scene, model: Model) -> str:
+        done.append((config.object, config.steps))
+        return "found" if config.object == "book" else "robust"
+
+    monkeypatch.setattr(hardening, "_attacked", attacked)
+    monkeypatch.setattr(hardening, "CLEAN_SCENES", 1)
+    return done
+
+
+def test_a_run_trains_measures_and_goes_on(attacks: list[tuple[str, int]], monkeypatch: pytest.MonkeyPatch) -> None:
+    config = HardenConfig(**SMALL, labels="labels.json", run="run")
+    taught = Course.round
+
+    def stopped(self: Any, number: int, *args: Any) -> None:
+        if number == 2:
+            raise KeyboardInterrupt
+        taught(self, number, *args)
+
+    monkeypatch.setattr(Course, "round", stopped)
+    first = hardening.harden_from_config(config)
+    assert (first.ending, len(first.rounds), first.after, first.hardened) == ("interrupted", 2, None, None)
+    assert attacks == [("ball", 40), ("book", 40)]
+    monkeypatch.setattr(Course, "round", taught)
+    result = hardening.harden_from_config(config, resumed=Path("runs/run"))
+    assert attacks[2:] == [("ball", 40), ("book", 40), ("ball", 120)]  # what was found is not sought any harder
+    assert result.rounds[:2] == [one.model_copy(update={"kept": result.rounds[k].kept}) for k, one in
+                                 enumerate(first.rounds)]  # fmt: skip
+    assert [one.lessons for one in result.rounds] == [0, 1, 2] and sum(one.kept for one in result.rounds) == 1
+    assert result.before is not None and (result.before.right, result.before.count) == (1, 2)
+    assert result.clean_after is not None and result.clean_after.count == 4
+    assert read_result(Path("runs/run")) == result
+    held = result.split["held out"]
+    assert not set(held.environments) & set(result.split["training"].environments)
+    assert result.hardened == f"small_models:Colours@{result.weights}"
+    assert advsearch.load_model(result.hardened, input_size=32).classes == 14
+    assert len(list(Path(str(result.pictures)).glob("*/*.png"))) == 4
+    assert "robust to texture" in answer(result)
+
+
+def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple[str, int]]) -> None:
+    config = HardenConfig(**SMALL, labels="labels.json")
+    rows = [(0.9, 0.2), (0.89, 0.5), (0.87, 0.8), (0.885, 0.5)]
+    with RunDirectory.create_for(config) as run:
+        noted = [{"lessons": 1, "clean": clean, "robust": robust, "kept": False} for clean, robust in rows]
+        run.store.set_note(hardening.ROUNDS, json.dumps(noted))
+        course: Any = None
+        work = hardening.Hardening(config, run, load(), course, {}, NullProgress())
+        assert work.best == 3
+        work.config = config.model_copy(update={"clean_loss": 0.05})
+        assert work.best == 2
+        work.config = config.model_copy(update={"clean_loss": 0.0})
+        assert work.best == 0
+    shutil.rmtree(run.path)
+
+
+def test_quick_is_less_of_what_nothing_is_said_of() -> None:
+    quick = HardenConfig(quick=True, measured=3)
+    assert quick.measured == 3 and quick.rounds == QUICK["rounds"] and quick.steps == QUICK["steps"]
+    assert HardenConfig().rounds > quick.rounds
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"object": "x.glb"}, "held_out: x.glb has no other instances"),
+        ({"environment": "noon,studio", "held_out_environment": "studio"}, "held_out_environment: studio is an env"),
+        ({"epsilon": 0.1, "controls": "pose"}, "the control has ranges and no epsilon"),
+        ({"task": "detection"}, "task: `advsearch harden` has no such setting"),
+    ],
+)
+def test_what_cannot_be_hardened_is_refused_in_words(
+    attacks: list[tuple[str, int]], given: dict[str, Any], text: str
+) -> None:
+    with pytest.raises(InputError, match=text):
+        hardening.harden_from_config(HardenConfig(**{**SMALL, "labels": "labels.json", **given}))
+    assert not list(Path("runs").glob("*/*"))
+
+
+def test_the_command_asks_what_its_flags_say(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    given: list[HardenConfig] = []
+
+    def noted(config: HardenConfig, **others: Any) -> Any:
+        given.append(config)
+        raise InputError("stop here")
+
+    monkeypatch.setattr(hardening, "harden_from_config", noted)
+    flags = "harden --model reference --control texture --epsilon 0.03 --quick --held-out a.glb --json"
+    assert main(flags.split()) == 2 and "stop here" in capsys.readouterr().err
+    assert given == [HardenConfig(controls={"texture": {}}, epsilon=0.03, quick=True, held_out="a.glb")]

@@ -1,0 +1,56 @@
+"""Shares of wrong answers with and without each of many parts, and what is told from chance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2_contingency
+
+from advsearch.engine.sweeps.association import SHARINGS, PartCounts, _likelihood_ratio, _newcombe, association
+
+
+def test_the_interval_of_a_difference_is_newcombe_s() -> None:
+    # Newcombe (1998), table II, method 10: 56/70 - 48/80 and 9/10 - 3/10
+    difference, low, high = _newcombe(np.array([56, 9]), np.array([70, 10]), np.array([48, 3]), np.array([80, 10]))
+    assert difference == pytest.approx([0.2, 0.6])
+    assert low == pytest.approx([0.0524, 0.1705], abs=1e-4) and high == pytest.approx([0.3339, 0.8090], abs=1e-4)
+
+
+def test_the_statistic_is_that_of_the_likelihood_ratio() -> None:
+    k, n = np.array([7, 0, 12]), np.array([20, 5, 12])
+    found = _likelihood_ratio(k, n, 15, 50)
+    for one, (wrong, seen) in zip(found, zip(k, n, strict=True), strict=True):
+        table = [[wrong, seen - wrong], [15 - wrong, 35 - seen + wrong]]
+        expected = chi2_contingency(table, correction=False, lambda_="log-likelihood").statistic
+        assert one == pytest.approx(expected)
+
+
+def test_wrong_answers_are_shared_out_to_the_last() -> None:
+    counts = PartCounts(2, 9, 4, seed=1)
+    for number in range(9):
+        counts.add(np.array([0] if number % 3 else [0, 1]), number < 4)
+    assert counts.seen.tolist() == [9, 3] and counts.wrong.tolist() == [4, 2]
+    assert (counts.chance[:, 0] == 4).all() and len(counts.chance) == SHARINGS
+    assert counts.chance[:, 1].mean() == pytest.approx(4 * 3 / 9, abs=0.2)
+
+
+def test_nothing_is_told_where_nothing_is_but_what_is_there() -> None:
+    random, told = np.random.default_rng(3), 0
+    for trial in range(60):
+        wrong = random.random(40) < 0.4
+        counts = PartCounts(60, 40, int(wrong.sum()), seed=trial)
+        angle, width = random.random(40), 0.4
+        for picture, failed in zip(angle, wrong, strict=True):  # neighbours are seen together
+            counts.add(np.flatnonzero((np.arange(60) / 60 - picture) % 1.0 < width), bool(failed))
+        told += bool(association(counts, slice(0, 60), 5).told.any())
+    assert told <= 8  # 3 on average; 9 or more once in 200
+
+
+def test_a_part_that_decides_is_told_and_one_that_is_always_there_is_not_compared() -> None:
+    counts = PartCounts(3, 24, 12, seed=0)
+    for number in range(24):
+        counts.add(np.array([0, *([1] if number < 12 else [])]), number < 12)
+    found = association(counts, slice(0, 3), 5)
+    assert found.compared.tolist() == [False, True, False] and found.told.tolist() == [False, True, False]
+    assert found.difference[1] == 1.0 and found.low[1] == found.strength[1] > 0.6 and np.isnan(found.p[0])
+    assert association(counts, slice(1, 2), 5).p.tolist() == [1 / (1 + SHARINGS)]

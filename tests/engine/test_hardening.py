@@ -1,0 +1,165 @@
+"""Hardening: the split, what is trained, the training, and the data set; without renders but for one scene."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tarfile
+from importlib import resources
+from pathlib import Path
+
+import pytest
+import torch
+from small_models import Colours
+from torch import Tensor, nn
+
+from advsearch.engine.hardening.lessons import Lesson, RenderedLesson, harder, surprise
+from advsearch.engine.hardening.pictures import save_pictures, write_archive
+from advsearch.engine.hardening.split import HELD_OUT, TRAINING, Split, check_disjoint
+from advsearch.engine.hardening.training import Course, score
+from advsearch.errors import InputError, ModelError
+from advsearch.models import load_model, reference
+from advsearch.models.trainable import Trainable, trainable
+
+LABELS = [f"class {number}" for number in range(14)]
+
+
+def student(layers: str = "all") -> Trainable:
+    return trainable(load_model(Colours(), labels=LABELS, input_size=16), layers)
+
+
+def coloured(right: int, level: float, seed: int) -> Tensor:
+    """A noisy picture whose red is the class's own."""
+    picture = 0.3 + 0.1 * torch.rand((16, 16, 3), generator=torch.Generator().manual_seed(seed))
+    picture[..., right] += level
+    return picture
+
+
+def pupils() -> list[Lesson]:
+    """Three classes by their brightest channel, of which the worst pictures show little."""
+    return [Lesson((n % 3,), coloured(n % 3, 0.4, n), coloured(n % 3, 0.2, 99 + n)) for n in range(24)]
+
+
+# ---- the split ------------------------------------------------------------------------------------------------------
+
+
+def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
+    bundled = Path(str(resources.files("advsearch.bundled")))
+    training = Split(TRAINING, ("ball", "book"), ("noon", "studio"), 1)
+    held = Split(HELD_OUT, ("ball", "book"), ("gallery",), 2)
+    name, scene = training.scene(1)
+    assert (name, scene.description.object.label) == ("book", "book")
+    assert repr(training.scene(1)[1]) == repr(scene)
+    assert training.scene(1, {"camera.fov": 30.0})[1].description.number("camera.fov") == 30.0
+    file = shutil.copy(bundled / "data" / "objects" / "ball" / "mesh.ply", tmp_path / "tennis-ball.ply")
+    mine = Split(TRAINING, (str(file),), ("noon",), 1).scene(0)[1]
+    assert mine.description.object.label == "tennis ball"
+    check_disjoint({training: [scene, mine], held: [held.scene(1)[1]]})
+    with pytest.raises(InputError, match="held_out: book is in the training split and in the held out one"):
+        check_disjoint({training: [scene], held: [scene]})
+    with pytest.raises(InputError, match="held_out_environment: noon is an environment of the training too"):
+        check_disjoint({training: [], Split(HELD_OUT, ("ball",), ("noon",), 2): []})
+
+
+# ---- what is trained ------------------------------------------------------------------------------------------------
+
+
+def test_the_model_sees_the_weights_of_a_copy_as_they_change() -> None:
+    given = Colours()
+    made = trainable(load_model(given, labels=LABELS, input_size=16))
+    image = torch.rand((1, 16, 16, 3), generator=torch.Generator().manual_seed(0))
+    before = made.model(image)
+    assert torch.allclose(made.logits(image), before)
+    with torch.no_grad():
+        made.parameters()[-1].add_(1.0)
+    assert torch.allclose(made.model(image), before + 1.0)
+    assert not made.model(image).requires_grad and made.logits(image).requires_grad
+    assert torch.equal(given.last.bias, Colours().last.bias)
+
+
+def test_the_last_layer_alone_is_trained_where_that_is_asked() -> None:
+    assert [tuple(one.shape) for one in student("last").parameters()] == [(14, 24), (14,)]
+    assert len(student().parameters()) == 4
+
+
+def test_programs_and_probabilities_are_refused() -> None:
+    program = torch.fx.symbolic_trace(Colours())
+    with pytest.raises(ModelError, match="an exported program cannot be trained"):
+        trainable(load_model(program, input_size=16))
+    with pytest.warns(UserWarning, match="answers with probabilities"):
+        model = load_model(nn.Sequential(Colours(), nn.Softmax(dim=1)), input_size=16)
+    with pytest.raises(ModelError, match="only a classifier that answers with logits"):
+        trainable(model)
+
+
+def test_the_reference_model_is_loaded_with_other_weights(tmp_path: Path) -> None:
+    from safetensors.torch import save_file
+
+    made = trainable(reference.load())
+    with torch.no_grad():
+        made.net.get_parameter("head.bias").zero_().add_(torch.arange(14.0))
+    path = tmp_path / "hardened.safetensors"
+    save_file({name: one.contiguous() for name, one in made.net.state_dict().items()}, path)
+    loaded = load_model(f"reference@{path}")
+    image = torch.rand((1, 128, 128, 3), generator=torch.Generator().manual_seed(0))
+    assert loaded.labels == made.model.labels
+    assert torch.allclose(loaded(image), made.model(image), atol=1e-3)
+    assert not torch.allclose(loaded(image), reference.load()(image), atol=1e-1)
+
+
+# ---- lessons and training -------------------------------------------------------------------------------------------
+
+
+def test_the_worst_of_what_was_rendered_is_that_of_the_model_as_it_is() -> None:
+    model = student().model
+    pictures = torch.stack([coloured(0, level, 7) for level in (0.0, 0.3, 0.6)])
+    lesson = RenderedLesson((1,), pictures[0], pictures[0], pictures)
+    harder([lesson], model)
+    loss = surprise(model(pictures), [(1,)] * 3)
+    assert torch.equal(lesson.worst, pictures[int(loss.argmax())])
+    both = surprise(torch.tensor([[1.0, 1.0, 1.0, 1.0]]), [(0, 2)])
+    assert both.item() == pytest.approx(0.6931, abs=1e-3)
+
+
+def test_a_round_teaches_plain_and_worst_pictures() -> None:
+    made, lessons = student(), pupils()
+    before = score(made.model, lessons)
+    ticks: list[int] = []
+    course = Course(made, 0.04, 12, seed=3)
+    course.round(1, lessons, lambda: ticks.append(1))
+    after = score(made.model, lessons)
+    assert len(ticks) == course.steps(len(lessons)) == 12
+    assert before.robust < 0.6 and after.clean >= 0.9 and after.robust >= 0.9
+
+
+def test_a_round_takes_the_users_optimiser_and_their_batches() -> None:
+    made, asked = student("last"), list[int]()
+
+    def optimiser(parameters: object) -> torch.optim.Optimizer:
+        asked.append(1)
+        return torch.optim.SGD(parameters, 0.5)  # type: ignore[arg-type]
+
+    further = [(torch.stack([coloured(2, 0.4, n) for n in range(8)]), torch.full((8,), 9))]
+    Course(made, 1.0, 10, 3, optimiser, further).round(1, pupils())
+    assert asked == [1]
+    assert (made.model(further[0][0]).argmax(dim=1) == 9).float().mean() > 0.5  # only the batches beside say 9
+
+
+# ---- the data set ---------------------------------------------------------------------------------------------------
+
+
+def test_pictures_are_a_folder_for_each_class_and_a_webdataset(tmp_path: Path) -> None:
+    save_pictures(tmp_path / "pictures", 1, pupils()[:2], ["wine glass", "mug"])
+    assert sorted(one.relative_to(tmp_path / "pictures").as_posix() for one in tmp_path.glob("pictures/*/*")) == [
+        "0000-wine-glass/001-00000-plain.png",
+        "0000-wine-glass/001-00000-worst.png",
+        "0001-mug/001-00001-plain.png",
+        "0001-mug/001-00001-worst.png",
+    ]
+    assert write_archive(tmp_path / "pictures", tmp_path / "pictures.tar") == 4
+    with tarfile.open(tmp_path / "pictures.tar") as tar:
+        names = tar.getnames()
+        assert [name.rpartition(".")[2] for name in names] == ["png", "cls", "json"] * 4
+        assert len({name.partition(".")[0] for name in names}) == 4
+        last = tar.extractfile(names[-1])
+        assert last is not None and json.loads(last.read()) == {"class": 1, "kind": "worst"}

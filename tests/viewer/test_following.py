@@ -1,0 +1,106 @@
+"""A run that goes on, as the dashboard follows it: what is new in its rows and its log, and when its page is shown."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+from stored_sweeps import described, serving
+
+from advsearch.config import AttackConfig
+from advsearch.errors import FileFormatError
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.replay import Entry, LoggedEvaluation, entries
+from advsearch.runs.store import Row
+from advsearch.viewer.following import START, following_page, goes_on, progress
+
+
+def step(run: RunDirectory, number: int, *, picture: bool = True) -> None:
+    """What a search leaves of one evaluation."""
+    facts = LoggedEvaluation(
+        index=number, u="", objective="0x1p+0", success=False, non_finite=0, cost=1, seconds=0.1
+    )  # fmt: skip
+    arrays: dict[str, Any] = {"gradient": np.zeros(5)}
+    if picture:
+        arrays["picture"] = np.full((4, 4, 3), 20 * number, np.uint8)
+    run.replay.append(Entry("search", number, facts, arrays))
+    values = {"pose.yaw": described(10.0 * number, "degrees")}
+    run.record(Row("search", number, objective=float(number), success=False, label="mug", values=values))
+
+
+def news(run: Path, after: str = START) -> dict[str, Any]:
+    found = json.loads(progress(run, after))
+    assert isinstance(found, dict)
+    return found
+
+
+def test_what_is_new_is_told_once(tmp_path: Path) -> None:
+    with RunDirectory.create_for(AttackConfig(object="mug", run=str(tmp_path / "run"))) as run:
+        for number in range(3):
+            step(run, number, picture=number != 1)
+        first = news(run.path)
+        assert [(row["kind"], row["step"], row["objective"]) for row in first["rows"]] == [
+            ("search", 0, 0.0), ("search", 1, 1.0), ("search", 2, 2.0),
+        ]  # fmt: skip
+        assert first["rows"][2]["values"] == {"pose.yaw": [20.0, "degrees"]}
+        assert [one["step"] for one in first["pictures"]] == [0, 2]
+        assert first["pictures"][0]["picture"].startswith("data:image/jpeg;base64,")
+        assert first["running"] and not first["ended"]
+        again = news(run.path, first["next"])
+        assert again["rows"] == again["pictures"] == [] and again["next"] == first["next"]
+        step(run, 3)
+        run.record(Row("baseline", 0, objective=float("nan"), values={"pose.yaw": described(float("inf"))}))
+        later = news(run.path, again["next"])
+        assert [(row["kind"], row["objective"]) for row in later["rows"]] == [("search", 3.0), ("baseline", None)]
+        assert [one["step"] for one in later["pictures"]] == [3]
+    assert not news(tmp_path / "run")["running"]
+
+
+def test_an_entry_that_is_being_written_is_waited_for(tmp_path: Path) -> None:
+    with RunDirectory.create_for(AttackConfig(object="mug", run=str(tmp_path / "run"))) as run:
+        step(run, 0)
+        step(run, 1)
+        log = run.path / "replay.bin"
+        whole = log.read_bytes()
+        log.write_bytes(whole[:-3])
+        ((_, place),) = entries(log)
+        log.write_bytes(whole)
+        assert [entry.number for entry, _ in entries(log, place)] == [1]
+        assert list(entries(log, place + 1)) == []
+        assert list(entries(tmp_path / "none")) == []
+        with pytest.raises(FileFormatError):
+            list(entries(tmp_path))
+
+
+def test_its_own_page_is_shown_when_it_has_ended(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    with RunDirectory.create_for(AttackConfig(object="mug", run=str(path))) as run, serving(path) as server:
+        step(run, 0)
+        address = f"{server.address}runs/run/"
+        with urlopen(address) as answer:
+            page = answer.read().decode()
+        assert "has not ended" in page and "A process is working on it." in page and "1 of search" in page
+        with urlopen(f"{address}progress?after={START}") as answer:
+            assert answer.headers["Content-Type"] == "application/json"
+            assert len(json.load(answer)["rows"]) == 1
+        (path / "report.html").write_text("what came out")
+        assert goes_on(path)  # an attack that is resumed has the page of its first sitting
+        run.finish()
+        assert not goes_on(path) and news(path)["ended"]
+        with urlopen(address) as answer:
+            assert answer.read() == b"what came out"
+
+
+def test_a_study_that_goes_on_leads_to_what_has_ended(tmp_path: Path) -> None:
+    path = tmp_path / "<b>"
+    with RunDirectory.create_for(AttackConfig(object="mug", run=str(path))):
+        for name in ("00-mug", "01-bowl"):
+            (path / "parts" / name).mkdir(parents=True)
+        (path / "parts" / "00-mug" / "report.html").write_text("")
+        page = following_page("<b>", path)
+    assert 'href="parts/00-mug/report.html"' in page and "01-bowl" in page and "parts/01-bowl" not in page
+    assert "<b>" not in page
