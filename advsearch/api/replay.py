@@ -26,8 +26,9 @@ from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import CONFIG, RunDirectory, find_run
 from advsearch.runs.results.attack import AttackSummary, ControlGroup
 from advsearch.runs.results.base import INTERRUPTED
-from advsearch.runs.results.replay import ReplayResult, ReplayRow
+from advsearch.runs.results.replay import NOT_DONE, ReplayResult, ReplayRow
 from advsearch.runs.summary import attack_of
+from advsearch.scene.exporting.cycles import BlenderError
 from advsearch.viewer.pages import write_page
 
 if TYPE_CHECKING:
@@ -81,13 +82,19 @@ def replay_from_config(
         try:
             with interruptible():
                 for way in ways:
+                    if way.missing:
+                        rows.append(_not_done(way, way.missing))
+                        continue
                     total = 2 * config.trials
                     progress.stage(f"replaying, {way.name}: {way.text}", total, hint="`trials` or `ways` shorten it")
                     condition = way.condition()
                     before = condition.problem.renderer.renders
                     seed = seeds.stream(theirs.seed, "replay")
                     retrials = Retrials([condition], run, progress, trials=config.trials, seed=seed)
-                    rows.append(_row(way, condition, retrials, u))
+                    try:
+                        rows.append(_row(way, condition, retrials, u))
+                    except BlenderError as error:
+                        rows.append(_not_done(way, str(error)))
                     renders += condition.problem.renderer.renders - before
         except KeyboardInterrupt:
             ending = INTERRUPTED
@@ -147,6 +154,10 @@ def _models(config: ReplayConfig, theirs: AttackConfig, summary: AttackSummary) 
             return RetrialCondition(f"model: {name}", problem_from_config(own)[0], _spp(summary), name)
 
         yield Way("model", condition, name)
+
+
+def _not_done(way: Way, reason: str) -> ReplayRow:
+    return ReplayRow(way=way.name, condition=way.text, ending=NOT_DONE, reason=reason)
 
 
 def _row(way: Way, condition: RetrialCondition, retrials: Retrials, u: torch.Tensor) -> ReplayRow:

@@ -21,6 +21,7 @@ WAYS = (
     "curve",
     "jpeg",
     "sensor",
+    "blender",
 )
 """What a replay may change beside the model."""
 

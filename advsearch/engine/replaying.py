@@ -13,6 +13,7 @@ from advsearch.controls.corruption.digital import coded
 from advsearch.controls.sensor import through_sensor
 from advsearch.engine.problem import Problem
 from advsearch.engine.retrial import RetrialCondition, unchanged
+from advsearch.scene.exporting.cycles import BlenderError, Cycles
 from advsearch.scene.renderer import MAX_SPP
 
 OWN = "as verified"
@@ -43,11 +44,14 @@ class Way:
     Attributes:
         name: what is changed.
         condition: it is made anew each time, and holds a scene of its own where it has to.
+        text: to what.
+        missing: why it cannot be had; empty where it can.
     """
 
     name: str
     condition: Callable[[], RetrialCondition]
     text: str
+    missing: str = ""
 
 
 def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Problem]) -> Iterator[Way]:
@@ -105,6 +109,28 @@ def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Probl
         yield way("jpeg", f"quality {quality}", same(change=_file(quality)))
     for name, values in SENSORS.items():
         yield way("sensor", name, same(change=_sensor(values)))
+    yield _by_blender(problem, spp)
+
+
+def _by_blender(problem: Problem, spp: int) -> Way:
+    """The scene rendered by another program."""
+    renderer = problem.renderer
+    formation, text = renderer.formation, "Cycles, Blender's renderer"
+
+    def condition() -> RetrialCondition:
+        rendered = replace(problem, renderer=renderer.rendered_by(made.radiance))
+        return RetrialCondition(f"blender: {text}", rendered, spp, "blender")
+
+    try:
+        made = Cycles(
+            renderer.scene.made[0],
+            formation.resolution,
+            max_depth=renderer.scene.max_depth,
+            denoise=formation.denoiser != "none",
+        )
+    except BlenderError as error:
+        return Way("blender", condition, text, str(error))
+    return Way("blender", condition, text)
 
 
 def _file(quality: int) -> Callable[[Tensor, int], Tensor]:

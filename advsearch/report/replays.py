@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from advsearch.report import wording
-from advsearch.runs.results.replay import ReplayResult, ReplayRow
+from advsearch.runs.results.replay import NOT_DONE, ReplayResult, ReplayRow
 
 HEADS = ("changed", "to", "clean right", "95 % interval", "success", "95 % interval", "")
 """Of the columns."""
@@ -11,7 +11,7 @@ HEADS = ("changed", "to", "clean right", "95 % interval", "success", "95 % inter
 
 def replay_text(result: ReplayResult) -> str:
     """Return what the table says, in a sentence."""
-    changed = result.table[1:]
+    changed = [row for row in result.table[1:] if row.ending != NOT_DONE]
     if not result.table:
         return "Nothing was rendered again."
     own = "holds" if result.table[0].ending == "found" else "does not hold"
@@ -31,6 +31,8 @@ def replay_rows(result: ReplayResult) -> list[list[str]]:
 
 def _rates(row: ReplayRow) -> list[str]:
     clean, rated = row.clean, row.verified
+    if clean is None or rated is None:
+        return ["", "", "", "", f"{NOT_DONE}: {row.reason}"]
     return [
         f"{clean.correct}/{clean.trials}",
         wording.interval_text(clean.interval),

@@ -34,6 +34,9 @@ from advsearch.scene.surfaces import Surfaces
 
 MAX_SPP = 65536
 
+Source = Callable[[Mapping[str, Tensor], int, int], Tensor]
+"""From scene inputs, seed and samples a pixel to linear radiance (H, W, 3)."""
+
 
 class InputSpace(Protocol):
     """What the renderer asks of a space: its start, its groups, and what a configuration does."""
@@ -89,6 +92,7 @@ class Renderer:
         self.formation = formation
         self.root_seed = root_seed
         self._denoise = Denoiser(formation.resolution)
+        self._source: Source | None = None
         self.renders = 0
         self.gradients = 0
         self.non_finite = 0
@@ -109,6 +113,12 @@ class Renderer:
         other = copy.copy(self)
         other.formation = replace(self.formation, **formation)
         other.scene = self.scene if scene is None else scene
+        return other
+
+    def rendered_by(self, source: Source) -> Renderer:
+        """Return a renderer of the same space whose pictures another program renders, and denoises; as of `like`."""
+        other = self.like()
+        other._source = source
         return other
 
     def __call__(self, u: Tensor, seed: int = 0, spp: int = 16) -> Tensor:
@@ -243,6 +253,9 @@ class Renderer:
     def primal(self, inputs: Mapping[str, Tensor], seed: int, spp: int, hide: bool = False) -> Tensor:
         """Radiance of given scene inputs, without a graph, with coverage if hidden; counted in `renders`."""
         noise = seeds.stream(self.root_seed, "primal", seed)
+        if self._source is not None:
+            self.renders += 1
+            return self._finite(self._source(inputs, noise, spp))
         rendered = self._finite(self.scene.radiance(inputs, noise, spp, hide=hide))
         if self.formation.denoiser == "oidn":
             albedo, normal = self.scene.guides(inputs, seeds.stream(self.root_seed, "guides", seed), spp)

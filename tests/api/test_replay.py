@@ -38,23 +38,27 @@ def attacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_an_answer_is_rendered_again_under_every_condition(
-    attacked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    attacked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = tmp_path / "run"
+    monkeypatch.setattr("advsearch.scene.importing.blender.shutil.which", lambda name: None)
     assert main(["replay", str(attacked), "--trials", "6", "--model", "small_models:hard", "--code", EASY, "--run",
                  str(run), "--json", "--quiet"]) == 0  # fmt: skip
     said = json.loads(capsys.readouterr().out)
     rows = {(row["way"], row["condition"]): row for row in said["table"]}
     assert {way for way, _ in rows} == {
         "as verified", "samples", "resolution", "depth", "integrator", "sampler", "denoiser", "curve", "jpeg", "sensor",
-        "model",
+        "blender", "model",
     }  # fmt: skip
+    without = rows.pop(("blender", "Cycles, Blender's renderer"))
+    assert without["ending"] == "not done" and "none is installed" in without["reason"] and "clean" not in without
+    said["table"].remove(without)
     assert all(row["clean"]["trials"] == row["verified"]["trials"] == 6 for row in said["table"])
     assert rows["as verified", "as verified"]["ending"] == "found", "what was verified holds in fresh pictures too"
     assert rows["samples", "16 a pixel"]["verified"]["spp"] == 16 and ("samples", "1 a pixel") in rows
     assert ("resolution", "16 x 16 pixels") in rows and ("resolution", "64 x 64 pixels") in rows
     assert rows["integrator", "Mitsuba's path in place of prb"]["ending"] == "found"
-    assert read_result(run).to_dict() == said
+    assert read_result(run).to_dict() == {**said, "table": [*said["table"][:-1], without, said["table"][-1]]}
     with Store(run / "results.sqlite", read_only=True) as store:
         seeds = {tuple(row.seed for row in store.rows(kind)) for kind in store.counts()}
     assert len(seeds) == 1, "the same seeds under every condition"

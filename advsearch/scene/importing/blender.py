@@ -61,8 +61,16 @@ def read_mesh_bytes(path: Path, what: str, suffixes: tuple[str, ...]) -> bytes:
     return _exported(path)
 
 
-def _command(path: Path) -> list[str]:
-    """The program that is given the script behind it, with what makes it run that and nothing else."""
+def command(who: str, otherwise: str) -> list[str]:
+    """Return the program that is given a script behind it, with what makes it run that and nothing else.
+
+    Args:
+        who: needs it, for the message.
+        otherwise: what else can be done.
+
+    Raises:
+        FileFormatError: there is none.
+    """
     program = os.environ.get(PROGRAM) or shutil.which("blender")
     if program is None and importlib.util.find_spec("bpy") is not None:
         program = sys.executable
@@ -70,9 +78,8 @@ def _command(path: Path) -> list[str]:
     if runs is None:
         missing = "none is installed" if program is None else f"{PROGRAM} names {program}, which can't be run"
         raise FileFormatError(
-            f"{path}: Blender has to read it, and {missing}; install Blender so that `blender` is found, or type "
-            f"`python3.11 -m venv bpy && bpy/bin/pip install bpy` and set {PROGRAM}=bpy/bin/python; or export glTF "
-            "(.glb) from Blender and name that"
+            f"{who}, and {missing}; install Blender so that `blender` is found, or type "
+            f"`python3.11 -m venv bpy && bpy/bin/pip install bpy` and set {PROGRAM}=bpy/bin/python; or {otherwise}"
         )
     program = os.path.abspath(runs)
     if Path(program).name.startswith("python"):
@@ -80,20 +87,31 @@ def _command(path: Path) -> list[str]:
     return [program, "--background", "--factory-startup", "--disable-autoexec", "--python-exit-code", "1", "--python"]
 
 
+def surroundings(folder: str) -> dict[str, str]:
+    """Return the environment of a process that has a folder for its home, and nothing of ours but the path."""
+    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
+    return {**kept, "HOME": folder, "TMPDIR": folder}
+
+
+def last_line(said: str) -> str:
+    """Return the last line of what Blender has said, for a message; empty if there is none."""
+    lines = [line for line in said.splitlines() if line.strip()]
+    return f": {shown(lines[-1].strip(), quoted=False)}" if lines else ""
+
+
 def _exported(path: Path) -> bytes:
     """Have the file written as glTF in a folder of its own, and return that."""
-    command = _command(path)
+    program = command(f"{path}: Blender has to read it", "export glTF (.glb) from Blender and name that")
     with tempfile.TemporaryDirectory(prefix="advsearch-blender-") as folder:
         script, target = Path(folder) / "export.py", Path(folder) / "scene.glb"
         script.write_text(EXPORT, "utf-8")
         names = [str(path.resolve()), str(target), str(files.scaled(LARGEST_FILE))]
-        between = [] if "-I" in command else ["--"]
-        kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
+        between = [] if "-I" in program else ["--"]
         try:
             done = subprocess.run(
-                [*command, str(script), *between, *names],
+                [*program, str(script), *between, *names],
                 cwd=folder,
-                env={**kept, "HOME": folder, "TMPDIR": folder},
+                env=surroundings(folder),
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 text=True,
@@ -107,9 +125,8 @@ def _exported(path: Path) -> bytes:
                 f"yourself, or give it longer: {files.FACTOR}=10 in the environment makes all limits ten times as large"
             ) from None
         except OSError as error:
-            raise FileFormatError(f"{path}: Blender can't be started ({error.strerror}); check {command[0]}") from error
+            raise FileFormatError(f"{path}: Blender can't be started ({error.strerror}); check {program[0]}") from error
         if done.returncode or not target.is_file():
-            said = [line for line in (done.stdout + done.stderr).splitlines() if line.strip()]
-            last = f": {shown(said[-1].strip(), quoted=False)}" if said else ""
-            raise FileFormatError(f"{path}: Blender could not read it{last}; export glTF (.glb) from it yourself")
+            said = last_line(done.stdout + done.stderr)
+            raise FileFormatError(f"{path}: Blender could not read it{said}; export glTF (.glb) from it yourself")
         return read_bytes(target, "object", (".glb",))
