@@ -92,7 +92,7 @@ BROUGHT_ALONG = {"drjit": "mitsuba", "typing_extensions": "pydantic"}
 """Imported, but pinned by another package on purpose: Mitsuba works with exactly one version of Dr.Jit, and types of
 pydantic's classes are written with its own typing_extensions."""
 
-OPTIONAL = {"pyarrow": "parquet"}
+OPTIONAL = {"pyarrow": "parquet", "textual_image": "terminal"}
 """Packages that only an extra brings, and which: imported inside a function that says what to do where it is not."""
 
 

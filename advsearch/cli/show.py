@@ -21,7 +21,7 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
         "show",
-        usage="advsearch show [--json] RUN | control NAME | policy NAME | task NAME | recipe NAME",
+        usage="advsearch show [--json] RUN [--picture] | control NAME | policy NAME | task NAME | recipe NAME",
         help=HELP,
         description=HELP[0].upper() + HELP[1:] + ".",
     )
@@ -31,11 +31,14 @@ def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
         metavar="WHAT",
         help="a run's name or folder; or: control NAME, policy NAME, task NAME, recipe NAME",
     )
+    parser.add_argument("--picture", action="store_true", help="draw a run's pictures in a terminal that can")
     output.add_flags(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the answer of a run, a control's parameters, or the options of a policy or a task."""
+    if args.picture and (args.json or len(args.what) > 1):
+        raise InputError("--picture: draws a run's pictures beside its answer in words; leave out the rest")
     match args.what:
         case ["control", name]:
             return _show_control(name, args.json)
@@ -44,13 +47,13 @@ def run(args: argparse.Namespace) -> int:
         case ["recipe", name]:
             return _show_recipe(name, args.json)
         case [name]:
-            return show_run(name, args.json)
+            return show_run(name, args.json, picture=args.picture)
     kinds = "control NAME, policy NAME, task NAME, recipe NAME"
     raise InputError(f"expected the name of a run, or one of {kinds}, got {' '.join(args.what)!r}")
 
 
-def show_run(name: str, as_json: bool) -> int:
-    """Print the answer of a run, or how far one has come that has none yet."""
+def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
+    """Print the answer of a run, or how far one has come that has none yet, and draw its pictures if wanted."""
     import importlib
 
     from advsearch.runs.directory import find_run
@@ -66,6 +69,10 @@ def show_run(name: str, as_json: bool) -> int:
         output.print_json(result)
     else:
         print(answer(result) + output.go_on_text(result))
+    if picture:
+        from advsearch.cli.picture import pictures_of, show_pictures
+
+        show_pictures(pictures_of(path))
     return 0
 
 
