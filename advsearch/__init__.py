@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from advsearch.api.check import check as check
     from advsearch.api.gap import gap as gap
     from advsearch.api.harden import harden as harden
+    from advsearch.api.photos import photo_agreement as photo_agreement
     from advsearch.api.plan import plan as plan
     from advsearch.api.precision import precision as precision
     from advsearch.api.recipe import recipe as recipe
@@ -47,6 +48,7 @@ _HOMES = {
     "harden": "advsearch.api.harden",
     "load_model": "advsearch.models",
     "load_scene": "advsearch.engine.loading",
+    "photo_agreement": "advsearch.api.photos",
     "plan": "advsearch.api.plan",
     "precision": "advsearch.api.precision",
     "recipe": "advsearch.api.recipe",

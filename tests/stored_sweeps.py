@@ -16,6 +16,7 @@ from advsearch.described import Value
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.viewer import thumbnails
+from advsearch.viewer.photographing import PhotoTaker
 from advsearch.viewer.server import Dashboard
 from advsearch.viewer.sweep_page import write_page
 
@@ -66,9 +67,11 @@ def make_sweep(path: Path, *, keep: str = "none", label: str = "mug", ended: boo
 
 
 @contextmanager
-def serving(*runs: Path, host: str = "127.0.0.1") -> Iterator[Dashboard]:
+def serving(
+    *runs: Path, host: str = "127.0.0.1", https: bool = False, photographs: PhotoTaker | None = None
+) -> Iterator[Dashboard]:
     """A server of these runs, for as long as the block."""
-    server = Dashboard(runs, host, 0)
+    server = Dashboard(runs, host, 0, https=https, photographs=photographs)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
     thread.start()
     try:

@@ -11,8 +11,11 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.files import JsonValue
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from advsearch.controls import Choice, Parameter
     from advsearch.runs.listing import Listed
+    from advsearch.runs.results.photos import PhotoAgreement
 
 HELP = "show what a run found, the parameters of a control, the options of a policy or a task, or a recipe"
 
@@ -65,15 +68,44 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
         return _show_unfinished(described(path), as_json)
     result = read_result(path)
     answer = importlib.import_module(f"advsearch.cli.{result.command}").answer
+    photos = _photos(path)
     if as_json:
-        output.print_json(result)
+        output.print_json({**result.to_dict(), "photos": photos.to_dict()} if photos else result)
     else:
-        print(answer(result) + output.go_on_text(result))
+        print(answer(result) + output.go_on_text(result) + (_photos_text(photos) if photos else ""))
     if picture:
         from advsearch.cli.picture import pictures_of, show_pictures
 
         show_pictures(pictures_of(path))
     return 0
+
+
+def _photos(run: Path) -> PhotoAgreement | None:
+    """How photographs agree with the run's renderings; None where there are none."""
+    from advsearch.runs.directory import IMAGES
+    from advsearch.viewer.photos import FOLDER
+
+    if not (run / IMAGES / FOLDER).is_dir():
+        return None
+    from advsearch.api.photos import photo_agreement
+
+    return photo_agreement(run)
+
+
+def _photos_text(table: PhotoAgreement) -> str:
+    from advsearch.report.wording import count, interval_text
+
+    if table.interval is None:
+        return ""
+    lines = [
+        ["", "photograph right", "photograph wrong"],
+        ["rendering right", str(table.right_right), str(table.right_wrong)],
+        ["rendering wrong", str(table.wrong_right), str(table.wrong_wrong)],
+    ]
+    agreeing = table.right_right + table.wrong_wrong
+    total = count(table.photos, "photograph")
+    text = f"Renderings and reality agree in {agreeing} of {total}, 95 % interval {interval_text(table.interval)}:"
+    return f"\n\n{text}\n{output.columns(lines)}"
 
 
 def _show_unfinished(run: Listed, as_json: bool) -> int:

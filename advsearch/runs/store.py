@@ -204,6 +204,21 @@ class Store:
         while (values := self._next(cursor)) is not None:
             yield _decode(values, self.path)
 
+    def row(self, kind: str, step: int) -> Row | None:
+        """Return the last row of a kind with a step; None where there is none."""
+        with _readable(self.path):
+            found = self._db.execute(
+                f"SELECT {', '.join(_COLUMNS)} FROM evaluations WHERE kind = ? AND step = ? ORDER BY id DESC LIMIT 1",
+                (kind, step),
+            ).fetchone()
+        return None if found is None else _decode(found, self.path)
+
+    def last_step(self, kind: str) -> int:
+        """Return the largest step of a kind; -1 where there is none."""
+        with _readable(self.path):
+            found = self._db.execute("SELECT max(step) FROM evaluations WHERE kind = ?", (kind,)).fetchone()[0]
+        return -1 if found is None else int(found)
+
     def count(self, kind: str | None = None) -> int:
         """Return how many rows there are, or how many of one kind."""
         where, given = ("", ()) if kind is None else (" WHERE kind = ?", (kind,))

@@ -1,9 +1,10 @@
 """`advsearch dashboard`: the pages of runs from a small server, on this machine unless asked otherwise.
 
-What it answers: GET and HEAD of the list, of a run's page, of its rows and thumbnails, and nothing else. No part of an
-address becomes a path: runs are looked up by name among those that it was given, pictures by number. A request whose
-`Host` is not this server's is refused, so that a page elsewhere whose name is made to lead here (DNS rebinding) reads
-nothing; so is one that another origin's page sends. Beyond this machine every request needs the token.
+What it answers: GET and HEAD of the list, of a run's page, of its rows and pictures, POST of a photograph, and nothing
+else. No part of an address becomes a path: runs are looked up by name among those that it was given, pictures by
+number. A request whose `Host` is not this server's is refused, so that a page elsewhere whose name is made to lead here
+(DNS rebinding) reads nothing; so is one that another origin's page sends. Beyond this machine every request needs the
+token, and goes over HTTPS. A photograph has to come from this server's own page, which alone knows the key for it.
 """
 
 from __future__ import annotations
@@ -12,9 +13,11 @@ import hmac
 import ipaddress
 import re
 import secrets
+import ssl
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
@@ -25,12 +28,15 @@ from urllib.parse import parse_qs, quote, unquote, urlsplit
 
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.files import open_regular
-from advsearch.report.markup import element
 from advsearch.runs import listing, lock
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, is_run
+from advsearch.viewer import photographing
+from advsearch.viewer.certificate import https_context, reachable
 from advsearch.viewer.columns import read_columns
-from advsearch.viewer.document import document
 from advsearch.viewer.following import START, following_page, goes_on, progress
+from advsearch.viewer.list_page import list_page
+from advsearch.viewer.photographing import PhotoTaker
+from advsearch.viewer.refused import Refused
 from advsearch.viewer.sweep_page import SweepSource, page, result_of
 from advsearch.viewer.thumbnails import kept_pictures, path_of
 
@@ -45,8 +51,11 @@ LARGEST = 1 << 30
 WORKERS = 16
 """Requests that are answered at once; others wait."""
 
-WAITING = 1024
-"""Connections that may wait."""
+WAITING = 128
+"""Connections that may wait for a worker; as many more as `BACKLOG` wait in the operating system, without a file open
+here."""
+
+BACKLOG = 4096
 
 PATIENCE = 20.0
 """Seconds after which a connection that sends or takes nothing is closed."""
@@ -57,14 +66,6 @@ LONGEST = 4096
 COOKIE = "advsearch"
 
 
-class Refused(Exception):
-    """A request that is not answered as asked."""
-
-    def __init__(self, status: HTTPStatus, text: str) -> None:
-        super().__init__(text)
-        self.status = status
-
-
 class Dashboard(HTTPServer):
     """The server. `serve_forever` answers until `shutdown`.
 
@@ -72,21 +73,39 @@ class Dashboard(HTTPServer):
         runs: folders of runs; empty for those in ``runs/``, looked up anew for each request.
         host: address to listen at.
         port: 0 takes a free one.
+        https: speak HTTPS on this machine too; beyond it that is always so.
+        photographs: takes photographs in; None refuses them.
 
     Attributes:
         token: what every request has to bring; None on this machine only.
+        key: what a photograph has to bring besides.
+        fingerprint: SHA-256 of the certificate; None without HTTPS.
+        photographs: as given.
 
     Raises:
-        InputError: the address can't be listened at.
+        InputError: the address can't be listened at, or there is nothing to make a certificate.
     """
 
-    request_queue_size = WAITING
+    request_queue_size = BACKLOG
     allow_reuse_address = True
 
-    def __init__(self, runs: Sequence[Path], host: str = LOOPBACK, port: int = 0) -> None:
+    def __init__(
+        self,
+        runs: Sequence[Path],
+        host: str = LOOPBACK,
+        port: int = 0,
+        *,
+        https: bool = False,
+        photographs: PhotoTaker | None = None,
+    ) -> None:
         self._given = tuple(runs)
         self.token = None if _is_loopback(host) else secrets.token_urlsafe(24)
-        self._host = host
+        self.key, self.photographs = secrets.token_urlsafe(24), photographs
+        self._host, self.fingerprint = host, None
+        self._context: ssl.SSLContext | None = None
+        if https or self.token:
+            names = (reachable(host), "localhost", LOOPBACK)
+            self._context, self.fingerprint = https_context(names)
         self._waiting: Queue[tuple[socket, Any] | None] = Queue(WAITING)
         try:
             super().__init__((host, port), _Handler)
@@ -96,11 +115,20 @@ class Dashboard(HTTPServer):
             threading.Thread(target=self._work, daemon=True).start()
 
     @property
+    def scheme(self) -> str:
+        """``"https"`` or ``"http"``."""
+        return "http" if self._context is None else "https"
+
+    @property
     def address(self) -> str:
         """What to open in a browser."""
-        host = self._host if self._host not in ("0.0.0.0", "::") else LOOPBACK
+        return self.address_of("/")
+
+    def address_of(self, path: str) -> str:
+        """What to open in a browser, here or elsewhere, to see a page."""
+        host = reachable(self._host)
         host = f"[{host}]" if ":" in host else host
-        return f"http://{host}:{self.server_port}/" + (f"?token={self.token}" if self.token else "")
+        return f"{self.scheme}://{host}:{self.server_port}{path}" + (f"?token={self.token}" if self.token else "")
 
     def runs(self) -> Mapping[str, Path]:
         """The runs that are shown, by the name under which they are."""
@@ -122,6 +150,8 @@ class Dashboard(HTTPServer):
             request, client = job
             try:
                 request.settimeout(PATIENCE)
+                if self._context is not None:
+                    request = self._context.wrap_socket(request, server_side=True)
                 self.finish_request(request, client)
             except Exception:
                 continue  # whatever one client does, the others are answered
@@ -146,6 +176,9 @@ class _Handler(BaseHTTPRequestHandler):
     def do_HEAD(self) -> None:
         self._answer(body=False)
 
+    def do_POST(self) -> None:
+        self._answer(body=True)
+
     def log_message(self, format: str, *args: Any) -> None:
         """Say nothing."""
 
@@ -153,7 +186,7 @@ class _Handler(BaseHTTPRequestHandler):
         headers: dict[str, str] = {}
         try:
             self._check()
-            kind, data, headers = self._found()
+            kind, data, headers = self._found(_POSTED if self.command == "POST" else _ROUTES)
             status = HTTPStatus.OK
         except Refused as refused:
             status, kind, data = refused.status, "text/plain; charset=utf-8", f"{refused}\n".encode()
@@ -170,6 +203,7 @@ class _Handler(BaseHTTPRequestHandler):
             "X-Frame-Options": "DENY",
             "Referrer-Policy": "no-referrer",
             "Cross-Origin-Resource-Policy": "same-origin",
+            "Permissions-Policy": "camera=(self), microphone=(), geolocation=()",
             **headers,
         }.items():
             self.send_header(name, value)
@@ -186,7 +220,7 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._is_own(host):
             raise Refused(HTTPStatus.FORBIDDEN, "this server is not called so; open the address that it printed")
         origin = self.headers.get("Origin")
-        if origin is not None and origin != f"http://{host}":
+        if origin is not None and origin != f"{self.server.scheme}://{host}":
             raise Refused(HTTPStatus.FORBIDDEN, "a page of another origin asks; open the address that was printed")
         if self.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
             if self.headers.get("Sec-Fetch-Mode") != "navigate":
@@ -220,7 +254,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     # ---- what is answered --------------------------------------------------------------------------------------------
 
-    def _found(self) -> tuple[str, bytes, dict[str, str]]:
+    def _found(self, routes: Routes) -> tuple[str, bytes, dict[str, str]]:
         if not self.path.startswith("/"):
             raise Refused(HTTPStatus.BAD_REQUEST, "this server is no proxy")
         address = urlsplit(self.path)
@@ -228,8 +262,8 @@ class _Handler(BaseHTTPRequestHandler):
         headers = {}
         if self.server.token and "token" in query:
             cookie = f"{COOKIE}-{self.server.server_port}={self.server.token}"
-            headers["Set-Cookie"] = f"{cookie}; HttpOnly; SameSite=Strict; Path=/"
-        for pattern, answer in _ROUTES:
+            headers["Set-Cookie"] = f"{cookie}; HttpOnly; Secure; SameSite=Strict; Path=/"
+        for pattern, answer in routes:
             match = re.fullmatch(pattern, address.path)
             if match:
                 kind, data = answer(self, query, *map(unquote, match.groups()))
@@ -295,6 +329,25 @@ class _Handler(BaseHTTPRequestHandler):
         more = len(columns.step) == part
         return "application/octet-stream", replace(columns, more=more, running=running).packed()
 
+    # ---- photographs -------------------------------------------------------------------------------------------------
+
+    def _align(self, _query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
+        path = f"/runs/{quote(name, safe='')}/align/"
+        elsewhere = self.server.address_of(path) if self.server.token else None
+        return photographing.page(self.server.photographs, self._run(name), name, path, self.server.key, elsewhere)
+
+    def _rendering(self, _query: Mapping[str, list[str]], name: str, rendering: str) -> tuple[str, bytes]:
+        return photographing.rendering(self._run(name), rendering)
+
+    def _photo(self, _query: Mapping[str, list[str]], name: str, photo: str) -> tuple[str, bytes]:
+        return photographing.photo(self._run(name), photo)
+
+    def _take(self, _query: Mapping[str, list[str]], name: str, rendering: str) -> tuple[str, bytes]:
+        photographing.check_sender(self.headers, self.server.key)
+        path = f"/runs/{quote(name, safe='')}/align/"
+        data = partial(photographing.body, self.headers, self.rfile)
+        return photographing.take(self.server.photographs, self._run(name), rendering, path, data)
+
     def _picture(self, _query: Mapping[str, list[str]], name: str, number: str) -> tuple[str, bytes]:
         file = path_of(self._run(name), int(number))
         if file.is_symlink():
@@ -303,8 +356,9 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 Answer = Callable[..., tuple[str, bytes]]
+Routes = tuple[tuple[str, Answer], ...]
 
-_ROUTES: tuple[tuple[str, Answer], ...] = (
+_ROUTES: Routes = (
     ("/", _Handler._list),
     ("/compare/", _Handler._compare),
     ("/runs/([^/]+)/", _Handler._page),
@@ -312,29 +366,18 @@ _ROUTES: tuple[tuple[str, Answer], ...] = (
     ("/runs/([^/]+)/progress", _Handler._progress),
     (f"/runs/([^/]+)/{PARTS}/([^/]+)/{re.escape(REPORT)}", _Handler._part),
     (r"/runs/([^/]+)/pictures/[0-9]+/([0-9]{1,12})\.jpg", _Handler._picture),
+    ("/runs/([^/]+)/align/", _Handler._align),
+    ("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._rendering),
+    ("/runs/([^/]+)/align/photos/([^/]+)", _Handler._photo),
 )
+
+_POSTED: Routes = (("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._take),)
+"""What is sent, not asked for."""
 
 
 def _source(name: str, run: Path) -> SweepSource:
     base = f"/runs/{quote(name, safe='')}"
     return SweepSource(name, f"{base}/rows", parts=True, pictures=kept_pictures(run), folder=f"{base}/pictures")
-
-
-def list_page(runs: Mapping[str, Path]) -> str:
-    """Return the page that lists runs, by the name under which each is shown."""
-    lines, sweeps = [], 0
-    for name, path in runs.items():
-        one = listing.described(path, counts=False)
-        sweep = one.command == "sweep"
-        sweeps += sweep
-        what = ", ".join(filter(None, (one.command, one.object, " and ".join(one.controls), one.state, one.answer)))
-        box = element("input", type="checkbox", name="run", value=name, aria_label=f"compare {name}") if sweep else None
-        link = element("a", name, href=f"/runs/{quote(name, safe='')}/")
-        lines.append(element("li", box, " " if box else None, link, element("div", what, class_="soft")))
-    button = element("p", element("button", "Show the chosen sweeps side by side", type="submit"))
-    form = element("form", element("ul", *lines, class_="runs"), button if sweeps > 1 else None, action="/compare/")
-    none = element("p", "No runs here yet: advsearch sweep, or advsearch attack, makes one.")
-    return document("Runs", element("header", element("h1", "Runs")), element("main", form if lines else none))
 
 
 def _is_loopback(host: str) -> bool:

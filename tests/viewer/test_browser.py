@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,10 +16,12 @@ from PIL import Image
 from samples import GAP, gap, keep_object, make_run
 from stored_sweeps import described, make_sweep, serving
 
+from advsearch.api.photos import Photographs
 from advsearch.config import AttackConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.replay import Entry, LoggedEvaluation
 from advsearch.runs.store import Row, Store
+from advsearch.viewer import thumbnails
 from advsearch.viewer.attack_page import write_report
 from advsearch.viewer.document import asset
 from advsearch.viewer.pages import write_page
@@ -43,7 +46,8 @@ def browser() -> Iterator[Browser]:
         pytest.skip("there is no Chromium here: apt-get install chromium")
     with playwright.sync_playwright() as started:
         drawing = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        running = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *drawing])
+        camera = ["--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream"]
+        running = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *drawing, *camera])
         yield running
         running.close()
 
@@ -105,7 +109,8 @@ def explored(page: Page) -> None:
     assert page.locator('[data-cell="0,1,2"]').get_attribute("aria-pressed") == "true"
     page.get_by_label("Show", exact=True).select_option("wrong")
     assert page.locator(".card").count() == 2
-    assert page.locator(".card.wrong strong").first.inner_text().strip() == "✗"
+    mark = page.locator(".card.wrong strong").first
+    until(page, lambda: mark.inner_text().strip() == "✗")  # a card has no text until a frame has shown it
     page.locator(".card").first.click()
     assert "camera.elevation [degrees]" in page.locator("dialog").inner_text()
     page.locator("dialog button").click()
@@ -347,3 +352,60 @@ def test_intervals_are_those_of_clopper_and_pearson(browser: Browser, sweep: Pat
     ):
         mine = page.evaluate(f"(() => {{ {part}; return interval({right}, {count}); }})()")
         assert mine == pytest.approx(clopper_pearson(right, count), abs=2e-7), (right, count)
+
+
+# ---- photographs ----------------------------------------------------------------------------------------------------
+
+
+def test_a_photograph_is_aligned_taken_and_counted(browser: Browser, tmp_path: Path) -> None:
+    """With a camera that isn't there, over HTTPS as a phone has it; and everybody can use the page."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+    run = make_sweep(tmp_path / "first", keep="all")
+    settings: dict[str, Any] = {"ignore_https_errors": True, "bypass_csp": True}
+    with serving(run, host="0.0.0.0", photographs=Photographs()) as server:
+        with opened(browser, server.address_of("/runs/first/align/"), 390, **settings) as page:
+            status = page.locator("#align .status")
+            until(page, lambda: status.inner_text() == "Rendering 0.")
+            assert page.get_by_role("button", name="Take a photograph").is_disabled()
+            page.get_by_role("button", name="Open the camera").click()
+            until(page, lambda: status.inner_text() == "The camera is open.")
+            page.get_by_label("Opacity").fill("80")
+            assert page.locator(".camera canvas").evaluate("one => one.style.opacity") == "0.8"
+            page.get_by_label("Renderings").fill("7, 2")
+            page.get_by_label("Renderings").press("Enter")
+            until(page, lambda: status.inner_text() == "Rendering 7, 1 of 2.")
+            page.get_by_role("button", name="Next").click()
+            until(page, lambda: status.inner_text() == "Rendering 2, 2 of 2.")
+            page.get_by_role("button", name="Take a photograph").click()
+            until(page, lambda: page.locator("table.agreement").count())
+            assert "of 1 photograph:" in page.locator("#agreement").inner_text()
+            (photo,) = (run / "images/photos").iterdir()
+            assert photo.name == "2-0000.jpg"
+            with Image.open(photo) as image:
+                assert image.width == image.height > 200  # of the fake camera, in the shape of the rendering
+                assert np.ptp(np.asarray(image)) > 100
+            page.locator("summary").click()
+            assert page.locator(".qr svg").is_visible()
+            for width, dark in itertools.product((390, 1440), (False, True)):
+                page.set_viewport_size({"width": width, "height": 900})
+                page.emulate_media(color_scheme="dark" if dark else "light")
+                found = axe.Axe().run(page).response["violations"]
+                assert [(one["id"], one["nodes"][0]["html"][:200]) for one in found] == []
+                assert page.evaluate("document.scrollingElement.scrollWidth <= innerWidth")
+
+
+def test_edges_alone_are_drawn_from_the_rendering(browser: Browser, tmp_path: Path) -> None:
+    run = make_sweep(tmp_path / "first", keep="all")
+    square = np.zeros((64, 64, 3), np.float32)
+    square[16:48, 16:48] = 1.0
+    thumbnails.keep(run, 5, thumbnails.thumbnail(square))
+    with serving(run, photographs=Photographs()) as server:
+        with opened(browser, f"{server.address}runs/first/align/?rendering=5") as page:
+            until(page, lambda: page.locator("#align .status").inner_text() == "Rendering 5.")
+            page.get_by_label("Shown").select_option("edges only")
+            drawn = (
+                "one => Array.from(one.getContext('2d').getImageData(0, 32, 64, 1).data).filter((_, k) => k % 4 == 3)"
+            )
+            opaque = [k for k, alpha in enumerate(page.locator(".camera canvas").evaluate(drawn)) if alpha > 200]
+            assert set(opaque) >= {15, 16, 47, 48}
+            assert all(min(abs(k - 15.5), abs(k - 47.5)) < 3 for k in opaque)

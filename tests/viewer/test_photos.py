@@ -1,0 +1,361 @@
+"""Photographs: what a browser may send, what is kept of it, how it is judged and counted, and over what it comes."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import socket
+import ssl
+import struct
+import tempfile
+import zlib
+from collections.abc import Iterator
+from contextlib import closing
+from http.client import HTTPConnection, HTTPResponse, HTTPSConnection
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from samples import make_run
+from stored_sweeps import make_sweep, serving
+
+from advsearch.api.photos import Photographs, photo_agreement
+from advsearch.attacks import clopper_pearson
+from advsearch.cli.main import main
+from advsearch.errors import InputError
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.store import Store
+from advsearch.viewer import certificate
+from advsearch.viewer.align_page import align_page
+from advsearch.viewer.photos import LARGEST, photo_file, rendering_file, rendering_names, sound_photo
+from advsearch.viewer.server import Dashboard
+
+
+def picture(size: tuple[int, int] = (64, 48), format: str = "JPEG", level: int = 128) -> bytes:
+    """A grey picture as a file."""
+    stream = io.BytesIO()
+    Image.new("RGB", size, (level, level, level)).save(stream, format)
+    return stream.getvalue()
+
+
+def bomb(side: int) -> bytes:
+    """A PNG of a few bytes that says that it is side x side pixels."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(b"\0" * 1000)) + chunk(b"IEND", b"")
+
+
+def post(
+    server: Dashboard, path: str, data: bytes, secure: bool = False, **headers: str | None
+) -> tuple[HTTPResponse, bytes]:
+    """The answer to a photograph, sent as the page does; headers that are None are left out."""
+    host = f"127.0.0.1:{server.server_port}"
+    given: dict[str, str | None] = {
+        "Origin": f"{server.scheme}://{host}", "X-Advsearch-Key": server.key, "Content-Length": str(len(data)),
+        **{name.replace("_", "-"): text for name, text in headers.items()},
+    }  # fmt: skip
+    context = ssl._create_unverified_context() if secure else None
+    made = HTTPSConnection(host, timeout=60, context=context) if secure else HTTPConnection(host, timeout=60)
+    with closing(made):
+        made.putrequest("POST", path)
+        for name, text in given.items():
+            if text is not None:
+                made.putheader(name, text)
+        made.endheaders()
+        made.send(data)
+        answer = made.getresponse()
+        return answer, answer.read()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_sweep(tmp_path_factory.mktemp("runs") / "first", keep="all")
+
+
+@pytest.fixture(scope="module")
+def taker() -> Photographs:
+    return Photographs()
+
+
+@pytest.fixture(scope="module")
+def server(run: Path, taker: Photographs) -> Iterator[Dashboard]:
+    with serving(run, photographs=taker) as started:
+        yield started
+
+
+PATH = "/runs/first/align/renderings/3"
+
+
+def kept(run: Path) -> int:
+    """How many photographs a run has."""
+    return len(list((run / "images/photos").glob("*"))) if (run / "images/photos").is_dir() else 0
+
+
+# ---- what is taken in -----------------------------------------------------------------------------------------------
+
+
+def test_a_photograph_is_cut_to_the_renderings_shape_and_says_nothing_else() -> None:
+    stream = io.BytesIO()
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0112] = "a phone", 6  # the maker; turned by a quarter
+    Image.new("RGB", (300, 100), (200, 0, 0)).save(stream, "JPEG", exif=exif)
+    with Image.open(io.BytesIO(sound_photo(stream.getvalue(), (40, 60)))) as image:
+        assert image.format == "JPEG"
+        assert image.size == (200, 300)
+        assert not image.getexif()
+        assert "exif" not in image.info
+    with Image.open(io.BytesIO(sound_photo(picture((3000, 2000), "WEBP"), (16, 16)))) as image:
+        assert image.size == (1024, 1024)
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        (b"", "expected a picture"),
+        (b"<svg/>", "expected a picture"),
+        (picture()[:100], "expected a picture"),
+        (picture(format="GIF"), "expected a picture"),
+        (bomb(8000), "at most 50,000,000 pixels, got 8000 x 8000"),
+        (bomb(12_000), "at most 50,000,000 pixels"),
+        (bomb(60_000), "at most 50,000,000 pixels"),
+        (bomb(100), "expected a picture"),
+        (bytes(LARGEST + 1), "at most 16 MB"),
+    ],
+)
+def test_what_is_no_photograph_is_refused(data: bytes, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        sound_photo(data, (16, 16))
+
+
+@pytest.mark.parametrize(
+    "name", ["..", "../run", "3/../../run.yaml", "%2e%2e", "99", "-1", "difference", "\0", "3\n", ""]
+)
+def test_a_rendering_is_found_by_its_own_name_only(run: Path, name: str) -> None:
+    with pytest.raises(InputError):
+        rendering_file(run, name)
+    with pytest.raises(InputError):
+        photo_file(run, name)
+
+
+def test_renderings_are_those_that_were_kept(run: Path, tmp_path: Path) -> None:
+    assert rendering_names(run) == tuple(map(str, range(24)))
+    assert rendering_names(make_sweep(tmp_path / "none")) == ()
+    attack = make_run(tmp_path / "attack")
+    assert rendering_names(attack) == ("adversarial", "clean", "verification-00", "verification-01")
+    (attack / "images/verification-02.png").symlink_to(run / "run.yaml")
+    assert "verification-02" not in rendering_names(attack)
+    with pytest.raises(InputError):
+        rendering_file(attack, "verification-02")
+
+
+# ---- judged and counted ---------------------------------------------------------------------------------------------
+
+
+def test_photographs_are_judged_by_the_runs_model_and_counted(tmp_path: Path, taker: Photographs) -> None:
+    run = make_sweep(tmp_path / "sweep", keep="all")
+    for name in ("0", "2", "2"):  # 2 is wrong in the rendering; the model calls a grey picture something else as well
+        table = taker.add(run, name, picture())
+    grey = table.renderings[0].labels[0]
+    assert grey != "mug"
+    assert (table.right_right, table.right_wrong, table.wrong_right, table.wrong_wrong) == (0, 1, 0, 2)
+    assert table.agreement == pytest.approx(2 / 3)
+    assert table.interval == clopper_pearson(2, 3)
+    one, two = table.renderings
+    assert (one.rendering, one.label, one.rendering_right, one.agreeing) == ("0", "mug", True, 0)
+    assert (two.rendering, two.label, two.rendering_right, two.photos, two.agreeing) == ("2", "cup", False, 2, 2)
+    assert two.interval == clopper_pearson(2, 2)
+    assert two.files == ["2-0001.jpg", "2-0002.jpg"]
+    assert all(photo_file(run, name).read_bytes()[:2] == b"\xff\xd8" for name in (*one.files, *two.files))
+    with Store(run / "results.sqlite", read_only=True) as store:
+        row = store.row("photo", 1)
+    assert row is not None
+    assert row.values["camera.elevation"]["value"] == 40.0  # the configuration that it should show
+    assert row.label == grey
+    assert photo_agreement(run) == table
+
+
+def test_what_the_model_says_of_a_photograph_of_a_rendering_is_what_it_says_of_the_rendering(
+    tmp_path: Path, taker: Photographs
+) -> None:
+    run = make_run(tmp_path / "attack")
+    noise = np.random.default_rng(0).random((128, 128, 3))
+    with RunDirectory.resume(run) as held:
+        held.save_image("adversarial", noise)
+    table = taker.add(run, "adversarial", (run / "images/adversarial.png").read_bytes())
+    assert table.renderings[0].labels == [table.renderings[0].label]
+    assert table.agreement == 1.0
+
+
+def test_a_run_at_work_takes_no_photographs(tmp_path: Path, taker: Photographs) -> None:
+    run = make_sweep(tmp_path / "going", keep="all", ended=False)
+    with RunDirectory.resume(run), pytest.raises(InputError, match="is working on this run"):
+        taker.add(run, "3", picture())
+    assert kept(run) == 0
+
+
+# ---- over the network -----------------------------------------------------------------------------------------------
+
+
+def test_a_page_takes_a_photograph(server: Dashboard, run: Path) -> None:
+    before = kept(run)
+    answer, data = post(server, PATH, picture())
+    assert answer.status == 200
+    assert "agree in" in json.loads(data)["table"]
+    assert kept(run) == before + 1
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({"X_Advsearch_Key": None}, 403),
+        ({"X_Advsearch_Key": "wrong"}, 403),
+        ({"X_Advsearch_Key": "\xe9"}, 403),
+        ({"Origin": None}, 403),
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Origin": "null"}, 403),
+        ({"Host": "evil.example"}, 403),
+        ({"Content_Length": None}, 411),
+        ({"Content_Length": "-5"}, 411),
+        ({"Content_Length": str(LARGEST + 1)}, 413),
+        ({"Content_Length": "9" * 15}, 413),
+    ],
+)
+def test_others_send_no_photograph(server: Dashboard, run: Path, headers: dict[str, str | None], status: int) -> None:
+    before = kept(run)
+    if "Host" in headers:
+        answer, data = ask_as(server, str(headers["Host"]))
+    else:
+        answer, data = post(server, PATH, b"" if status in (411, 413) else picture(), False, **headers)
+    assert answer.status == status
+    assert len(data) < 200
+    assert kept(run) == before
+
+
+def ask_as(server: Dashboard, host: str) -> tuple[HTTPResponse, bytes]:
+    """The answer to a photograph for another host's name."""
+    made = HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+    made.putrequest("POST", PATH, skip_host=True)
+    for name, text in (("Host", host), ("Origin", f"http://{host}"), ("X-Advsearch-Key", server.key)):
+        made.putheader(name, text)
+    made.endheaders()
+    answer = made.getresponse()
+    return answer, answer.read()
+
+
+@pytest.mark.parametrize(
+    ("data", "status"), [(b"no picture", 400), (bomb(60_000), 400), (b"", 400), (picture(format="GIF"), 400)]
+)
+def test_what_is_no_photograph_is_told(server: Dashboard, run: Path, data: bytes, status: int) -> None:
+    before = kept(run)
+    answer, text = post(server, PATH, data)
+    assert answer.status == status
+    assert b"photo: expected" in text
+    assert kept(run) == before
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/", "/runs/first/", "/runs/first/rows", "/runs/first/align/", "/runs/none/align/renderings/3",
+        "/runs/first/align/renderings/99", "/runs/first/align/renderings/..%2f..%2frun.yaml",
+        "/runs/first/align/renderings/..", "/runs/..%2f..%2fetc/align/renderings/3", "/runs/first/align/photos/x.jpg",
+    ],
+)  # fmt: skip
+def test_a_photograph_goes_nowhere_else(server: Dashboard, run: Path, path: str) -> None:
+    before = kept(run)
+    answer, data = post(server, path, picture())
+    assert answer.status == 404
+    assert len(data) < 200
+    assert kept(run) == before
+
+
+def test_renderings_and_photographs_are_shown(server: Dashboard, run: Path) -> None:
+    post(server, PATH, picture())
+    name = sorted((run / "images/photos").glob("*"))[0].name
+    for path, found in (("renderings/3", "images/rows/0000/3.jpg"), (f"photos/{name}", f"images/photos/{name}")):
+        made = HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+        made.request("GET", f"/runs/first/align/{path}")
+        assert made.getresponse().read() == (run / found).read_bytes()
+    made.request("GET", "/runs/first/align/")
+    page = made.getresponse().read().decode()
+    assert server.key in page
+    assert "Renderings of this run (24): 0, 1" in page
+
+
+def test_beyond_this_machine_it_is_https_with_a_token(run: Path, taker: Photographs) -> None:
+    with serving(run, host="0.0.0.0", photographs=taker) as server:
+        assert server.address.startswith("https://")
+        assert server.fingerprint is not None
+        assert post(server, PATH, picture(), secure=True)[0].status == 401
+        answer, _ = post(server, f"{PATH}?token={server.token}", picture(), secure=True)
+        assert answer.status == 200
+        assert "Secure" in answer.headers["Set-Cookie"]
+        with pytest.raises((ConnectionError, OSError, ssl.SSLError)):
+            post(server, PATH, picture())  # no HTTP beside it
+        assert post(server, f"{PATH}?token={server.token}", picture(), secure=True)[0].status == 200
+
+
+def test_https_is_there_on_this_machine_when_asked_for(run: Path) -> None:
+    with serving(run, https=True) as server:
+        assert server.address.startswith("https://127.0.0.1")
+        assert server.token is None
+        with socket.create_connection(("127.0.0.1", server.server_port)) as plain:
+            context = ssl._create_unverified_context()
+            with context.wrap_socket(plain) as talk:
+                data = talk.getpeercert(binary_form=True)
+        assert data is not None
+        assert hashlib.sha256(data).hexdigest() == str(server.fingerprint).replace(":", "").lower()
+
+
+def test_the_key_is_for_this_user_alone_and_does_not_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[int, int]] = []
+    original = ssl.SSLContext.load_cert_chain
+
+    def looked_at(self: ssl.SSLContext, certfile: Path, keyfile: Path) -> None:
+        seen.append((os.stat(keyfile).st_mode & 0o777, os.stat(keyfile.parent).st_mode & 0o777))
+        original(self, certfile, keyfile)
+
+    monkeypatch.setattr(ssl.SSLContext, "load_cert_chain", looked_at)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    certificate.https_context(["127.0.0.1", "localhost"])
+    assert seen == [(0o600, 0o700)]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_without_openssl_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(InputError, match="apt-get install openssl"):
+        Dashboard((), "0.0.0.0", 0)
+
+
+def test_any_address_is_told_as_one_that_others_reach() -> None:
+    assert certificate.reachable("192.0.2.7") == "192.0.2.7"
+    assert certificate.reachable("0.0.0.0") not in ("0.0.0.0", "")
+
+
+def test_the_page_shows_a_code_for_a_phone(run: Path, tmp_path: Path) -> None:
+    table = photo_agreement(make_sweep(tmp_path / "none"))
+    page = align_page("a", ("0",), table, "/runs/a/align/", "key", "https://192.0.2.7:1/?token=t")
+    assert "<svg" in page
+    assert "https://192.0.2.7:1/?token=t" in page
+    assert "<svg" not in align_page("a", ("0",), table, "/runs/a/align/", "key", None)
+    assert "keep_pictures=all" in align_page("a", (), table, "/runs/a/align/", "key", None)
+
+
+def test_show_prints_the_table(tmp_path: Path, taker: Photographs, capsys: pytest.CaptureFixture[str]) -> None:
+    run = make_sweep(tmp_path / "sweep", keep="all")
+    assert main(["show", str(run), "--json"]) == 0
+    assert "photos" not in json.loads(capsys.readouterr().out)
+    taker.add(run, "2", picture())
+    assert main(["show", str(run), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["photos"] == photo_agreement(run).to_dict()
+    assert main(["show", str(run)]) == 0
+    text = capsys.readouterr().out
+    assert "Renderings and reality agree in 1 of 1 photograph, 95 % interval" in text
+    assert "rendering wrong   0                  1" in text
