@@ -62,6 +62,10 @@ class EnvironmentSetupError(AdvsearchError):
     """A part of the machine is missing or unusable (no usable LLVM, say). The message holds the command to type."""
 
 
+class ClusterError(AdvsearchError):
+    """Workers that cannot be reached, or that cannot do what they are given."""
+
+
 def resembling(name: str, known: Iterable[str]) -> list[str]:
     """Return the known names that are like `name`, whatever their case, best first.
 

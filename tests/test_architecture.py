@@ -65,7 +65,7 @@ RULES = {
     "models": Rule(set(), {"torch", "numpy", "safetensors"}),
     "tasks": Rule({"models"}, {"torch"}),
     "attacks": Rule({"tasks"}, {"torch", "numpy", "scipy", "cma"}),
-    "cluster": Rule({"scene"}, {"yaml", "distributed", "dask"}),
+    "cluster": Rule({"scene", "settings"}, {"distributed", "dask"}),
     "engine": Rule(
         {"scene", "bundled", "controls", "models", "tasks", "attacks", "cluster", "runs", "report", "viewer", "config"}
         | {"settings"}
@@ -92,7 +92,7 @@ BROUGHT_ALONG = {"drjit": "mitsuba", "typing_extensions": "pydantic"}
 """Imported, but pinned by another package on purpose: Mitsuba works with exactly one version of Dr.Jit, and types of
 pydantic's classes are written with its own typing_extensions."""
 
-OPTIONAL = {"pyarrow": "parquet", "textual_image": "terminal"}
+OPTIONAL = {"pyarrow": "parquet", "textual_image": "terminal", "distributed": "dask", "dask": "dask"}
 """Packages that only an extra brings, and which: imported inside a function that says what to do where it is not."""
 
 

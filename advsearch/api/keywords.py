@@ -102,6 +102,8 @@ class SweepKeywords(PictureKeywords, total=False):
     specialise: bool
     aov: str | None
     surface: bool
+    workers: int | None
+    cluster: str | None
     trials: int
     verify_spp: int | None
     overwrite: bool

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from advsearch.api.attack import LOADING
 from advsearch.api.keywords import SweepKeywords, asks
+from advsearch.cluster.executor import Call, Executor, Work
+from advsearch.cluster.opening import executor_of
 from advsearch.config import SweepConfig
 from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.budget import verification_ladder
@@ -16,9 +19,11 @@ from advsearch.engine.naming import AnyModel, different, load_models, model_name
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.engine.sweeps.axes import read_axes
-from advsearch.engine.sweeps.job import Job, NamedScene, check_scenes
+from advsearch.engine.sweeps.batch import Batches
+from advsearch.engine.sweeps.job import Job, NamedScene, check_all, check_scenes
 from advsearch.engine.sweeps.loop import carry_out
 from advsearch.errors import InputError
+from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress
@@ -26,7 +31,7 @@ from advsearch.runs.directory import CONFIG, RunDirectory, check_free, is_run, r
 from advsearch.runs.listing import finished
 from advsearch.scene.mitsuba_backend.samplers import next_count
 from advsearch.scene.surfaces import aovs_of
-from advsearch.settings import split_names
+from advsearch.settings import FILES, split_names
 from advsearch.tasks import AnyTask, Task, make_task
 
 if TYPE_CHECKING:
@@ -95,11 +100,20 @@ def sweep(
     if config.surface and config.run is None:
         raise InputError("surface: expected `run` beside it, the folder that keeps the map; name one")
     progress = progress or NullProgress()
+    spread = config.workers is not None or config.cluster is not None
+    if spread and (loaded or not all(isinstance(one, (str, Path)) for one in networks)):
+        raise InputError(
+            "workers: expected names of objects and models beside it, which other processes can load, got ones that "
+            "are loaded; give their names or files"
+        )
     resumed = _stopped(config)
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
     job = _job(config, loaded or _places(config), several(networks), task, controls)
-    return _kept(config, job, progress, resumed) if config.run is not None else carry_out(job, None, progress)
+    if config.run is not None:
+        return _kept(config, job, progress, resumed)
+    with _executor(config, progress) as executor:
+        return carry_out(job, None, progress, executor)
 
 
 def sweep_from_config(
@@ -247,5 +261,22 @@ def _stopped(config: SweepConfig) -> Path | None:
 
 def _kept(config: SweepConfig, job: Job, progress: Progress, resumed: Path | None) -> SweepResult:
     """Sweep in a run directory: a new one, or one that was begun."""
-    with RunDirectory.of(config, resumed) as run:
-        return carry_out(job, run, progress)
+    with RunDirectory.of(config, resumed) as run, _executor(config, progress) as executor:
+        return carry_out(job, run, progress, executor)
+
+
+# ---- who does it ----------------------------------------------------------------------------------------------------
+
+
+def batches_of(settings: JsonObject) -> Call:
+    """Return what carries out batches of the sweep that the settings describe: what a worker does."""
+    job = job_of(SweepConfig(**settings))
+    points, _ = check_all(job)
+    return Batches(job, points.count)
+
+
+def _executor(config: SweepConfig, progress: Progress) -> AbstractContextManager[Executor | None]:
+    """What carries out the batches; None for this process."""
+    settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
+    work = Work("advsearch.api.sweep:batches_of", settings, FILES, config.used_threads or 1)
+    return executor_of(work, workers=config.workers, cluster=config.cluster, tell=progress.message)

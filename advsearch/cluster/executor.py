@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from advsearch.files import JsonObject
@@ -75,7 +75,7 @@ class Facts:
     busy: float = 0.0
     loading: float = 0.0
     alive: float = 0.0
-    machines: Mapping[str, Mapping[str, str]] | None = None
+    machines: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     link: str = ""
 
 

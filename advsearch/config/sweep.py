@@ -22,7 +22,7 @@ class SweepConfig(SceneConfig):
     """Everything that decides what `sweep` does: the average case over a grid, over random draws, or both."""
 
     command: ClassVar[str] = "sweep"
-    free: ClassVar[tuple[str, ...]] = (*SceneConfig.free, "surface")
+    free: ClassVar[tuple[str, ...]] = (*SceneConfig.free, "surface", "workers", "cluster")
     several: ClassVar[tuple[str, ...]] = ("object", "environment", "model")
     clashes: ClassVar[tuple[Clash, ...]] = (
         *SceneConfig.clashes,
@@ -117,6 +117,24 @@ class SweepConfig(SceneConfig):
     )
     verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", description="samples per pixel of these")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-sweep-NNN")
+    workers: int | None = setting(
+        None,
+        "run",
+        "processes that share the work, each on one thread unless `threads` says more",
+        otherwise="this one alone",
+        unit="processes",
+        ge=1,
+        le=100_000,
+    )
+    cluster: str | None = setting(
+        None,
+        "run",
+        "where these are",
+        "the address of a Dask scheduler, local, or a .yaml file",
+        metavar="PLACE",
+        otherwise="this machine, where there are `workers`",
+        min_length=1,
+    )
 
     @property
     def title(self) -> tuple[str, ...]:

@@ -5,12 +5,13 @@
 
 from __future__ import annotations
 
-from advsearch.settings.configuration import Config
+from advsearch.settings.configuration import FILES, Config
 from advsearch.settings.declaration import Clash, Setting, setting, setting_as_in, settings
 from advsearch.settings.values import all_finite, check_once, number_or_text, parse_assignment, split_names
 from advsearch.settings.yaml_files import HEADER, read_yaml
 
 __all__ = [
+    "FILES",
     "HEADER",
     "Clash",
     "Config",

@@ -5,8 +5,9 @@ A batch is its numbers: what comes of it depends on them and on the job alone, s
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,11 +17,14 @@ from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.swept_scene import SweptScene
 from advsearch.runs.results.attack import LinearTransport
 from advsearch.scene.description import OBJECT
-from advsearch.tasks import Judgement
+from advsearch.tasks import Answer, Judgement
 from advsearch.viewer import thumbnails
 
 KIND = "sweep"
 """Rows of the sweep, and the stream of their seeds."""
+
+LOST = "(no answer)"
+"""The answer to a picture that nobody could make; what the row keeps beside it says why."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +53,20 @@ class Batch:
     thumbnails: Mapping[int, bytes] = field(default_factory=dict)
     layers: Mapping[int, tuple[Mapping[str, Any], Mapping[str, str]]] = field(default_factory=dict)
 
+    @classmethod
+    def lost(cls, models: int, values: list[dict[str, Value]], why: str) -> Batch:
+        """Return what stands for a picture that nobody could make: an answer that is not right, and why."""
+        nothing = Judgement(math.nan, math.nan, right=False, answer=Answer(LOST, None, None), payload={"lost": why})
+        return cls(
+            judgements=[[nothing]] * models,
+            values=[values] * models,
+            shown=[[(False, 0)]] * models,
+            seconds=0.0,
+            light=[],
+            not_finite=False,
+            sizes=0,
+        )
+
 
 class Batches:
     """Carries out batches of a sweep in this process, and holds the scene of the last one.
@@ -56,11 +74,10 @@ class Batches:
     Args:
         job: what is swept.
         per_scene: pictures of a scene; the first of the next scene has the next number.
-        kept: whether there is a folder for pictures that are kept.
     """
 
-    def __init__(self, job: Job, per_scene: int, *, kept: bool) -> None:
-        self._job, self._per_scene, self._kept = job, per_scene, kept
+    def __init__(self, job: Job, per_scene: int) -> None:
+        self._job, self._per_scene = job, per_scene
         self._seeds = Seeds(job.pictures.seed, KIND)
         self.view: SweptScene | None = None
 
@@ -81,14 +98,13 @@ class Batches:
         seen = view.look(picks, [self._seeds(number) for number in numbers])
         seconds = (time.perf_counter() - begun) / (len(numbers) * len(self._job.models))
         pictures, layers = {}, {}
-        if self._kept:
-            for k, number in enumerate(numbers):
-                if self._is_kept(judged[k] for judged in seen.judgements):
-                    pictures[number] = thumbnails.thumbnail(seen.pictures[k])
-            if self._job.aovs:
-                for number, surfaces in zip(numbers, view.surfaces(picks), strict=True):
-                    channels = {name: one.numpy() for name, one in surfaces.layers(self._job.aovs, OBJECT).items()}
-                    layers[number] = channels, surfaces.notes(self._job.aovs)
+        for k, number in enumerate(numbers):
+            if self._is_kept(judged[k] for judged in seen.judgements):
+                pictures[number] = thumbnails.thumbnail(seen.pictures[k])
+        if self._job.aovs:
+            for number, surfaces in zip(numbers, view.surfaces(picks), strict=True):
+                channels = {name: one.numpy() for name, one in surfaces.layers(self._job.aovs, OBJECT).items()}
+                layers[number] = channels, surfaces.notes(self._job.aovs)
         return Batch(
             judgements=seen.judgements,
             values=seen.values,
@@ -101,7 +117,7 @@ class Batches:
             layers=layers,
         )
 
-    def _is_kept(self, seen: Any) -> bool:
+    def _is_kept(self, seen: Iterable[Judgement]) -> bool:
         """Whether the thumbnail of a picture of which the models say this is kept."""
         asked = self._job.keep_pictures
         return asked == "all" or (asked == "wrong" and not all(one.right for one in seen))

@@ -8,7 +8,7 @@ number, so that a sweep that was stopped, or whose batches come in another order
 
 from __future__ import annotations
 
-import math
+import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -21,7 +21,7 @@ from advsearch.engine.pictures import save_marked
 from advsearch.engine.record import Stages
 from advsearch.engine.rows import judgement_of, trial_row
 from advsearch.engine.sweeps.answer import SweepResult
-from advsearch.engine.sweeps.batch import KIND, Batch, Batches
+from advsearch.engine.sweeps.batch import KIND, LOST, Batch, Batches
 from advsearch.engine.sweeps.job import Job, check_all
 from advsearch.engine.sweeps.light import together
 from advsearch.engine.sweeps.points import Picks, Points
@@ -38,11 +38,21 @@ from advsearch.runs.files import write_bytes
 from advsearch.runs.images import write_layers
 from advsearch.runs.results.attack import DescribedValue, LinearTransport
 from advsearch.runs.results.base import Formation
-from advsearch.runs.results.sweep import SurfaceMap, SweepSummary, WorstClaim, WorstConfiguration, WorstVerified
+from advsearch.runs.results.sweep import (
+    SharedWork,
+    SurfaceMap,
+    SweepSummary,
+    WorstClaim,
+    WorstConfiguration,
+    WorstVerified,
+)
 from advsearch.scene.transport.renderer import SPP as BASIS_SPP
-from advsearch.tasks import Answer, Judgement
+from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 from advsearch.viewer.sweep_page import write_page
+
+MACHINES = "machines"
+"""The note under which the store keeps what the machines are that rows name."""
 
 NOT_FINITE = "pictures not finite"
 """The note under which the store keeps that there were some."""
@@ -81,12 +91,13 @@ class Sweep:
         self.samples = job.spp
         self._seeds = Seeds(job.pictures.seed, KIND)
         self._kept: list[store.Row] = []
-        self._batches = Batches(job, self.per_scene, kept=run is not None)
+        self._batches = Batches(job, self.per_scene)
         self._executor = InProcess(self._batches) if executor is None else executor
-        self._rendered = self._traced = self._predicted = 0
+        self._rendered = self._traced = self._predicted = self._lost = 0
         self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
+        self._machines: dict[str, dict[str, str]] = (run.store.noted(MACHINES) if run is not None else None) or {}
         self._not_finite = run is not None and run.store.note(NOT_FINITE) is not None
-        self._told, self._untold = 0.0, 0
+        self._told, self._untold, self._begun = 0.0, 0, 0.0
         self._surface: SurfaceMap | None = None
         objects, environments = (
             list(dict.fromkeys(getattr(place, name) for place in job.places)) for name in ("object", "environment")
@@ -138,6 +149,7 @@ class Sweep:
     def _go_through(self, left: Sequence[range], tally: Tally) -> Tally:
         """Have what is left carried out, store and count it; return the counts."""
         expected = left[0].start // self.models if left else 0
+        self._begun = time.monotonic()
         in_order = not left or (len(left) == 1 and left[0].stop == self.total)
         for done in self._executor.results(self._pieces(left)):
             in_order, expected = in_order and done.numbers.start >= expected, done.numbers.stop
@@ -191,22 +203,21 @@ class Sweep:
             self._not_finite = True
             if self.run is not None:
                 self.run.store.set_note(NOT_FINITE, "yes")
+        if done.machine is not None and done.machine not in self._machines:
+            self._meet(done.machine)
         self._tell(len(rows), tally)
+
+    def _meet(self, name: str) -> None:
+        """Keep what another machine is."""
+        facts = self._executor.facts
+        self._machines[name] = dict(facts.machines.get(name, {})) if facts is not None else {}
+        if self.run is not None:
+            self.run.store.set_note(MACHINES, json.dumps(self._machines))
 
     def _missed(self, done: Done) -> Batch:
         """What stands for a picture that nobody could make."""
         points, picks, _ = self._find(done.numbers.start * self.models)
-        values = points.values(points.configurations(picks), picks)
-        nothing = Judgement(math.nan, math.nan, right=False, answer=Answer(f"({done.lost})", None, None))
-        return Batch(
-            judgements=[[nothing]] * self.models,
-            values=[values] * self.models,
-            shown=[[(False, 0)]] * self.models,
-            seconds=0.0,
-            light=[],
-            not_finite=False,
-            sizes=0,
-        )
+        return Batch.lost(self.models, points.values(points.configurations(picks), picks), done.lost)
 
     def _pictures_text(self) -> str:
         """What the kept pictures take, said beforehand."""
@@ -239,7 +250,11 @@ class Sweep:
         self._untold += count
         now = time.monotonic()
         if now - self._told >= TELL_SECONDS:
-            self.stages.progress.advance(self._untold, accuracy=tally.correct / tally.seen)
+            facts, info = self._executor.facts, {"accuracy": tally.correct / tally.seen}
+            if facts is not None:
+                info |= {"workers": facts.workers, "a second": self._rendered / max(1e-9, now - self._begun)}
+                info |= {name: count for name in ("lost", "retried") if (count := getattr(facts, name))}
+            self.stages.progress.advance(self._untold, **info)
             self._told, self._untold = now, 0
 
     # ---- counting ---------------------------------------------------------------------------------------------------
@@ -247,7 +262,7 @@ class Sweep:
     def _counted(self) -> Tally:
         """Counts of the rows that are stored already, read one after the other."""
         tally = Tally(self._outer, self.job.axes, self._shown)
-        self._traced = self._predicted = 0
+        self._traced = self._predicted = self._lost = 0
         key, picks = (-1, -1), self.points.picks(0, 0)
         for row in self._kept if self.run is None else self.run.store.rows(KIND):
             number, model = divmod(row.step, self.models)
@@ -267,6 +282,7 @@ class Sweep:
             first = self._is_first_of_size(row.step % self.models)
             self._traced += int(first) if row.renders is None else row.renders
             self._predicted += row.seed is None and first
+            self._lost += row.label == LOST
 
     def _count(self, tally: Tally, scene: int, picks: Picks, k: int, model: int, trial: Judgement) -> None:
         tally.add((picks.number + k) * self.models + model, (*self._places[scene], model), picks, k, trial)
@@ -350,6 +366,7 @@ class Sweep:
             },
             transport=together([one for light in self._transport.values() for one in light]),
             surface=self._surface,
+            shared=SharedWork.of_facts(self._executor.facts, self._machines),
             renders_per_second=self._rendered / swept if self._rendered and swept else None,
             seconds={**seconds, "total": self.stages.total},
             seed=job.pictures.seed,
@@ -366,6 +383,17 @@ class Sweep:
     def _remarks(self, tally: Tally, checked: WorstVerified | None) -> list[str]:
         """What a reader has to know beside the numbers."""
         remarks = []
+        if self._lost:
+            which = [count(self._lost, "answer"), "there is none" if self._lost == 1 else "there are none"]
+            remarks.append(
+                f"{which[0]} of the model {which[1]}: every worker that took the picture died; counted as not right."
+            )
+        if self._machines:
+            told = "; ".join(", ".join(f"{key} {text}" for key, text in one.items()) for one in self._machines.values())
+            remarks.append(
+                "Rows come from machines that are not alike, so that their last bits may differ; beside the one that "
+                f"kept the run: {told}."
+            )
         if tally.not_finite:
             remarks.append(f"{tally.not_finite} answers of the model were not finite; they count as not right.")
         if self._not_finite:

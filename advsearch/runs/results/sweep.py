@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
@@ -115,6 +116,29 @@ class SurfaceMap(Fields):
     tables: list[SurfaceTable] = Field(description="for every object, model and kind of part")
 
 
+class SharedWork(Fields):
+    """How the workers did that shared the work, in this sitting."""
+
+    most: int = Field(description="workers that were ready at once, at most")
+    lost: int = Field(description="that went away")
+    refused: int = Field(description="that could not do it")
+    retried: int = Field(description="batches that were given out again")
+    batches: int = Field(description="batches that came back")
+    busy: Number = Field(description="seconds that workers were at batches")
+    loading: Number = Field(description="seconds that they loaded scenes and models")
+    alive: Number = Field(description="seconds that they were there and ready")
+    utilisation: Number | None = Field(description="`busy` over `alive`")
+    machines: dict[str, dict[str, str]] = Field(description="what rows call by a name, where machines are not alike")
+
+    @classmethod
+    def of_facts(cls, facts: Any, machines: Mapping[str, Mapping[str, str]]) -> SharedWork | None:
+        """Return the fields from what an executor says; None where it says nothing."""
+        if facts is None:
+            return None
+        share = min(1.0, facts.busy / facts.alive) if facts.alive else None
+        return cls.model_validate({**vars(facts), "utilisation": share, "machines": machines})
+
+
 class SweepSummary(CountedAnswers, RunResult):
     """How often the model is right over configurations that were not searched for."""
 
@@ -146,6 +170,9 @@ class SweepSummary(CountedAnswers, RunResult):
     surface: SurfaceMap | None = Field(
         default=None,
         description="which parts of the [surface](#the-surface), when seen, go with wrong answers; absent unless asked",
+    )
+    shared: SharedWork | None = Field(
+        default=None, description="how [workers](cluster.md) did that shared the work; absent without"
     )
     renders_per_second: float | None = Field(description="pictures of the sweep; null where nothing was rendered now")
     warnings: list[str] = Field(description="sentences that a reader has to know")

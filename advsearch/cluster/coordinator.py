@@ -1,0 +1,327 @@
+"""Gives ranges to workers and takes what comes of them, whatever happens to the workers.
+
+Every range is pinned to one worker, which has `DEPTH` of them at most. A range whose worker died is given to another,
+from then on as the only one that a worker has, so that it is known what it died of: after `DEATHS` such deaths the
+range is cut in halves, and a single number that has as many is given up in words. A worker that takes far longer than
+the median counts as dead. Answers that come later than that change nothing: their tickets are not known any more.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+
+from advsearch.cluster.executor import Done, Facts, Work
+from advsearch.cluster.inputs import Files
+from advsearch.cluster.machine import Machine, name_of
+from advsearch.cluster.pool import Answer, Disconnected, Dropped, Event, Joined, Left, Pool
+from advsearch.cluster.worker import Carried, Failure, Ready, carry_out, prepare
+from advsearch.errors import ClusterError
+
+DEPTH = 2
+"""Ranges that a worker has at once: the one it is at, and the next, so that it never waits for the network."""
+
+DEATHS = 3
+"""Workers that may die of a range before it is cut in halves or given up."""
+
+LOADS = 5
+"""Times that as many workers as there are may die while they get ready, and none gets ready, before all is given up."""
+
+SLOW, LEAST_DEADLINE, FIRST_DEADLINE = 10.0, 60.0, 900.0
+"""Times the median that a range may take, least seconds of that, and seconds before there is a median."""
+
+MEDIAN_OF = 101
+"""Ranges, the last ones, of which the median is taken."""
+
+ENOUGH = 5
+"""Ranges that a median takes."""
+
+PATIENCE, LESS_PATIENCE = 300.0, 15.0
+"""Seconds without any worker after which there is no hope; where those that are there are refused, fewer."""
+
+POLL = 0.5
+"""Seconds between two looks at the clock where nothing happens."""
+
+
+@dataclass(eq=False)
+class _Range:
+    numbers: range
+    alone: bool = False
+    deaths: int = 0
+
+
+@dataclass(eq=False)
+class _Worker:
+    address: str
+    ready: bool = False
+    machine: str | None = None
+    tickets: list[int] = field(default_factory=list)
+    since: float = 0.0
+
+
+class Coordinator:
+    """An `Executor` over a pool of workers.
+
+    Args:
+        pool: the workers.
+        work: what ranges are of.
+        key: of the work, by its content.
+        files: that it needs.
+        version: of advsearch.
+        machine: this one, where rows of its kind need no mark.
+        tell: told what a person should read.
+        clock: seconds, growing.
+    """
+
+    def __init__(
+        self,
+        pool: Pool,
+        work: Work,
+        key: str,
+        files: Files,
+        version: str,
+        machine: Machine,
+        tell: Callable[[str], None] = lambda text: None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.facts = Facts(link=pool.link)
+        self._pool, self._key, self._tell, self._clock = pool, key, tell, clock
+        self._work, self._files, self._version = work, files, version
+        self._here = name_of(machine)
+        self._machines: dict[str, Machine] = {}
+        self._workers: dict[str, _Worker] = {}
+        self._refused: dict[str, str] = {}
+        self._tickets: dict[int, tuple[_Worker, _Range | None]] = {}
+        self._next_ticket = 0
+        self._todo: deque[_Range] = deque()
+        self._free: deque[_Worker] = deque()
+        self._per_number: deque[float] = deque(maxlen=MEDIAN_OF)
+        self._load_deaths = self._seen = 0
+        self._counted_at = self._alone_since = self._looked_at = clock()
+
+    def results(self, ranges: Iterable[range]) -> Iterator[Done]:
+        """See `Executor.results`.
+
+        Raises:
+            ClusterError: nobody can carry them out, or the scheduler has gone.
+        """
+        source = iter(ranges)
+        while True:
+            self._give_out(source)
+            if not self._todo and not any(one for _, one in self._tickets.values()):
+                return
+            for event in self._pool.events(POLL):
+                yield from self._happened(event)
+            self._count_time()
+            yield from self._look_at_clock()
+
+    # ---- giving out -------------------------------------------------------------------------------------------------
+
+    def _give_out(self, source: Iterator[range]) -> None:
+        while self._free:
+            worker = self._free[0]
+            if not self._is_there(worker):
+                self._free.popleft()
+                continue
+            one = self._todo.popleft() if self._todo else next((_Range(numbers) for numbers in source), None)
+            if one is None:
+                return
+            if one.alone:
+                idle = next((free for free in self._free if not free.tickets and self._is_there(free)), None)
+                if idle is None:  # soon
+                    self._todo.appendleft(one)
+                    return
+                worker = idle
+                self._free = deque(free for free in self._free if free is not worker)
+            else:
+                self._free.popleft()
+            self._submit(worker, one)
+        if not self._todo and not self._workers:  # nobody is there: is there anything to do?
+            numbers = next(source, None)
+            if numbers is not None:
+                self._todo.append(_Range(numbers))
+
+    def _is_there(self, worker: _Worker) -> bool:
+        return self._workers.get(worker.address) is worker
+
+    def _submit(self, worker: _Worker, one: _Range | None, *, send: bool = False) -> None:
+        """Give a worker a range, or have it get ready; `send` it the files then, which it may have already."""
+        ticket, self._next_ticket = self._next_ticket, self._next_ticket + 1
+        if not worker.tickets:
+            worker.since = self._clock()
+        worker.tickets.append(ticket)
+        self._tickets[ticket] = worker, one
+        if one is None:
+            files = self._files if send else self._files.named_only
+            self._pool.submit(ticket, worker.address, prepare, self._key, self._work, files, self._version)
+        else:
+            self._pool.submit(ticket, worker.address, carry_out, self._key, one.numbers.start, one.numbers.stop)
+
+    # ---- what happens -----------------------------------------------------------------------------------------------
+
+    def _happened(self, event: Event) -> Iterator[Done]:
+        if isinstance(event, Joined):
+            if event.worker not in self._workers and event.worker not in self._refused:
+                self._workers[event.worker] = worker = _Worker(event.worker)
+                self._seen = max(self._seen, len(self._workers))
+                self._submit(worker, None)
+        elif isinstance(event, Left):
+            self._refused.pop(event.worker, None)
+            yield from self._gone(event.worker, died=not event.told)
+        elif isinstance(event, Dropped):
+            found = self._tickets.get(event.ticket)
+            if found is not None:
+                yield from self._gone(found[0].address, died=True)
+        elif isinstance(event, Answer):
+            yield from self._answered(event)
+        elif isinstance(event, Disconnected):
+            self._tell(f"{self._pool.where}: the scheduler has gone; what was under way will be done again")
+            for address in list(self._workers):
+                yield from self._gone(address, died=False)
+            self._refused.clear()
+            self._pool.reconnect()
+            self.facts.link = self._pool.link
+            self._alone_since = self._clock()
+
+    def _answered(self, event: Answer) -> Iterator[Done]:
+        worker, one = self._tickets.pop(event.ticket, (None, None))
+        if worker is None:
+            return  # late
+        worker.tickets.remove(event.ticket)
+        worker.since = self._clock()
+        value = event.value
+        if isinstance(value, Ready):
+            self._is_ready(worker, value)
+        elif isinstance(value, Carried) and one is not None:
+            self.facts.batches += 1
+            self.facts.busy += value.seconds
+            self._per_number.append(value.seconds / max(1, len(one.numbers)))
+            self._free.extend([worker] * (DEPTH if one.alone else 1))
+            yield Done(one.numbers, value.value, worker.address, worker.machine)
+        elif isinstance(value, Failure):
+            if one is not None and (value.unfit or value.forgotten):
+                self._todo.appendleft(one)
+            if value.forgotten:
+                self._workers[worker.address] = again = _Worker(worker.address)
+                self._requeue(worker)
+                self._submit(again, None)
+            elif value.missing:
+                self._submit(worker, None, send=True)
+            elif value.unfit:
+                self._refuse(worker, value.text)
+            elif value.trace:
+                raise RuntimeError(f"on {worker.address}:\n{value.trace}")
+            else:
+                raise ClusterError(value.text)
+
+    def _is_ready(self, worker: _Worker, value: Ready) -> None:
+        name = name_of(value.machine)
+        if name != self._here:
+            worker.machine = name
+            if name not in self._machines:
+                self._machines[name] = value.machine
+                self.facts.machines = dict(self._machines)
+                told = ", ".join(f"{key} {text}" for key, text in value.machine.items())
+                self._tell(f"{worker.address} is another machine than this ({told}): last bits of rows may differ")
+        self._count_time()
+        self._load_deaths = 0
+        self.facts.loading += value.seconds
+        worker.ready = True
+        self.facts.workers += 1
+        self.facts.most = max(self.facts.most, self.facts.workers)
+        self._free.extend([worker] * DEPTH)
+
+    def _refuse(self, worker: _Worker, text: str) -> None:
+        """Give a worker nothing more."""
+        self.facts.refused += 1
+        self._refused[worker.address] = text
+        self._tell(f"{worker.address} is given nothing: {text}")
+        self._forget(worker)
+        self._requeue(worker)
+
+    def _gone(self, address: str, *, died: bool) -> Iterator[Done]:
+        """Take back what a worker had; what it was at when it died is suspected."""
+        worker = self._workers.get(address)
+        if worker is None:
+            return
+        self._forget(worker)
+        head = self._tickets.get(worker.tickets[0]) if worker.tickets else None
+        if died:
+            self.facts.lost += 1
+        if died and head is not None and not worker.ready:
+            self._load_deaths += 1
+            if self._load_deaths >= LOADS * max(2, self._seen) and not self.facts.workers:
+                self._give_up(f"{self._load_deaths} workers died while they loaded the scene and the model")
+        suspects = [one for ticket in worker.tickets if (one := self._tickets[ticket][1])] if died else []
+        self._requeue(worker)
+        for one in suspects:
+            one.alone = True
+        if len(suspects) != 1:
+            return
+        (suspect,) = suspects
+        suspect.deaths += 1
+        if suspect.deaths < DEATHS:
+            return
+        self._todo.remove(suspect)
+        numbers = suspect.numbers
+        if len(numbers) > 1:
+            half = numbers.start + len(numbers) // 2
+            self._todo.appendleft(_Range(range(half, numbers.stop), alone=True))
+            self._todo.appendleft(_Range(range(numbers.start, half), alone=True))
+        else:
+            yield Done(numbers, None, address, lost=f"no answer: {suspect.deaths} workers died of it")
+
+    def _forget(self, worker: _Worker) -> None:
+        self._count_time()
+        self._workers.pop(worker.address, None)
+        self.facts.workers -= worker.ready
+        if not self._workers:
+            self._alone_since = self._clock()
+
+    def _requeue(self, worker: _Worker) -> None:
+        """Put what a worker had back in front, in its order."""
+        for ticket in reversed(worker.tickets):
+            _, one = self._tickets.pop(ticket, (None, None))
+            self._pool.forget(ticket)
+            if one is not None:
+                self.facts.retried += 1
+                self._todo.appendleft(one)
+        worker.tickets.clear()
+
+    # ---- the clock --------------------------------------------------------------------------------------------------
+
+    def _count_time(self) -> None:
+        now = self._clock()
+        self.facts.alive += self.facts.workers * (now - self._counted_at)
+        self._counted_at = now
+
+    def _look_at_clock(self) -> Iterator[Done]:
+        now = self._clock()
+        if now - self._looked_at < POLL:
+            return
+        self._looked_at = now
+        median = statistics.median(self._per_number) if len(self._per_number) >= ENOUGH else None
+        for worker in list(self._workers.values()):
+            if not worker.tickets:
+                continue
+            one = self._tickets[worker.tickets[0]][1]
+            deadline = FIRST_DEADLINE
+            if one is not None and median is not None:
+                deadline = max(LEAST_DEADLINE, SLOW * median * len(one.numbers))
+            if now - worker.since > deadline:
+                self._tell(f"{worker.address} has not answered for {now - worker.since:.0f} s, so it is ended")
+                self._pool.restart(worker.address)
+                yield from self._gone(worker.address, died=True)
+        patience = LESS_PATIENCE if self._refused else PATIENCE
+        if not self._workers and now - self._alone_since > patience:
+            self._give_up(f"there was no worker that can do it for {patience:.0f} s")
+
+    def _give_up(self, text: str) -> None:
+        reasons = "; ".join(dict.fromkeys(self._refused.values()))
+        raise ClusterError(
+            f"{self._pool.where}: {text}" + (f" ({reasons})" if reasons and reasons != text else "") + "; what was "
+            "stored is kept, so that the run can go on with advsearch resume"
+        )

@@ -1,0 +1,318 @@
+"""A pool of Dask's workers: of processes on this machine, of a scheduler that runs, or of a cluster that is started.
+
+Dask carries calls and answers, and starts and watches processes; who does what is decided in `coordinator`. All of it
+runs in an event loop of its own, in a thread. Nothing is kept on the cluster: an answer is fetched and let go.
+
+What is relied on (https://distributed.dask.org): the scheduler tells the topic "all" of each worker that it adds and
+removes; a call that is pinned to a worker runs nowhere else; a nanny starts a worker that died again, at another
+address; processes are spawned, and end with their parent.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any
+
+from advsearch.cluster.pool import Answer, Disconnected, Dropped, Event, Joined, Left
+from advsearch.errors import ClusterError
+
+CONNECT, RECONNECT = 30.0, 120.0
+"""Seconds to find a scheduler at first, and to find it again when it has gone."""
+
+LOOK = 0.5
+"""Seconds between two looks at whether the scheduler is there."""
+
+RESYNC = 10.0
+"""Seconds between two looks at who is there: an event may get lost."""
+
+RESTART = 20.0
+"""Seconds that a worker may take to end."""
+
+SILENT = logging.CRITICAL + 1
+"""Level of Dask's log: what matters of it is said in a user's words, and a worker that dies is no error here."""
+
+CONFIG = {
+    "distributed.worker.multiprocessing-method": "spawn",  # a fork would share what Mitsuba and torch hold
+    "distributed.scheduler.allowed-failures": 1_000_000,  # who died of what is counted by the coordinator
+    "distributed.admin.large-graph-warning-threshold": "2GiB",  # files of a scene are sent once a worker
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.system-monitor.gil.enabled": False,
+}
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where workers are.
+
+    Attributes:
+        where: in a user's words.
+        address: of a scheduler that runs; empty where a cluster is started.
+        start: makes the cluster; takes keywords of Dask's classes.
+        security: keywords of Dask's `Security`.
+        count: workers to ask a cluster for; None leaves it as it starts.
+    """
+
+    where: str
+    address: str = ""
+    start: Callable[..., Any] | None = None
+    security: Mapping[str, Any] | None = None
+    count: int | None = None
+
+
+def local(workers: int) -> Place:
+    """Return the place of so many processes on this machine, which nobody else can reach."""
+
+    def start(**more: Any) -> Any:
+        import distributed
+
+        make: Any = distributed.LocalCluster
+        return make(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address="127.0.0.1:0",
+            memory_limit=0,
+            silence_logs=SILENT,
+            env={"OMP_NUM_THREADS": "1"},
+            **more,
+        )
+
+    return Place(f"{workers} workers on this machine", start=start)
+
+
+class DaskPool:
+    """See `pool.Pool`. Close it.
+
+    Args:
+        place: where the workers are.
+
+    Raises:
+        ClusterError: there is no scheduler, or it could not be started.
+    """
+
+    def __init__(self, place: Place) -> None:
+        self.where, self.link = place.where, ""
+        self._place = place
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+        self._calls: dict[int, asyncio.Task[None]] = {}
+        self._known: set[str] = set()
+        self._client: Any = None
+        self._cluster: Any = None
+        self._watch: asyncio.Task[None] | None = None
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="cluster", daemon=True)
+        self._thread.start()
+        try:
+            self._done(self._open(CONNECT))
+        except BaseException:
+            self.close()
+            raise
+
+    # ---- what the coordinator calls ---------------------------------------------------------------------------------
+
+    def submit(self, ticket: int, worker: str, function: Callable[..., Any], *args: Any) -> None:
+        """See `Pool.submit`."""
+
+        def begin() -> None:
+            self._calls[ticket] = self._loop.create_task(self._call(ticket, worker, function, args))
+
+        self._loop.call_soon_threadsafe(begin)
+
+    def forget(self, ticket: int) -> None:
+        """See `Pool.forget`."""
+
+        def cancel() -> None:
+            if (call := self._calls.pop(ticket, None)) is not None:
+                call.cancel()
+
+        self._loop.call_soon_threadsafe(cancel)
+
+    def restart(self, worker: str) -> None:
+        """See `Pool.restart`; a worker without a nanny is only told to close."""
+        self._begin(self._restart(worker))
+
+    def events(self, seconds: float) -> list[Event]:
+        """See `Pool.events`."""
+        found: list[Event] = []
+        try:
+            found.append(self._events.get(timeout=seconds))
+            while True:
+                found.append(self._events.get_nowait())
+        except queue.Empty:
+            return found
+
+    def reconnect(self) -> None:
+        """See `Pool.reconnect`."""
+        self._done(self._leave())
+        self._done(self._open(RECONNECT))
+
+    def close(self) -> None:
+        """See `Pool.close`."""
+        if self._loop.is_closed():
+            return
+        try:
+            self._done(self._leave(), RESTART)
+        except Exception:  # it was going anyway
+            pass
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join(RESTART)
+        if not self._thread.is_alive():
+            self._loop.close()
+
+    # ---- in the loop ------------------------------------------------------------------------------------------------
+
+    def _begin(self, work: Any) -> Future[Any]:
+        return asyncio.run_coroutine_threadsafe(work, self._loop)
+
+    def _done(self, work: Any, seconds: float | None = None) -> Any:
+        return self._begin(work).result(seconds)
+
+    async def _open(self, seconds: float) -> None:
+        import dask
+        import distributed
+
+        made: Any = distributed
+        security = made.Security(**self._place.security) if self._place.security else None
+        deadline = time.monotonic() + seconds
+        dask.config.set(CONFIG)
+        logging.getLogger("distributed").setLevel(SILENT)
+        while True:
+            try:
+                if self._place.start is not None and self._cluster is None:
+                    named = {} if security is None else {"security": security}
+                    self._cluster = await self._place.start(asynchronous=True, **named)
+                    if self._place.count is not None:
+                        self._cluster.scale(self._place.count)
+                self._client = await made.Client(
+                    self._cluster or self._place.address,
+                    asynchronous=True,
+                    security=security,
+                    timeout=max(1.0, min(CONNECT, deadline - time.monotonic())),
+                    set_as_default=False,
+                )
+                break
+            except (OSError, TimeoutError, asyncio.TimeoutError, RuntimeError, ValueError) as error:
+                if time.monotonic() >= deadline:
+                    raise ClusterError(
+                        f"{self.where}: there is no scheduler that answers ({error or type(error).__name__}); start "
+                        "one with dask scheduler, check address and certificates, and go on with advsearch resume"
+                    ) from error
+                await asyncio.sleep(LOOK)
+        self.link = self._dashboard()
+        self._known = set()
+        self._client.subscribe_topic("all", self._told)
+        await self._look_around()
+        self._watch = self._loop.create_task(self._watching(self._client))
+
+    async def _leave(self) -> None:
+        """Let go of calls, client and cluster."""
+        for call in (self._watch, *self._calls.values()):
+            if call is not None:
+                call.cancel()
+        self._calls.clear()
+        self._watch = None
+        client, cluster, self._client, self._cluster = self._client, self._cluster, None, None
+        if client is not None and client.status == "running":
+            client.unsubscribe_topic("all")  # or the scheduler tells it of its own leaving
+        for one in (client, cluster):
+            if one is not None:
+                try:
+                    await asyncio.wait_for(one.close(), RESTART)
+                except Exception:  # its other end is not there any more
+                    logging.getLogger(__name__).debug("closing %r failed", one, exc_info=True)
+
+    def _dashboard(self) -> str:
+        drawn = importlib.util.find_spec("bokeh") is not None  # what Dask draws its pages with
+        return str(self._client.dashboard_link or "") if drawn else ""
+
+    async def _call(self, ticket: int, worker: str, function: Callable[..., Any], args: tuple[Any, ...]) -> None:
+        from distributed import KilledWorker
+
+        client = self._client
+        future = client.submit(
+            function, *args, workers=[worker], allow_other_workers=False, pure=False, retries=0, priority=-ticket
+        )
+        try:
+            event: Event = Answer(ticket, await future)
+        except asyncio.CancelledError:
+            if client.status == "running":  # else all workers are gone, which `_watching` says
+                future.release()
+            return
+        except KilledWorker as error:
+            event = Dropped(ticket, str(error))
+        except Exception as error:
+            if client.status != "running":
+                return
+            event = Answer(ticket, _failure(error))
+        finally:
+            self._calls.pop(ticket, None)
+        future.release()
+        self._events.put(event)
+
+    async def _restart(self, worker: str) -> None:
+        client = self._client
+        try:
+            await asyncio.wait_for(
+                client.restart_workers([worker], timeout=RESTART, raise_for_error=False), RESTART + LOOK
+            )
+        except Exception:  # it has no nanny, or that does not answer either
+            try:
+                await asyncio.wait_for(client.retire_workers([worker], close_workers=True), RESTART)
+            except Exception:
+                logging.getLogger(__name__).debug("%s could not be ended", worker, exc_info=True)
+
+    def _told(self, event: tuple[float, Any]) -> None:
+        """The scheduler tells of a worker."""
+        _, message = event
+        action = message.get("action") if isinstance(message, Mapping) else None
+        if action == "add-worker":
+            self._there(message["worker"])
+        elif action == "remove-worker":
+            self._known.discard(message["worker"])
+            self._events.put(Left(message["worker"], told=bool(message.get("expected"))))
+
+    def _there(self, worker: str) -> None:
+        if worker not in self._known:
+            self._known.add(worker)
+            self._events.put(Joined(worker))
+
+    async def _look_around(self) -> None:
+        info = await self._client.scheduler.identity(n_workers=-1)
+        there = set(info["workers"])
+        for worker in self._known - there:
+            self._events.put(Left(worker))
+        self._known &= there
+        for worker in there:
+            self._there(worker)
+
+    async def _watching(self, client: Any) -> None:
+        looked = time.monotonic()
+        while client.status == "running":
+            await asyncio.sleep(LOOK)
+            if time.monotonic() - looked > RESYNC:
+                looked = time.monotonic()
+                try:
+                    await asyncio.wait_for(self._look_around(), RESYNC)
+                except Exception:
+                    if client.status == "running":
+                        continue  # slow; the next look will tell
+        self._events.put(Disconnected())
+
+
+def _failure(error: Exception) -> Any:
+    """What a call that raised comes to: nothing of ours does, so the worker could not even begin."""
+    from advsearch.cluster.worker import Failure
+
+    text = f"{type(error).__name__}: {error}"
+    if isinstance(error, (ImportError, AttributeError)):
+        return Failure(f"it cannot begin ({text}); install the same advsearch there", unfit=True)
+    return Failure(text, trace=text)

@@ -1,0 +1,158 @@
+"""From what a user says (`workers`, `cluster`) to an executor."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from advsearch import threads
+from advsearch.cluster.coordinator import Coordinator
+from advsearch.cluster.dask_pool import DaskPool, Place, local
+from advsearch.cluster.executor import Executor, Work
+from advsearch.cluster.inputs import Files, gathered
+from advsearch.cluster.machine import this_machine, version
+from advsearch.errors import FileFormatError, InputError
+from advsearch.settings import read_yaml
+
+LOCAL = "local"
+"""The cluster of this machine's own processes."""
+
+SCHEMES = ("tcp://", "tls://", "ws://", "wss://")
+
+CLASSES = {
+    **dict.fromkeys(
+        ("SLURMCluster", "PBSCluster", "LSFCluster", "SGECluster", "MoabCluster", "OARCluster", "HTCondorCluster"),
+        "dask_jobqueue",
+    ),
+    "KubeCluster": "dask_kubernetes.operator",
+}
+"""Classes of clusters that a file may name, and where each is; anything else would be code that the file runs."""
+
+
+@contextmanager
+def executor_of(
+    work: Work, *, workers: int | None, cluster: str | None, tell: Callable[[str], None]
+) -> Iterator[Executor | None]:
+    """Open an executor of a work for the block; None where everything is done in this process.
+
+    Args:
+        work: what is to be done.
+        workers: how many processes.
+        cluster: a scheduler's address, "local", or a YAML file.
+        tell: told what a person should read.
+
+    Raises:
+        InputError: they make no sense, or Dask is not installed.
+        ClusterError: there is no scheduler.
+    """
+    if workers is None and cluster is None:
+        yield None
+        return
+    check_installed()
+    files = gathered(work)
+    place = place_of(workers, cluster)
+    pool = DaskPool(place)
+    try:
+        if pool.link:
+            tell(f"Dask shows its workers at {pool.link}")
+        yield Coordinator(pool, work, key_of(work, files), files, version(), this_machine(), tell)
+    finally:
+        pool.close()
+
+
+def check_installed() -> None:
+    """Check that Dask is there.
+
+    Raises:
+        InputError: it is not; the message says what to type.
+    """
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise InputError("workers: needs Dask; pip install 'advsearch[dask]', or leave `workers` out") from None
+
+
+def key_of(work: Work, files: Files) -> str:
+    """Return a name of a work by its content."""
+    said = [work.function, work.settings, work.threads, sorted(files.named.items())]
+    return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def place_of(workers: int | None, cluster: str | None) -> Place:
+    """Return where the workers are.
+
+    Args:
+        workers: how many processes; None for one a core, or as many as there are.
+        cluster: a scheduler's address, "local", or a YAML file; None for this machine.
+
+    Raises:
+        InputError: no such form, or a number of workers beside a scheduler that runs.
+        FileFormatError: the file is missing or says something else.
+    """
+    if cluster is None or cluster == LOCAL:
+        return local(workers or threads.cores())
+    if cluster.startswith(SCHEMES):
+        if workers is not None:
+            raise InputError("workers: the scheduler of `cluster` says how many there are; leave one of the two out")
+        return Place(cluster, address=cluster)
+    path = Path(cluster)
+    if path.suffix not in (".yaml", ".yml"):
+        raise InputError(
+            f"cluster: expected the address of a scheduler such as tcp://10.0.0.1:8786, local, or a .yaml file, got "
+            f"{cluster!r}"
+        )
+    return _from_file(path, workers)
+
+
+def _from_file(path: Path, workers: int | None) -> Place:
+    said = read_yaml(path)
+    unknown = sorted(set(said) - {"address", "class", "arguments", "workers", "security"})
+    if unknown or ("address" in said) == ("class" in said):
+        got = f"got {', '.join(map(str, unknown))}" if unknown else "got both or neither"
+        raise FileFormatError(
+            f"{path}: expected either address, or class with arguments and workers; beside it security; {got}"
+        )
+    security, arguments = (_mapping(path, said, name) for name in ("security", "arguments"))
+    for name in ("tls_ca_file", "tls_client_cert", "tls_client_key", "tls_scheduler_cert", "tls_scheduler_key"):
+        if isinstance(security.get(name), str):
+            security[name] = str(path.parent / security[name])
+    count = workers if workers is not None else said.get("workers")
+    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
+        raise FileFormatError(f"{path}: workers: expected a whole number of at least 1, got {count!r}")
+    if "address" in said:
+        if not str(said["address"]).startswith(SCHEMES):
+            raise FileFormatError(f"{path}: address: expected tcp://HOST:PORT or tls://HOST:PORT")
+        if count is not None:
+            raise InputError("workers: the scheduler of `cluster` says how many there are; leave one of the two out")
+        return Place(str(said["address"]), address=str(said["address"]), security=security or None)
+    name = str(said["class"])
+    if name not in CLASSES:
+        raise FileFormatError(f"{path}: class: expected one of {', '.join(CLASSES)}, got {name!r}")
+    return Place(name, start=_starter(name, arguments), security=security or None, count=count or 1)
+
+
+def _mapping(path: Path, said: Mapping[str, Any], name: str) -> dict[str, Any]:
+    given = said.get(name) or {}
+    if not isinstance(given, dict) or not all(isinstance(key, str) for key in given):
+        raise FileFormatError(f"{path}: {name}: expected names and values, got {given!r}")
+    return dict(given)
+
+
+def _starter(name: str, arguments: Mapping[str, Any]) -> Callable[..., Any]:
+    """What starts a cluster of a class.
+
+    Raises:
+        InputError: its package is not installed.
+    """
+    module = CLASSES[name]
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except ImportError:
+        package = module.partition(".")[0].replace("_", "-")
+        raise InputError(f"cluster: {name} needs {package}; pip install {package}") from None
+    return lambda **more: found(**{**arguments, **more})

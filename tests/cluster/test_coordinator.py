@@ -1,0 +1,208 @@
+"""Every range comes back once, whatever becomes of the workers. The workers are simulated, and so is the time."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterator
+
+import pytest
+from simulated_cluster import Failure, Simulated, coordinator
+
+from advsearch.cluster.coordinator import DEPTH, PATIENCE
+from advsearch.cluster.executor import Done
+from advsearch.cluster.worker import Ready
+from advsearch.errors import ClusterError
+
+COUNT, SIZE = 400, 16
+
+
+def ranges(count: int = COUNT) -> Iterator[range]:
+    return (range(first, min(first + SIZE, count)) for first in range(0, count, SIZE))
+
+
+def carried(pool: Simulated, count: int = COUNT, tell: Callable[[str], None] = lambda text: None) -> list[Done]:
+    """What comes back, checked: each number once, and as it should be."""
+    found = list(coordinator(pool, tell).results(ranges(count)))
+    numbers = [number for done in found for number in done.numbers]
+    assert sorted(numbers) == list(range(count)), "none is lost, and none comes twice"
+    assert all(done.value == list(done.numbers) for done in found if not done.lost)
+    return found
+
+
+def test_ranges_are_shared_and_few_are_under_way() -> None:
+    pool = Simulated()
+    pool.add(4)
+    taken: list[range] = []
+
+    def source() -> Iterator[range]:
+        for one in ranges(20_000):
+            taken.append(one)
+            yield one
+
+    shared = coordinator(pool)
+    for count, done in enumerate(shared.results(source()), 1):
+        assert len(taken) - count <= 4 * DEPTH and done.numbers in taken
+    assert pool.most <= 4 * DEPTH
+    facts = shared.facts
+    assert facts.most == facts.workers == 4 and facts.batches == 1250 and facts.retried == facts.lost == 0
+    assert facts.busy / facts.alive > 0.99 and facts.busy == pytest.approx(10_000.0)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_kills_at_any_time_change_nothing(seed: int) -> None:
+    """Of workers, of all of them at once, and of the scheduler."""
+    chance, pool = random.Random(seed), Simulated(load=2.0)
+    pool.add(3)
+
+    def strike() -> None:
+        what = chance.random()
+        if what < 0.7 and pool.alive:
+            pool.end(chance.choice(pool.alive), told=chance.random() < 0.2)
+        elif what < 0.9:
+            for worker in pool.alive:
+                pool.end(worker)
+        else:
+            pool.lose_scheduler()
+        pool.at(pool.now + chance.expovariate(1 / 15.0), strike)
+
+    pool.at(1.0, strike)
+    found = carried(pool)
+    assert not [done for done in found if done.lost]
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.1, 30.0])
+def test_a_number_of_which_every_worker_dies_is_found_and_said(lag: float) -> None:
+    """And no other, not even one whose answer dies with the worker that was at the next already."""
+    pool = Simulated(kill={37, 212}, lag=lag)
+    pool.add(2)
+    lost = {done.numbers.start: done.lost for done in carried(pool) if done.lost}
+    assert lost == {37: "no answer: 3 workers died of it", 212: "no answer: 3 workers died of it"}
+
+
+def test_a_worker_that_hangs_is_ended_and_its_range_done_elsewhere() -> None:
+    told: list[str] = []
+    pool = Simulated(hang={90})
+    pool.add(2)
+    pool.at(300.0, lambda: setattr(pool, "hang", ()))
+    found = carried(pool, tell=told.append)
+    assert not [done for done in found if done.lost] or pool.hang
+    assert any("has not answered for" in text for text in told)
+
+
+def test_a_number_that_hangs_for_ever_is_given_up() -> None:
+    pool = Simulated(hang={90})
+    pool.add(2)
+    assert [done.numbers for done in carried(pool) if done.lost] == [range(90, 91)]
+
+
+def test_late_answers_change_nothing() -> None:
+    """A worker that was given up for dead answers after all, and another has answered before."""
+
+    class Stubborn(Simulated):
+        def restart(self, worker: str) -> None:
+            ended.append(worker)
+
+        def forget(self, ticket: int) -> None:
+            assert ticket in self._at, "its answer is still to come"
+
+    ended: list[str] = []
+    slow = {200: 150.0}
+    pool = Stubborn(seconds=lambda number: slow.pop(number, 0.5))
+    pool.add(2)
+    carried(pool, 2000)
+    assert len(ended) == 1
+
+
+def test_another_version_is_refused_with_both_versions() -> None:
+    told: list[str] = []
+    pool = Simulated(answers={"w0": Failure("it has advsearch 2, and 1 asks; install the same on both", unfit=True)})
+    pool.add(2)
+    found = carried(pool, tell=told.append)
+    assert {done.worker for done in found} == {"w1"}
+    assert told == ["w0 is given nothing: it has advsearch 2, and 1 asks; install the same on both"]
+
+
+def test_workers_none_of_which_can_do_it_end_the_run_with_the_reason() -> None:
+    without = Failure("no libLLVM is found; apt install libllvm19", unfit=True)
+    pool = Simulated(answers={"w0": without, "w1": without})
+    pool.add(2)
+    with pytest.raises(ClusterError, match=r"no libLLVM is found; apt install libllvm19.*advsearch resume"):
+        carried(pool)
+    assert pool.now < 60.0
+
+
+def test_workers_that_die_while_they_load_are_not_blamed_on_a_batch() -> None:
+    pool = Simulated()
+
+    def strike() -> None:
+        for worker in pool.alive:
+            pool.end(worker)
+        pool.at(pool.now + 2.0, strike)
+
+    pool.add(2)
+    pool.at(2.0, strike)
+    with pytest.raises(ClusterError, match="workers died while they loaded the scene and the model"):
+        carried(pool)
+    assert not pool.given
+
+
+def test_nobody_at_all_is_waited_for_and_then_said() -> None:
+    pool = Simulated()
+    with pytest.raises(ClusterError, match="there was no worker that can do it for 300 s; what was stored is kept"):
+        carried(pool)
+    assert pool.now > PATIENCE
+    late = Simulated()
+    late.add(1, after=PATIENCE - 10.0)
+    carried(late)
+
+
+def test_a_scheduler_that_does_not_come_back_says_how_to_go_on() -> None:
+    pool = Simulated(returns=False)
+    pool.add(2)
+    pool.at(30.0, pool.lose_scheduler)
+    with pytest.raises(ClusterError, match="go on with advsearch resume"):
+        carried(pool)
+
+
+def test_files_are_sent_only_to_a_worker_that_lacks_them() -> None:
+    sent: list[bool] = []
+
+    class Sending(Simulated):
+        def submit(self, ticket: int, worker: str, function: Callable[..., object], *args: object) -> None:
+            if len(args) == 4:
+                sent.append(bool(getattr(args[2], "contents", None)))
+                if worker == "w0":
+                    lacks = Failure("it lacks mug.obj", missing=True)
+                    self.answers[worker] = Ready({"processor": "here"}, 1.0) if sent[-1] else lacks
+            super().submit(ticket, worker, function, *args)
+
+    from advsearch.cluster.coordinator import Coordinator
+    from advsearch.cluster.executor import Work
+    from advsearch.cluster.inputs import Files
+
+    pool = Sending()
+    pool.add(2)
+    files = Files({"/a/mug.obj": ("d", "mug.obj")}, {"d": {"mug.obj": b"v"}})
+    shared = Coordinator(pool, Work("a:b", {}), "key", files, "1", {"processor": "here"}, clock=pool.clock)
+    assert len(list(shared.results(ranges()))) == COUNT // SIZE
+    assert sorted(sent) == [False, False, True]
+
+
+def test_what_comes_from_another_machine_says_so() -> None:
+    told: list[str] = []
+    pool = Simulated(answers={"w1": Ready({"processor": "another"}, 5.0)})
+    pool.add(2)
+    found = carried(pool, tell=told.append)
+    marks = {done.worker: done.machine for done in found}
+    assert marks["w0"] is None and marks["w1"] is not None and "processor another" in told[0]
+
+
+def test_an_error_of_ours_ends_the_run_with_its_words_and_a_bug_with_its_trace() -> None:
+    for answer, error, text in (
+        (Failure("grid: pose.yaw is out of range"), ClusterError, "grid: pose.yaw is out of range"),
+        (Failure("KeyError", trace="Traceback of the worker"), RuntimeError, "Traceback of the worker"),
+    ):
+        pool = Simulated(answers={"w0": answer})
+        pool.add(1)
+        with pytest.raises(error, match=text):
+            carried(pool)

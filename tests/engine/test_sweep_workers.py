@@ -1,0 +1,148 @@
+"""A sweep whose batches are carried out by others: the rows and the summary of one that did it all itself."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+from samples import sweep as swept
+from test_sweep import FakeRenderer
+
+import advsearch
+from advsearch.api.sweep import job_of
+from advsearch.cli.main import main
+from advsearch.cli.sweep import answer
+from advsearch.cluster.executor import Done, Facts
+from advsearch.config import SweepConfig
+from advsearch.engine.sweeps import swept_scene
+from advsearch.engine.sweeps.batch import LOST, Batches
+from advsearch.engine.sweeps.loop import Sweep
+from advsearch.errors import InputError
+from advsearch.progress import NullProgress
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results.sweep import SharedWork
+from advsearch.runs.store import NAME, Store
+
+SMALL = {"object": "mug", "grid": {"pose.yaw": "0:360:3", "camera.elevation": [5, 35]}, "environment": "studio,noon"}
+CONFIG = SweepConfig(**SMALL, batch=2, resolution=16, spp=1, trials=0)
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_rendered(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But in the test with processes of their own."""
+    FakeRenderer.made, FakeRenderer.calls, FakeRenderer.stops_at, FakeRenderer.level = [], 0, None, None
+    if "two_workers" not in request.node.name:
+        monkeypatch.setattr(swept_scene, "make_renderer", FakeRenderer)
+
+
+@dataclass
+class Disorder:
+    """Carries out batches in any order, with facts as of two machines."""
+
+    batches: Batches
+    seed: int = 0
+    lose: int | None = None
+    stop: int | None = None
+    facts: Facts | None = field(default_factory=lambda: Facts(most=2, lost=1, busy=9.0, alive=10.0, retried=3))
+
+    def results(self, ranges: Iterable[range]) -> Iterator[Done]:
+        pieces = list(ranges)
+        random.Random(self.seed).shuffle(pieces)
+        for count, numbers in enumerate(pieces):
+            if count == self.stop:
+                raise KeyboardInterrupt
+            if self.lose in numbers:
+                for number in numbers:
+                    one = range(number, number + 1)
+                    lost = "no answer: 3 workers died of it" if number == self.lose else ""
+                    yield Done(one, None if lost else self.batches(one), lost=lost)
+            else:
+                yield Done(numbers, self.batches(numbers), f"worker {count % 2}")
+
+
+def rows(path: Path) -> list[Any]:
+    with Store(path / NAME, read_only=True) as store:
+        return [{**vars(row), "seconds": None, "time": None} for row in store.rows()]
+
+
+def summary(result: Any) -> dict[str, Any]:
+    times = ("seconds", "run", "renders_per_second", "shared", "warnings")
+    return {name: value for name, value in result.summary.to_dict().items() if name not in times}
+
+
+def shared(path: Path, resumed: bool = False, **given: Any) -> Any:
+    job = job_of(CONFIG)
+    sweep = Sweep(job, None, NullProgress())
+    with RunDirectory.resume(path) if resumed else RunDirectory.create(path) as run:
+        executor = Disorder(Batches(job, sweep.per_scene), **given)
+        return Sweep(job, run, NullProgress(), executor).carry_out()
+
+
+def test_any_order_any_interrupt_and_any_repetition_end_with_the_same_rows(tmp_path: Path) -> None:
+    job = job_of(CONFIG)
+    with RunDirectory.create(tmp_path / "alone") as run:
+        alone = Sweep(job, run, NullProgress()).carry_out()
+    assert alone.summary.shared is None and len(rows(tmp_path / "alone")) == 12
+    path = tmp_path / "shared"
+    first = shared(path, seed=1, stop=3)
+    assert first.summary.configurations == len(rows(path)) == 6 and first.summary.ending == "interrupted"
+    again = shared(path, resumed=True, seed=7)
+    assert rows(path) == rows(tmp_path / "alone") and summary(again) == summary(alone)
+
+
+def test_a_configuration_that_kills_every_worker_is_a_row_that_says_so(tmp_path: Path) -> None:
+    result = shared(tmp_path / "run", lose=7)
+    (lost,) = [row for row in result.rows() if row.label == LOST]
+    assert lost.step == 7 and lost.payload == {"lost": "no answer: 3 workers died of it"}
+    assert (lost.correct, lost.margin, lost.probability, lost.renders) == (False, None, None, 0)
+    assert lost.values["pose.yaw"]["value"] in (0.0, 120.0, 240.0) and lost.values["environment"]["value"] == "noon"
+    assert result.summary.configurations == 12 and result.summary.renders["sweep"] == 11
+    assert any("every worker that took the picture died" in text for text in result.summary.warnings)
+    again = shared(tmp_path / "run", resumed=True)
+    assert any("every worker that took the picture died" in text for text in again.summary.warnings)
+
+
+def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: Path) -> None:
+    class Two(Disorder):
+        def results(self, ranges: Iterable[range]) -> Iterator[Done]:
+            for done in super().results(ranges):
+                yield Done(done.numbers, done.value, done.worker, "ab12" if done.numbers.start < 4 else None)
+
+    job = job_of(CONFIG)
+    facts = Facts(machines={"ab12": {"processor": "another", "LLVM": "19.1"}})
+    with RunDirectory.create(tmp_path / "run") as run:
+        executor = Two(Batches(job, 6), facts=facts)
+        result = Sweep(job, run, NullProgress(), executor).carry_out()
+        assert run.store.noted("machines") == {"ab12": {"processor": "another", "LLVM": "19.1"}}
+    assert [row.machine for row in result.rows()] == ["ab12"] * 4 + [None] * 8
+    told = "not alike, so that their last bits may differ; beside the one that kept the run: processor another, LLVM 19"
+    assert any(told in text for text in result.summary.warnings)
+    with RunDirectory.resume(tmp_path / "run") as run:
+        assert any(told in text for text in Sweep(job, run, NullProgress()).carry_out().summary.warnings)
+
+
+def test_what_is_shown_says_where_the_time_went() -> None:
+    facts = Facts(most=2, lost=1, refused=1, retried=3, batches=9, busy=9.0, loading=6.0, alive=10.0)
+    text = answer(swept().model_copy(update={"shared": SharedWork.of_facts(facts, {})}))
+    assert "2 at most, busy 90 % of 10" in text and "1 lost, 1 refused, 3 given out again" in text
+    assert "workers" not in answer(swept())
+
+
+def test_what_is_loaded_already_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="workers: expected names of objects and models"):
+        advsearch.sweep("mug", advsearch.load_model("reference"), {"pose.yaw": [0, 90]}, workers=2)
+
+
+def test_two_workers_have_the_rows_of_none(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Really rendered, by processes of their own."""
+    words = ["sweep", "--object", "mug", "--grid", "pose.yaw=0:360:4", "--grid", "camera.elevation=5:60:2"]
+    words += ["--resolution", "32", "--spp", "2", "--batch", "2", "--trials", "0", "--quiet"]
+    assert main([*words, "--run", str(tmp_path / "alone")]) == 0
+    assert main([*words, "--run", str(tmp_path / "shared"), "--workers", "2"]) == 0
+    assert len(rows(tmp_path / "alone")) == 8 and rows(tmp_path / "shared") == rows(tmp_path / "alone")
+    out, err = capfd.readouterr()
+    assert "workers" in out and "at most, busy" in out and not err
