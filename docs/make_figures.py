@@ -363,6 +363,37 @@ def _classes(labels: Sequence[str], figures: Record) -> list[list[str]]:
     return rows
 
 
+# ---- recipes --------------------------------------------------------------------------------------------------------
+
+RECIPES = "images/recipes/results.json"
+
+
+def recipe_results(record: Record) -> str:
+    """What `docs/make_recipe_images.py` kept of each recipe, on bundled objects and on other data."""
+    path = DOCS / RECIPES
+    kept = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return "\n".join(_recipe(name, found) for name, found in sorted(kept.items())) or "None was kept yet.\n"
+
+
+def _recipe(name: str, found: Mapping[str, Any]) -> str:
+    text = f"### {name}\n"
+    for kind in ("bundled", "data"):
+        if kind in found:
+            text += "\n" + _recipe_on(found[kind], "With `--quick`" if kind == "bundled" else "On real data")
+    return text
+
+
+def _recipe_on(told: Mapping[str, Any], how: str) -> str:
+    what = ", ".join(f"`{one}`" for one in told["objects"])
+    places = ", ".join(f"`{one}`" for one in told["environments"])
+    models = ", ".join(f"`{one}`" for one in told["models"])
+    text = _wrapped(f"**{how}**: {what} in {places}, seen by {models}; {told['renders']} renders.") + "\n"
+    for figure in told["figures"]:
+        text += f"![{figure['title']}](images/recipes/{figure['image']})\n\n"
+        text += _wrapped(f"*{figure['title']}.* " + " ".join(figure["text"])) + "\n"
+    return text
+
+
 # ---- the reliability diagram: 100 units are a probability of 1 ------------------------------------------------------
 
 SIDE, LEFT, TOP, COUNTS, GAP = 300, 56, 16, 60, 22
@@ -437,6 +468,7 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("harden.md", "harden-fields"): result_fields(HardenResult),
     ("stability.md", "case-fields"): result_fields(CaseRow),
     ("reference-model.md", "reference"): reference,
+    ("recipes.md", "recipe-results"): recipe_results,
 }
 """What makes each part of a page: (page, name of the part)."""
 

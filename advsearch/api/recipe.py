@@ -164,10 +164,13 @@ def _figures(
     for one, result in results:
         if isinstance(result, (AttackSummary, SweepSummary)):
             rows += rows_of(one.part, run.path / PARTS / one.name, result)
-    table = Table(rows, described.groups)
+    surfaces = {
+        one.name: result.surface for one, result in results if isinstance(result, SweepSummary) and result.surface
+    }
+    table = Table(rows, described.groups, surfaces)
     for number, figure in enumerate(described.figures):
         made = compute(table, *read_options(figure, config.recipe))
-        for suffix, data in draw(made).items():
+        for suffix, data in draw(made, run.path).items():
             write_bytes(run.path / IMAGES / f"figure-{number + 1}.{suffix}", data)
         yield made
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from advsearch.attacks import clopper_pearson
@@ -12,7 +12,7 @@ from advsearch.errors import InputError
 from advsearch.report.wording import short_name
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.recipe import NamedCount
-from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.results.sweep import SurfaceMap, SweepSummary
 from advsearch.runs.store import NAME, Store
 
 ANSWER, GROUP, PART, TRIAL = "answer", "group", "part", "trial"
@@ -56,14 +56,16 @@ class Table:
     Attributes:
         rows: of its sweeps, and the trials of its attacks.
         groups: names of groups, each with the names of objects in it.
+        surfaces: by the names of runs, which parts of the object go with wrong answers.
     """
 
     rows: Sequence[Answered]
     groups: Mapping[str, Sequence[str]]
+    surfaces: Mapping[str, SurfaceMap] = field(default_factory=dict)
 
     def of(self, parts: Sequence[str]) -> Table:
         """Return the answers of some parts; of all where none is named."""
-        return Table([row for row in self.rows if not parts or row.part in parts], self.groups)
+        return Table([row for row in self.rows if not parts or row.part in parts], self.groups, self.surfaces)
 
     def value(self, row: Answered, column: str) -> float | str:
         """Return what a row has in a column: a value, the answer, or the group of its object.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from advsearch.report.phrases import percent
-from advsearch.report.wording import interval_text
+from advsearch.report.wording import interval_text, short_name
 from advsearch.runs.results.recipe import (
     AnswersFigure,
     AnyFigure,
@@ -16,6 +16,7 @@ from advsearch.runs.results.recipe import (
     HeatMapFigure,
     NamedCount,
     PointsFigure,
+    SurfaceFigure,
     TernaryFigure,
 )
 
@@ -44,6 +45,8 @@ def figure_table(made: AnyFigure) -> Numbers:
             return _ternary(made)
         case CorruptionFigure():
             return _corruptions(made)
+        case SurfaceFigure():
+            return _surface(made)
 
 
 def written(value: float) -> str:
@@ -120,3 +123,12 @@ def _ternary(made: TernaryFigure) -> Numbers:
         for one in made.answers
     ]
     return ["answer", "given", *(f"where most is {bare(name)}" for name in made.shares)], rows
+
+
+def _surface(made: SurfaceFigure) -> Numbers:
+    tables = [table for one in made.maps for table in one.tables]
+    rows = [
+        [one.object, short_name(one.model), one.part, *map(str, (one.seen, one.compared, one.worse, one.better))]
+        for one in tables
+    ]
+    return ["object", "model", "parts", "seen", "compared", "with wrong answers", "with right answers"], rows

@@ -15,11 +15,14 @@ from advsearch.viewer.study_page import again, facts_table, heading, table
 
 def recipe_page(run: Path, result: RecipeResult) -> str:
     """Return the page of a recipe in the folder `run`."""
-    what = f"recipe {Path(result.recipe).stem}; {result.model}; {', '.join(map(wording.short_name, result.objects))}"
+    objects, environments, models = (
+        ", ".join(map(wording.short_name, names))
+        for names in (result.objects, result.environment.split(","), result.model.split(","))
+    )
     facts = {
-        "Objects": ", ".join(result.objects),
-        "Environments": result.environment.replace(",", ", "),
-        "Models": result.model.replace(",", ", "),
+        "Objects": objects,
+        "Environments": environments,
+        "Models": models,
         "Renders": str(sum(one.renders for one in result.parts)),
         "Time": wording.seconds_text(result.seconds["total"]),
         "Seed": str(result.seed),
@@ -32,7 +35,9 @@ def recipe_page(run: Path, result: RecipeResult) -> str:
         _runs(result.parts),
         again(result.command_line),
     )
-    header = heading(what, result.title, [*_cautions(result), *result.warnings])
+    header = heading(
+        f"recipe {Path(result.recipe).stem}; {models}; {objects}", result.title, [*_cautions(result), *result.warnings]
+    )
     return document(
         f"{run.name}, {result.title}", header, main, footer=f"run {run.name}. This page needs no other file."
     )

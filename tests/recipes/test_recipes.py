@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 import advsearch
@@ -21,7 +22,9 @@ from advsearch.recipes.figures import FIGURES, compute, draw, read_options
 from advsearch.recipes.parts import planned
 from advsearch.recipes.table import Answered, Table
 from advsearch.report.recipes import figure_table
+from advsearch.runs.images import write_png
 from advsearch.runs.results.recipe import BarsFigure, HeatMapFigure, RecipeResult
+from advsearch.runs.results.sweep import SurfaceMap
 from advsearch.runs.summary import read_result
 
 TINY = """
@@ -278,12 +281,14 @@ def test_a_curve_puts_each_value_in_its_part_of_the_range() -> None:
 
 
 @pytest.mark.parametrize("kind", FIGURES)
-def test_every_figure_is_drawn_and_is_a_table(kind: str) -> None:
-    made = figure(EXAMPLES[kind], EXAMPLE_ROWS, {"round": ["mug"]})
+def test_every_figure_is_drawn_and_is_a_table(kind: str, tmp_path: Path) -> None:
+    write_png(tmp_path / "parts" / "views-00-mug" / "images" / "surface.png", np.zeros((8, 8, 3)))
+    table = Table(EXAMPLE_ROWS, {"round": ["mug"]}, {"views-00-mug": SURFACE})
+    made: Any = compute(table, *read_options(EXAMPLES[kind], "here"))
     assert made.figure == kind and made.title and made.text and all(one.endswith(".") for one in made.text)
     heads, lines = figure_table(made)
     assert lines and all(len(one) == len(heads) for one in lines)
-    assert draw(made)["png"].startswith(b"\x89PNG")
+    assert draw(made, tmp_path)["png"].startswith(b"\x89PNG")
 
 
 EXAMPLE_ROWS = [
@@ -293,6 +298,22 @@ EXAMPLE_ROWS = [
     )
     for at, row in enumerate(rows({"noon": (2, 6), "studio": (5, 6)}))
 ]
+COUNTED = {"configurations": 20, "correct": 2, "accuracy": 0.1, "interval": (0.0, 0.3)}
+SURFACE = SurfaceMap.of(
+    {
+        "file": "artifacts/surface.npz", "cells": 8, "least": 5,
+        "tables": [
+            {
+                "object": "mug", "model": "m", "part": "cell", "unwrapped": False, "seen": 9, "compared": 7, "worse": 1,
+                "better": 0,
+                "strongest": [
+                    {"face": 3, "u": 0.25, "v": 0.5, "place": (0.0, 0.0, 1.0), "seen": COUNTED, "hidden": COUNTED,
+                     "difference": 0.4, "interval": (0.2, 0.6), "p": 0.01}
+                ],
+            }
+        ],
+    }
+)  # fmt: skip
 MIXTURE = ("water", "milk", "coffee")
 EXAMPLES: dict[str, dict[str, object]] = {
     "curve": {"figure": "curve", "along": "yaw", "by": "environment", "bins": 3},
@@ -300,6 +321,7 @@ EXAMPLES: dict[str, dict[str, object]] = {
     "answers": {"figure": "answers", "by": "environment"},
     "cues": {"figure": "cues", "texture": "environment", "classes": {"noon": ["cup"]}},
     "ternary": {"figure": "ternary", "shares": list(MIXTURE), "normalised": True},
+    "surface": {"figure": "surface"},
     "corruption error": {"figure": "corruption error", "which": "environment"},
     "bars": {"figure": "bars", "by": "group"},
     "heat map": {"figure": "heat map", "rows": "object", "columns": "environment"},

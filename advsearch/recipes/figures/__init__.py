@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
@@ -16,6 +17,7 @@ from advsearch.recipes.figures.cues import CUES
 from advsearch.recipes.figures.curve import CURVE
 from advsearch.recipes.figures.heat_map import HEAT_MAP
 from advsearch.recipes.figures.points import POINTS
+from advsearch.recipes.figures.surface import SURFACE
 from advsearch.recipes.figures.ternary import TERNARY
 from advsearch.recipes.table import Table
 from advsearch.report.drawing import Figures, drawn
@@ -30,6 +32,7 @@ FIGURES: dict[str, Kind[Any, Any]] = {
     "cues": CUES,
     "ternary": TERNARY,
     "corruption error": CORRUPTION_ERROR,
+    "surface": SURFACE,
 }
 
 
@@ -66,7 +69,7 @@ def compute(table: Table, kind: str, options: Options) -> RecipeFigure:
     return made
 
 
-def draw(made: RecipeFigure) -> Figures:
-    """Return a figure as files."""
+def draw(made: RecipeFigure, run: Path) -> Figures:
+    """Return a figure as files; `run` is the recipe's folder."""
     kind = FIGURES[made.figure]
-    return drawn(lambda figure: kind.draw(made, figure), kind.size(made))
+    return drawn(lambda figure: kind.draw(made, figure, run), kind.size(made))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from pydantic import Field
@@ -59,7 +60,7 @@ def _given(one: GivenAnswer) -> str:
     return f"{one.name}, given in {one.correct} of {one.configurations} ({share}) and right in {one.right} of these"
 
 
-def _draw(made: AnswersFigure, figure: Any) -> None:
+def _draw(made: AnswersFigure, figure: Any, run: Path) -> None:
     axes = figure.subplots()
     for place, row in enumerate(reversed(made.rows)):
         left = 0.0

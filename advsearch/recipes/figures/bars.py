@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from advsearch.recipes.figures.base import Kind, Options, counted_by, extremes, plural
@@ -32,7 +33,7 @@ def _compute(table: Table, options: BarsOptions) -> BarsFigure:
     )
 
 
-def _draw(made: BarsFigure, figure: Any) -> None:
+def _draw(made: BarsFigure, figure: Any, run: Path) -> None:
     axes = figure.subplots()
     rows = made.bars[::-1]
     places = range(len(rows))

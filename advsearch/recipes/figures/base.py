@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -43,14 +44,14 @@ class Kind(Generic[Chosen, Made]):
         options: that it takes.
         result: its numbers.
         compute: makes these from the answers.
-        draw: draws them on a figure of matplotlib.
+        draw: draws them on a figure of matplotlib; it may look into the recipe's folder.
         size: of that, width and height in inches.
     """
 
     options: type[Chosen]
     result: type[Made]
     compute: Callable[[Table, Chosen], Made]
-    draw: Callable[[Made, Any], None]
+    draw: Callable[[Made, Any, Path], None]
     size: Callable[[Made], tuple[float, float]]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from pydantic import Field
@@ -79,7 +80,7 @@ def _said(one: CorruptionModel, first: str) -> list[str]:
     return [*said, *extremes(one.errors, "The most harmless", "the most harmful", "corruptions", "wrong")]
 
 
-def _draw(made: CorruptionFigure, figure: Any) -> None:
+def _draw(made: CorruptionFigure, figure: Any, run: Path) -> None:
     axes = figure.subplots()
     names = [one.name for one in sorted(made.models[0].errors, key=lambda one: one.accuracy or 0.0)]
     thick = 0.8 / len(made.models)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from pydantic import Field
@@ -93,7 +94,7 @@ def _hardest(rows: list[CuesRow]) -> list[str]:
     return extremes(rows, "The hardest texture", "the easiest", "textures")
 
 
-def _draw(made: CuesFigure, figure: Any) -> None:
+def _draw(made: CuesFigure, figure: Any, run: Path) -> None:
     axes = figure.subplots()
     rows = sorted(made.rows, key=lambda one: one.accuracy or 0.0)
     for place, one in enumerate(rows):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from pydantic import Field
@@ -88,7 +89,7 @@ def _between(lines: Sequence[CurveLine], by: str | None) -> list[str]:
     )
 
 
-def _draw(made: CurveFigure, figure: Any) -> None:
+def _draw(made: CurveFigure, figure: Any, run: Path) -> None:
     axes = figure.subplots()
     for number, line in enumerate(made.lines):
         known = [one for one in line.bins if one.interval and one.accuracy is not None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from advsearch.recipes.figures.base import Kind, Options, extremes, plural
@@ -52,7 +53,7 @@ def _said(cells: list[NamedCount], rows: str, columns: str) -> list[str]:
     return [*extremes(cells, "The lowest pair", "the highest", f"pairs of {rows} and {columns}"), *said]
 
 
-def _draw(made: HeatMapFigure, figure: Any) -> None:
+def _draw(made: HeatMapFigure, figure: Any, run: Path) -> None:
     axes = figure.subplots()
     shares = [
         [right / seen if seen else float("nan") for right, seen in zip(*pair, strict=True)]
@@ -75,5 +76,5 @@ HEAT_MAP = Kind(
     HeatMapFigure,
     _compute,
     _draw,
-    lambda made: (2.6 + 0.42 * len(made.columns), 1.7 + 0.28 * len(made.rows)),
+    lambda made: (max(2.6 + 0.42 * len(made.columns), 5.2), 1.7 + 0.28 * len(made.rows)),
 )

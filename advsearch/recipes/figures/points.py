@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from pydantic import Field
@@ -70,7 +71,7 @@ def _said(rows: list[str], counts: list[list[NamedCount]], totals: list[NamedCou
     return said
 
 
-def _draw(made: PointsFigure, figure: Any) -> None:
+def _draw(made: PointsFigure, figure: Any, run: Path) -> None:
     axes = figure.subplots()
     for number, name in enumerate(made.names):
         shift = (number - (len(made.names) - 1) / 2) * 0.22

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from pydantic import Field
@@ -103,7 +104,7 @@ def _said(one: TernaryAnswer, total: int) -> list[str]:
     return extremes(one.by_most, least, "most frequent where most of it", "things", "given")
 
 
-def _draw(made: TernaryFigure, figure: Any) -> None:
+def _draw(made: TernaryFigure, figure: Any, run: Path) -> None:
     panels = figure.subplots(1, len(made.answers), squeeze=False)[0]
     shown = None
     for axes, one in zip(panels, made.answers, strict=True):
@@ -142,4 +143,6 @@ def _place(shares: Shares) -> tuple[float, float]:
     return shares[1] + shares[2] / 2.0, shares[2] * math.sqrt(3.0) / 2.0
 
 
-TERNARY = Kind(TernaryOptions, TernaryFigure, _compute, _draw, lambda made: (1.0 + 2.3 * len(made.answers), 2.7))
+TERNARY = Kind(
+    TernaryOptions, TernaryFigure, _compute, _draw, lambda made: (max(1.0 + 2.1 * len(made.answers), 4.6), 2.7)
+)

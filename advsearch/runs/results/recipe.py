@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from advsearch.runs.results.base import Fields, RunResult
-from advsearch.runs.results.sweep import CountedAnswers
+from advsearch.runs.results.sweep import CountedAnswers, SurfaceTable
 
 
 class RecipePart(Fields):
@@ -172,6 +172,20 @@ class CorruptionFigure(RecipeFigure):
     models: list[CorruptionModel]
 
 
+class SurfaceOf(Fields):
+    """What goes with wrong answers on the surface of one object."""
+
+    run: str = Field(description="in `parts`")
+    tables: list[SurfaceTable]
+
+
+class SurfaceFigure(RecipeFigure):
+    """Which parts of each object, when seen, go with wrong answers."""
+
+    figure: Literal["surface"]
+    maps: list[SurfaceOf]
+
+
 AnyFigure = Annotated[
     BarsFigure
     | HeatMapFigure
@@ -180,7 +194,8 @@ AnyFigure = Annotated[
     | AnswersFigure
     | CuesFigure
     | TernaryFigure
-    | CorruptionFigure,
+    | CorruptionFigure
+    | SurfaceFigure,
     Field(discriminator="figure"),
 ]
 

@@ -1,0 +1,134 @@
+"""Carries out the recipes, and keeps what they say and their figures for docs/recipes.md.
+
+    python docs/make_recipe_images.py OUT [--data FOLDER] [--only NAME,NAME]
+
+Runs are kept in the folder OUT: what is done there is not done again. On bundled objects they are quick ones. With
+--data they are on a folder of meshes, environments and ImageNet classifiers of one's own, at the counts below, fewer
+than a recipe's own. `python docs/make_figures.py` puts what was kept into the page.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+import advsearch
+from advsearch.runs.results.recipe import RecipeResult
+from advsearch.runs.summary import NAME, read_result
+
+DOCS = Path(__file__).resolve().parent
+IMAGES = DOCS / "images" / "recipes"
+KEPT = IMAGES / "results.json"
+
+SHOWN = {
+    "backgrounds": (1, 2),
+    "texture-shape": (1, 3),
+    "orientation-scale": (2, 3),
+    "liquid": (1, 2),
+    "viewpoints": (1,),
+    "pose-space": (1, 5),
+    "common-corruptions": (1,),
+    "physical": (1,),
+    "parts": (1,),
+}
+"""The figures of each recipe that the page shows, from 1."""
+
+LABELS = {"mug": "coffee mug,cup", "teapot": "teapot,coffeepot"}
+
+COUNTS: dict[str, dict[str, Any]] = {
+    "backgrounds": {"views": {"samples": 40}},
+    "texture-shape": {"materials": {"samples": 8}},
+    "orientation-scale": {"views": {"samples": 120}},
+    "liquid": {"mixtures": {"samples": 240}},
+    "viewpoints": {"all": {"samples": 80}, "search": {"steps": 200, "trials": 6}, "worst": {"samples": 80}},
+    "pose-space": {"poses": {"samples": 120}},
+    "common-corruptions": {"clean": {"samples": 60}, "corrupted": {"samples": 3}},
+    "parts": {"views": {"samples": 200}},
+    "physical": {"texture": {"draws": 4, "steps": 80, "trials": 60, "verify_spp": 16}},
+}
+"""Settings of the parts on data of one's own."""
+
+ONE_OBJECT = ("liquid", "common-corruptions", "physical", "parts")
+
+
+def main() -> int:
+    """Carry out what is asked for and keep it; returns the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("out", type=Path, help="the folder of the runs")
+    parser.add_argument("--data", type=Path, help="a folder with objects/, environments/ and models/")
+    parser.add_argument("--only", default=",".join(SHOWN), help="names of recipes")
+    args = parser.parse_args()
+    kept: dict[str, dict[str, Any]] = json.loads(KEPT.read_text("utf-8")) if KEPT.exists() else {}
+    for name in args.only.split(","):
+        result = real(name, args.data, args.out) if args.data else bundled(name, args.out)
+        kept.setdefault(name, {})["data" if args.data else "bundled"] = told(name, result, "data" if args.data else "")
+        IMAGES.mkdir(parents=True, exist_ok=True)
+        KEPT.write_text(json.dumps(kept, indent=1, ensure_ascii=False, sort_keys=True) + "\n", encoding="utf-8")
+        print(name, result.seconds["total"], file=sys.stderr)
+    return 0
+
+
+def bundled(name: str, out: Path) -> RecipeResult:
+    """Return what a recipe says of bundled objects, quickly."""
+    run = out / f"q-{name}"
+    return done(run) or advsearch.recipe(name, quick=True, run=run)
+
+
+def real(name: str, data: Path, out: Path) -> RecipeResult:
+    """Return what a recipe says of data of one's own."""
+    run, file = out / f"data-{name}", out / f"{name}.yaml"
+    base = str(resources.files("advsearch.recipes") / f"{name}.yaml")
+    parts = {part: {"settings": settings} for part, settings in COUNTS[name].items()}
+    out.mkdir(parents=True, exist_ok=True)
+    file.write_text(yaml.safe_dump({"base": base, "parts": parts}), encoding="utf-8")
+    several = name == "backgrounds"
+    environments = sorted(str(one) for one in (data / "environments").glob("*.hdr"))
+    models = [
+        "mobilenet_v2_imagenet.pt2",
+        *(["mobilenet_edgetpu_075_imagenet_224.pt2"] if "corruptions" in name else []),
+    ]
+    return done(run) or advsearch.recipe(
+        file,
+        object=[str(data / "objects" / f"{one}.obj") for one in LABELS if one == "mug" or name not in ONE_OBJECT],
+        environment=environments if several else environments[-1],
+        model=[str(data / "models" / one) for one in models],
+        labels=data / "models" / "imagenet_labels.json",
+        label=LABELS,
+        run=run,
+    )
+
+
+def done(run: Path) -> RecipeResult | None:
+    """Return the result of a run that is done already."""
+    result = read_result(run) if (run / NAME).is_file() else None
+    return result if isinstance(result, RecipeResult) and not result.goes_on else None
+
+
+def told(name: str, result: RecipeResult, suffix: str) -> dict[str, Any]:
+    """Copy the figures that are shown, and return what there is to tell."""
+    figures = []
+    for number in SHOWN[name]:
+        image = IMAGES / "-".join(filter(None, [name, suffix, f"{number}.png"]))
+        image.parent.mkdir(parents=True, exist_ok=True)
+        image.write_bytes((Path(str(result.run)) / "images" / f"figure-{number}.png").read_bytes())
+        made = result.figures[number - 1]
+        figures.append({"title": made.title, "text": made.text, "image": image.name})
+    return {
+        "title": result.title,
+        "objects": [Path(one).name for one in result.objects],
+        "environments": [Path(one).name for one in result.environment.split(",")],
+        "models": [Path(one).name for one in result.model.split(",")],
+        "renders": sum(one.renders for one in result.parts),
+        "seconds": round(result.seconds["total"]),
+        "figures": figures,
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())
