@@ -53,6 +53,7 @@ from advsearch.runs.results.gap import CurveResult
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.scene.leaving_out import EVERYTHING, NOTHING
 from advsearch.scene.mitsuba_backend.samplers import next_count
+from advsearch.scene.surfaces import aovs_of
 from advsearch.tasks import AnyTask, Facts, Task, make_task
 from advsearch.tasks.together import Together
 
@@ -124,6 +125,8 @@ def attack(
         raise InputError(
             "model: expected one, got several; add `ensemble`, which attacks them together, or attack each by itself"
         )
+    if config.aov is not None and config.run is None:
+        raise InputError("aov: expected `run` beside it, the folder that keeps the layers; name one")
     searched, drawn = _controls(config, controls, over)
     asked, objective = _asked(config, task, objective)
     loaded = _model(model, config, asked)
@@ -359,6 +362,7 @@ def _problem(job: _Job) -> Problem:
         searched=len(job.controls),
         draws=config.draws if job.over else 1,
         printable=config.printable,
+        aovs=aovs_of(config.aov),
     )
 
 

@@ -88,6 +88,7 @@ class AttackKeywords(SearchKeywords, total=False):
 
     smallest: bool
     printable: bool
+    aov: str | None
     ensemble: Literal["mean", "worst"] | None
     overwrite: bool
 

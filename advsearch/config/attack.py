@@ -9,6 +9,7 @@ from pydantic import JsonValue, model_validator
 
 from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.named import name_in, read_named
+from advsearch.config.rendering import RenderConfig
 from advsearch.config.scene import ControlsByName, SceneConfig
 from advsearch.files import JsonObject
 from advsearch.settings import Clash, setting, setting_as_in
@@ -146,6 +147,12 @@ class AttackConfig(DerivativeConfig):
     smallest: bool = setting(False, "search", "find the smallest epsilon at which the model is wrong, up to --epsilon")
     printable: bool = setting(
         False, "search", "prefer a texture or a patch that is smooth and of printable colours, at a cost in margin"
+    )
+    aov: str | None = setting_as_in(
+        RenderConfig,
+        "aov",
+        description="ground truth of each pixel, separated by commas, as layers of an EXR of the clean scene and the "
+        "answer",
     )
     over: ControlsByName = setting_as_in(
         SceneConfig,

@@ -25,6 +25,7 @@ class HardenConfig(AttackConfig):
         "smallest",
         "ensemble",
         "printable",
+        "aov",
         "target",
         "minimise",
         "over",

@@ -14,7 +14,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import KEPT, Findings
 from advsearch.report.marks import marked
 from advsearch.runs import images
-from advsearch.runs.directory import OBJECT_FILE, RunDirectory
+from advsearch.runs.directory import IMAGES, OBJECT_FILE, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.scene.description import OBJECT
 from advsearch.scene.exporting.gltf import PosedMesh, posed, web_glb
@@ -52,6 +52,9 @@ def write_pictures(
         run.save_image(name, seen[name])
         run.save_exr(name, linear[name] * gain)
         save_marked(run, name, seen[name], problem.marks(seen[name], problem.whole(at)))
+        if problem.aovs:
+            surfaces, file = problem.renderer.surfaces(problem.whole(at)), run.path / IMAGES / f"{name}.aov.exr"
+            images.write_layers(file, surfaces.layers(problem.aovs, OBJECT), surfaces.notes(problem.aovs))
     run.save_image("difference", images.difference(seen["clean"], seen["adversarial"]))
     checked = findings.verification
     kind = "verification" if findings.beaten is None else "baseline verification"

@@ -61,6 +61,7 @@ class Problem:
         search_depth: longest light path in segments of a search's renders; None for the scene's. Verification always
             renders the scene's.
         printable: whether searches prefer colours that can be printed; see `print_terms`.
+        aovs: layers of ground truth that are kept of the clean scene and the answer (`scene.surfaces.AOVS`).
         domain: where a search may look: the searched controls.
         conditions: where the others are drawn from; None where there are none.
     """
@@ -77,6 +78,7 @@ class Problem:
     draws: int = 1
     search_depth: int | None = None
     printable: bool = False
+    aovs: tuple[str, ...] = ()
     domain: Domain = field(init=False)
     conditions: Domain | None = field(init=False)
 

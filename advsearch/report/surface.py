@@ -87,7 +87,7 @@ def surface_figure(panels: Sequence[SurfacePanel]) -> Figures:
             colours = _coloured(panel, scale)
             flat.imshow(colours, extent=(0, 1, 0, 1), interpolation="nearest")
             flat.set(xlabel="u", ylabel="v")
-            flat.set_title(f"{panel.object}, {short_name(panel.model)}")
+            flat.set_title(f"{short_name(panel.object)}, {short_name(panel.model)}")
             solid.axis("off")
             across = ceil(len(panel.views) / ROWS)
             solid.imshow(_mosaic(panel.views, colours, across))

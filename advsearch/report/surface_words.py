@@ -16,7 +16,7 @@ def surface_sentences(surface: SurfaceMap) -> list[str]:
 
 
 def _sentence(table: SurfaceTable, least: int) -> str:
-    who, cells = f"{table.object}, {short_name(table.model)}", count(table.compared, table.part)
+    who, cells = f"{short_name(table.object)}, {short_name(table.model)}", count(table.compared, table.part)
     if not table.compared:
         return f"{who}: no {table.part} was seen in {least} pictures and hidden in as many, so nothing is compared."
     if not table.worse + table.better:

@@ -37,6 +37,9 @@ IMAGES = "images"
 ARTIFACTS = "artifacts"
 OBJECT_FILE = f"{ARTIFACTS}/object.glb"
 """What was attacked, before and after, to turn in a browser."""
+AOV_FOLDER = "aov"
+"""Of a sweep: the ground truth of each picture, by its number."""
+
 PARTS = "parts"
 """Runs that a study consists of."""
 
@@ -55,6 +58,7 @@ CONTENTS = (
     COLUMNS,
     IMAGES,
     ARTIFACTS,
+    AOV_FOLDER,
     PARTS,
 )
 """All that a run writes. `overwrite` removes these and nothing else."""

@@ -188,7 +188,8 @@ def _parts(table: SurfaceTable) -> Html:
         )
         for one in table.strongest
     ]
-    what = f"{table.part.capitalize()}s of {table.object} that are told most clearly, {wording.short_name(table.model)}"
+    who = f"{wording.short_name(table.object)}, {wording.short_name(table.model)}"
+    what = f"{who}: the {table.part}s that are told most clearly"
     return element("details", element("summary", what), _grid(heads, cells))
 
 

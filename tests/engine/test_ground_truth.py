@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -29,8 +30,46 @@ def test_ground_truth_of_every_configuration_is_that_of_its_scene(tmp_path: Path
     assert not np.array_equal(*masks)
 
 
+def test_an_attack_keeps_ground_truth_of_the_clean_scene_and_of_its_answer(tmp_path: Path) -> None:
+    names, scene = "mask,depth,normal,uv,id", advsearch.load_scene("mug")
+    controls = {"pose": {"yaw": [0.0, 180.0]}}
+    run = tmp_path / "run"
+    found = advsearch.attack(
+        scene, controls=controls, steps=2, trials=6, spp=1, verify_spp=1, resolution=24, measure="no", baseline=False,
+        denoise="none", run=run, aov=names, policy="random",
+    )  # fmt: skip
+    render = scene.renderer(controls, resolution=24)
+    assert not torch.equal(found.u, render.start)
+    for name, u in (("clean", render.start), ("adversarial", found.u)):
+        with OpenEXR.File(str(run / "images" / f"{name}.aov.exr"), separate_channels=True) as picture:
+            layers, header = {key: one.pixels for key, one in picture.channels().items()}, dict(picture.header())
+        expected = render.surfaces(u).layers(names.split(","), "object")
+        assert sorted(layers) == sorted(expected) and "object sizes" in header["depth"]
+        for key, value in expected.items():
+            assert np.array_equal(layers[key], value.numpy()), key
+        assert layers["mask.Y"].sum() > 50
+
+
+def test_overwriting_a_run_removes_its_ground_truth(tmp_path: Path) -> None:
+    def swept(**more: Any) -> None:
+        advsearch.sweep(
+            "mug", grid={"pose.yaw": [0, 90]}, trials=0, run=tmp_path / "run", resolution=8, spp=1, denoise="none",
+            **more,
+        )  # fmt: skip
+
+    swept(aov="mask")
+    assert (tmp_path / "run" / "aov").exists()
+    swept(overwrite=True)
+    assert not (tmp_path / "run" / "aov").exists()
+
+
 def test_ground_truth_without_a_run_or_of_another_name_is_refused() -> None:
     with pytest.raises(InputError, match=r"aov.*run"):
         advsearch.sweep("mug", grid={"pose.yaw": [0, 90]}, aov="mask")
+    with pytest.raises(InputError, match=r"aov.*run"):
+        advsearch.attack("mug", aov="mask")
     with pytest.raises(UnknownNameError, match=r"unknown aov 'masks'. Did you mean 'mask'"):
         advsearch.sweep("mug", grid={"pose.yaw": [0, 90]}, aov="masks", run="never")
+    with pytest.raises(UnknownNameError, match=r"unknown aov 'masks'. Did you mean 'mask'"):
+        advsearch.attack("mug", controls="pose", aov="masks", run="never")
+    assert not Path("runs/never").exists()

@@ -33,7 +33,7 @@ from advsearch.progress import Progress
 from advsearch.report.studies import sweep_figure
 from advsearch.report.wording import count
 from advsearch.runs import store
-from advsearch.runs.directory import RunDirectory
+from advsearch.runs.directory import AOV_FOLDER, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.images import write_layers
 from advsearch.runs.results.attack import DescribedValue, LinearTransport
@@ -59,9 +59,6 @@ NOT_FINITE = "pictures not finite"
 
 PICTURE_SPP = 64
 """Samples a pixel of the picture that is kept, unless verification needed more."""
-
-AOV_FOLDER = "aov"
-"""Folder of a run with the ground truth of each picture, by its number."""
 
 TELL_SECONDS = 0.1
 """Least time between two reports of progress."""
