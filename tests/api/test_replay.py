@@ -107,6 +107,17 @@ def test_a_run_without_an_answer_is_refused(attacked: Path, tmp_path: Path) -> N
     assert not (tmp_path / "never").exists()
 
 
+@pytest.mark.parametrize(
+    "header", [b"{'descr': '<f4', 'fortran_order': False, 'shape': (10%b,), }", b"{'shape': '''%b"]
+)
+def test_a_hostile_header_of_an_answer_is_refused(header: bytes, tmp_path: Path) -> None:
+    text = header % (b"0" * 11) + b"\n"
+    path = write_answer(tmp_path, torch.zeros(3).numpy())
+    path.write_bytes(b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text)
+    with pytest.raises(FileFormatError, match=r"answer\.npy: expected numbers"):
+        read_answer(tmp_path)
+
+
 @pytest.mark.parametrize("data", [[[0.5]], [2.0], [float("nan")]], ids=["two axes", "out of range", "nan"])
 def test_an_answer_is_a_point_of_the_box(data: Any, tmp_path: Path) -> None:
     write_answer(tmp_path, torch.tensor(data).numpy())

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import random
 
-from fuzz import gltf, meshes, mitsuba_scenes, models, pictures, runs
+from fuzz import blender, gltf, meshes, mitsuba_scenes, models, pictures, runs
 from fuzz.case import Case, Maker
 
 MAKERS: tuple[Maker, ...] = (
-    *(*meshes.MAKERS, *gltf.MAKERS, *mitsuba_scenes.MAKERS),
+    *(*meshes.MAKERS, *gltf.MAKERS, *blender.MAKERS, *mitsuba_scenes.MAKERS),
     *(*pictures.MAKERS, *models.MAKERS, *runs.MAKERS),
 )
 """They take turns, so that any few dozen cases in a row have some of everything."""

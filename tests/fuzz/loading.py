@@ -74,6 +74,37 @@ def load_run(path: Path) -> None:
     show_run(str(path.parent), as_json=False)
 
 
+def load_answer(path: Path) -> None:
+    """Read the answer of a run."""
+    from advsearch.runs.answer import read_answer
+
+    read_answer(path.parents[1])
+
+
+def load_blend(path: Path) -> None:
+    """Read a Blender file, where Blender says and writes what is beside it; no process is started."""
+    import subprocess
+    import sys
+    import tempfile
+    from unittest.mock import patch
+
+    from advsearch.scene.importing import blender
+
+    def stand_in(command: list[str], **given: object) -> subprocess.CompletedProcess[str]:
+        made, target = path.with_name("made.glb"), Path(command[-2])
+        if made.exists():
+            target.write_bytes(made.read_bytes())
+        said = path.with_name("said").read_text("utf-8", "replace")
+        return subprocess.CompletedProcess(command, 0 if made.exists() else 1, said, "")
+
+    with (
+        patch("advsearch.scene.importing.blender.subprocess.run", stand_in),
+        patch.dict(os.environ, {blender.PROGRAM: sys.executable}),
+        patch.object(tempfile, "tempdir", str(path.parents[1] / "runs")),
+    ):
+        load_object(path)
+
+
 def load_threedb(path: Path) -> None:
     """Read a folder of 3DB as `import-3db` does."""
     from advsearch.engine.sweeps.imported import read_picture
@@ -112,6 +143,8 @@ LOADERS: dict[str, Callable[[Path], object]] = {
     "labels": load_labels,
     "settings": load_settings,
     "run": load_run,
+    "answer": load_answer,
+    "blend": load_blend,
     "3db": load_threedb,
     "misbehave": misbehave,
 }
@@ -122,7 +155,7 @@ def warm_up(loaders: Iterable[str]) -> None:
     """Import what the loaders need, so that the libraries are not counted as the first case's memory and time."""
     import advsearch
 
-    if {"object", "mitsuba", "environment", "picture"} & set(loaders):
+    if {"object", "mitsuba", "blend", "environment", "picture"} & set(loaders):
         advsearch.load_scene("book").renderer("texture", resolution=16)
         from PIL import Image
 

@@ -37,7 +37,7 @@ def archive(kind: str) -> bytes:
     return buffer.getvalue()
 
 
-class _Planted:
+class Planted:
     """What a pickle runs when it is opened."""
 
     def __reduce__(self) -> tuple[Callable[[str], object], tuple[str]]:
@@ -74,13 +74,13 @@ def model(random: Random) -> Case:
         f"{chosen} damaged": lambda: in_one(lambda content: damaged(random, content or b"\0")[1]),
         f"{chosen} empty": lambda: in_one(lambda content: b""),
         "a planted pickle": lambda: in_one(
-            lambda content: pickle.dumps(_Planted()),
+            lambda content: pickle.dumps(Planted()),
             next((n for n in names if n.endswith(("data.pkl", ".pt"))), chosen),
         ),
         "a bomb": lambda: repacked(data, lambda _, content: content, {f"{root}/data/bomb": bytes(1 << 30)}),
         "a name above": lambda: repacked(data, lambda _, content: content, {"../planted": b"x"}),
         "a name twice": lambda: repacked(data, lambda _, content: content, {chosen: b"x"}),
-        "a pickle": lambda: pickle.dumps(_Planted()),
+        "a pickle": lambda: pickle.dumps(Planted()),
     }
     if texts:
         text = random.choice(texts)

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import json
+import pickle
 import sqlite3
 import tempfile
 from contextlib import closing
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+
 from advsearch.described import Value
 from advsearch.runs.store import Row, Store
 from advsearch.settings import HEADER
 from fuzz import pictures
 from fuzz.case import Case, Maker, Random
+from fuzz.models import Planted
 from fuzz.mutations import as_json, confused, damaged
 
 SUMMARY = {
@@ -52,6 +57,37 @@ def folder(random: Random) -> Case:
     return Case(f"run: {name} {what}", "run", "run.yaml", files)
 
 
+ANSWER = np.linspace(0.0, 1.0, 12, dtype=np.float32)
+HEADERS = (
+    b"{'descr': '<f4', 'fortran_order': False, 'shape': (1000000000000,), }",
+    b"{'descr': '<f4', 'fortran_order': False, 'shape': (12L,), }",
+    b"{'descr': '<f4', 'fortran_order': False, 'shape': ('''",
+    b"{'descr': '<f4', 'fortran_order': False, 'shape': " + b"(" * 3000,
+    b"{'descr': '<f4', 'fortran_order': False, 'shape': (-1,), }",
+    b"{'descr': '|O', 'fortran_order': False, 'shape': (1,), }",
+    b"{'descr': [('a', '<f4')], 'fortran_order': True, 'shape': (12,), }",
+    b"{'descr': '<f4', 'fortran_order': False, 'shape': (3, 4), }",
+)
+
+
+def answer(random: Random) -> Case:
+    """A run's answer: a damaged array, a hostile header, objects to unpickle, or an archive of arrays."""
+    buffer = io.BytesIO()
+    np.save(buffer, ANSWER)
+    what, data = damaged(random, buffer.getvalue())
+    kind = random.random()
+    if kind < 0.4:
+        text = random.choice(HEADERS) + b"\n"
+        what, data = "header", b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + ANSWER.tobytes()
+    elif kind < 0.5:
+        what, data = "pickle", pickle.dumps(Planted())
+    elif kind < 0.6:
+        buffer = io.BytesIO()
+        np.savez(buffer, u=ANSWER)
+        what, data = "archive", buffer.getvalue()
+    return Case(f"answer: {what}", "answer", "artifacts/answer.npy", {"artifacts/answer.npy": data})
+
+
 LINE = {
     "id": "one", "environment": "park", "model": "mug", "is_correct": "True", "loss": 0.25, "prediction": [1, 0],
     "output_type": "classes", "render_args": {"rotation": 0.5, "on": True, "where": [1.0, 2.0]},
@@ -76,4 +112,4 @@ def threedb(random: Random) -> Case:
     return Case(f"3db: {what}", "3db", "details.log", files, links)
 
 
-MAKERS: tuple[Maker, ...] = (folder, threedb)
+MAKERS: tuple[Maker, ...] = (folder, answer, threedb)
