@@ -8,10 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-import torch
-from safetensors import torch as safetensors
+from typing import TYPE_CHECKING
 
 from advsearch import seeds
 from advsearch.api.attack import LOADING, attack_on, problem_of
@@ -21,10 +18,11 @@ from advsearch.attacks.verification import WORST_CASE
 from advsearch.bundled.objects import OBJECTS
 from advsearch.config import AttackConfig, HardenConfig
 from advsearch.config.hardening import ALL
-from advsearch.engine.hardening.lessons import Lesson, harder, lessons
-from advsearch.engine.hardening.pictures import ARCHIVE, FOLDER, save_pictures, write_archive
+from advsearch.engine.hardening.lessons import Lesson, lessons
+from advsearch.engine.hardening.pictures import FOLDER
+from advsearch.engine.hardening.rounds import VALIDATION_VIEWS, WEIGHTS, Rounds
 from advsearch.engine.hardening.split import HELD_OUT, TRAINING, VALIDATION, Split, check_disjoint
-from advsearch.engine.hardening.training import Course, Examples, MakeOptimiser, right_share, score
+from advsearch.engine.hardening.training import Course, Examples, MakeOptimiser, right_share
 from advsearch.engine.loading import Scene
 from advsearch.engine.naming import AnyModel, load_models, model_name, scene_settings
 from advsearch.engine.run_settings import RunSettings
@@ -34,20 +32,23 @@ from advsearch.models import Model
 from advsearch.models.imported import split_weights
 from advsearch.models.trainable import Trainable, trainable
 from advsearch.progress import NullProgress, Progress
-from advsearch.report.phrases import percent
-from advsearch.runs.directory import ARTIFACTS, RunDirectory
+from advsearch.report.hardening import hardened_figure
+from advsearch.runs.directory import ARTIFACTS, IMAGES, RunDirectory, is_run, run_path
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.base import INTERRUPTED
-from advsearch.runs.results.harden import HardenedControl, HardenResult, Share, SplitSide, TrainingRound
+from advsearch.runs.results.harden import HardenedControl, HardenResult, Share, SplitSide
+from advsearch.runs.store import Row
 from advsearch.scene.library import list_environments
 from advsearch.settings import split_names
 from advsearch.tasks import make_task
+from advsearch.viewer.pages import write_page
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-WEIGHTS = "hardened.safetensors"
-ROUNDS, MEASURED = "rounds", "measured"
+ROBUST = "robust"
+"""Of a scene in which nothing was found; otherwise there is an ending."""
+MEASURED, MEANS = "measured", "means"
 """Notes under which the store keeps what is done."""
 
 OVER: dict[str, dict[str, object]] = {
@@ -58,9 +59,7 @@ OVER: dict[str, dict[str, object]] = {
 
 TRIES = 6
 """Random configurations of a view that is rendered, of which the worst is trained on."""
-FIRST_STEPS = 4
-"""Steps of a new texture before the training."""
-VALIDATION_VIEWS, CLEAN_VIEWS = 2, 2
+CLEAN_VIEWS = 2
 CLEAN_SCENES = 4
 """Held-out scenes whose plain pictures are looked at, for each one that is attacked."""
 CLEAN_SPP = 16
@@ -76,6 +75,7 @@ def harden(
     *,
     optimiser: MakeOptimiser | None = None,
     beside: Examples | None = None,
+    resume: bool = False,
     progress: Progress | None = None,
     **settings: Unpack[HardenKeywords],
 ) -> HardenResult:
@@ -90,13 +90,17 @@ def harden(
             rate is then the highest, in place of `rate`.
         beside: batches of further examples, such as a `DataLoader`: images (N, H, W, 3) sRGB in [0, 1], class indices
             (N,). One is taken with each step.
+        resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
+            was.
         progress: told how far it is.
 
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
     config = configured(HardenConfig, model=model_name(model), **settings)
-    return _carry_out(config, model, optimiser, beside, progress or NullProgress(), None)
+    path = run_path(config.run) if resume and config.run is not None else None
+    resumed = path if path is not None and is_run(path) else None
+    return _carry_out(config, model, optimiser, beside, progress or NullProgress(), resumed)
 
 
 def harden_from_config(
@@ -123,6 +127,7 @@ def _carry_out(
     splits = splits_of(config, loaded)
     course = Course(student, config.rate, config.epochs, seeds.stream(config.seed, "order"), optimiser, beside)
     with RunDirectory.of(config, resumed) as run:
+        _same_means(run, {"optimiser": optimiser is not None, "beside": beside is not None}, resumed)
         work = Hardening(config, run, loaded, course, splits, progress)
         try:
             with interruptible():
@@ -131,8 +136,29 @@ def _carry_out(
         except KeyboardInterrupt:
             ending = INTERRUPTED
         result = work.result(ending, warnings, time.perf_counter() - begun)
+        for suffix, data in hardened_figure(result).items():
+            write_bytes(run.path / IMAGES / f"{config.command}.{suffix}", data)
         run.write_summary(result)
+        write_page(run.path, result)
         return result
+
+
+def _same_means(run: RunDirectory, given: dict[str, bool], resumed: Path | None) -> None:
+    """Note what a training has from Python, or refuse to go on with other means than it began with.
+
+    Raises:
+        InputError: it had something else.
+    """
+    if resumed is None:
+        run.store.set_note(MEANS, json.dumps(given))
+        return
+    before = json.loads(run.store.note(MEANS) or "{}")
+    for name, was in before.items():
+        if was != given[name]:
+            raise InputError(
+                f"{run.path}: cannot go on: it began {'with' if was else 'without'} `{name}`, which only Python gives; "
+                "go on with advsearch.harden(..., run=..., resume=True) and the same arguments"
+            )
 
 
 def splits_of(config: HardenConfig, model: Model) -> dict[str, Split]:
@@ -188,8 +214,10 @@ class Hardening:
     progress: Progress
 
     def __post_init__(self) -> None:
-        self.rounds = [TrainingRound.of(one) for one in self._noted(ROUNDS, [])]
-        self.measured: dict[str, str] = self._noted(MEASURED, {})
+        config = self.config
+        amounts = (config.scenes, config.views, len(config.controls), config.clean_loss)
+        self.rounds = Rounds(self.run, self.course, self._drawn, *amounts, self.progress)
+        self.measured: dict[str, str] = json.loads(self.run.store.note(MEASURED) or "{}")
         self.clean: dict[str, Share] = {}
         self._set = scene_settings(self.config.set_, self.config.exposure)
 
@@ -198,21 +226,24 @@ class Hardening:
         """What is trained."""
         return self.course.student
 
-    def _noted(self, key: str, otherwise: Any) -> Any:
-        return json.loads(self.run.store.note(key) or "null") or otherwise
-
     # ---- the parts --------------------------------------------------------------------------------------------------
 
     def carry_out(self) -> None:
         """Measure, train, and measure again."""
-        held = [scene for _, scene in self.splits[HELD_OUT].scenes(self.config.measured, self._set)]
-        first = [scene for _, scene in self.splits[TRAINING].scenes(self.config.scenes, self._set)]
-        check_disjoint({self.splits[HELD_OUT]: held, self.splits[TRAINING]: first})
+        sides = self.splits
+        check_disjoint(sides[HELD_OUT], [sides[TRAINING], sides[VALIDATION]], self._counts)
         self._measure("before", "attacking the model as it is", self.model, 1)
-        self._train()
+        self.rounds.carry_out(self.config.rounds)
         self._measure("after", "attacking the hardened model", self.student.model, 1)
         self._measure("stronger", "attacking it with a stronger search", self.student.model, TIMES)
         self._look()
+
+    @property
+    def _counts(self) -> dict[str, int]:
+        """Scenes of each split, by its name; of those that are held out a part is attacked."""
+        config = self.config
+        held = CLEAN_SCENES * config.measured
+        return {TRAINING: config.scenes * config.rounds, VALIDATION: self.rounds.judged, HELD_OUT: held}
 
     def _alone(self, control: str, name: str, **changes: object) -> AttackConfig:
         """What one control is searched with, on an object of a name."""
@@ -223,72 +254,17 @@ class Hardening:
         found |= {"controls": {control: given}, "measure": "no", "baseline": False}
         return AttackConfig.of(config, **found)
 
-    def _lessons(self, split: Split, number: int, control: str, views: int, tries: int, shared: bool) -> list[Lesson]:
-        name, scene = split.scene(number, self._set)
-        problem = problem_of(self._alone(control, name, over=_without(control)), scene, self.student.model)
-        return lessons(problem, views, tries, seeds.stream(split.seed, "views", number), shared=shared)
-
-    # ---- training ---------------------------------------------------------------------------------------------------
-
-    def _train(self) -> None:
-        config, student = self.config, self.student
-        scenes = list(range(config.scenes))
-        self.progress.stage("drawing scenes to choose weights by", config.scenes * len(config.controls))
-        held_back = self._drawn(self.splits[VALIDATION], scenes, VALIDATION_VIEWS)
-        if not self.rounds:
-            self._keep_round(0, [], held_back)
-        pool: list[Lesson] = []
-        for number in range(1, config.rounds + 1):
-            places = [(number - 1) * config.scenes + one for one in scenes]
-            self.progress.stage(f"round {number}: drawing scenes", config.scenes * len(config.controls))
-            new = self._drawn(self.splits[TRAINING], places, config.views)
-            pool += new
-            if number < len(self.rounds):
-                continue  # done before this run was stopped
-            student.net.load_state_dict(self._weights(number - 1))
-            self.progress.stage(f"round {number}: training", self.course.steps(len(pool)))
-            harder(pool, student.model, FIRST_STEPS)
-            self.course.round(number, pool, lambda: self.progress.advance(1))
-            self._keep_round(number, new, held_back, len(pool))
-        student.net.load_state_dict(self._weights(self.best))
-        state = {name: one.contiguous() for name, one in student.net.state_dict().items()}
-        write_bytes(self._artifact(WEIGHTS), safetensors.save(state))
-        write_archive(self._artifact(FOLDER), self._artifact(ARCHIVE))
-
-    def _drawn(self, split: Split, places: Sequence[int], views: int) -> list[Lesson]:
-        """Lessons of scenes for each control; of every fourth one all views share a texture."""
-        found = []
+    def _drawn(self, split: str, places: Sequence[int], views: int) -> list[Lesson]:
+        """Lessons of scenes for each control; in every fourth scene of the training all views share a texture."""
+        side, found = self.splits[split], list[Lesson]()
         for control in self.config.controls:
             for number in places:
-                shared = split.name == TRAINING and number % 4 == 3
-                found += self._lessons(split, number, control, views, TRIES, shared)
+                name, scene = side.scene(number, self._set)
+                problem = problem_of(self._alone(control, name, over=_without(control)), scene, self.student.model)
+                shared = split == TRAINING and number % 4 == 3
+                found += lessons(problem, views, TRIES, seeds.stream(side.seed, "views", number), shared=shared)
                 self.progress.advance(1)
         return found
-
-    def _keep_round(self, number: int, new: Sequence[Lesson], held_back: Sequence[Lesson], trained: int = 0) -> None:
-        """Judge the weights, and keep them and the round's pictures."""
-        found = score(self.student.model, held_back)
-        state = {name: one.contiguous() for name, one in self.student.net.state_dict().items()}
-        write_bytes(self._artifact(f"round-{number:03d}.safetensors"), safetensors.save(state))
-        save_pictures(self._artifact(FOLDER), number, new, self.model.labels)
-        row = TrainingRound(lessons=trained, clean=found.clean, robust=found.robust, kept=False)
-        self.rounds = [*self.rounds[:number], row]
-        self.run.store.set_note(ROUNDS, json.dumps([one.model_dump() for one in self.rounds]))
-        clean, worst = percent(found.clean), percent(found.robust)
-        self.progress.message(f"round {number}: {clean} of plain pictures right, {worst} of the worst")
-
-    @property
-    def best(self) -> int:
-        """The round whose weights are kept: the most robust one whose clean accuracy is within what may be lost."""
-        least = self.rounds[0].clean - self.config.clean_loss - 1e-9
-        allowed = [number for number, one in enumerate(self.rounds) if one.clean >= least]
-        return max(allowed, key=lambda number: (self.rounds[number].robust, number))
-
-    def _weights(self, number: int) -> dict[str, torch.Tensor]:
-        return safetensors.load(self._artifact(f"round-{number:03d}.safetensors").read_bytes())
-
-    def _artifact(self, name: str) -> Path:
-        return self.run.path / ARTIFACTS / name
 
     # ---- measurement ------------------------------------------------------------------------------------------------
 
@@ -302,16 +278,18 @@ class Hardening:
             for control in config.controls:
                 key = f"{which} {control} {number}"
                 if key not in self.measured:
-                    beaten = times > 1 and self.measured[f"after {control} {number}"] != "robust"
+                    beaten = times > 1 and self.measured[f"after {control} {number}"] != ROBUST
                     seed = seeds.stream(config.seed, f"measured {control}", number)
                     asked = self._alone(control, name, seed=seed, **harder_search)
                     self.measured[key] = "found before" if beaten else _attacked(asked, scene, model)
                     self.run.store.set_note(MEASURED, json.dumps(self.measured))
+                    wrong = self.measured[key] != ROBUST
+                    self.run.record(Row(f"{which} {control}", number, seed=seed, spp=config.verify_spp, success=wrong))
                 self.progress.advance(1)
 
     def _look(self) -> None:
         """Ask both models about plain pictures of held-out scenes."""
-        count, control = CLEAN_SCENES * self.config.measured, next(iter(self.config.controls))
+        count, control = self._counts[HELD_OUT], next(iter(self.config.controls))
         self.progress.stage("looking at plain pictures of held-out scenes", count)
         seen: list[Lesson] = []
         for number in range(count):
@@ -334,7 +312,7 @@ class Hardening:
         endings = [[self.measured.get(f"{which} {control} {number}") for control in controls] for number in scenes]
         if any(one is None for row in endings for one in row):
             return None
-        return _share(sum(all(one == "robust" for one in row) for row in endings), len(endings))
+        return _share(sum(all(one == ROBUST for one in row) for row in endings), len(endings))
 
     def result(self, ending: str, warnings: list[str], seconds: float) -> HardenResult:
         """Return what is known."""
@@ -345,12 +323,13 @@ class Hardening:
             if all(one is not None for one in shares):
                 before, after, stronger = shares
                 table.append(HardenedControl(control=control, before=before, after=after, stronger=stronger))
-        if done and self.best == 0:
+        if done and self.rounds.best == 0:
             warnings = [*warnings, "No round kept the clean accuracy, so the weights are the model's own."]
-        rounds = [one.model_copy(update={"kept": done and n == self.best}) for n, one in enumerate(self.rounds)]
-        weights = self._artifact(WEIGHTS)
-        counts = {TRAINING: config.scenes * config.rounds, VALIDATION: config.scenes, HELD_OUT: config.measured}
-        views = {TRAINING: config.views, VALIDATION: VALIDATION_VIEWS, HELD_OUT: 1}
+        rounds = [
+            one.model_copy(update={"kept": done and n == self.rounds.best}) for n, one in enumerate(self.rounds.done)
+        ]
+        weights = self.run.path / ARTIFACTS / WEIGHTS
+        views = {TRAINING: config.views, VALIDATION: VALIDATION_VIEWS, HELD_OUT: CLEAN_VIEWS}
         names = list(config.controls)
         return HardenResult(
             run=str(self.run.path),
@@ -371,7 +350,7 @@ class Hardening:
                 name: SplitSide(
                     objects=list(one.objects),
                     environments=list(one.environments),
-                    scenes=counts[name],
+                    scenes=self._counts[name],
                     views=views[name],
                 )
                 for name, one in self.splits.items()
@@ -379,7 +358,7 @@ class Hardening:
             rounds=rounds,
             hardened=_loads(config.model, weights) if done else None,
             weights=str(weights) if done else None,
-            pictures=str(self._artifact(FOLDER)) if done else None,
+            pictures=str(self.run.path / ARTIFACTS / FOLDER) if done else None,
             warnings=warnings,
             seconds={"total": seconds},
             seed=config.seed,
@@ -403,7 +382,7 @@ def _attacked(config: AttackConfig, scene: Scene, model: Model) -> str:
     steady = control is not None and control.correct >= WORST_CASE.needed(control.trials)
     if found.ending in ("found", "already wrong"):
         return found.ending
-    return "robust" if steady else "unsteady"
+    return ROBUST if steady else "unsteady"
 
 
 def _share(right: int, count: int) -> Share:

@@ -15,6 +15,7 @@ from advsearch.cli.harden import answer
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig, HardenConfig
 from advsearch.config.hardening import QUICK
+from advsearch.engine.hardening.rounds import ROUNDS
 from advsearch.engine.hardening.training import Course
 from advsearch.engine.loading import Scene
 from advsearch.errors import InputError
@@ -47,7 +48,9 @@ def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, 
 
 
 def test_a_run_trains_measures_and_goes_on(attacks: list[tuple[str, int]], monkeypatch: pytest.MonkeyPatch) -> None:
-    config = HardenConfig(**SMALL, labels="labels.json", run="run")
+    given = {**SMALL, "labels": "labels.json", "run": "run"}
+    config = HardenConfig(**given)
+    given.pop("model")
     taught = Course.round
 
     def stopped(self: Any, number: int, *args: Any) -> None:
@@ -60,7 +63,9 @@ def test_a_run_trains_measures_and_goes_on(attacks: list[tuple[str, int]], monke
     assert (first.ending, len(first.rounds), first.after, first.hardened) == ("interrupted", 2, None, None)
     assert attacks == [("ball", 40), ("book", 40)]
     monkeypatch.setattr(Course, "round", taught)
-    result = hardening.harden_from_config(config, resumed=Path("runs/run"))
+    with pytest.raises(InputError, match="cannot go on: it began without `beside`, which only Python gives"):
+        advsearch.harden(SMALL["model"], beside=[], resume=True, **given)
+    result = advsearch.harden(SMALL["model"], resume=True, **given)
     assert attacks[2:] == [("ball", 40), ("book", 40), ("ball", 120)]  # what was found is not sought any harder
     assert result.rounds[:2] == [one.model_copy(update={"kept": result.rounds[k].kept}) for k, one in
                                  enumerate(first.rounds)]  # fmt: skip
@@ -74,6 +79,8 @@ def test_a_run_trains_measures_and_goes_on(attacks: list[tuple[str, int]], monke
     assert advsearch.load_model(result.hardened, input_size=32).classes == 14
     assert len(list(Path(str(result.pictures)).glob("*/*.png"))) == 4
     assert "robust to texture" in answer(result)
+    page = Path("runs/run/report.html").read_text("utf-8")
+    assert "Robust in 1 of 2 scenes, before 1." in page and "data:image/png" in page
 
 
 def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple[str, int]]) -> None:
@@ -81,14 +88,14 @@ def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple
     rows = [(0.9, 0.2), (0.89, 0.5), (0.87, 0.8), (0.885, 0.5)]
     with RunDirectory.create_for(config) as run:
         noted = [{"lessons": 1, "clean": clean, "robust": robust, "kept": False} for clean, robust in rows]
-        run.store.set_note(hardening.ROUNDS, json.dumps(noted))
+        run.store.set_note(ROUNDS, json.dumps(noted))
         course: Any = None
         work = hardening.Hardening(config, run, load(), course, {}, NullProgress())
-        assert work.best == 3
-        work.config = config.model_copy(update={"clean_loss": 0.05})
-        assert work.best == 2
-        work.config = config.model_copy(update={"clean_loss": 0.0})
-        assert work.best == 0
+        assert work.rounds.best == 3
+        work.rounds.clean_loss = 0.05
+        assert work.rounds.best == 2
+        work.rounds.clean_loss = 0.0
+        assert work.rounds.best == 0
     shutil.rmtree(run.path)
 
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from advsearch.engine.hardening.lessons import Lesson, RenderedLesson, harder, surprise
 from advsearch.engine.hardening.pictures import save_pictures, write_archive
-from advsearch.engine.hardening.split import HELD_OUT, TRAINING, Split, check_disjoint
+from advsearch.engine.hardening.split import HELD_OUT, TRAINING, Split, check_disjoint, fingerprint
 from advsearch.engine.hardening.training import Course, score
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model, reference
@@ -54,11 +54,16 @@ def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
     file = shutil.copy(bundled / "data" / "objects" / "ball" / "mesh.ply", tmp_path / "tennis-ball.ply")
     mine = Split(TRAINING, (str(file),), ("noon",), 1).scene(0)[1]
     assert mine.description.object.label == "tennis ball"
-    check_disjoint({training: [scene, mine], held: [held.scene(1)[1]]})
-    with pytest.raises(InputError, match="held_out: book is in the training split and in the held out one"):
-        check_disjoint({training: [scene], held: [scene]})
+    counts = {TRAINING: 2, HELD_OUT: 2}
+    check_disjoint(held, [training], counts)
+    again = Split(TRAINING, held.objects, ("noon",), 2)
+    assert fingerprint(next(again.assets(1))) != fingerprint(next(held.assets(1)))  # seeds of splits differ by name
+    files = [Split(name, (str(file),), (lit,), 1) for name, lit in ((HELD_OUT, "gallery"), (TRAINING, "noon"))]
+    assert len(list(files[0].assets(5))) == 1
+    with pytest.raises(InputError, match="held_out: tennis-ball is an object of the training too"):
+        check_disjoint(files[0], files[1:], counts)
     with pytest.raises(InputError, match="held_out_environment: noon is an environment of the training too"):
-        check_disjoint({training: [], Split(HELD_OUT, ("ball",), ("noon",), 2): []})
+        check_disjoint(Split(HELD_OUT, ("ball",), ("noon",), 2), [training], counts)
 
 
 # ---- what is trained ------------------------------------------------------------------------------------------------

@@ -74,9 +74,15 @@ class Split:
             scene = Scene(replace(own, object=replace(own.object, label=label)))
         return name, scene
 
-    def scenes(self, count: int, given: Given | None = None) -> Iterator[tuple[str, Scene]]:
-        """Yield the first `count` scenes."""
-        return (self.scene(number, given) for number in range(count))
+    def assets(self, count: int) -> Iterator[ObjectAsset]:
+        """Yield the objects of the first `count` scenes; what a file holds comes once."""
+        files = set[str]()
+        for number in range(count):
+            name = self.objects[number % len(self.objects)]
+            if name not in files:
+                yield self.scene(number)[1].description.object
+            if name not in OBJECTS:
+                files.add(name)
 
 
 def fingerprint(asset: ObjectAsset) -> str:
@@ -87,26 +93,22 @@ def fingerprint(asset: ObjectAsset) -> str:
     return found.hexdigest()
 
 
-def check_disjoint(splits: Mapping[Split, Sequence[Scene]]) -> None:
-    """Refuse splits that share an object, by its geometry and texture, or measure in an environment of the training.
+def check_disjoint(held: Split, taught: Sequence[Split], counts: Mapping[str, int]) -> None:
+    """Refuse to measure what is trained on: an object with the geometry and texture of one of the training, or one of
+    its environments.
 
     Args:
-        splits: each with the scenes that it consists of.
+        held: what is measured.
+        taught: what weights are fitted to and chosen by.
+        counts: scenes of each, by its name.
 
     Raises:
         InputError: they share something; it is named.
     """
-    owner: dict[str, str] = {}
-    for split, scenes in splits.items():
-        for one in scenes:
-            asset = one.description.object
-            other = owner.setdefault(fingerprint(asset), split.name)
-            if other != split.name:
-                raise InputError(
-                    f"held_out: {asset.name} is in the {other} split and in the {split.name} one; name other objects"
-                )
-    held = [split for split in splits if split.name == HELD_OUT]
-    taught = {name for split in splits if split.name != HELD_OUT for name in split.environments}
-    both = sorted({name for split in held for name in split.environments} & taught)
+    both = sorted({name for split in taught for name in split.environments} & set(held.environments))
     if both:
         raise InputError(f"held_out_environment: {', '.join(both)} is an environment of the training too; name others")
+    seen = {fingerprint(asset) for split in taught for asset in split.assets(counts[split.name])}
+    for asset in held.assets(counts[held.name]):
+        if fingerprint(asset) in seen:
+            raise InputError(f"held_out: {asset.name} is an object of the training too; name others")

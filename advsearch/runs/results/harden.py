@@ -41,7 +41,7 @@ class SplitSide(Fields):
 
     objects: list[str]
     environments: list[str]
-    scenes: int
+    scenes: int = Field(description="of those held out, a fourth is attacked")
     views: int
 
 
@@ -69,3 +69,10 @@ class HardenResult(RunResult):
     weights: str | None = Field(description="the hardened weights, safetensors")
     pictures: str | None = Field(description="folder of the pictures of the training, a folder for each class")
     warnings: list[str] = Field(description="sentences that a reader has to know")
+
+    @property
+    def brief(self) -> str:
+        """How many scenes were robust and are."""
+        if self.before is None or self.after is None:
+            return ""
+        return f"robust in {self.after.right} of {self.after.count} scenes, before {self.before.right}"

@@ -1,0 +1,123 @@
+"""Rounds of search and training, each kept in the run when it is done: its weights, its pictures and its score."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from safetensors import torch as safetensors
+
+from advsearch.engine.hardening.lessons import Lesson, harder
+from advsearch.engine.hardening.pictures import ARCHIVE, FOLDER, save_pictures, write_archive
+from advsearch.engine.hardening.split import TRAINING, VALIDATION
+from advsearch.engine.hardening.training import Course, score
+from advsearch.progress import Progress
+from advsearch.report.phrases import percent
+from advsearch.runs.directory import ARTIFACTS, RunDirectory
+from advsearch.runs.files import write_bytes
+from advsearch.runs.results.harden import TrainingRound
+
+WEIGHTS = "hardened.safetensors"
+ROUNDS = "rounds"
+"""The note under which the store keeps the scores."""
+FIRST_STEPS = 4
+"""Steps of each texture before a training."""
+VALIDATION_VIEWS = 2
+
+Draw = Callable[[str, Sequence[int], int], list[Lesson]]
+"""From the name of a split, numbers of its scenes and the views of each to lessons."""
+
+
+@dataclass
+class Rounds:
+    """The rounds of a run.
+
+    Attributes:
+        run: keeps them.
+        course: trains.
+        draw: draws lessons; advances `progress` by one for each scene and control.
+        each: scenes that a round adds for each control.
+        views: of each.
+        controls: how many there are.
+        clean_loss: share of plain pictures that may be lost.
+        progress: told how far it is.
+        done: what each round came to; the first is the model as it was.
+    """
+
+    run: RunDirectory
+    course: Course
+    draw: Draw
+    each: int
+    views: int
+    controls: int
+    clean_loss: float
+    progress: Progress
+    done: list[TrainingRound] = field(init=False)
+
+    def __post_init__(self) -> None:
+        noted = json.loads(self.run.store.note(ROUNDS) or "[]")
+        self.done = [TrainingRound.of(one) for one in noted]
+
+    @property
+    def judged(self) -> int:
+        """Scenes by which weights are chosen, for each control: half as many as a round adds."""
+        return -(-self.each // 2)
+
+    @property
+    def best(self) -> int:
+        """The round whose weights are kept: the most robust one whose clean accuracy is within what may be lost."""
+        least = self.done[0].clean - self.clean_loss - 1e-9
+        allowed = [number for number, one in enumerate(self.done) if one.clean >= least]
+        return max(allowed, key=lambda number: (self.done[number].robust, number))
+
+    def carry_out(self, count: int) -> None:
+        """Do what is left of so many rounds; the student has the best weights afterwards, which the run keeps."""
+        if len(self.done) <= count:
+            self._train(count)
+        student = self.course.student
+        student.net.load_state_dict(self._weights(self.best))
+        self._save(WEIGHTS)
+        folder = self.run.path / ARTIFACTS
+        write_archive(folder / FOLDER, folder / ARCHIVE)
+
+    def _train(self, count: int) -> None:
+        student, pool = self.course.student, list[Lesson]()
+        self.progress.stage("drawing scenes to choose weights by", self.judged * self.controls)
+        held_back = self.draw(VALIDATION, range(self.judged), VALIDATION_VIEWS)
+        if not self.done:
+            self._keep(0, [], held_back, 0)
+        for number in range(1, count + 1):
+            self.progress.stage(f"round {number}: drawing scenes", self.each * self.controls)
+            new = self.draw(TRAINING, range((number - 1) * self.each, number * self.each), self.views)
+            pool += new
+            if number < len(self.done):
+                continue  # done before this run was stopped
+            student.net.load_state_dict(self._weights(number - 1))
+            self.progress.stage(f"round {number}: training", self.course.steps(len(pool)))
+            harder(pool, student.model, FIRST_STEPS)
+            self.course.round(number, pool, lambda: self.progress.advance(1))
+            self._keep(number, new, held_back, len(pool))
+
+    def _keep(self, number: int, new: Sequence[Lesson], held_back: Sequence[Lesson], trained: int) -> None:
+        """Judge the weights, and keep them and the round's pictures."""
+        model = self.course.student.model
+        found = score(model, held_back)
+        self._save(_file(number))
+        save_pictures(self.run.path / ARTIFACTS / FOLDER, number, new, model.labels)
+        self.done.append(TrainingRound(lessons=trained, clean=found.clean, robust=found.robust, kept=False))
+        self.run.store.set_note(ROUNDS, json.dumps([one.model_dump() for one in self.done]))
+        clean, worst = percent(found.clean), percent(found.robust)
+        self.progress.message(f"round {number}: {clean} of plain pictures right, {worst} of the worst")
+
+    def _save(self, name: str) -> None:
+        state = {key: one.contiguous() for key, one in self.course.student.net.state_dict().items()}
+        write_bytes(self.run.path / ARTIFACTS / name, safetensors.save(state))
+
+    def _weights(self, number: int) -> dict[str, torch.Tensor]:
+        return safetensors.load((self.run.path / ARTIFACTS / _file(number)).read_bytes())
+
+
+def _file(number: int) -> str:
+    return f"round-{number:03d}.safetensors"
