@@ -29,6 +29,7 @@ _EXAMPLES = """examples:
   advsearch export mug-texture-001
   advsearch export runs/mug-texture-001 --kind search --out search.parquet
   advsearch export mug-sweep-001 --format 3db --out folder
+  advsearch export mug-sweep-001 --format fiftyone --out folder
   advsearch export mug-patch-001 --format print --size 95 --out sheets.pdf
   advsearch export mug-texture-001 --format mitsuba --out folder
   advsearch export mug-texture-001 --format gltf --out mug.glb
@@ -124,6 +125,17 @@ def _threedb(args: argparse.Namespace, out: Path) -> Written:
     return {"rows": count}, f"{count} rows in {out}; look at them with: python -m threedboard {out}"
 
 
+def _fiftyone(args: argparse.Namespace, out: Path) -> Written:
+    """Write a dataset of the pictures that were kept."""
+    from advsearch.runs.directory import find_run
+    from advsearch.runs.fiftyone import write_fiftyone
+    from advsearch.viewer.pictured import object_of, pictured
+
+    folder = find_run(args.run)
+    count = write_fiftyone(lambda: pictured(folder), out, folder.resolve().name, object_of(folder))
+    return {"samples": count}, f"{count} samples in {out}, a fiftyone.types.FiftyOneDataset"
+
+
 def _print(args: argparse.Namespace, out: Path) -> Written:
     """Write the sheets."""
     from advsearch.cli.progress import at_work
@@ -169,6 +181,7 @@ def _gltf(args: argparse.Namespace, out: Path) -> Written:
 
 WRITERS: dict[str, tuple[str, Callable[[argparse.Namespace, Path], Written]]] = {
     "3db": ("a folder", _threedb),
+    "fiftyone": ("a folder", _fiftyone),
     "print": ("a PDF file", _print),
     "mitsuba": ("an XML file and what belongs to it, or a new folder for them", _mitsuba),
     "gltf": ("a .glb file", _gltf),
