@@ -1,8 +1,11 @@
-"""How quick the page of a sweep of a million rows is in a browser: python benchmarks/viewer.py [--rows 1000000].
+"""How quick the pages of runs are: python benchmarks/viewer.py [--rows 1000000] [--attack].
 
 The rows are made up; what is timed is reading them from the store when the sweep ends, and in Chromium (through
 Playwright, both of which `make test` sees to): the first paint of the page from `advsearch dashboard`, the map, and
 each interaction until the page is painted again. Seconds; medians of five for interactions.
+
+With `--attack` it is the page of a real attack of 40 steps on a texture at 224 pixels: how large it is,
+how long it takes to be made, and until the object that can be turned is drawn.
 """
 
 from __future__ import annotations
@@ -31,6 +34,9 @@ if TYPE_CHECKING:
     from playwright.sync_api import Page
 
 REPEATS = 5
+STEPS, SIDE = 40, 224
+"""Steps of the attack, and pixels a side of its pictures."""
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 BATCH = 10_000
 PAINTED = """(change) => new Promise((done) => {
   const begun = performance.now();
@@ -114,32 +120,64 @@ def timed(page: Page, address: str) -> dict[str, float]:
     return answer
 
 
-def main() -> int:
-    """Make the sweep, open it, and print what was measured."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", type=int, default=1_000_000, help="rows of the sweep")
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    args = parser.parse_args()
+def of_attack(folder: Path) -> dict[str, float]:
+    """Attack, make its page again, and open it."""
     from playwright.sync_api import sync_playwright
 
-    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if chromium is None:
+    import advsearch
+    from advsearch.viewer.attack_page import write_report
+
+    scene = advsearch.load_scene("teapot")
+    advsearch.attack(scene, controls=["texture"], steps=STEPS, resolution=SIDE, run=folder)
+    seconds = []
+    for _ in range(REPEATS):
+        begun = time.perf_counter()
+        report = write_report(folder)
+        seconds.append(time.perf_counter() - begun)
+    found = {"page made [s]": statistics.median(seconds), "page [MB]": report.stat().st_size / 1e6}
+    with sync_playwright() as playwright:
+        drawing = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=drawing)
+        page, begun = browser.new_page(bypass_csp=True), time.perf_counter()
+        page.goto(report.as_uri(), wait_until="commit")
+        page.wait_for_selector("#object canvas")
+        found["object drawn [s]"] = time.perf_counter() - begun
+        browser.close()
+    return found
+
+
+def of_sweep(folder: Path, rows: int) -> dict[str, float]:
+    """Make a sweep, open it from the server, and interact."""
+    from playwright.sync_api import sync_playwright
+
+    found = make(folder, rows)
+    found["columns [MB]"] = (folder / COLUMNS).stat().st_size / 1e6
+    server = Dashboard([folder])
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page(bypass_csp=True)
+        found |= timed(page, f"{server.address}runs/{folder.name}/")
+        browser.close()
+    server.shutdown()
+    return found
+
+
+def main() -> int:
+    """Make the run, open it, and print what was measured."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rows", type=int, default=1_000_000, help="rows of the sweep")
+    parser.add_argument("--attack", action="store_true", help="the page of an attack in place of a sweep's")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    args = parser.parse_args()
+    if CHROMIUM is None:
         print("there is no Chromium here: apt-get install chromium", file=sys.stderr)
         return 2
     with tempfile.TemporaryDirectory() as folder:
-        run = Path(folder) / "sweep"
-        found = make(run, args.rows)
-        found["columns [MB]"] = (run / COLUMNS).stat().st_size / 1e6
-        server = Dashboard([run])
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        with sync_playwright() as playwright:
-            browser = playwright.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-            page = browser.new_page(bypass_csp=True)
-            found |= timed(page, f"{server.address}runs/sweep/")
-            browser.close()
-        server.shutdown()
+        run = Path(folder) / "run"
+        found = of_attack(run) if args.attack else of_sweep(run, args.rows)
     if args.json:
-        print(json.dumps({"rows": args.rows, **found}, indent=2))
+        print(json.dumps(found if args.attack else {"rows": args.rows, **found}, indent=2))
         return 0
     for name, value in found.items():
         print(f"{name:32} {value:8.3f}")

@@ -57,7 +57,6 @@ def simpler(mesh: Mesh, most: int) -> Simpler | None:
     low = mesh.vertices.min(axis=0)
     extent = max(float((mesh.vertices.max(axis=0) - low).max()), 1e-12)
     chart = np.floor(mesh.uvs.astype(np.float64) * TEXTURE_CELLS).astype(np.int64)
-    found = None
     for grid in GRIDS:
         cells = np.floor((mesh.vertices - low) / extent * (grid - 1) + 0.5).astype(np.int64)
         places = np.unique(_key(cells), return_inverse=True)[1].reshape(-1)
@@ -66,10 +65,9 @@ def simpler(mesh: Mesh, most: int) -> Simpler | None:
         faces = left.reshape(-1)[mesh.faces]
         first, second, third = places[kept][faces].T
         faces = faces[(first != second) & (second != third) & (third != first)]
-        found = Simpler(kept, places[kept], places, np.unique(faces, axis=0).astype(np.uint32))
-        if len(found.faces) <= most:
+        if len(faces) <= most:
             break
-    return found
+    return Simpler(kept, places[kept], places, np.unique(faces, axis=0).astype(np.uint32))
 
 
 def _key(rows: Numbers) -> Numbers:

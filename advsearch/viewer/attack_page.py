@@ -15,12 +15,14 @@ from advsearch.files import JsonObject
 from advsearch.report import wording
 from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
 from advsearch.report.markup import Html, element, join
+from advsearch.report.method import PLAN_HEADS, method_facts, plan_rows, plan_text
 from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, marks_text
 from advsearch.runs import directory, images, store
 from advsearch.runs.files import write_text
 from advsearch.runs.results.attack import AttackSummary, FoundValue, UsualAnswer
 from advsearch.runs.summary import attack_of
 from advsearch.viewer.document import data_script, data_url, document
+from advsearch.viewer.study_page import facts_table, table
 from advsearch.viewer.turning import object_data, object_section, read_object
 
 LARGE_PICTURE = 1_000_000
@@ -34,6 +36,9 @@ FRAME_QUALITY = 85
 
 MOST_TRIALS = 24
 """Pictures of the verification that the page shows."""
+
+AT_THE_END = 1e-6
+"""Of a range: as near as that to one of its ends a value was stopped by it."""
 
 _PNG = "image/png"
 
@@ -245,16 +250,25 @@ def _cost(summary: AttackSummary) -> Html:
         "Model": summary.model,
         "Seed": str(summary.seed),
     }
-    return join(element("h2", "Cost and conditions"), _table_of_facts(facts))
+    return join(element("h2", "Cost and conditions"), facts_table(facts), _method(summary))
+
+
+def _method(summary: AttackSummary) -> Html:
+    """How the search worked, and how it got its derivatives; folded."""
+    worked = element("details", element("summary", "How the search worked"), facts_table(method_facts(summary)))
+    rows = plan_rows(summary)
+    if not rows:
+        return worked
+    return join(worked, element("details", element("summary", plan_text(summary)), table(PLAN_HEADS, rows)))
 
 
 def _repeat(data: RunData) -> Html:
     commands = [shlex.join(["advsearch", "run", f"{data.summary.run or data.path}/{directory.CONFIG}"])]
     if data.summary.command_line:
         commands.append(data.summary.command_line)
-    recipe = (
-        element("details", element("summary", "All settings"), element("pre", data.recipe)) if data.recipe else None
-    )
+    recipe = None
+    if data.recipe:
+        recipe = element("details", element("summary", "All settings"), element("pre", data.recipe, class_="wrap"))
     return join(element("h2", "Do it again"), *(element("pre", text, class_="wrap") for text in commands), recipe)
 
 
@@ -292,13 +306,6 @@ def _trial(name: str) -> str:
     return "trial " + Path(name).stem.removeprefix("verification").removesuffix("-answer").strip("-_")
 
 
-def _table_of_facts(facts: Mapping[str, str]) -> Html:
-    lines = [
-        element("tr", element("th", name, scope="row"), element("td", value)) for name, value in facts.items() if value
-    ]
-    return element("table", element("tbody", *lines), class_="facts")
-
-
 def _changes(summary: AttackSummary) -> Html:
     """The answer in a few values, each in its range where it has one."""
     found = summary.configuration or {}
@@ -332,8 +339,10 @@ def _place(one: FoundValue) -> Html | None:
     one_low = one.low
     marks = [element("span", style=at(one.clean), class_="from")] if isinstance(one.clean, (int, float)) else []
     words = f"from {wording.number_text(one.low)} to {wording.number_text(one.high)}"
+    stopped = min(one.value - one.low, one.high - one.value) <= AT_THE_END * width
     dot = element("span", style=at(one.value), class_="to")
-    return element("div", *marks, dot, class_="place", role="img", aria_label=words, title=words)
+    drawn = element("div", *marks, dot, class_="place", role="img", aria_label=words, title=words)
+    return join(drawn, element("span", "at its end", class_="soft") if stopped else None)
 
 
 def _animation(data: RunData) -> JsonObject:

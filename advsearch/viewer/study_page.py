@@ -159,7 +159,8 @@ def table(
         shown = [_cell(text, (shares or {}).get((number, at))) for at, text in enumerate(cells, 1)]
         lines.append(element("tr", element("th", name, scope="row"), *shown))
     head = element("tr", *(element("th", text, scope="col") for text in heads))
-    return element("div", element("table", element("thead", head), element("tbody", *lines)), class_="scroll")
+    made = element("table", element("thead", head), element("tbody", *lines))
+    return element("div", made, class_="scroll", tabindex=0)  # who has no mouse scrolls a wide one by keys
 
 
 LONG = 32

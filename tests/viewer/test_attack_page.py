@@ -495,3 +495,55 @@ def test_a_damaged_object_is_left_out(tmp_path: Path) -> None:
         file.write_bytes(data)
         assert read_object(tmp_path) == b""
     assert object_section(b"") is None
+
+
+METHOD: dict[str, Any] = {
+    "gradient_plan": {"renders_per_gradient": 2, "spp": 8, "groups": [
+        {"control": "pose", "parameter": "yaw", "size": 1, "estimator": "secant", "valid": ["secant"], "step": 0.03,
+         "step_reason": "an outline moves", "reason": "the quickest", "variance_x_seconds": {}, "step_in_unit": 5.4,
+         "unit": "degrees"},
+        {"control": "texture", "parameter": "texels", "size": 192, "estimator": "adjoint", "valid": ["adjoint"],
+         "step": 0.05, "step_reason": "", "reason": "the only one", "variance_x_seconds": {}, "step_in_unit": None,
+         "unit": ""}]},
+    "transport": {"used": True, "error": {"levels": 0.8123, "logits": None}, "renewed": 1, "seconds": 2.0},
+    "renders": {"search": 3, "products": 37},
+    "gradients": {"count": 36, "cosine_with_the_one_before": 0.253, "zero": 2, "cut": 1, "shortened": 4, "rejected": 3},
+    "claimed": {"objective": 4.5, "re_evaluated": 3.25, "success_rate": 1.0},
+    "sample_count": {"spp": 64, "converged": False},
+    "non_finite": {"objectives": 1, "gradient_elements": 7},
+    "printability": {"clean": {"variation": 0.01, "off_print": 0.2}, "answer": {"variation": 0.03, "off_print": 0.1}},
+    "configuration": {
+        "pose.yaw": {"value": 90.0, "unit": "degrees", "clean": 0.0, "low": -90.0, "high": 90.0},
+        "pose.roll": {"value": 9.0, "unit": "degrees", "clean": 0.0, "low": -90.0, "high": 90.0},
+    },
+}  # fmt: skip
+
+
+def test_the_page_says_how_the_search_worked(tmp_path: Path) -> None:
+    text = page_of(make_run(tmp_path / "run", attack(**METHOD))).text
+    for said in (
+        "The search's claim margin 4.5 in the render that won, 3.25 when rendered again",
+        "Sample count 64 a pixel in the verification; the margin still moved there",
+        "Light transport a matrix predicted 37 pictures; at the last comparison with a traced one it was off by 0.812 "
+        "of 255 levels of the picture's change (root mean square) and an unknown amount of the objective; made anew 1 "
+        "time; it and the comparisons took 2.0 s",
+        "Gradients 36 of the search, 2 of them zero, median cosine with the one before 0.25",
+        "Cut or taken back 1 gradient with single outliers cut, 4 shortened as a whole, 3 steps taken back",
+        "Not finite 1 objective, 7 numbers of gradients",
+        "Light paths at most 6 segments in the search, 6 in the verification",
+        "clean: step between neighbours 0.01, distance from printable colours 0.2; answer: step between neighbours",
+        "Gradient plan: 2 parameters, 2 renders a gradient beside the picture itself, 8 samples a pixel",
+        "pose.yaw 1 secant the quickest 5.4 degrees: an outline moves",
+        "texture.texels 192 adjoint the only one",
+    ):
+        assert said in text, said
+    assert text.count("at its end") == 1
+
+
+def test_the_page_does_not_say_what_is_not_known_of_the_search(tmp_path: Path) -> None:
+    text = page_of(make_run(tmp_path / "run")).text
+    assert "Light paths" in text
+    assert not re.search("Gradient plan|Light transport|Not finite|Printability|taken back|at its end", text)
+    used = {"used": False, "reason": "a pose is searched"}
+    text = page_of(make_run(tmp_path / "other", attack(transport=used))).text
+    assert "Light transport every picture was rendered: a pose is searched" in text

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from samples import GAP, gap, keep_object, make_run
+from samples import attack as attack_with
 from stored_sweeps import described, make_sweep, serving
 
 from advsearch.api.photos import Photographs
@@ -32,6 +33,14 @@ if TYPE_CHECKING:
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 Open = Callable[..., Any]
+
+PLANNED: dict[str, Any] = {
+    "control": "geometry", "parameter": "amplitudes", "size": 24, "estimator": "material", "valid": ["material"],
+    "step": 0.05, "step_reason": "an outline moves, and the picture with it, so that it has to be wide",
+    "reason": "preferred among material, simultaneous, boundary; not measured", "variance_x_seconds": {},
+    "step_in_unit": 0.1, "unit": "object sizes",
+}  # fmt: skip
+"""A parameter of a gradient plan that says much."""
 
 
 def test_a_browser_is_looked_for() -> None:
@@ -77,7 +86,8 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def attack(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = make_run(tmp_path_factory.mktemp("runs") / "attack")
+    plan = {"renders_per_gradient": 0, "spp": None, "groups": [PLANNED]}
+    run = make_run(tmp_path_factory.mktemp("runs") / "attack", attack_with(gradient_plan=plan))
     keep_object(run)
     write_report(run)
     return run
@@ -316,6 +326,7 @@ def test_everybody_can_use_the_pages(
         page.wait_for_selector(
             {"sweep": "[data-cell]", "attack": "#object canvas", "study": "svg"}[which], state="attached"
         )
+        page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
         found = axe.Axe().run(page).response["violations"]
         assert [
             (one["id"], one["nodes"][0]["html"][:200]) for one in found if one["impact"] in ("serious", "critical")
