@@ -138,11 +138,8 @@ def test_a_patch_that_goes_with_failures_lights_up_and_no_other_model_s(tmp_path
     assert "none of" in page and "told from chance" in page
 
 
-@pytest.mark.parametrize(
-    ("task", "module"),
-    [("detection", Detecting()), pytest.param("segmentation", Segmenting(), marks=pytest.mark.slow)],
-    ids=["detection", "segmentation"],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("task", "module"), [("detection", Detecting()), ("segmentation", Segmenting())])
 def test_tasks_beside_classification_have_such_a_map(tmp_path: Path, task: str, module: nn.Module) -> None:
     asked = {"detection": {"name": "detection", "iou": 0.2}}.get(task, task)
     summary = swept(tmp_path / "run", module, task=asked)

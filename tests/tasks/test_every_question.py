@@ -89,10 +89,39 @@ def test_a_sweep_counts_and_keeps_the_worst(
 ) -> None:
     swept = answer(
         capsys, "sweep", "--object", "mug", *asked, "--grid", "pose.yaw=0,180", "--grid", "camera.elevation=25,85",
-        "--denoise", "none", "--spp", "2", "--trials", "6", "--verify-spp", "4", "--run", str(tmp_path / "run"),
+        "--denoise", "none", "--spp", "2", "--trials", "6", "--verify-spp", "4", "--surface", "--run",
+        str(tmp_path / "run"),
     )  # fmt: skip
+    assert {table["part"]: table["seen"] > 500 for table in swept["surface"]["tables"]} == {"cell": True, "face": True}
     assert swept["configurations"] == 4 and swept["worst"]["claimed"]["payload"] is not None
     assert (tmp_path / "run" / "images" / "worst-answer.png").is_file()
+
+
+@pytest.mark.parametrize("asked", ["detection", pytest.param("segmentation", marks=pytest.mark.slow)], indirect=True)
+def test_an_answer_is_tried_on_other_models_and_under_other_conditions(
+    asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Each model's, on both, of which the second is the first under another name; then the first's, replayed."""
+    one, other, run = Path(asked[3]), tmp_path / "other.pt2", tmp_path / "run"
+    other.write_bytes(one.read_bytes())
+    both = [f"{one},{other}" if word == str(one) else word for word in asked]
+    flags = ["--epsilon", "0.3", "--steps", "6", "--trials", "6", "--no-baseline", "--run", str(run)]
+    found = answer(capsys, "attack", "--object", "mug", *both, *SHORT, *flags)
+    assert [row["attacked"] for row in found["table"]] == found["models"] == [str(one), str(other)]
+    said = "bowl" if task_of(asked) == "detection" else "background"
+    for cell in (cell for row in found["table"] for cell in row["tested"]):
+        assert cell["ending"] == "found" and set(cell["verified"]["labels"]) == {said}
+    assert [tested["clean"]["correct"] for tested in found["tested"]] == [6, 6]
+    part = next((run / "parts").iterdir())
+    again = answer(
+        capsys, "replay", str(part), "--ways", "curve", "--trials", "6", "--model", str(other), "--run",
+        str(tmp_path / "replayed"), "--json",
+    )  # fmt: skip
+    assert {row["way"] for row in again["table"]} == {"as verified", "curve", "model"}
+    assert all(
+        row["clean"]["correct"] == row["clean"]["trials"] == 6 for row in again["table"] if row["way"] == "model"
+    )
+    assert {row["ending"] for row in again["table"] if row["way"] in ("as verified", "model")} == {"found"}
 
 
 def test_how_much_worse_than_the_average(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
