@@ -19,6 +19,9 @@ from typing import Any
 import yaml
 
 import advsearch
+from advsearch.api.recipe import recipe_from_config
+from advsearch.config import RecipeConfig
+from advsearch.runs.directory import CONFIG
 from advsearch.runs.results.recipe import RecipeResult
 from advsearch.runs.summary import NAME, read_result
 
@@ -44,11 +47,11 @@ LABELS = {"mug": "coffee mug,cup", "teapot": "teapot,coffeepot"}
 COUNTS: dict[str, dict[str, Any]] = {
     "backgrounds": {"views": {"samples": 40}},
     "texture-shape": {"materials": {"samples": 8}},
-    "orientation-scale": {"views": {"samples": 120}},
-    "liquid": {"mixtures": {"samples": 240}},
+    "orientation-scale": {"views": {"samples": 60}},
+    "liquid": {"mixtures": {"samples": 120}},
     "viewpoints": {"all": {"samples": 80}, "search": {"steps": 200, "trials": 6}, "worst": {"samples": 80}},
-    "pose-space": {"poses": {"samples": 120}},
-    "common-corruptions": {"clean": {"samples": 60}, "corrupted": {"samples": 3}},
+    "pose-space": {"poses": {"samples": 60}},
+    "common-corruptions": {"clean": {"samples": 40}, "corrupted": {"samples": 2}},
     "parts": {"views": {"samples": 200}},
     "physical": {"texture": {"draws": 4, "steps": 80, "trials": 60, "verify_spp": 16}},
 }
@@ -77,7 +80,7 @@ def main() -> int:
 def bundled(name: str, out: Path) -> RecipeResult:
     """Return what a recipe says of bundled objects, quickly."""
     run = out / f"q-{name}"
-    return done(run) or advsearch.recipe(name, quick=True, run=run)
+    return done(run) or gone_on(run) or advsearch.recipe(name, quick=True, run=run)
 
 
 def real(name: str, data: Path, out: Path) -> RecipeResult:
@@ -93,14 +96,18 @@ def real(name: str, data: Path, out: Path) -> RecipeResult:
         "mobilenet_v2_imagenet.pt2",
         *(["mobilenet_edgetpu_075_imagenet_224.pt2"] if "corruptions" in name else []),
     ]
-    return done(run) or advsearch.recipe(
-        file,
-        object=[str(data / "objects" / f"{one}.obj") for one in LABELS if one == "mug" or name not in ONE_OBJECT],
-        environment=environments if several else environments[-1],
-        model=[str(data / "models" / one) for one in models],
-        labels=data / "models" / "imagenet_labels.json",
-        label=LABELS,
-        run=run,
+    return (
+        done(run)
+        or gone_on(run)
+        or advsearch.recipe(
+            file,
+            object=[str(data / "objects" / f"{one}.obj") for one in LABELS if one == "mug" or name not in ONE_OBJECT],
+            environment=environments if several else environments[-1],
+            model=[str(data / "models" / one) for one in models],
+            labels=data / "models" / "imagenet_labels.json",
+            label=LABELS,
+            run=run,
+        )
     )
 
 
@@ -108,6 +115,11 @@ def done(run: Path) -> RecipeResult | None:
     """Return the result of a run that is done already."""
     result = read_result(run) if (run / NAME).is_file() else None
     return result if isinstance(result, RecipeResult) and not result.goes_on else None
+
+
+def gone_on(run: Path) -> RecipeResult | None:
+    """Return the result of a run that was begun, once it is done."""
+    return recipe_from_config(RecipeConfig.from_yaml(run / CONFIG), resumed=run) if (run / CONFIG).is_file() else None
 
 
 def told(name: str, result: RecipeResult, suffix: str) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,6 @@ from advsearch.api.keywords import RecipeKeywords, asks, configured
 from advsearch.config import CONFIGS, RecipeConfig
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.controls import CONTROLS
-from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
 from advsearch.recipes.description import Recipe, read_recipe, recipe_of
 from advsearch.recipes.figures import compute, draw, read_options
@@ -23,7 +22,7 @@ from advsearch.recipes.table import Answered, Table, rows_of
 from advsearch.runs.directory import CONFIG, IMAGES, PARTS, RunDirectory, is_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.listing import finished
-from advsearch.runs.results.attack import AttackSummary, DescribedValue, FoundValue
+from advsearch.runs.results.attack import AnswerDistribution, AttackSummary, DescribedValue, FoundValue
 from advsearch.runs.results.base import INTERRUPTED, Result
 from advsearch.runs.results.recipe import RecipeFigure, RecipePart, RecipeResult
 from advsearch.runs.results.sweep import SweepSummary
@@ -33,6 +32,9 @@ from advsearch.viewer.pages import write_page
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
+
+TURN = 360.0
+"""Degrees."""
 
 NOTE = "recipe"
 """Under which a run's store keeps the recipe, so that it goes on as it began."""
@@ -75,10 +77,11 @@ def recipe_from_config(
         if described is None:
             described = recipe_of(run.store.noted(NOTE) or {}, f"{run.path}: the recipe that it began with")
         run.store.set_note(NOTE, json.dumps(described.model_dump(mode="json")))
-        results = _carried_out(planned(described, config), run, progress or NullProgress())
+        notes: list[str] = []
+        results = _carried_out(planned(described, config), run, progress or NullProgress(), notes)
         interrupted = any(one.goes_on for _, one in results)
         figures = [] if interrupted else list(_figures(described, config, results, run))
-        result = _result(described, config, run, results, figures, time.perf_counter() - begun)
+        result = _result(described, config, run, results, figures, notes, time.perf_counter() - begun)
         run.write_summary(result)
         write_page(run.path, result)
         return result
@@ -94,8 +97,17 @@ def _check(described: Recipe, config: RecipeConfig) -> None:
 # ---- the runs -------------------------------------------------------------------------------------------------------
 
 
-def _carried_out(runs: Sequence[Planned], run: RunDirectory, progress: Progress) -> list[tuple[Planned, Result]]:
-    """Carry out the runs that are not done, until one is interrupted; return all that there are."""
+def _carried_out(
+    runs: Sequence[Planned], run: RunDirectory, progress: Progress, notes: list[str]
+) -> list[tuple[Planned, Result]]:
+    """Carry out the runs that are not done, until one is interrupted; return all that there are.
+
+    Args:
+        runs: in their order.
+        run: of the recipe.
+        progress: told how far it is.
+        notes: gets a sentence for each run that cannot be carried out after another one's answer.
+    """
     results: list[tuple[Planned, Result]] = []
     for number, one in enumerate(runs):
         path = run.path / PARTS / one.name
@@ -105,7 +117,14 @@ def _carried_out(runs: Sequence[Planned], run: RunDirectory, progress: Progress)
         else:
             own = one.config.model_copy(update={"run": str(path), "overwrite": True})
             if one.around is not None:
-                own = _around(own, attack_of(run.path / PARTS / one.around))
+                search = attack_of(run.path / PARTS / one.around)
+                if search.distribution is None:
+                    notes.append(
+                        f"{one.config.object}: the search ended with {search.ending!r} and no distribution, so that "
+                        f"the part {one.part} is left out for it."
+                    )
+                    continue
+                own = _around(own, search.distribution, search.configuration or {})
             done = carry_out(own, progress=progress)
         results.append((one, done))
         if done.goes_on:
@@ -113,23 +132,19 @@ def _carried_out(runs: Sequence[Planned], run: RunDirectory, progress: Progress)
     return results
 
 
-def _around(config: SceneConfig, summary: AttackSummary) -> SceneConfig:
+def _around(config: SceneConfig, found: AnswerDistribution, searched: Mapping[str, FoundValue]) -> SceneConfig:
     """Draw evenly from the distribution that a search answers with: mean and deviation are the same.
 
-    An even distribution of deviation s is sqrt(12) s wide. The ranges end where the search's did, but angles that come
-    round.
+    An even distribution of deviation s is sqrt(12) s wide. The ranges end where the search's did; angles that go
+    all the way round may pass that end, and take the whole turn at most.
 
-    Raises:
-        InputError: the search answers with one configuration, since its policy does or since it searched nothing.
+    Args:
+        config: of the sweep that draws.
+        found: what the search answers with; its deviations are shares of the ranges.
+        searched: the ranges of its parameters.
     """
-    searched = summary.configuration
-    if summary.distribution is None or searched is None:
-        raise InputError(
-            f"{summary.run}: ended with {summary.ending!r} and no distribution to draw from; search with a policy that "
-            "answers with one, such as `policy=nes`"
-        )
     controls: dict[str, dict[str, object]] = {}
-    for (name, mean), deviation in zip(summary.distribution.mean.items(), summary.distribution.deviation, strict=True):
+    for (name, mean), deviation in zip(found.mean.items(), found.deviation, strict=True):
         control, _, parameter = name.partition(".")
         controls.setdefault(control, {})[parameter] = _range(name, mean, searched[name], deviation)
     return config.model_copy(update={"controls": controls, "sampler": "random"})
@@ -142,9 +157,10 @@ def _range(name: str, mean: DescribedValue, searched: FoundValue, deviation: flo
     if declared.log:
         low, high, at = (math.log(value) for value in (low, high, at))
     wide = math.sqrt(3.0) * deviation * (high - low)
-    ends = [at - wide, at + wide]
-    if not declared.periodic:
-        ends = [min(max(end, low), high) for end in ends]
+    if declared.periodic and high - low >= TURN:
+        ends = [at - min(wide, TURN / 2), at + min(wide, TURN / 2)]
+    else:
+        ends = [max(at - wide, low), min(at + wide, high)]
     return [math.exp(end) for end in ends] if declared.log else ends
 
 
@@ -181,11 +197,12 @@ def _result(
     run: RunDirectory,
     results: Sequence[tuple[Planned, Result]],
     figures: Sequence[RecipeFigure],
+    notes: Sequence[str],
     seconds: float,
 ) -> RecipeResult:
     settings = made_of(described, config).settings
     controls = [name for one, _ in results if isinstance(one.config, SceneConfig) for name in one.config.controls]
-    warnings = [text for _, one in results for text in getattr(one, "warnings", ())]
+    warnings = [*notes] + [text for _, one in results for text in getattr(one, "warnings", ())]
     return RecipeResult(
         run=str(run.path),
         recipe=config.recipe,

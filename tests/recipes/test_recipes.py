@@ -15,7 +15,7 @@ import advsearch
 from advsearch.api import carry_out
 from advsearch.api import recipe as carrying_out
 from advsearch.cli.main import main
-from advsearch.config import RecipeConfig
+from advsearch.config import RecipeConfig, SweepConfig
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
 from advsearch.recipes.description import Recipe, names, read_recipe, titles
 from advsearch.recipes.figures import FIGURES, compute, draw, read_options
@@ -23,6 +23,7 @@ from advsearch.recipes.parts import planned
 from advsearch.recipes.table import Answered, Table
 from advsearch.report.recipes import figure_table
 from advsearch.runs.images import write_png
+from advsearch.runs.results.attack import AnswerDistribution, FoundValue
 from advsearch.runs.results.recipe import BarsFigure, HeatMapFigure, RecipeResult
 from advsearch.runs.results.sweep import SurfaceMap
 from advsearch.runs.summary import read_result
@@ -199,6 +200,26 @@ def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
     }
     assert main(["show", str(run), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["figures"][1]["by"] == "environment"
+
+
+def test_what_is_drawn_has_the_mean_and_the_deviation_that_a_search_answers_with() -> None:
+    searched = {
+        "camera.elevation": {"value": 30.0, "unit": "degrees", "low": 0.0, "high": 80.0},
+        "camera.azimuth": {"value": 350.0, "unit": "degrees", "low": 0.0, "high": 360.0},
+        "camera.roll": {"value": 0.0, "unit": "degrees", "low": -30.0, "high": 30.0},
+        "camera.distance": {"value": 2.0, "unit": "object sizes", "low": 1.0, "high": 4.0},
+    }
+    found = AnswerDistribution.of({"mean": searched, "deviation": [0.1, 0.05, 2.0, 0.1]})
+    ranges = {name: FoundValue.of(value) for name, value in searched.items()}
+    drawn = carrying_out._around(SweepConfig(object="mug"), found, ranges)
+    assert isinstance(drawn, SweepConfig) and drawn.sampler == "random"
+    camera: Any = drawn.controls["camera"]
+    low, high = camera["elevation"]
+    assert ((low + high) / 2, (high - low) / 12**0.5) == pytest.approx((30.0, 8.0))
+    assert camera["azimuth"][1] > 360.0 and sum(camera["azimuth"]) / 2 == pytest.approx(350.0)
+    assert camera["roll"] == pytest.approx([-30.0, 30.0])
+    low, high = np.log2(camera["distance"])  # evenly along the logarithm, as it is searched
+    assert ((low + high) / 2, (high - low) / 12**0.5) == pytest.approx((1.0, 0.2))
 
 
 # ---- what figures say -----------------------------------------------------------------------------------------------
