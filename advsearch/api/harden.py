@@ -18,7 +18,7 @@ from advsearch.attacks.verification import WORST_CASE
 from advsearch.bundled.objects import OBJECTS
 from advsearch.config import AttackConfig, HardenConfig
 from advsearch.config.hardening import ALL
-from advsearch.engine.hardening.lessons import Lesson, lessons
+from advsearch.engine.hardening.lessons import Lesson, lessons, plain_lessons
 from advsearch.engine.hardening.pictures import FOLDER
 from advsearch.engine.hardening.rounds import VALIDATION_VIEWS, WEIGHTS, Rounds
 from advsearch.engine.hardening.split import HELD_OUT, TRAINING, VALIDATION, Split, check_disjoint
@@ -60,6 +60,8 @@ OVER: dict[str, dict[str, object]] = {
 TRIES = 6
 """Random configurations of a view that is rendered, of which the worst is trained on."""
 CLEAN_VIEWS = 2
+PLAIN_VIEWS = 6
+"""Further views of each scene as it is: clean accuracy is lost where there are too few."""
 CLEAN_SCENES = 4
 """Held-out scenes whose plain pictures are looked at, for each one that is attacked."""
 CLEAN_SPP = 16
@@ -262,7 +264,9 @@ class Hardening:
                 name, scene = side.scene(number, self._set)
                 problem = problem_of(self._alone(control, name, over=_without(control)), scene, self.student.model)
                 shared = split == TRAINING and number % 4 == 3
-                found += lessons(problem, views, TRIES, seeds.stream(side.seed, "views", number), shared=shared)
+                seed = seeds.stream(side.seed, "views", number)
+                found += lessons(problem, views, TRIES, seed, shared=shared)
+                found += plain_lessons(problem, PLAIN_VIEWS, seed)
                 self.progress.advance(1)
         return found
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from advsearch.engine.hardening.lessons import Lesson, RenderedLesson, harder, surprise
 from advsearch.engine.hardening.pictures import save_pictures, write_archive
 from advsearch.engine.hardening.split import HELD_OUT, TRAINING, Split, check_disjoint, fingerprint
-from advsearch.engine.hardening.training import Course, score
+from advsearch.engine.hardening.training import Course, Score, score
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model, reference
 from advsearch.models.trainable import Trainable, trainable
@@ -37,7 +37,8 @@ def coloured(right: int, level: float, seed: int) -> Tensor:
 
 def pupils() -> list[Lesson]:
     """Three classes by their brightest channel, of which the worst pictures show little."""
-    return [Lesson((n % 3,), coloured(n % 3, 0.4, n), coloured(n % 3, 0.2, 99 + n)) for n in range(24)]
+    worst = [coloured(n % 3, 0.2, 99 + n) for n in range(24)]
+    return [RenderedLesson((n % 3,), coloured(n % 3, 0.4, n), one, one[None]) for n, one in enumerate(worst)]
 
 
 # ---- the split ------------------------------------------------------------------------------------------------------
@@ -134,6 +135,8 @@ def test_a_round_teaches_plain_and_worst_pictures() -> None:
     course.round(1, lessons, lambda: ticks.append(1))
     after = score(made.model, lessons)
     assert len(ticks) == course.steps(len(lessons)) == 12
+    more = [Lesson((5,), coloured(0, 0.4, 1), coloured(0, 0.4, 1))] * 24  # nothing makes them harder
+    assert score(made.model, [*lessons, *more]) == Score(after.clean / 2, after.robust)
     assert before.robust < 0.6 and after.clean >= 0.9 and after.robust >= 0.9
 
 

@@ -91,6 +91,14 @@ class RenderedLesson(Lesson):
     pictures: Tensor
 
 
+def plain_lessons(problem: Problem, views: int, seed: int) -> list[Lesson]:
+    """Draw views of one scene as it is: lessons that nothing makes harder. Arguments as for `lessons`."""
+    right = tuple(int(index) for index in problem.truth())
+    drawn = [seeds.stream(seed, "plain lesson", number) for number in range(views)]
+    pictures = [problem.picture(problem.domain.start, one, SPP) for one in drawn]
+    return [Lesson(right, picture, picture) for picture in pictures]
+
+
 def lessons(problem: Problem, views: int, tries: int, seed: int, *, shared: bool = False) -> list[Lesson]:
     """Draw lessons from one scene whose view and light vary by chance.
 

@@ -9,7 +9,7 @@ import tarfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from advsearch.engine.hardening.lessons import Lesson
+from advsearch.engine.hardening.lessons import Lesson, RenderedLesson, TextureLesson
 from advsearch.files import JsonObject
 from advsearch.runs.files import replacing
 from advsearch.runs.images import write_png
@@ -29,7 +29,7 @@ def save_pictures(folder: Path, number: int, chosen: Sequence[Lesson], labels: S
     """
     for place, one in enumerate(chosen):
         name = re.sub(r"[^a-z0-9]+", "-", labels[one.right[0]].lower()).strip("-")
-        for kind in KINDS:
+        for kind in KINDS if isinstance(one, (TextureLesson, RenderedLesson)) else KINDS[:1]:
             path = folder / f"{one.right[0]:04d}-{name}" / f"{number:03d}-{place:05d}-{kind}.png"
             path.parent.mkdir(parents=True, exist_ok=True)
             write_png(path, getattr(one, kind))

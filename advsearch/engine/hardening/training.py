@@ -1,4 +1,4 @@
-"""Training on lessons: half of each step plain pictures, half the worst ones, which are made worse as it goes.
+"""Training on lessons: in each step plain pictures and the worst ones, which are made worse as it goes, count alike.
 
 Weights are averaged over the steps; the average is what is judged and kept.
 """
@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.engine.hardening.augmentation import Augmentation
-from advsearch.engine.hardening.lessons import TOGETHER, Lesson, TextureLesson, harder, surprise
+from advsearch.engine.hardening.lessons import TOGETHER, Lesson, RenderedLesson, TextureLesson, harder, surprise
 from advsearch.models import Model
 from advsearch.models.trainable import Trainable
 
@@ -114,9 +114,14 @@ class Course:
             return AUGMENTATION(images.permute(0, 3, 1, 2), generator).permute(0, 2, 3, 1)
 
         harder(batch, self.student.model, change=change)
-        right = [one.right for one in batch]
-        plain, worst = (torch.stack([getattr(one, which) for one in batch]) for which in ("plain", "worst"))
-        loss = surprise(self.student.logits(torch.cat([change(plain), change(worst)])), right * 2).mean()
+        searched = [one for one in batch if isinstance(one, (TextureLesson, RenderedLesson))]
+        images = [change(torch.stack([one.plain for one in batch]))]
+        if searched:
+            images.append(change(torch.stack([one.worst for one in searched])))
+        found = surprise(self.student.logits(torch.cat(images)), [one.right for one in [*batch, *searched]])
+        loss = found[: len(batch)].mean()
+        if searched:
+            loss = loss + found[len(batch) :].mean()
         if self.beside is not None:
             shown, labels = self._next()
             truth = [(int(label),) for label in labels]
@@ -136,13 +141,14 @@ class Course:
 
 
 def score(model: Model, held_back: Sequence[Lesson]) -> Score:
-    """Judge a model on lessons; they stay as they are."""
+    """Judge a model on lessons, which stay as they are; those that nothing makes harder count for `clean` alone."""
     own = [copy.copy(one) for one in held_back]
     for one in own:
         if isinstance(one, TextureLesson):
             one.texture = copy.copy(one.texture)
     harder(own, model, HELD_BACK_STEPS)
-    return Score(right_share(model, own, "plain"), right_share(model, own, "worst"))
+    searched = [one for one in own if isinstance(one, (TextureLesson, RenderedLesson))]
+    return Score(right_share(model, own, "plain"), right_share(model, searched, "worst"))
 
 
 def right_share(model: Model, chosen: Sequence[Lesson], which: str) -> float:
