@@ -12,7 +12,7 @@ from advsearch.report.surface_words import surface_sentences
 from advsearch.runs.directory import IMAGES, PARTS
 from advsearch.runs.results.recipe import SurfaceFigure, SurfaceOf
 
-SIZE = 6.4, 4.6
+SIZE = 6.4, 2.9
 """Of one object's map, width and height in inches."""
 
 
