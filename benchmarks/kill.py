@@ -39,8 +39,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         _start([args.command, *words, "--run", str(whole)]).wait()
         seconds = time.perf_counter() - begun
         kills = _killed([args.command, *words, "--run", str(killed)], killed, args.kills, seconds)
-        same = _rows(whole) == _rows(killed)
-        print(f"{args.command}: {len(_rows(whole))} rows, {kills} kills, rows {'agree' if same else 'DIFFER'}")
+        same = rows_of(whole) == rows_of(killed)
+        print(f"{args.command}: {len(rows_of(whole))} rows, {kills} kills, rows {'agree' if same else 'DIFFER'}")
     return 0 if same else 3
 
 
@@ -68,7 +68,8 @@ def _killed(first: Sequence[str], folder: Path, wanted: int, seconds: float) -> 
             kills += 1
 
 
-def _rows(folder: Path) -> list[Row]:
+def rows_of(folder: Path) -> list[Row]:
+    """Return the rows of a run without times."""
     with Store(folder / NAME, read_only=True) as store:
         return [Row(**{**vars(row), "seconds": None, "time": None}) for row in store.rows()]
 

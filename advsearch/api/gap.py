@@ -13,12 +13,12 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.attack import LOADING, attack_once, check_from_config, problem_from_config
 from advsearch.api.keywords import GapKeywords, asks, configured
+from advsearch.api.parts import parts_of, share
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.config import AttackConfig, GapConfig
 from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.naming import different, load_models
-from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.transfer import Transfer
 from advsearch.engine.transport import CleanMatrix
 from advsearch.interrupts import interruptible
@@ -340,16 +340,16 @@ def _flips_within(row: ObjectRow, epsilon: float | None) -> bool:
 
 
 def _gap(config: GapConfig, parts: _Parts) -> list[GapRow]:
-    shared = RunSettings(config.epsilon, config.norm, config.texture_resolution)
-    shared.check(config.controls, config.over)
-    rows = []
-    for place, name in enumerate(different(config.objects, "object")):
-        for number, (control, settings) in enumerate(config.controls.items()):
-            own = vars(shared.alone(control, settings))
-            one = AttackConfig.of(config, object=name, controls={control: settings}, **own)
-            summary = parts.attack(one, f"{place:02d}-{number:02d}-" + default_name(name, [control]))
-            if summary is not None and summary.average is not None:
-                rows.append(_compared(name, control, summary, summary.average))
+    attacks, rows = parts_of(config), []
+    try:
+        with interruptible():
+            share(config, attacks, parts.run.path, parts.progress)
+    except KeyboardInterrupt:
+        parts.interrupted = True
+    for one in attacks:
+        summary = parts.attack(one.config, one.name)
+        if summary is not None and summary.average is not None:
+            rows.append(_compared(one.object, one.control, summary, summary.average))
     return rows
 
 

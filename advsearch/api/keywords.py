@@ -115,6 +115,8 @@ class GapKeywords(SearchKeywords, NamedKeywords, total=False):
 
     objective: str | None
     policy: Named
+    workers: int | None
+    cluster: str | None
     over: NamedControls
 
 

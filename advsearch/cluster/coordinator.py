@@ -22,7 +22,7 @@ from advsearch.cluster.worker import Carried, Failure, Ready, carry_out, prepare
 from advsearch.errors import ClusterError
 
 DEPTH = 2
-"""Ranges that a worker has at once: the one it is at, and the next, so that it never waits for the network."""
+"""Ranges that a worker has at once: the one it is at, and the next (`Work.ahead`), so that it never waits."""
 
 DEATHS = 3
 """Workers that may die of a range before it is cut in halves or given up."""
@@ -89,6 +89,7 @@ class Coordinator:
     ) -> None:
         self.facts = Facts(link=pool.link)
         self._pool, self._key, self._tell, self._clock = pool, key, tell, clock
+        self._depth = DEPTH if work.ahead else 1
         self._work, self._files, self._version = work, files, version
         self._here = name_of(machine)
         self._machines: dict[str, Machine] = {}
@@ -199,7 +200,7 @@ class Coordinator:
             self.facts.batches += 1
             self.facts.busy += value.seconds
             self._per_number.append(value.seconds / max(1, len(one.numbers)))
-            self._free.extend([worker] * (DEPTH if one.alone else 1))
+            self._free.extend([worker] * (self._depth if one.alone else 1))
             yield Done(one.numbers, value.value, worker.address, worker.machine)
         elif isinstance(value, Failure):
             if one is not None and (value.unfit or value.forgotten):
@@ -232,7 +233,7 @@ class Coordinator:
         worker.ready = True
         self.facts.workers += 1
         self.facts.most = max(self.facts.most, self.facts.workers)
-        self._free.extend([worker] * DEPTH)
+        self._free.extend([worker] * self._depth)
 
     def _refuse(self, worker: _Worker, text: str) -> None:
         """Give a worker nothing more."""
@@ -311,6 +312,8 @@ class Coordinator:
             deadline = FIRST_DEADLINE
             if one is not None and median is not None:
                 deadline = max(LEAST_DEADLINE, SLOW * median * len(one.numbers))
+            if one is not None and self._work.seconds is not None:
+                deadline = max(deadline, self._work.seconds)
             if now - worker.since > deadline:
                 self._tell(f"{worker.address} has not answered for {now - worker.since:.0f} s, so it is ended")
                 self._pool.restart(worker.address)

@@ -21,12 +21,16 @@ class Work:
         settings: JSON values that decide everything.
         files: names of those settings that may hold paths, separated by commas. Files go along with the work.
         threads: processor threads of a worker.
+        seconds: that a range may take at least, where that is known beforehand; None goes by the median.
+        ahead: whether a worker has its next range before it is done with one; not where ranges take long.
     """
 
     function: str
     settings: JsonObject
     files: tuple[str, ...] = ()
     threads: int = 1
+    seconds: float | None = None
+    ahead: bool = True
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,223 @@
+"""Many workers: what two real ones gain on one, and what the coordinator can feed of thousands that are simulated.
+
+    python benchmarks/cluster.py [--turns 3] [--pictures 512] [--rows 100000] [--figure FILE.png] [--only KIND]
+
+Real: the rate of a sweep between its first and its last row, so that loading does not count, with no workers on one
+thread, with one and with two; ratios of rates of the same turn, their medians. Asked: two over one 1.9, one over none
+0.97, on a machine that does nothing else.
+
+Simulated: workers of 0.5 s a picture (exponential around it, with a fixed seed) and an answer that takes 5 ms to come,
+in simulated time, to which the time is added that the coordinator really takes: it gives out, takes back, makes rows
+and writes them to a real `results.sqlite`. Nothing is rendered; rows have real values and answers. Asked: 0.95 of
+linear up to 1,000 workers, 4,000 rows a second stored, memory that stays (`--rows 1000000`). Each worker has 40 batches
+to do, since some wait at the end for the last ones. The question is that of 3DB (Leclerc et al. 2021, appendix F.7).
+What is not in it: Dask's own scheduler and network; a task is 16 pictures, so 1,000 workers make 125 tasks a second.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+from advsearch import threads
+
+threads.configure()
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from simulated_cluster import Simulated, coordinator  # noqa: E402
+from sweep import ConstantRenderer, resident  # noqa: E402
+
+from advsearch.api.sweep import job_of  # noqa: E402
+from advsearch.cluster.coordinator import DEPTH  # noqa: E402
+from advsearch.cluster.pool import Event  # noqa: E402
+from advsearch.config import SweepConfig  # noqa: E402
+from advsearch.described import Value  # noqa: E402
+from advsearch.engine.sweeps import swept_scene  # noqa: E402
+from advsearch.engine.sweeps.batch import KIND, Batch  # noqa: E402
+from advsearch.engine.sweeps.loop import Sweep  # noqa: E402
+from advsearch.progress import NullProgress  # noqa: E402
+from advsearch.runs.directory import RunDirectory  # noqa: E402
+from advsearch.runs.store import NAME, Store  # noqa: E402
+from advsearch.tasks import Answer, Judgement  # noqa: E402
+
+SECONDS, LAG = 0.5, 0.005
+"""Of a picture, and until an answer has come."""
+
+BATCHES = 40
+"""Of a worker, of 16 pictures each."""
+
+WORKERS = (1, 3, 10, 30, 100, 300, 1000)
+"""Simulated ones."""
+
+ASKED_TWO, ASKED_ONE, ASKED_LINEAR, ASKED_ROWS = 1.9, 0.97, 0.95, 4000.0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print the figures; returns 0 if all that is asked holds, 3 otherwise."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--turns", type=int, default=3)
+    parser.add_argument("--pictures", type=int, default=512)
+    parser.add_argument("--rows", type=int, default=100_000)
+    parser.add_argument("--figure", type=Path)
+    parser.add_argument("--only", choices=("real", "simulated"))
+    args = parser.parse_args(argv)
+    held = [] if args.only == "simulated" else real(args.turns, args.pictures)
+    if args.only != "real":
+        held += simulated(args.figure) + stored(args.rows)
+    return 0 if all(held) else 3
+
+
+# ---- real workers ---------------------------------------------------------------------------------------------------
+
+
+def real(turns: int, pictures: int) -> list[bool]:
+    """Print what real workers gain."""
+    one_over_none, two_over_one = [], []
+    for _ in range(turns):
+        none, one, two = (rate(workers, pictures) for workers in (0, 1, 2))
+        one_over_none.append(one / none)
+        two_over_one.append(two / one)
+    one, two = statistics.median(one_over_none), statistics.median(two_over_one)
+    print(f"  real       {one:.3f} one worker over none (asked {ASKED_ONE}), of {turns}: {_listed(one_over_none)}")
+    print(f"  real       {two:.3f} two workers over one (asked {ASKED_TWO}), of {turns}: {_listed(two_over_one)}")
+    return [one >= ASKED_ONE, two >= ASKED_TWO]
+
+
+def rate(workers: int, pictures: int) -> float:
+    """Rows a second of a sweep, from its first batch to its last."""
+    side = max(2, pictures // 8)
+    with tempfile.TemporaryDirectory() as folder:
+        words = ["sweep", "--object", "mug", "--grid", f"pose.yaw=0:360:{side}", "--grid", "camera.elevation=5:60:8"]
+        words += ["--trials", "0", "--quiet", "--threads", "1", "--run", f"{folder}/run"]
+        words += ["--workers", str(workers)] if workers else []
+        subprocess.run([sys.executable, "-m", "advsearch", *words], check=True, stdout=subprocess.DEVNULL)
+        with Store(Path(folder) / "run" / NAME, read_only=True) as store:
+            times = sorted(row.time or 0.0 for row in store.rows(KIND))
+    first = times.count(times[0])
+    return (len(times) - first) / (times[-1] - times[0])
+
+
+def _listed(ratios: Sequence[float]) -> str:
+    return " ".join(f"{one:.3f}" for one in ratios)
+
+
+# ---- simulated ones -------------------------------------------------------------------------------------------------
+
+
+class Timed(Simulated):
+    """A simulated pool to whose time that of the coordinator is added."""
+
+    returned: float | None = None
+
+    def events(self, seconds: float) -> list[Event]:
+        if self.returned is not None:
+            self.now += time.perf_counter() - self.returned
+        now = self.now
+        found = super().events(seconds)
+        self.now = max(self.now, now)  # what was due meanwhile is late, not in the past
+        self.returned = time.perf_counter()
+        return found
+
+
+def swept(workers: int, pictures: int, watch: Any = None) -> tuple[float, float, Simulated]:
+    """Sweep on simulated workers; return simulated seconds that loading is not in, real ones, and the pool."""
+    chance = random.Random(1)
+    drawn = [chance.expovariate(1.0 / SECONDS) for _ in range(1009)]
+    side = max(1, round(pictures / 10))
+    grid = {"pose.yaw": f"0:360:{side}", "camera.elevation": "5:60:10"}
+    config = SweepConfig(object="mug", grid=grid, trials=0, resolution=64)
+    answer = Judgement(-3.2, -3.2, right=True, answer=Answer("mug", 3, 0.93))
+    values: dict[str, Value] = {
+        "pose.yaw": {"value": 12.5, "unit": "degrees"},
+        "camera.elevation": {"value": 5.0, "unit": "degrees"},
+    }
+
+    def seen(numbers: range) -> Batch:
+        told: list[dict[str, Value]] = [dict(values) for _ in numbers]
+        return Batch([[answer] * len(numbers)], [told], [[(False, 1)] * len(numbers)], 0.03, [None], False, 1)
+
+    pool = Timed(call=seen, seconds=lambda number: drawn[number % len(drawn)], load=0.0, lag=LAG, again=None)
+    pool.add(workers)
+    with tempfile.TemporaryDirectory() as folder, RunDirectory.create(Path(folder) / "run") as run:
+        sweep = Sweep(job_of(config), run, watch or NullProgress(), coordinator(pool))
+        sweep.carry_out()
+        assert run.store.count(KIND) == sweep.total
+        return pool.now, sweep.stages.seconds["sweep"], pool
+
+
+def without_rendering() -> Any:
+    """Patch what would load a scene into Mitsuba."""
+    return mock.patch.object(
+        swept_scene, "make_renderer", lambda scene, space, size, *more, **named: ConstantRenderer(space, size)
+    )
+
+
+def simulated(figure: Path | None) -> list[bool]:
+    """Print pictures a second against workers, and draw them."""
+    found, held = [], []
+    with without_rendering():
+        for workers in WORKERS:
+            pictures = 16 * BATCHES * workers
+            seconds, _, pool = swept(workers, pictures)
+            ideal = sum(pool.seconds(number) for number in range(pictures)) / workers
+            share = ideal / seconds
+            found.append((workers, pictures / seconds))
+            print(
+                f"  simulated  {workers:5d} workers: {pictures / seconds:8.1f} pictures a second, {share:.3f} of linear"
+            )
+            held.append(share >= ASKED_LINEAR)
+            assert pool.most <= workers * DEPTH
+    if figure is not None:
+        draw(found, figure)
+    return held
+
+
+def draw(found: Sequence[tuple[int, float]], path: Path) -> None:
+    """Draw pictures a second against workers."""
+    from advsearch.report.drawing import new_axes
+
+    axes = new_axes()
+    workers = [one for one, _ in found]
+    axes.loglog(workers, [one / SECONDS for one in workers], color="0.7", label="linear")
+    axes.loglog(workers, [rate for _, rate in found], "o-", markersize=4, label="simulated workers, real coordinator")
+    axes.set_xlabel(f"workers of {SECONDS} s a picture")
+    axes.set_ylabel("pictures a second")
+    axes.legend(frameon=False)
+    axes.figure.savefig(path, bbox_inches="tight")
+
+
+def stored(rows: int) -> list[bool]:
+    """Print how many rows a second are stored where workers are never waited for, and how the memory grows."""
+
+    class Watch(NullProgress):
+        done, memory = 0, 0
+
+        def advance(self, n: int = 1, **info: float | str) -> None:
+            self.done += n
+            if not self.memory and self.done >= rows // 10:
+                self.memory = resident()
+
+    watch = Watch()
+    with without_rendering():
+        _, seconds, _ = swept(20_000, rows, watch)
+    speed, growth = rows / seconds, (resident() - watch.memory) / 2**20
+    print(f"  stored     {speed:.0f} rows a second (asked {ASKED_ROWS:.0f}), which bounds the number of workers:")
+    print(
+        f"             {speed * SECONDS:.0f} of {SECONDS} s a picture; 10,000 want {10_000 / SECONDS:.0f} rows a second"
+    )
+    print(f"  stored     {growth:+.1f} MiB over the last nine tenths of {rows} rows")
+    return [speed >= ASKED_ROWS]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

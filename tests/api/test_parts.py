@@ -1,0 +1,96 @@
+"""The attacks of a gap that others carry out: their folders come back as those of attacks that were made here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from advsearch.api import parts
+from advsearch.api.gap import gap_from_config
+from advsearch.api.parts import parts_of
+from advsearch.cluster.executor import Done, Facts, Work
+from advsearch.config import GapConfig
+from advsearch.errors import ClusterError
+from advsearch.runs.answer import read_answer
+from advsearch.runs.store import NAME, Store
+
+SMALL = GapConfig(
+    object="mug",
+    controls={"pose": {"yaw": [-30, 30]}, "camera.azimuth": {}},
+    policy="random",
+    resolution=16,
+    denoise="none",
+    spp=1,
+    steps=2,
+    trials=6,
+    verify_spp=2,
+    average=6,
+    baseline=False,
+    deterministic=True,
+)
+
+
+class Backwards:
+    """Carries out the last range first, in this process; `lost` says of what it dies."""
+
+    facts = Facts(workers=1)
+
+    def __init__(self, work: Work, lost: str) -> None:
+        self.call, self.lost = parts.attacks_of(work.settings), lost
+        assert work.function == "advsearch.api.parts:attacks_of" and not work.ahead
+
+    def results(self, ranges: Iterable[range]) -> Iterator[Done]:
+        for one in reversed(list(ranges)):
+            yield Done(one, None if self.lost else self.call(one), "elsewhere", lost=self.lost)
+
+
+def elsewhere(monkeypatch: pytest.MonkeyPatch, lost: str = "") -> None:
+    @contextmanager
+    def opened(work: Work, **asked: Any) -> Iterator[Any]:
+        assert (asked["workers"], asked["cluster"]) in ((2, None), (None, None))
+        yield None if asked["workers"] is None else Backwards(work, lost)
+
+    monkeypatch.setattr(parts, "executor_of", opened)
+
+
+def rows(path: Path) -> list[Any]:
+    with Store(path / NAME, read_only=True) as store:
+        return [{**vars(row), "seconds": None, "time": None} for row in store.rows()]
+
+
+def test_a_shared_gap_is_the_one_that_was_made_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    alone = gap_from_config(SMALL.model_copy(update={"run": str(tmp_path / "alone")}))
+    elsewhere(monkeypatch)
+    shared = gap_from_config(SMALL.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2}))
+    assert [(one.control, one.ending, one.margin) for one in shared.table] == [
+        (one.control, one.ending, one.margin) for one in alone.table
+    ]
+    for name in (part.name for part in parts_of(SMALL)):
+        here, there = (tmp_path / one / "parts" / name for one in ("alone", "shared"))
+        assert rows(there) == rows(here) and (read_answer(there) == read_answer(here)).all()
+        assert {one.name for one in there.iterdir()} >= {"run.yaml", "summary.json", "report.html", "images"}
+        assert "advsearch-part-" not in (there / "summary.json").read_text()
+        assert str(there) in [one.run for one in shared.table]
+
+
+def test_an_attack_of_which_every_worker_dies_ends_the_study_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    elsewhere(monkeypatch, lost="no answer: 3 workers died of it")
+    with pytest.raises(ClusterError, match=r"mug with camera.azimuth: no answer: 3 workers died of it; leave it out"):
+        gap_from_config(SMALL.model_copy(update={"run": str(tmp_path / "run"), "workers": 2}))
+
+
+def test_a_gap_is_every_object_with_every_control() -> None:
+    found = parts_of(SMALL.model_copy(update={"object": "mug,bowl"}))
+    assert [part.name for part in found] == [
+        "00-00-mug-pose",
+        "00-01-mug-camera-azimuth",
+        "01-00-bowl-pose",
+        "01-01-bowl-camera-azimuth",
+    ]
+    assert {part.config.run for part in found} == {None} and [len(part.config.controls) for part in found] == [1] * 4
