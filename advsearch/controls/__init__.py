@@ -235,6 +235,8 @@ def check_about(controls: Sequence[Control], scene: SceneDescription) -> None:
 
 def _suggestion(control: Control) -> str:
     """A range that could be given, for a message."""
+    if not control.parameters:
+        return f"{control.name}:KEY=[0.2, 0.8]"
     one = next((one for one in control.parameters if one.search is not None), control.parameters[0])
     low, high = one.search or (one.low, one.high)
     return f"{control.name}={{{one.name}: [{low:g}, {high:g}]}}"

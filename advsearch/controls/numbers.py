@@ -255,14 +255,18 @@ class Slot:
 
 
 class BoundNumbers(BoundControl):
-    """A `NumberControl` in a scene."""
+    """A `NumberControl` in a scene.
+
+    Attributes:
+        slots: each parameter with what it is set to, in the order of its coordinates.
+    """
 
     def __init__(self, control: NumberControl, scene: SceneDescription, slots: tuple[Slot, ...]) -> None:
         self.control = control
         self.scene = scene
         self.name = control.name
         self.refines = control.refines(scene)
-        self._slots = slots
+        self.slots = slots
         self.moved = tuple(control.moved(scene, slots))
         self.start = torch.tensor([share for slot in slots for share in slot.start()], dtype=torch.float32)
         self.groups = tuple(self._group(slot) for slot in slots if slot.width)
@@ -283,7 +287,7 @@ class BoundNumbers(BoundControl):
 
     def values(self, u: Tensor) -> dict[str, Tensor]:
         """Return every parameter's value at a slice of u, fixed ones too."""
-        return {slot.parameter.name: slot.value(u) for slot in self._slots}
+        return {slot.parameter.name: slot.value(u) for slot in self.slots}
 
     def inputs(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Tensor]:
         return self.control.scene_inputs(self.scene, self.values(u), so_far)
@@ -295,7 +299,7 @@ class BoundNumbers(BoundControl):
         u = u.detach()
         values = self.values(u)
         said: dict[str, Value] = {}
-        for slot in self._slots:
+        for slot in self.slots:
             if slot.width == 0:
                 continue
             parameter, value = slot.parameter, values[slot.parameter.name]

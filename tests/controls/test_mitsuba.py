@@ -108,6 +108,7 @@ def test_bundled_scenes_have_such_names_too() -> None:
         ({"mitsuba:floor.to_world": [0, 1]}, "expected a number or a colour, and Mitsuba has a AffineTransform4f"),
         ({f"mitsuba:{RED}": {}}, "expected a range, as in mitsuba:red"),
         ({f"mitsuba:{RED}": [0, 1], "mitsuba": {RED: [0, 1]}}, "each of Mitsuba's names once"),
+        ({f"mitsuba:{RED}": 0.5}, r"every parameter is fixed.* such as mitsuba:KEY=\[0\.2, 0\.8\]"),
         ({"mitsuba": {}}, "expected Mitsuba's names, as in mitsuba:KEY"),
         ({f"mitsuba.{RED}": {}}, "expected a range, as in mitsuba:red"),
         ({"pose:small-box": {}}, r"make it the object, or .* mitsuba:small-box\.KEY=\[low, high\]"),

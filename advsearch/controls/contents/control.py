@@ -203,10 +203,10 @@ class BoundContents(BoundNumbers):
     control: ContentsControl
 
     def __init__(self, control: ContentsControl, bound: BoundNumbers) -> None:
-        super().__init__(control, bound.scene, bound._slots)
+        super().__init__(control, bound.scene, bound.slots)
         wanted = {one.name: float(one.default) for one in control.parameters if one.name in INGREDIENTS}
         cuts = control.cuts(wanted)
-        for slot in self._slots:
+        for slot in self.slots:
             if slot.width and slot.parameter.name in cuts:
                 self.start[slot.begin] = cuts[slot.parameter.name]
 

@@ -231,15 +231,9 @@ def _unit(parameter: Parameter) -> str:
 
 def _spec(bound: BoundNumbers, name: str) -> tuple[Parameter, Range | OneOf]:
     """A parameter that is not fixed, and what it is set to."""
-    control = bound.control
-    parameter = next(one for one in control.parameters if one.name == name)
-    spec = control.specs.get(name)
-    if spec is not None and not isinstance(spec, Fixed):
-        return parameter, spec
-    if parameter.options:
-        return parameter, OneOf(parameter.options)
-    low, high = control.search_range(bound.scene, parameter) or (parameter.low, parameter.high)
-    return parameter, Range(low, high)
+    slot = next(one for one in bound.slots if one.parameter.name == name)
+    assert not isinstance(slot.spec, Fixed)
+    return slot.parameter, slot.spec
 
 
 def _teller(space: Space, control: BoundControl, part: slice, axes: Sequence[tuple[int, Axis]]) -> Tell:
