@@ -89,6 +89,7 @@ class AttackKeywords(SearchKeywords, total=False):
     smallest: bool
     printable: bool
     aov: str | None
+    log: Literal["mlflow", "tensorboard", "wandb"] | None
     ensemble: Literal["mean", "worst"] | None
     overwrite: bool
 
@@ -103,6 +104,7 @@ class SweepKeywords(PictureKeywords, total=False):
     specialise: bool
     aov: str | None
     surface: bool
+    log: Literal["mlflow", "tensorboard", "wandb"] | None
     workers: int | None
     cluster: str | None
     trials: int

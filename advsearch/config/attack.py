@@ -30,6 +30,7 @@ class AttackConfig(DerivativeConfig):
     command: ClassVar[str] = "attack"
     several: ClassVar[tuple[str, ...]] = ("object", "epsilon", "model")
 
+    free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "log")
     clashes: ClassVar[tuple[Clash, ...]] = (
         *DerivativeConfig.clashes,
         Clash(
@@ -153,6 +154,9 @@ class AttackConfig(DerivativeConfig):
         "aov",
         description="ground truth of each pixel, separated by commas, as layers of an EXR of the clean scene and the "
         "answer",
+    )
+    log: Literal["mlflow", "tensorboard", "wandb"] | None = setting(
+        None, "run", "what is told of every evaluation as it comes, through its own package", otherwise="nothing"
     )
     over: ControlsByName = setting_as_in(
         SceneConfig,

@@ -26,6 +26,7 @@ class HardenConfig(AttackConfig):
         "ensemble",
         "printable",
         "aov",
+        "log",
         "target",
         "minimise",
         "over",

@@ -20,7 +20,7 @@ class GapConfig(AttackConfig):
     command: ClassVar[str] = "gap"
     free: ClassVar[tuple[str, ...]] = (*AttackConfig.free, "workers", "cluster")
     several: ClassVar[tuple[str, ...]] = ("object",)
-    without: ClassVar[tuple[str, ...]] = ("smallest", "ensemble", "printable", "aov")
+    without: ClassVar[tuple[str, ...]] = ("smallest", "ensemble", "printable", "aov", "log")
 
     model: str = setting_as_in(SceneConfig, "model")
     average: int = setting_as_in(AttackConfig, "average", default=200, ge=1)

@@ -22,7 +22,7 @@ class SweepConfig(SceneConfig):
     """Everything that decides what `sweep` does: the average case over a grid, over random draws, or both."""
 
     command: ClassVar[str] = "sweep"
-    free: ClassVar[tuple[str, ...]] = (*SceneConfig.free, "surface", "workers", "cluster")
+    free: ClassVar[tuple[str, ...]] = (*SceneConfig.free, "surface", "workers", "cluster", "log")
     several: ClassVar[tuple[str, ...]] = ("object", "environment", "model")
     clashes: ClassVar[tuple[Clash, ...]] = (
         *SceneConfig.clashes,
@@ -117,6 +117,7 @@ class SweepConfig(SceneConfig):
     )
     verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", description="samples per pixel of these")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-sweep-NNN")
+    log: Literal["mlflow", "tensorboard", "wandb"] | None = setting_as_in(AttackConfig, "log")
     workers: int | None = setting(
         None,
         "run",

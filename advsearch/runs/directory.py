@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, UnknownNameError
 from advsearch.files import JsonObject, open_regular
-from advsearch.runs import images, lock, replay, store, summary
+from advsearch.runs import images, lock, replay, store, summary, tracking
 from advsearch.runs.files import PART, replacing, storage_errors, write_text
 from advsearch.yaml_text import LARGEST
 
@@ -81,6 +81,7 @@ class RunDirectory:
         self._lock = held
         self._began = True
         self._replay: replay.ReplayLog | None = None
+        self._tracker: tracking.Tracker | None = None
         self.store = store.Store(path / store.NAME)
 
     @classmethod
@@ -139,7 +140,12 @@ class RunDirectory:
         Raises:
             InputError: as for `create`, and for `resume`.
         """
-        return cls.create_for(config) if resumed is None else cls.resume(resumed, config)
+        log: str | None = getattr(config, "log", None)
+        tracking.check_tracker(log)
+        run = cls.create_for(config) if resumed is None else cls.resume(resumed, config)
+        if log is not None:
+            run._tracker = tracking.Tracker(log, run.path, config.deciding())
+        return run
 
     @classmethod
     def create_for(cls, config: Config) -> RunDirectory:
@@ -233,6 +239,8 @@ class RunDirectory:
             StorageError: the disk is full or cannot be written; none of these rows is kept.
         """
         self.store.append(rows)
+        if self._tracker is not None:
+            self._tracker.rows(rows)
 
     def save_image(self, name: str, image: Any, folder: str = IMAGES) -> Path:
         """Write ``<folder>/<name>.png`` and return its path.
@@ -277,13 +285,21 @@ class RunDirectory:
 
     def close(self) -> None:
         """Close the results and give up the lock; a second call does nothing."""
+        self._told()
         self.store.close()
         if self._replay is not None:
             self._replay.close()
         self._lock.release()
 
+    def _told(self) -> None:
+        """Let what is told of the run end."""
+        if self._tracker is not None:
+            self._tracker.close()
+            self._tracker = None
+
     def discard(self) -> None:
         """Remove what this run wrote, and the directory if that leaves it empty."""
+        self._told()
         self.store.close()
         if self._replay is not None:
             self._replay.close()
