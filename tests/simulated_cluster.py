@@ -10,7 +10,7 @@ from typing import Any
 from advsearch.cluster.coordinator import Coordinator
 from advsearch.cluster.executor import Work
 from advsearch.cluster.inputs import Files
-from advsearch.cluster.pool import Answer, Disconnected, Event, Joined, Left
+from advsearch.cluster.pool import Disconnected, Ended, Event, Joined, Left
 from advsearch.cluster.worker import Carried, Failure, Ready, prepare
 from advsearch.errors import ClusterError
 
@@ -125,7 +125,7 @@ class Simulated:
         def answer() -> Event | None:
             if self._at.pop(ticket, None) is None:
                 return None
-            return Answer(ticket, value() if callable(value) else value)
+            return Ended(ticket, value() if callable(value) else value)
 
         return answer
 

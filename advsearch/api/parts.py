@@ -33,7 +33,7 @@ TEXTS = (".json", ".html", ".yaml")
 
 
 @dataclass(frozen=True)
-class Part:
+class GapAttack:
     """One attack of a gap.
 
     Attributes:
@@ -49,7 +49,7 @@ class Part:
     name: str
 
 
-def parts_of(config: GapConfig) -> list[Part]:
+def parts_of(config: GapConfig) -> list[GapAttack]:
     """Return the attacks of a gap: every object with every control.
 
     Raises:
@@ -62,7 +62,7 @@ def parts_of(config: GapConfig) -> list[Part]:
         for number, (control, settings) in enumerate(config.controls.items()):
             own = vars(shared.alone(control, settings))
             one = AttackConfig.of(config, object=name, controls={control: settings}, **own)
-            parts.append(Part(name, control, one, f"{place:02d}-{number:02d}-" + default_name(name, [control])))
+            parts.append(GapAttack(name, control, one, f"{place:02d}-{number:02d}-" + default_name(name, [control])))
     return parts
 
 
@@ -81,7 +81,7 @@ def attacks_of(settings: JsonObject) -> Call:
     return call
 
 
-def share(config: GapConfig, parts: Sequence[Part], run: Path, progress: Progress) -> None:
+def share(config: GapConfig, parts: Sequence[GapAttack], run: Path, progress: Progress) -> None:
     """Have the attacks that are not begun carried out by workers, where some were asked for.
 
     Args:

@@ -14,10 +14,10 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
-from advsearch.cluster.executor import Done, Facts, Work
+from advsearch.cluster.executor import Done, Work, Workforce
 from advsearch.cluster.inputs import Files
 from advsearch.cluster.machine import Machine, name_of
-from advsearch.cluster.pool import Answer, Disconnected, Dropped, Event, Joined, Left, Pool
+from advsearch.cluster.pool import Disconnected, Dropped, Ended, Event, Joined, Left, Pool
 from advsearch.cluster.worker import Carried, Failure, Ready, carry_out, prepare
 from advsearch.errors import ClusterError
 
@@ -87,7 +87,7 @@ class Coordinator:
         tell: Callable[[str], None] = lambda text: None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.facts = Facts(link=pool.link)
+        self.facts = Workforce(link=pool.link)
         self._pool, self._key, self._tell, self._clock = pool, key, tell, clock
         self._depth = DEPTH if work.ahead else 1
         self._work, self._files, self._version = work, files, version
@@ -176,7 +176,7 @@ class Coordinator:
             found = self._tickets.get(event.ticket)
             if found is not None:
                 yield from self._gone(found[0].address, died=True)
-        elif isinstance(event, Answer):
+        elif isinstance(event, Ended):
             yield from self._answered(event)
         elif isinstance(event, Disconnected):
             self._tell(f"{self._pool.where}: the scheduler has gone; what was under way will be done again")
@@ -187,7 +187,7 @@ class Coordinator:
             self.facts.link = self._pool.link
             self._alone_since = self._clock()
 
-    def _answered(self, event: Answer) -> Iterator[Done]:
+    def _answered(self, event: Ended) -> Iterator[Done]:
         worker, one = self._tickets.pop(event.ticket, (None, None))
         if worker is None:
             return  # late

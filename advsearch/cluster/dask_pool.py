@@ -21,7 +21,8 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
 
-from advsearch.cluster.pool import Answer, Disconnected, Dropped, Event, Joined, Left
+from advsearch.cluster.pool import Disconnected, Dropped, Ended, Event, Joined, Left
+from advsearch.cluster.worker import Failure
 from advsearch.errors import ClusterError
 
 CONNECT, RECONNECT = 30.0, 120.0
@@ -49,7 +50,7 @@ CONFIG = {
 
 
 @dataclass(frozen=True)
-class Place:
+class Site:
     """Where workers are.
 
     Attributes:
@@ -67,7 +68,7 @@ class Place:
     count: int | None = None
 
 
-def local(workers: int) -> Place:
+def local(workers: int) -> Site:
     """Return the place of so many processes on this machine, which nobody else can reach."""
 
     def start(**more: Any) -> Any:
@@ -86,7 +87,7 @@ def local(workers: int) -> Place:
             **more,
         )
 
-    return Place(f"{workers} workers on this machine", start=start)
+    return Site(f"{workers} workers on this machine", start=start)
 
 
 class DaskPool:
@@ -99,7 +100,7 @@ class DaskPool:
         ClusterError: there is no scheduler, or it could not be started.
     """
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: Site) -> None:
         self.where, self.link = place.where, ""
         self._place = place
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
@@ -170,11 +171,11 @@ class DaskPool:
 
     # ---- in the loop ------------------------------------------------------------------------------------------------
 
-    def _begin(self, work: Any) -> Future[Any]:
+    def _begin(self, work: Any) -> Future[None]:
         return asyncio.run_coroutine_threadsafe(work, self._loop)
 
-    def _done(self, work: Any, seconds: float | None = None) -> Any:
-        return self._begin(work).result(seconds)
+    def _done(self, work: Any, seconds: float | None = None) -> None:
+        self._begin(work).result(seconds)
 
     async def _open(self, seconds: float) -> None:
         import dask
@@ -242,7 +243,7 @@ class DaskPool:
             function, *args, workers=[worker], allow_other_workers=False, pure=False, retries=0, priority=-ticket
         )
         try:
-            event: Event = Answer(ticket, await future)
+            event: Event = Ended(ticket, await future)
         except asyncio.CancelledError:
             if client.status == "running":  # else all workers are gone, which `_watching` says
                 future.release()
@@ -252,7 +253,7 @@ class DaskPool:
         except Exception as error:
             if client.status != "running":
                 return
-            event = Answer(ticket, _failure(error))
+            event = Ended(ticket, _failure(error))
         finally:
             self._calls.pop(ticket, None)
         future.release()
@@ -308,10 +309,8 @@ class DaskPool:
         self._events.put(Disconnected())
 
 
-def _failure(error: Exception) -> Any:
+def _failure(error: Exception) -> Failure:
     """What a call that raised comes to: nothing of ours does, so the worker could not even begin."""
-    from advsearch.cluster.worker import Failure
-
     text = f"{type(error).__name__}: {error}"
     if isinstance(error, (ImportError, AttributeError)):
         return Failure(f"it cannot begin ({text}); install the same advsearch there", unfit=True)

@@ -41,7 +41,7 @@ class Done:
         numbers: the range.
         value: what the call returned; None where nothing came back.
         worker: who carried it out; empty in this process.
-        machine: what that is, by its name among `Facts.machines`; None where it is like this machine.
+        machine: what that is, by its name among `Workforce.machines`; None where it is like this machine.
         lost: why nothing came back, in words; only of ranges of one number.
     """
 
@@ -53,7 +53,7 @@ class Done:
 
 
 @dataclass
-class Facts:
+class Workforce:
     """How the workers did.
 
     Attributes:
@@ -87,7 +87,7 @@ class Executor(Protocol):
     """Carries out ranges."""
 
     @property
-    def facts(self) -> Facts | None:
+    def facts(self) -> Workforce | None:
         """How the workers do; None where there are none."""
 
     def results(self, ranges: Iterable[range]) -> Iterator[Done]:
@@ -107,7 +107,7 @@ class InProcess:
         call: carries out one.
     """
 
-    facts: Facts | None = None
+    facts: Workforce | None = None
 
     def __init__(self, call: Call) -> None:
         self._call = call

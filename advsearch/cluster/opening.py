@@ -12,7 +12,7 @@ from typing import Any
 
 from advsearch import threads
 from advsearch.cluster.coordinator import Coordinator
-from advsearch.cluster.dask_pool import DaskPool, Place, local
+from advsearch.cluster.dask_pool import DaskPool, Site, local
 from advsearch.cluster.executor import Executor, Work
 from advsearch.cluster.inputs import Files, gathered
 from advsearch.cluster.machine import this_machine, version
@@ -83,7 +83,7 @@ def key_of(work: Work, files: Files) -> str:
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()[:32]
 
 
-def place_of(workers: int | None, cluster: str | None) -> Place:
+def place_of(workers: int | None, cluster: str | None) -> Site:
     """Return where the workers are.
 
     Args:
@@ -99,7 +99,7 @@ def place_of(workers: int | None, cluster: str | None) -> Place:
     if cluster.startswith(SCHEMES):
         if workers is not None:
             raise InputError("workers: the scheduler of `cluster` says how many there are; leave one of the two out")
-        return Place(cluster, address=cluster)
+        return Site(cluster, address=cluster)
     path = Path(cluster)
     if path.suffix not in (".yaml", ".yml"):
         raise InputError(
@@ -109,7 +109,7 @@ def place_of(workers: int | None, cluster: str | None) -> Place:
     return _from_file(path, workers)
 
 
-def _from_file(path: Path, workers: int | None) -> Place:
+def _from_file(path: Path, workers: int | None) -> Site:
     said = read_yaml(path)
     unknown = sorted(set(said) - {"address", "class", "arguments", "workers", "security"})
     if unknown or ("address" in said) == ("class" in said):
@@ -129,11 +129,11 @@ def _from_file(path: Path, workers: int | None) -> Place:
             raise FileFormatError(f"{path}: address: expected tcp://HOST:PORT or tls://HOST:PORT")
         if count is not None:
             raise InputError("workers: the scheduler of `cluster` says how many there are; leave one of the two out")
-        return Place(str(said["address"]), address=str(said["address"]), security=security or None)
+        return Site(str(said["address"]), address=str(said["address"]), security=security or None)
     name = str(said["class"])
     if name not in CLASSES:
         raise FileFormatError(f"{path}: class: expected one of {', '.join(CLASSES)}, got {name!r}")
-    return Place(name, start=_starter(name, arguments), security=security or None, count=count or 1)
+    return Site(name, start=_starter(name, arguments), security=security or None, count=count or 1)
 
 
 def _mapping(path: Path, said: Mapping[str, Any], name: str) -> dict[str, Any]:

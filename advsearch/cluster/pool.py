@@ -32,7 +32,7 @@ class Left:
 
 
 @dataclass(frozen=True)
-class Answer:
+class Ended:
     """A call has ended.
 
     Attributes:
@@ -62,7 +62,7 @@ class Disconnected:
     """The scheduler has gone, and all workers with it."""
 
 
-Event = Joined | Left | Answer | Dropped | Disconnected
+Event = Joined | Left | Ended | Dropped | Disconnected
 
 
 class Pool(Protocol):
@@ -77,7 +77,7 @@ class Pool(Protocol):
         """What it is, in a user's words."""
 
     def submit(self, ticket: int, worker: str, function: Callable[..., Any], *args: Any) -> None:
-        """Have a worker call a function of a module; an `Answer` or `Dropped` with this ticket follows."""
+        """Have a worker call a function of a module; an `Ended` or `Dropped` with this ticket follows."""
 
     def restart(self, worker: str) -> None:
         """End a worker that does not answer; another may join in its place."""

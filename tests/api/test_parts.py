@@ -12,7 +12,7 @@ import pytest
 from advsearch.api import parts
 from advsearch.api.gap import gap_from_config
 from advsearch.api.parts import parts_of
-from advsearch.cluster.executor import Done, Facts, Work
+from advsearch.cluster.executor import Done, Work, Workforce
 from advsearch.config import GapConfig
 from advsearch.errors import ClusterError
 from advsearch.runs.answer import read_answer
@@ -37,7 +37,7 @@ SMALL = GapConfig(
 class Backwards:
     """Carries out the last range first, in this process; `lost` says of what it dies."""
 
-    facts = Facts(workers=1)
+    facts = Workforce(workers=1)
 
     def __init__(self, work: Work, lost: str) -> None:
         self.call, self.lost = parts.attacks_of(work.settings), lost

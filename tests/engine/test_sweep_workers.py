@@ -16,7 +16,7 @@ import advsearch
 from advsearch.api.sweep import job_of
 from advsearch.cli.main import main
 from advsearch.cli.sweep import answer
-from advsearch.cluster.executor import Done, Facts
+from advsearch.cluster.executor import Done, Workforce
 from advsearch.config import SweepConfig
 from advsearch.engine.sweeps import swept_scene
 from advsearch.engine.sweeps.batch import LOST, Batches
@@ -47,7 +47,7 @@ class Disorder:
     seed: int = 0
     lose: int | None = None
     stop: int | None = None
-    facts: Facts | None = field(default_factory=lambda: Facts(most=2, lost=1, busy=9.0, alive=10.0, retried=3))
+    facts: Workforce | None = field(default_factory=lambda: Workforce(most=2, lost=1, busy=9.0, alive=10.0, retried=3))
 
     def results(self, ranges: Iterable[range]) -> Iterator[Done]:
         pieces = list(ranges)
@@ -113,7 +113,7 @@ def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: P
                 yield Done(done.numbers, done.value, done.worker, "ab12" if done.numbers.start < 4 else None)
 
     job = job_of(CONFIG)
-    facts = Facts(machines={"ab12": {"processor": "another", "LLVM": "19.1"}})
+    facts = Workforce(machines={"ab12": {"processor": "another", "LLVM": "19.1"}})
     with RunDirectory.create(tmp_path / "run") as run:
         executor = Two(Batches(job, 6), facts=facts)
         result = Sweep(job, run, NullProgress(), executor).carry_out()
@@ -126,7 +126,7 @@ def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: P
 
 
 def test_what_is_shown_says_where_the_time_went() -> None:
-    facts = Facts(most=2, lost=1, refused=1, retried=3, batches=9, busy=9.0, loading=6.0, alive=10.0)
+    facts = Workforce(most=2, lost=1, refused=1, retried=3, batches=9, busy=9.0, loading=6.0, alive=10.0)
     text = answer(swept().model_copy(update={"shared": SharedWork.of_facts(facts, {})}))
     assert "2 at most, busy 90 % of 10" in text and "1 lost, 1 refused, 3 given out again" in text
     assert "workers" not in answer(swept())
