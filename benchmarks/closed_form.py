@@ -54,6 +54,13 @@ BUDGETS: Mapping[str, Mapping[str, tuple[int | None, ...]]] = {
         "quadratic, box": (10, 10, 10, 10),
         "hills, box": (None, None),
     },
+    "archive": {
+        "linear, linf": (100, 10_000, None, None),
+        "linear, l2": (100, 1000, None, None),
+        "linear, box": (50, 5000, None, None),
+        "quadratic, box": (2000, 2000, None, None),
+        "hills, box": (500, 2000),
+    },
     "auto": {
         "linear, linf": (10, 10, 10, 10),
         "linear, l2": (10, 10, 10, 10),

@@ -64,7 +64,7 @@ RULES = {
     "controls": Rule({"scene"}),
     "models": Rule(set(), {"torch", "numpy", "safetensors"}),
     "tasks": Rule({"models"}, {"torch"}),
-    "attacks": Rule({"tasks"}, {"torch", "numpy", "scipy", "cma"}),
+    "attacks": Rule({"tasks"}, {"torch", "numpy", "scipy", "cma", "ribs"}),
     "cluster": Rule({"scene", "settings"}, {"distributed", "dask"}),
     "engine": Rule(
         {"scene", "bundled", "controls", "models", "tasks", "attacks", "cluster", "runs", "report", "viewer", "config"}
@@ -92,7 +92,7 @@ BROUGHT_ALONG = {"drjit": "mitsuba", "typing_extensions": "pydantic"}
 """Imported, but pinned by another package on purpose: Mitsuba works with exactly one version of Dr.Jit, and types of
 pydantic's classes are written with its own typing_extensions."""
 
-OPTIONAL = {"pyarrow": "parquet", "textual_image": "terminal", "distributed": "dask", "dask": "dask"}
+OPTIONAL = {"pyarrow": "parquet", "textual_image": "terminal", "distributed": "dask", "dask": "dask", "ribs": "archive"}
 """Packages that only an extra brings, and which: imported inside a function that says what to do where it is not."""
 
 

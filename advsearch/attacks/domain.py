@@ -30,7 +30,7 @@ class Block:
             whole block, not a norm per element, so a sensible value grows with the square root of the size.
         low, high: bounds, 0 <= low < high <= 1.
         periodic: whether `high` and `low` are the same place (an angle): projecting wraps around. Only for "box".
-        name: for messages, e.g. "texture".
+        name: of its parameter, e.g. "pose.yaw".
         options: over 0 for a discrete choice among so many: u means option floor(u * options). Such a block has
             size 1, norm "box" and the whole unit interval; it has no direction that is uphill.
         reach: length of one whole step in a "box", over 0; None for half the diagonal of the bounds.

@@ -79,7 +79,8 @@ def scaled(domain: Domain, scale: float) -> Domain:
     Raises:
         InputError: a block has bounds and no budget, so that there is nothing to scale.
     """
-    bare = [block.name or "a block" for block in domain.blocks if block.epsilon is None]
+    names = (block.name.partition(".")[0] for block in domain.blocks if block.epsilon is None)
+    bare = [name or "a block" for name in dict.fromkeys(names)]
     if bare:
         raise InputError(
             f"smallest: expected controls with a budget (texture, geometry, patch, ...), got {', '.join(bare)}, "

@@ -26,7 +26,7 @@ def domain_of(controls: Sequence[BoundControl], start: Tensor | None = None, **m
             group.budget.norm,  # type: ignore[arg-type]
             group.budget.epsilon,
             periodic=group.periodic,
-            name=control.name,
+            name=f"{control.name}.{group.parameter}",
             options=group.options,
         )
         for control in controls

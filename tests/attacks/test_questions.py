@@ -101,8 +101,8 @@ def test_without_a_flip_the_whole_budget_is_the_lower_end() -> None:
 
 
 def test_a_range_has_no_smallest_epsilon() -> None:
-    domain = Domain(torch.tensor([0.5]), (Block(1, "box", name="pose"),))
-    with pytest.raises(InputError, match=r"smallest: expected controls with a budget .*got pose"):
+    domain = Domain(torch.tensor([0.5, 0.5]), (Block(1, name="pose.yaw"), Block(1, name="pose.pitch")))
+    with pytest.raises(InputError, match=r"smallest: expected controls with a budget .*got pose, whose"):
         scaled(domain, 0.5)
 
 

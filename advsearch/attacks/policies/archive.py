@@ -1,0 +1,216 @@
+"""Quality diversity: many different failures instead of one, kept in an archive over chosen parameters."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from advsearch.attacks.domain import Domain
+from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.scaling import half_widths
+from advsearch.errors import InputError, UnknownNameError
+from advsearch.seeds import stream
+
+MOST = 10_000
+"""More numbers are refused: every cell keeps a whole configuration."""
+
+MOST_CELLS = 1_000_000
+"""An archive has no more."""
+
+MOST_SPANNED = 4
+"""Parameters that an archive is spanned by at most; with more, nearly every configuration has a cell of its own."""
+
+ANEW = 0.1
+"""Share of the configurations, and of the discrete choices, that are drawn anew."""
+
+TOURNAMENT = 4
+"""So many kept configurations are drawn, and the one with the largest objective is changed."""
+
+WIDER = 4.0
+"""How much larger steps are in the parameters that span the archive: that is where there are cells to fill."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArchiveState:
+    """Where the search stands.
+
+    Attributes:
+        spanned: (k,) positions in u of the parameters that span the archive.
+        half: (d,) half of each number's range.
+        archive: that of ribs; never written to again.
+        generation: how many generations were drawn.
+        points: (n, d) float32, this generation's configurations.
+        values: objectives of the first of them.
+        wrong: whether each of these was a success.
+    """
+
+    domain: Domain
+    seed: int
+    spanned: Tensor
+    half: Tensor
+    archive: Any
+    generation: int
+    points: Tensor
+    values: tuple[float, ...] = ()
+    wrong: tuple[bool, ...] = ()
+
+
+@dataclass(frozen=True)
+class Archive(Policy[ArchiveState]):
+    """MAP-Elites (Mouret and Clune 2015, "Illuminating search spaces by mapping elites") with the package ribs.
+
+    The archive is a grid over a few parameters. Each cell keeps the configuration with the largest objective that fell
+    into it, whatever the parameters beyond are there. A new configuration is made of two kept ones, a the best of four
+    that are drawn, b one that is drawn, as by Vassiliades and Mouret 2018, "Discovering the elite hypervolume by
+    leveraging interspecies correlation":
+
+        P(a + sigma s z + line (b - a) y),
+
+    z a vector and y a number, standard normal, s half of each number's range, four times that for the parameters of
+    the archive: what makes the model fail in one cell is tried in others. A discrete choice is that of a. One in ten
+    configurations, and one in ten choices, are drawn anew, so that no part of the domain is out of reach.
+
+    The objective is noisy, so a cell may keep a configuration that was lucky; only verified ones count as failures.
+
+    Attributes:
+        over: the parameters that span the archive, at most 4, separated by commas, by name ("pose.yaw",
+            "camera.target.0"); empty for the first two.
+        cells: how many parts each number's range has in the archive, 2 to 1,000; a discrete choice has its options.
+        sigma: standard deviation of the steps in units of half of each number's range, over 0, at most 2.
+        line: of the step along the line through two configurations, in units of their distance, at least 0, at most 2.
+        population: configurations a generation, at least 2.
+
+    Raises:
+        InputError: ribs is not installed, or a value is outside what is said here; at the start, no parameter has the
+            name, or the domain has more than 10,000 numbers or the archive more than a million cells.
+    """
+
+    over: str = ""
+    cells: int = 10
+    sigma: float = 0.1
+    line: float = 0.3
+    population: int = 10
+
+    name: ClassVar[str] = "archive"
+    uses_gradient: ClassVar[bool] = False
+    handles_choices: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        if find_spec("ribs") is None:
+            raise InputError("policy 'archive' needs ribs, which is not installed: pip install 'advsearch[archive]'")
+        if not 2 <= self.cells <= 1000:
+            raise InputError(f"cells: expected 2 to 1000 parts of each range, got {self.cells}")
+        if not 0.0 < self.sigma <= 2.0:
+            raise InputError(f"sigma: expected a number in (0, 2], a share of half the range, got {self.sigma}")
+        if not 0.0 <= self.line <= 2.0:
+            raise InputError(f"line: expected a number in [0, 2], a share of a distance, got {self.line}")
+        if self.population < 2:
+            raise InputError(f"population: expected at least 2, got {self.population}")
+
+    def start(self, domain: Domain, generator: torch.Generator, steps: int) -> ArchiveState:
+        if domain.dim > MOST:
+            raise InputError(f"policy 'archive': expected at most {MOST} numbers, got {domain.dim}; use pgd or auto")
+        seed, spanned = draw_seed(generator), _spanned(domain, self.over)
+        sizes = [block.options or self.cells for block, part in domain.parts() for _ in range(block.size)]
+        dims = [sizes[place] for place in spanned.tolist()]
+        if math.prod(dims) > MOST_CELLS:
+            raise InputError(f"cells: expected at most {MOST_CELLS} in all, got {math.prod(dims)}; set `cells` lower")
+        archive = _ribs().GridArchive(
+            solution_dim=domain.dim,
+            dims=dims,
+            ranges=list(zip(domain.lower[spanned].tolist(), domain.upper[spanned].tolist(), strict=True)),
+            seed=stream(seed, "archive"),
+            solution_dtype=np.float32,
+            objective_dtype=np.float64,
+            measures_dtype=np.float64,
+            extra_fields={"wrong": ((), np.bool_)},
+        )
+        first = [domain.begin[None], domain.sample(seeded(seed, 0), self.population - 1)]
+        return ArchiveState(domain, seed, spanned, half_widths(domain), archive, 0, torch.cat(first))
+
+    def propose(self, state: ArchiveState, n: int) -> tuple[tuple[Proposal, ...], ArchiveState]:
+        return tuple(Proposal(u) for u in state.points[len(state.values) :][:n]), state
+
+    def update(self, state: ArchiveState, evaluated: Evaluated) -> ArchiveState:
+        values = tuple(evaluation.objective for _, evaluation in evaluated)
+        wrong = tuple(evaluation.success for _, evaluation in evaluated)
+        state = replace(state, values=(*state.values, *values), wrong=(*state.wrong, *wrong))
+        return state if len(state.values) < len(state.points) else self._next(_kept(state))
+
+    def _next(self, state: ArchiveState) -> ArchiveState:
+        """Draw a generation; the archive belongs to nobody else yet."""
+        number = state.generation + 1
+        return replace(state, generation=number, points=self._drawn(state, number), values=(), wrong=())
+
+    def _drawn(self, state: ArchiveState, number: int) -> Tensor:
+        """Return (population, d) configurations made of kept ones."""
+        domain, rng = state.domain, seeded(state.seed, number)
+        if state.archive.empty:
+            return domain.sample(rng, self.population)
+        archive = copy.deepcopy(state.archive)  # it draws with a generator of its own
+        drawn = archive.sample_elites((TOURNAMENT + 1) * self.population)
+        kept = torch.from_numpy(drawn["solution"]).unflatten(0, (TOURNAMENT + 1, self.population))
+        best = torch.from_numpy(drawn["objective"]).unflatten(0, (TOURNAMENT + 1, self.population))[1:].argmax(0)
+        samples = domain.sample(rng, self.population)
+        anew = (torch.rand(self.population, generator=rng) < ANEW).tolist()
+        return torch.stack(
+            [
+                samples[k] if anew[k] else self._bred(state, kept[1 + int(best[k]), k], kept[0, k], samples[k], rng)
+                for k in range(len(anew))
+            ]
+        )
+
+    def _bred(self, state: ArchiveState, a: Tensor, b: Tensor, sample: Tensor, rng: torch.Generator) -> Tensor:
+        """Return the configuration made of a and b; its options are those of a, now and then of `sample`."""
+        domain = state.domain
+        noise = torch.randn(domain.dim, generator=rng)
+        along = self.line * float(torch.randn(1, generator=rng))
+        noise[state.spanned] *= WIDER
+        u = domain.project(a + self.sigma * state.half * noise + along * (b - a))
+        for block, part in domain.parts():
+            if block.options:
+                u[part] = sample[part] if float(torch.rand(1, generator=rng)) < ANEW else a[part]
+        return u
+
+
+def _kept(state: ArchiveState) -> ArchiveState:
+    """Let a copy of the archive take in a whole generation; what could not be evaluated has no cell."""
+    values = np.array(state.values)
+    finite = np.isfinite(values)
+    archive = copy.deepcopy(state.archive)
+    if finite.any():
+        points = state.points[torch.from_numpy(finite)]
+        measures = points[:, state.spanned].double().numpy()
+        archive.add(points.numpy(), values[finite], measures, wrong=np.array(state.wrong)[finite])
+    return replace(state, archive=archive)
+
+
+def _spanned(domain: Domain, over: str) -> Tensor:
+    """Return (k,) positions of the parameters of these names; of the first two without names."""
+    names = [name.strip() for name in over.split(",") if name.strip()]
+    if not names:
+        return torch.arange(min(2, domain.dim))
+    places: dict[str, int] = {}
+    for block, part in domain.parts():
+        for number in range(block.size):
+            places[block.name + (f".{number}" if block.size > 1 else "")] = part.start + number
+    for name in names:
+        if name not in places:
+            raise UnknownNameError("parameter in `over` of policy 'archive':", name, places)
+    if len(set(names)) != len(names) or len(names) > MOST_SPANNED:
+        raise InputError(f"over: expected 1 to {MOST_SPANNED} different parameters, got {', '.join(names)}")
+    return torch.tensor([places[name] for name in names])
+
+
+def _ribs() -> Any:
+    """Import the archives of ribs, which takes seconds."""
+    from ribs import archives
+
+    return archives

@@ -1,0 +1,115 @@
+"""The archive of different failures: what it keeps, over which parameters, and how many cells it fills."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import torch
+
+from advsearch.attacks import Block, Domain, Evaluation, make_policy
+from advsearch.attacks.policies import archive
+from advsearch.attacks.policies.archive import Archive, ArchiveState
+from advsearch.errors import InputError, UnknownNameError
+
+NAMED = Domain(
+    torch.full((5,), 0.5),
+    (
+        Block(1, name="pose.yaw", periodic=True),
+        Block(1, name="camera.elevation"),
+        Block(2, name="camera.target"),
+        Block(1, name="material.kind", options=3),
+    ),
+)
+
+
+def started(domain: Domain, **options: Any) -> ArchiveState:
+    state: ArchiveState = make_policy("archive", **options).start(domain, torch.Generator().manual_seed(0), 100)
+    return state
+
+
+def diversity() -> ModuleType:
+    """The benchmark, whose closed forms are taken."""
+    path = Path(__file__).resolve().parents[3] / "benchmarks" / "diversity.py"
+    spec = importlib.util.spec_from_file_location("diversity", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("scene", ["ball", "corner", "choice"])
+def test_three_times_as_many_cells_fail_as_in_random_search(scene: str) -> None:
+    cells = diversity().failing_cells
+    ours, theirs = (len(cells(scene, policy, 600, 0.2, 3)) for policy in ("archive", "random"))
+    assert theirs > 3 and ours >= 3 * theirs
+
+
+@pytest.mark.parametrize(
+    ("over", "places"),
+    [("", [0, 1]), ("camera.elevation", [1]), ("material.kind, camera.target.1", [4, 3])],
+)
+def test_parameters_have_names_and_a_choice_has_its_options(over: str, places: list[int]) -> None:
+    state = started(NAMED, over=over, cells=7)
+    assert state.spanned.tolist() == places
+    assert list(state.archive.dims) == [3 if place == 4 else 7 for place in places]
+
+
+def test_a_cell_keeps_the_largest_objective_and_nothing_that_could_not_be_evaluated() -> None:
+    domain = Domain(torch.tensor([0.5, 0.5]), (Block(1, name="a"), Block(1, name="b")))
+    policy = Archive(over="a", cells=2, population=4)
+    state = policy.start(domain, torch.Generator().manual_seed(0), 100)
+    points = [torch.tensor(point) for point in ([0.1, 0.2], [0.2, 0.9], [0.3, 0.4], [0.8, 0.8])]
+    values = [1.0, 3.0, -math.inf, -math.inf]
+    state = ArchiveState(**{**vars(state), "points": torch.stack(points)})
+    told = [(u, Evaluation(value, None, value > 2.0)) for u, value in zip(points, values, strict=True)]
+    kept = policy.update(state, told).archive.data()
+    assert kept["objective"].tolist() == [3.0]
+    assert kept["wrong"].tolist() == [True]
+    assert kept["solution"][0].tolist() == pytest.approx([0.2, 0.9])
+
+
+def test_when_nothing_can_be_evaluated_it_goes_on_at_random() -> None:
+    policy, state = make_policy("archive"), started(NAMED)
+    for _ in range(10):
+        proposals, state = policy.propose(state, 2)
+        state = policy.update(state, [(one.u, Evaluation(-math.inf, None, False)) for one in proposals])
+    assert state.generation == 2 and state.archive.empty
+    assert all(NAMED.contains(u) for u in state.points)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"cells": 1}, "cells: expected 2 to 1000 parts of each range, got 1"),
+        ({"cells": 1001}, "cells: expected 2 to 1000"),
+        ({"sigma": 0.0}, r"sigma: expected a number in \(0, 2\]"),
+        ({"line": -0.1}, r"line: expected a number in \[0, 2\]"),
+        ({"population": 1}, "population: expected at least 2, got 1"),
+        ({"over": "pose.yaw,pose.yaw"}, "over: expected 1 to 4 different parameters, got pose.yaw, pose.yaw"),
+        ({"over": "pose.yaw,camera.elevation,camera.target.0", "cells": 200}, "cells: expected at most 1000000 in all"),
+    ],
+)
+def test_options_out_of_range_are_refused(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        started(NAMED, **options)
+
+
+def test_an_unknown_parameter_names_its_neighbour() -> None:
+    with pytest.raises(UnknownNameError, match=r"unknown parameter in `over`.*'pose.yav'. Did you mean 'pose.yaw'"):
+        started(NAMED, over="pose.yav")
+
+
+def test_many_numbers_are_refused() -> None:
+    with pytest.raises(InputError, match=r"expected at most 10000 numbers, got 10001; use pgd or auto"):
+        started(Domain(torch.full((10_001,), 0.5), (Block(10_001),)))
+
+
+def test_without_ribs_it_says_what_to_type(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(archive, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"needs ribs, which is not installed: pip install 'advsearch\[archive\]'"):
+        make_policy("archive")
