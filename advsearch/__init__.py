@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from advsearch.api.attack import attack as attack
     from advsearch.api.check import check as check
+    from advsearch.api.explain import explain as explain
     from advsearch.api.gap import gap as gap
     from advsearch.api.harden import harden as harden
     from advsearch.api.photos import photo_agreement as photo_agreement
@@ -44,6 +45,7 @@ _HOMES = {
     "SweepResult": "advsearch.engine.sweeps.answer",
     "attack": "advsearch.api.attack",
     "check": "advsearch.api.check",
+    "explain": "advsearch.api.explain",
     "gap": "advsearch.api.gap",
     "harden": "advsearch.api.harden",
     "load_model": "advsearch.models",

@@ -29,6 +29,7 @@ from advsearch.config import CONFIGS, AttackConfig
 from advsearch.controls import OWN
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import END, Fields, Result
+from advsearch.runs.results.explain import ExplainResult
 from advsearch.runs.results.gap import CurveResult, GapResult
 from advsearch.runs.results.harden import HardenResult
 from advsearch.runs.results.matrix import MatrixResult
@@ -465,6 +466,7 @@ PARTS: dict[tuple[str, str], Callable[[Record], str]] = {
     ("questions.md", "replay-fields"): result_fields(ReplayResult),
     ("questions.md", "gap-fields"): result_fields(GapResult),
     ("questions.md", "region-fields"): result_fields(RegionResult),
+    ("explain.md", "explain-fields"): result_fields(ExplainResult),
     ("harden.md", "harden-fields"): result_fields(HardenResult),
     ("stability.md", "case-fields"): result_fields(CaseRow),
     ("reference-model.md", "reference"): reference,

@@ -78,6 +78,7 @@ RULES = {
     ),
     "report": Rule({"runs", "config", "settings"}, {"numpy", "PIL", "matplotlib"}, HEAVY),
     "viewer": Rule({"runs", "report", "config", "settings"}, {"numpy", "PIL"}, HEAVY),
+    "explanations": Rule({"attacks", "recipes", "config", "settings"}, {"numpy", "scipy"}, HEAVY),
     "recipes": Rule({"attacks", "runs", "report", "config", "settings"}, {"matplotlib", "pydantic"}, HEAVY),
     "api": Rule(None),
     "cli": Rule(None),

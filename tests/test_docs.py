@@ -48,6 +48,7 @@ from advsearch.config import (
     TRIALS_OVER,
     WAYS,
     AttackConfig,
+    ExplainConfig,
     HardenConfig,
     RecipeConfig,
     RegionConfig,
@@ -382,6 +383,9 @@ def check_names(config: Config) -> None:
     """Look up every name in a configuration, as its command would; nothing is loaded."""
     if isinstance(config, StabilityConfig):
         chosen(config.cases, config.groups)
+        return
+    if isinstance(config, ExplainConfig):
+        assert config.confirm >= 0
         return
     if isinstance(config, ReplayConfig):
         assert set(config.chosen) <= set(WAYS)

@@ -203,6 +203,16 @@ class PlanKeywords(DerivativeKeywords, NamedKeywords, total=False):
     seconds: float | None
 
 
+class ExplainKeywords(RunKeywords, total=False):
+    """Of `explain`."""
+
+    confirm: int
+    pairs: int
+    accuracy: float
+    seed: int
+    threads: int | None
+
+
 class CheckKeywords(PlanKeywords, total=False):
     """Of `check`."""
 

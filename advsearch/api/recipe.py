@@ -9,9 +9,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from advsearch.api import carry_out
 from advsearch.api.keywords import RecipeKeywords, asks, configured
-from advsearch.config import CONFIGS, RecipeConfig
+from advsearch.api.subruns import carry_out_part
+from advsearch.config import RecipeConfig
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.controls import CONTROLS
 from advsearch.progress import NullProgress, Progress
@@ -19,15 +19,13 @@ from advsearch.recipes.description import Recipe, read_recipe, recipe_of
 from advsearch.recipes.figures import compute, draw, read_options
 from advsearch.recipes.parts import Planned, listed, made_of, planned
 from advsearch.recipes.table import Answered, Table, rows_of
-from advsearch.runs.directory import CONFIG, IMAGES, PARTS, RunDirectory, is_run
+from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.runs.files import write_bytes
-from advsearch.runs.listing import finished
 from advsearch.runs.results.attack import AnswerDistribution, AttackSummary, DescribedValue, FoundValue
 from advsearch.runs.results.base import INTERRUPTED, Result
 from advsearch.runs.results.recipe import RecipeFigure, RecipePart, RecipeResult
 from advsearch.runs.results.sweep import SweepSummary
-from advsearch.runs.summary import attack_of, read_result
-from advsearch.settings import read_yaml
+from advsearch.runs.summary import attack_of
 from advsearch.viewer.pages import write_page
 
 if TYPE_CHECKING:
@@ -112,20 +110,17 @@ def _carried_out(
     for number, one in enumerate(runs):
         path = run.path / PARTS / one.name
         progress.message(f"run {number + 1} of {len(runs)}: {one.part}, {one.config.object}")
-        if is_run(path) and (path / CONFIG).is_file():
-            done = read_result(path) if finished(path) else _gone_on(path, progress)
-        else:
-            own = one.config.model_copy(update={"run": str(path), "overwrite": True})
-            if one.around is not None:
-                search = attack_of(run.path / PARTS / one.around)
-                if search.distribution is None:
-                    notes.append(
-                        f"{one.config.object}: the search ended with {search.ending!r} and no distribution, so that "
-                        f"the part {one.part} is left out for it."
-                    )
-                    continue
-                own = _around(own, search.distribution, search.configuration or {})
-            done = carry_out(own, progress=progress)
+        own = one.config
+        if one.around is not None:
+            search = attack_of(run.path / PARTS / one.around)
+            if search.distribution is None:
+                notes.append(
+                    f"{one.config.object}: the search ended with {search.ending!r} and no distribution, so that "
+                    f"the part {one.part} is left out for it."
+                )
+                continue
+            own = _around(own, search.distribution, search.configuration or {})
+        done = carry_out_part(path, own, progress)
         results.append((one, done))
         if done.goes_on:
             break
@@ -162,11 +157,6 @@ def _range(name: str, mean: DescribedValue, searched: FoundValue, deviation: flo
     else:
         ends = [max(at - wide, low), min(at + wide, high)]
     return [math.exp(end) for end in ends] if declared.log else ends
-
-
-def _gone_on(path: Path, progress: Progress) -> Result:
-    kind = CONFIGS[str(read_yaml(path / CONFIG)["command"])]
-    return carry_out(kind.from_yaml(path / CONFIG), progress=progress, resumed=path)
 
 
 # ---- what they come to ----------------------------------------------------------------------------------------------

@@ -29,6 +29,7 @@ COMMANDS = {
     "render": "advsearch.cli.render",
     "sweep": "advsearch.cli.sweep",
     "recipe": "advsearch.cli.recipe",
+    "explain": "advsearch.cli.explain",
     "run": "advsearch.cli.run",
     "gap": "advsearch.cli.gap",
     "region": "advsearch.cli.region",

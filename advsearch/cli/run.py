@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 HELP = "do what a YAML file describes: a run.yaml repeats its run"
 
-COMMANDS = ("attack", "sweep", "recipe", "gap", "region", "precision", "check", "plan", "stability", "harden")
+COMMANDS = (
+    *("attack", "sweep", "recipe", "gap", "region", "precision", "check", "plan", "stability", "harden", "explain"),
+)
 """What the `command` of a file may say."""
 
 

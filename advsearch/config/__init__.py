@@ -10,6 +10,7 @@ from __future__ import annotations
 from advsearch.config.attack import FEWEST_TRIALS, TRIALS, TRIALS_OVER, AttackConfig
 from advsearch.config.checking import CheckConfig, PlanConfig, StabilityConfig
 from advsearch.config.derivative import DerivativeConfig
+from advsearch.config.explain import ExplainConfig
 from advsearch.config.hardening import HardenConfig
 from advsearch.config.precision import QUANTITIES, SAMPLERS, PrecisionConfig
 from advsearch.config.questions import FEWEST_SAMPLES, GapConfig, RegionConfig
@@ -34,6 +35,7 @@ CONFIGS: dict[str, type[Config]] = {
         StabilityConfig,
         PrecisionConfig,
         RecipeConfig,
+        ExplainConfig,
         HardenConfig,
     )
 }
@@ -54,6 +56,7 @@ __all__ = [
     "AttackConfig",
     "CheckConfig",
     "DerivativeConfig",
+    "ExplainConfig",
     "GapConfig",
     "HardenConfig",
     "PlanConfig",

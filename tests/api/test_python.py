@@ -26,6 +26,7 @@ def test_dir_lists_the_public_names() -> None:
 
 QUESTIONS = (
     *("attack", "sweep", "gap", "region", "replay", "recipe", "plan", "check", "precision", "stability", "harden"),
+    "explain",
 )
 
 
@@ -36,7 +37,19 @@ def test_signatures_have_every_setting_as_it_is_declared(name: str) -> None:
     assert not [one for one in parameters.values() if one.kind is one.VAR_KEYWORD]
     names = {one.field.removesuffix("_"): one for one in declared if not one.required}
     assert set(names) <= set(parameters)
-    own = {"scene", "object", "answer", "recipe", "model", "grid", "resume", "progress", "optimiser", "beside"}
+    own = {
+        "scene",
+        "object",
+        "answer",
+        "recipe",
+        "sweeps",
+        "model",
+        "grid",
+        "resume",
+        "progress",
+        "optimiser",
+        "beside",
+    }
     assert set(parameters) - set(names) <= own
     written = vars(importlib.import_module("advsearch.api.keywords"))[f"{name.capitalize()}Keywords"]
     inner = inspect.signature(function.__wrapped__).parameters

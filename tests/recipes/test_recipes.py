@@ -13,6 +13,7 @@ import pytest
 
 import advsearch
 from advsearch.api import carry_out
+from advsearch.api import subruns
 from advsearch.api import recipe as carrying_out
 from advsearch.cli.main import main
 from advsearch.config import RecipeConfig, SweepConfig
@@ -182,7 +183,7 @@ def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
         done.append(config.object)
         return real(config, **named)
 
-    monkeypatch.setattr(carrying_out, "carry_out", stopping)
+    monkeypatch.setattr(subruns, "carry_out", stopping)
     with pytest.raises(KeyboardInterrupt):
         advsearch.recipe(path, run=run)
     path.unlink()  # it goes on as it began

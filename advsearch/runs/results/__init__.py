@@ -6,6 +6,7 @@ from advsearch.files import JsonObject
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.check import CheckResult
+from advsearch.runs.results.explain import ExplainResult
 from advsearch.runs.results.gap import CurveResult, GapResult
 from advsearch.runs.results.harden import HardenResult
 from advsearch.runs.results.matrix import MatrixResult
@@ -28,6 +29,7 @@ KEPT: tuple[type[Result], ...] = (
     PrecisionResult,
     StabilityResult,
     RecipeResult,
+    ExplainResult,
     HardenResult,
 )
 """The results that a run keeps in `summary.json`."""

@@ -50,7 +50,7 @@ class Fields(BaseModel):
     belongs to what was not asked for. Fields that a file has and the class has not are passed over.
     """
 
-    model_config = ConfigDict(frozen=True, from_attributes=True)
+    model_config = ConfigDict(frozen=True, from_attributes=True, populate_by_name=True)
 
     @classmethod
     def of(cls, source: object) -> Self:
@@ -59,7 +59,7 @@ class Fields(BaseModel):
 
     def to_dict(self) -> JsonObject:
         """Return the fields as JSON values; NaN and infinity are None."""
-        values: JsonObject = plain(self.model_dump(exclude_defaults=True))
+        values: JsonObject = plain(self.model_dump(exclude_defaults=True, by_alias=True))
         return values
 
 

@@ -1,0 +1,343 @@
+"""`explain`: failures in words, from the rows of sweeps, confirmed by fresh renders."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from advsearch import seeds
+from advsearch.api.keywords import ExplainKeywords, asks, configured
+from advsearch.api.subruns import carry_out_part
+from advsearch.attacks import clopper_pearson
+from advsearch.config import ExplainConfig, SweepConfig
+from advsearch.config.explain import FEWEST_ROWS
+from advsearch.errors import FileFormatError, InputError
+from advsearch.explanations.envelope import Envelope, find_envelope
+from advsearch.explanations.importance import Importance, find_importance
+from advsearch.explanations.observations import Factor, Observations, observed
+from advsearch.explanations.renders import along, inside, lies_inside
+from advsearch.explanations.rules import Conditions, CountedRule, RuleCondition, covered, find_rules
+from advsearch.progress import NullProgress, Progress
+from advsearch.recipes.table import Answered, rows_of
+from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, find_run
+from advsearch.runs.results.base import INTERRUPTED, Interval
+from advsearch.runs.results.explain import (
+    ConditionRow,
+    EnvelopeRow,
+    ExplainResult,
+    NearestRight,
+    ParameterWeight,
+    RightOf,
+    RuleRow,
+)
+from advsearch.runs.results.sweep import SweepSummary
+from advsearch.runs.summary import read_result
+from advsearch.settings import split_names
+from advsearch.viewer.pages import write_page
+from advsearch.viewer.thumbnails import path_of
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+
+@asks(ExplainConfig, ExplainKeywords)
+def explain(
+    sweeps: str | Path | Sequence[str | Path],
+    *,
+    progress: Progress | None = None,
+    **settings: Unpack[ExplainKeywords],
+) -> ExplainResult:
+    """Say in words where a model is wrong, from the rows of sweeps, and confirm it by renders (docs/explain.md).
+
+    All other arguments are the settings of `advsearch explain`. The run is kept, in `run` or under runs/.
+
+    Args:
+        sweeps: name or folder of a run of `sweep` that has ended, or several, whose rows are read together.
+        progress: told how far it is.
+
+    Raises:
+        InputError: anything that the caller can put right; nothing is written then.
+    """
+    return explain_from_config(configured(ExplainConfig, sweeps=sweeps, **settings), progress=progress)
+
+
+def explain_from_config(
+    config: ExplainConfig, *, progress: Progress | None = None, resumed: Path | None = None
+) -> ExplainResult:
+    """Explain what a configuration describes; renders are sweeps in `parts/`, and those that are done stay done.
+
+    Raises:
+        InputError: too few rows, nothing that varies, or a missing library.
+        FileFormatError: a run is not a finished sweep.
+    """
+    begun, progress = time.perf_counter(), progress or NullProgress()
+    progress.stage("reading rows")
+    asked = [_Asked.of(find_run(name)) for name in split_names(config.sweeps)]
+    rows = [row for one in asked for row in one.rows]
+    if len(rows) < FEWEST_ROWS:
+        raise InputError(f"explain: expected at least {FEWEST_ROWS} rows, got {len(rows)}; sweep more configurations")
+    found = observed([(_shown(row), row.correct) for row in rows])
+    choosing, counting = found.halves(config.seed)
+    progress.stage("seeking rules on one half of the rows")
+    rules = find_rules(choosing, counting, config.seed)
+    progress.stage("measuring which parameters matter")
+    importance = find_importance(choosing, counting, config.seed)
+    envelope = find_envelope(choosing, counting, config.accuracy)
+    with RunDirectory.of(config, resumed) as run:
+        renders = _Renders(run.path, progress, config, found)
+        table = [_rule_row(rule, found.factors, renders.confirmed(rule, n, asked)) for n, rule in enumerate(rules)]
+        pairs = list(renders.pairs(rules, rows, asked))
+        first = asked[0].summary
+        right = int(found.right.sum())
+        result = ExplainResult(
+            run=str(run.path),
+            sweeps=[str(one.folder) for one in asked],
+            object=_together(one.summary.object for one in asked),
+            model=_together(one.summary.model for one in asked),
+            environment=_together(one.summary.environment for one in asked),
+            controls=first.controls,
+            parameters=[one.name for one in found.factors],
+            right=right,
+            total=len(found),
+            interval=clopper_pearson(right, len(found)),
+            rules=table,
+            explained=None if importance is None else importance.explained,
+            importance=[] if importance is None else _weights(importance, found.factors),
+            envelope=None if envelope is None else _envelope_row(envelope, found.factors, config.accuracy),
+            pairs=pairs,
+            renders=renders.count,
+            ending=INTERRUPTED if renders.interrupted else "done",
+            warnings=[*renders.warnings, *_cautions(rows, importance)],
+            seconds={"total": time.perf_counter() - begun},
+            seed=config.seed,
+            command_line=config.command_line(),
+        )
+        run.write_summary(result)
+        write_page(run.path, result)
+        return result
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """One of the sweeps whose rows are read."""
+
+    folder: Path
+    config: SweepConfig
+    summary: SweepSummary
+    rows: list[Answered]
+
+    @classmethod
+    def of(cls, folder: Path) -> _Asked:
+        summary = read_result(folder)
+        if not isinstance(summary, SweepSummary):
+            raise FileFormatError(f"{folder}: expected the run of a sweep that has ended, got one of another command")
+        return cls(folder, SweepConfig.from_yaml(folder / CONFIG), summary, rows_of("", folder, summary))
+
+
+def _shown(row: Answered) -> dict[str, tuple[float | str, str]]:
+    return {name: (value, row.units.get(name, "")) for name, value in row.values.items()}
+
+
+def _together(names: Iterator[str] | Sequence[str]) -> str:
+    return ",".join(dict.fromkeys(one for name in names for one in split_names(name)))
+
+
+def _cautions(rows: Sequence[Answered], importance: Importance | None) -> list[str]:
+    right = sum(row.correct for row in rows)
+    if right in (0, len(rows)):
+        return [f"The model is {'right' if right else 'wrong'} in every row: there is nothing to tell apart."]
+    if importance is not None and not importance.weights:
+        return [
+            "What varies explains next to nothing of the answers, so that no importance is given "
+            f"({importance.explained:.1%} of their variance, on rows that were not fitted to)."
+        ]
+    return []
+
+
+# ---- renders --------------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class _Renders:
+    """Sweeps in the folder of the run; none any more after an interrupt."""
+
+    folder: Path
+    progress: Progress
+    config: ExplainConfig
+    found: Observations
+    count: int = 0
+    interrupted: bool = False
+    warnings: list[str] = field(default_factory=list)
+
+    def _rows(self, name: str, config: SweepConfig) -> list[Answered] | None:
+        """The rows of a sweep; None if it was interrupted, or the scene is not to be had any more."""
+        if self.interrupted:
+            return None
+        path = self.folder / PARTS / name
+        own = config.model_copy(update={"threads": self.config.threads}) if self.config.threads else config
+        try:
+            done = carry_out_part(path, own, self.progress)
+        except InputError as error:
+            text = f"Nothing was rendered for {name}: {error}"
+            self.warnings += [text] if text not in self.warnings else []
+            return None
+        assert isinstance(done, SweepSummary)
+        self.interrupted = done.goes_on
+        self.count += sum(done.renders.values())
+        return None if self.interrupted else rows_of("", path, done)
+
+    def confirmed(self, rule: CountedRule, number: int, asked: Sequence[_Asked]) -> RightOf | None:
+        """Render fresh configurations inside a rule, in the scene of each sweep."""
+        if not self.config.confirm:
+            return None
+        rows: list[Answered] = []
+        for place, one in enumerate(asked):
+            seed = seeds.stream(self.config.seed, "confirm", number * len(asked) + place)
+            samples = -(-self.config.confirm // len(asked))
+            self.progress.message(f"rule {number + 1}: rendering about {samples} configurations inside it")
+            own = inside(one.config, self.found, rule.conditions, samples, seed)
+            rows += self._rows(f"rule-{number + 1}-{place}", own) or []
+        kept = [row.correct for row in rows if lies_inside(rule.conditions, self.found.factors, row.values)]
+        return right_of(sum(kept), len(kept)) if kept else None
+
+    def pairs(
+        self, rules: Sequence[CountedRule], rows: Sequence[Answered], asked: Sequence[_Asked]
+    ) -> Iterator[NearestRight]:
+        """The nearest right configuration to a typical failure of each rule, along the parameters of the rule."""
+        for number, rule in enumerate(rules[: self.config.pairs]):
+            index = _typical(self.found, rule.conditions)
+            if index is None:
+                continue
+            one, row = _sweep_of(index, asked), rows[index]
+            near = [
+                found
+                for condition in rule.conditions
+                if (found := self._nearest(f"pair-{number + 1}", one, row, self.found.factors[condition.place]))
+            ]
+            if near:
+                yield min(near, key=self._moved)
+
+    def _moved(self, pair: NearestRight) -> float:
+        """How far the value moved, as a share of what the rows have; another name is as far as it goes."""
+        place = next(k for k, one in enumerate(self.found.factors) if one.name == pair.parameter)
+        column = self.found.values[:, place]
+        if self.found.factors[place].options:
+            return 1.0
+        return abs(float(pair.right_at) - float(pair.wrong_at)) / float(np.ptp(column))
+
+    def _nearest(self, name: str, one: _Asked, row: Answered, factor: Factor) -> NearestRight | None:
+        """Go along one factor until the answer is right, twice with other noise; the failure fails in both."""
+        self.progress.message(f"{name}: the nearest right answer along {factor.name}")
+        label = f"{name}-{factor.name.replace('.', '_')}"
+        passes: list[list[Answered]] = []
+        for number in range(2):
+            seed = seeds.stream(self.config.seed, f"{label} {number}")
+            found = self._rows(f"{label}-{number}", along(one.config, row.values, factor, self.found, seed))
+            if found is None:
+                return None
+            passes.append(found)
+        own = row.values[factor.name]
+        right = {
+            first.values[factor.name]: place
+            for place, (first, second) in enumerate(zip(*passes, strict=True))
+            if first.correct and second.correct
+        }
+        start = next(place for place, each in enumerate(passes[0]) if each.values[factor.name] == own)
+        if not right or passes[0][start].correct or passes[1][start].correct:
+            return None
+        at = min(right, key=lambda value: abs(float(value) - float(own)) if not factor.options else 0.0)
+        pictures = [
+            str(path.relative_to(self.folder))
+            for place in (start, right[at])
+            if (path := path_of(self.folder / PARTS / f"{label}-0", place)).is_file()
+        ]
+        return NearestRight(
+            values=dict(row.values),
+            parameter=factor.name,
+            unit=factor.unit,
+            wrong_at=own,
+            right_at=at,
+            answered=passes[0][start].answer,
+            answered_there=passes[0][right[at]].answer,
+            pictures=pictures,
+        )
+
+
+def _typical(found: Observations, conditions: Conditions) -> int | None:
+    """The failure under the conditions that is nearest to the middle of them all, by ranks; None without any."""
+    failures = np.flatnonzero(covered(conditions, found) & ~found.right)
+    if not len(failures):
+        return None
+    ranks = found.values.argsort(axis=0).argsort(axis=0)[failures] / len(found)
+    return int(failures[np.abs(ranks - ranks.mean(axis=0)).sum(axis=1).argmin()])
+
+
+def _sweep_of(index: int, asked: Sequence[_Asked]) -> _Asked:
+    for one in asked:
+        if index < len(one.rows):
+            return one
+        index -= len(one.rows)
+    raise IndexError(index)
+
+
+# ---- rows of the answer ---------------------------------------------------------------------------------------------
+
+
+def right_of(right: int, of: int) -> RightOf:
+    """Return a count with the interval of its share."""
+    return RightOf(**_counts(right, of))
+
+
+def _counts(right: int, of: int) -> dict[str, Any]:
+    return {"right": right, "total": of, "interval": clopper_pearson(right, of)}
+
+
+def _rule_row(rule: CountedRule, factors: Sequence[Factor], confirmed: RightOf | None) -> RuleRow:
+    return RuleRow(
+        conditions=_condition_rows(rule.conditions, factors),
+        **_counts(rule.right, rule.of),
+        elsewhere=right_of(rule.right_elsewhere, rule.of_elsewhere),
+        confirmed=confirmed,
+    )
+
+
+def _envelope_row(one: Envelope, factors: Sequence[Factor], accuracy: float) -> EnvelopeRow:
+    rows = _condition_rows(one.conditions, factors)
+    return EnvelopeRow(conditions=rows, **_counts(one.right, one.of), accuracy=accuracy, held=one.held)
+
+
+def _condition_rows(conditions: Conditions, factors: Sequence[Factor]) -> list[ConditionRow]:
+    return [_condition_row(one, factors[one.place]) for one in conditions]
+
+
+def _condition_row(one: RuleCondition, factor: Factor) -> ConditionRow:
+    return ConditionRow(
+        parameter=factor.name,
+        unit=factor.unit,
+        over=one.low if np.isfinite(one.low) else None,
+        at_most=one.high if np.isfinite(one.high) else None,
+        options=[factor.options[number] for number in sorted(one.options or ())],
+        text=one.text(factor),
+    )
+
+
+def _weights(importance: Importance, factors: Sequence[Factor]) -> list[ParameterWeight]:
+    return [
+        ParameterWeight(
+            parameters=[factors[place].name for place in one.places],
+            share=one.share,
+            interval=_between(one.share, one.half_width),
+            total=None if len(one.places) > 1 else one.total,
+            total_interval=None if len(one.places) > 1 else _between(one.total, one.total_half_width),
+        )
+        for one in importance.weights
+    ]
+
+
+def _between(middle: float, half_width: float) -> Interval:
+    return middle - half_width, middle + half_width

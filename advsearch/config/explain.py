@@ -1,0 +1,76 @@
+"""What `explain` needs to know."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pydantic import field_validator
+
+from advsearch.config.scene import SceneConfig
+from advsearch.settings import Clash, Config, check_once, setting, setting_as_in, split_names
+
+FEWEST_ROWS = 100
+"""Rows of which one half can choose and the other can count."""
+
+
+class ExplainConfig(Config):
+    """Everything that decides what `explain` does: whose rows it reads, and what it renders to see whether it is so."""
+
+    command: ClassVar[str] = "explain"
+    clashes: ClassVar[tuple[Clash, ...]] = tuple(one for one in SceneConfig.clashes if one.setting == "overwrite")
+
+    sweeps: str = setting(
+        ...,
+        "explain",
+        "the sweeps whose rows are read together, separated by commas",
+        "names or folders of runs of sweep",
+    )
+    confirm: int = setting(
+        100,
+        "explain",
+        "fresh configurations inside each rule that are rendered to confirm it; 0 for none",
+        unit="renders",
+        ge=0,
+        le=100_000,
+    )
+    pairs: int = setting(
+        3,
+        "explain",
+        "failures for which the nearest right configuration is sought; 0 for none",
+        unit="failures",
+        ge=0,
+        le=100,
+    )
+    accuracy: float = setting(
+        0.95,
+        "explain",
+        "accuracy that the envelope promises, at 95 % confidence",
+        gt=0.0,
+        le=0.999,
+    )
+    seed: int = setting_as_in(SceneConfig, "seed")
+    threads: int | None = setting_as_in(SceneConfig, "threads")
+    run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RUN-explain-NNN")
+    overwrite: bool = setting_as_in(SceneConfig, "overwrite")
+
+    @field_validator("sweeps", "run", mode="before")
+    @classmethod
+    def _as_text(cls, value: Any) -> Any:
+        """Accept a path for a folder and a list of names for names; refuse what can't be a name."""
+        parts = list(value) if isinstance(value, (list, tuple)) else [value]
+        text = ",".join(map(str, parts)) if all(isinstance(one, (str, Path)) for one in parts) else value
+        if isinstance(text, str) and (not text.strip(" ,\t\n") or "\0" in text):
+            raise ValueError("an empty name")
+        return text
+
+    @field_validator("sweeps")
+    @classmethod
+    def _different(cls, value: str) -> str:
+        check_once(split_names(value), "sweeps")
+        return value
+
+    @property
+    def title(self) -> tuple[str, ...]:
+        """The first run, and what is asked of it."""
+        return Path(split_names(self.sweeps)[0]).name, self.command

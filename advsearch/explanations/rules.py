@@ -1,0 +1,217 @@
+"""Rules with few conditions under which a model is wrong far more often than elsewhere.
+
+Candidates are the nodes of decision trees (Breiman et al. 1984) on one half of the rows. The best by weighted relative
+accuracy (Lavrac, Flach and Zupan 1999: share of the rows times excess of errors) is made shorter where that costs
+nothing, and what it covers is put aside before the next is sought (sequential covering; Friedman and Fisher 1999). The
+other half of the rows, which no choice has seen, says whether a rule holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import hypergeom
+
+from advsearch import seeds
+from advsearch.explanations.libraries import library
+from advsearch.explanations.observations import Factor, Mask, Observations, encoded
+
+MOST_RULES = 5
+DEPTH = 3
+"""Conditions of a rule, at most."""
+TREES = 24
+LEAST_SHARE, LEAST_ROWS = 0.01, 12
+"""Of the rows that choose, a rule covers at least so many."""
+KEPT = 0.97
+"""Share of its weighted relative accuracy that a rule keeps when a condition is left out."""
+PASSES, BOUNDS = 3, 250
+"""How often all bounds of a rule are moved, and to how many places (quantiles) of their factor."""
+CHANCE = 1e-3
+"""Probability that any rule is told where there is none: each is tested at a fifth of it (Bonferroni)."""
+LEAST_GAP = 0.1
+"""By how much more often the model is wrong under a rule than elsewhere, at least."""
+
+
+@dataclass(frozen=True)
+class RuleCondition:
+    """A part of the values of one factor.
+
+    Attributes:
+        place: number of the factor.
+        low: values are larger than this; -inf without a bound.
+        high: values are at most this; inf without a bound.
+        options: numbers of the options; None where the factor takes numbers.
+    """
+
+    place: int
+    low: float = -np.inf
+    high: float = np.inf
+    options: frozenset[int] | None = None
+
+    def holds(self, found: Observations) -> Mask:
+        """Return for which rows (n,) it holds."""
+        column = found.values[:, self.place]
+        if self.options is not None:
+            return np.isin(column, list(self.options))
+        return (column > self.low) & (column <= self.high)
+
+    def text(self, factor: Factor) -> str:
+        """Return it in words."""
+        unit = f" {factor.unit}" if factor.unit not in ("", "1") else ""
+        if self.options is not None:
+            return f"{factor.name} {' or '.join(factor.options[one] for one in sorted(self.options))}"
+        if self.low == -np.inf:
+            return f"{factor.name} at most {self.high:g}{unit}"
+        if self.high == np.inf:
+            return f"{factor.name} over {self.low:g}{unit}"
+        return f"{factor.name} over {self.low:g} and at most {self.high:g}{unit}"
+
+
+Conditions = tuple[RuleCondition, ...]
+
+
+@dataclass(frozen=True)
+class CountedRule:
+    """A rule, counted on rows that did not choose it and that no rule before it covers.
+
+    Attributes:
+        conditions: all of which hold; at most one for each factor.
+        right, of: rows under it.
+        right_elsewhere, of_elsewhere: the other rows.
+    """
+
+    conditions: Conditions
+    right: int
+    of: int
+    right_elsewhere: int
+    of_elsewhere: int
+
+
+def covered(conditions: Conditions, found: Observations) -> Mask:
+    """Return which rows (n,) lie under all conditions."""
+    mask = np.ones(len(found), dtype=bool)
+    for one in conditions:
+        mask &= one.holds(found)
+    return mask
+
+
+def find_rules(choosing: Observations, counting: Observations, seed: int) -> list[CountedRule]:
+    """Return the rules under which the model is wrong more often than elsewhere, the weightiest first.
+
+    Args:
+        choosing: rows that rules are chosen on.
+        counting: other rows, with the same factors, that they are counted on.
+        seed: of the trees.
+
+    Raises:
+        InputError: scikit-learn is missing.
+    """
+    rules: list[CountedRule] = []
+    for number in range(MOST_RULES):
+        conditions = _best(choosing, seeds.stream(seed, "rules", number))
+        if not conditions:
+            break
+        inside = covered(conditions, counting)
+        rule = _counted(conditions, counting.right[inside], counting.right[~inside])
+        if not _holds(rule):
+            break
+        rules.append(rule)
+        choosing, counting = choosing.where(~covered(conditions, choosing)), counting.where(~inside)
+    return rules
+
+
+def _counted(conditions: Conditions, inside: Mask, elsewhere: Mask) -> CountedRule:
+    return CountedRule(conditions, int(inside.sum()), len(inside), int(elsewhere.sum()), len(elsewhere))
+
+
+def _holds(rule: CountedRule) -> bool:
+    """Whether rows that did not choose it show it: Fisher's exact test, one-sided."""
+    if not rule.of or not rule.of_elsewhere:
+        return False
+    gap = rule.right_elsewhere / rule.of_elsewhere - rule.right / rule.of
+    total, right = rule.of + rule.of_elsewhere, rule.right + rule.right_elsewhere
+    return gap >= LEAST_GAP and float(hypergeom.cdf(rule.right, total, right, rule.of)) <= CHANCE / MOST_RULES
+
+
+def _best(found: Observations, seed: int) -> Conditions:
+    """The candidate of the largest weighted relative accuracy, as short as it can be; none where all are worthless."""
+    wrong = ~found.right
+    least = max(LEAST_ROWS, round(LEAST_SHARE * len(found)))
+    if len(found) < 2 * least or not 0 < int(wrong.sum()) < len(found):
+        return ()
+    excess = wrong - wrong.mean()
+
+    def weight(conditions: Conditions) -> float:
+        mask = covered(conditions, found)
+        return float(excess[mask].sum()) / len(found) if int(mask.sum()) >= least else -1.0
+
+    best = max(_candidates(found, least, seed), key=weight, default=())
+    reached = weight(best) if best else 0.0
+    if reached <= 0.0:
+        return ()
+    while len(best) > 1:
+        shorter = max((best[:k] + best[k + 1 :] for k in range(len(best))), key=weight)
+        if weight(shorter) < KEPT * reached:
+            break
+        best = shorter
+    for _ in range(PASSES):
+        for place in range(len(best)):
+            moved = [(*best[:place], one, *best[place + 1 :]) for one in _moved(best[place], found)]
+            best = max([best, *moved], key=weight)
+    return best
+
+
+def _moved(condition: RuleCondition, found: Observations) -> Iterator[RuleCondition]:
+    """The condition with its bounds elsewhere: nodes of trees lie where the nodes above them left them."""
+    if condition.options is not None:
+        return
+    quantiles = np.quantile(found.values[:, condition.place], np.linspace(0.0, 1.0, BOUNDS + 1)[1:-1])
+    for at in dict.fromkeys(float(f"{one:.3g}") for one in quantiles):
+        if condition.low > -np.inf and at < condition.high:
+            yield replace(condition, low=at)
+        if condition.high < np.inf and at > condition.low:
+            yield replace(condition, high=at)
+
+
+def _candidates(found: Observations, least: int, seed: int) -> Iterator[Conditions]:
+    """The nodes of one tree of all rows and of a random forest."""
+    one_tree = library("sklearn.tree").DecisionTreeClassifier
+    forest = library("sklearn.ensemble").RandomForestClassifier
+    columns, meaning = encoded(found)
+    shape = {"max_depth": DEPTH, "min_samples_leaf": least}
+    alone = one_tree(**shape, random_state=seed % 2**32)
+    several = forest(TREES, **shape, max_features=0.6, random_state=seed % 2**32)
+    trees = [alone.fit(columns, found.right), *several.fit(columns, found.right).estimators_]
+    seen: set[Conditions] = set()
+    for one in trees:
+        for conditions in _nodes(one.tree_, meaning, found.factors):
+            if conditions and conditions not in seen:
+                seen.add(conditions)
+                yield conditions
+
+
+def _nodes(tree: object, meaning: Sequence[tuple[int, int | None]], factors: Sequence[Factor]) -> Iterator[Conditions]:
+    """The conditions of every node of a tree of scikit-learn."""
+    left, right = tree.children_left, tree.children_right  # type: ignore[attr-defined]
+    columns, thresholds = tree.feature, tree.threshold  # type: ignore[attr-defined]
+    open_nodes: list[tuple[int, dict[int, RuleCondition]]] = [(0, {})]
+    while open_nodes:
+        node, so_far = open_nodes.pop()
+        yield tuple(so_far[place] for place in sorted(so_far))
+        if left[node] == right[node]:
+            continue
+        place, option = meaning[columns[node]]
+        everything = None if option is None else frozenset(range(len(factors[place].options)))
+        before = so_far.get(place, RuleCondition(place, options=everything))
+        if option is None:
+            at = float(f"{thresholds[node]:.3g}")  # as it is told
+            below, above = replace(before, high=min(before.high, at)), replace(before, low=max(before.low, at))
+        else:
+            assert before.options is not None
+            below, above = (
+                replace(before, options=before.options - {option}),
+                replace(before, options=before.options & {option}),
+            )
+        open_nodes += [(int(left[node]), {**so_far, place: below}), (int(right[node]), {**so_far, place: above})]

@@ -1,0 +1,92 @@
+"""The result of `explain`."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from pydantic import Field
+
+from advsearch.runs.results.base import Fields, Interval, Number, RunResult
+
+
+class RightOf(Fields):
+    """In how many of some configurations the model is right."""
+
+    right: int = Field(description="right answers")
+    total: int = Field(alias="of", description="how many")
+    interval: Interval = Field(description="of the share, 95 %")
+
+
+class ConditionRow(Fields):
+    """A part of the values of one parameter."""
+
+    parameter: str
+    unit: str
+    over: float | None = Field(description="values are larger; null without that bound, and for names")
+    at_most: float | None = Field(description="values are no larger; null without that bound, and for names")
+    options: list[str] = Field(description="the names it is about; empty for numbers")
+    text: str
+
+
+class RuleRow(RightOf):
+    """A rule under which the model is wrong more often than elsewhere, counted on rows that did not choose it."""
+
+    conditions: list[ConditionRow] = Field(description="all of which hold")
+    elsewhere: RightOf = Field(description="rows under no rule so far")
+    confirmed: RightOf | None = Field(description="fresh renders drawn inside the rule; null where none were asked for")
+
+
+class ParameterWeight(Fields):
+    """What one parameter, or two together, decide of the answer."""
+
+    parameters: list[str]
+    share: Number = Field(description="Sobol index: of one alone, or of two beyond what each does alone")
+    interval: Interval
+    total: Number | None = Field(description="of one with all that it does together with others; null for two")
+    total_interval: Interval | None
+
+
+class EnvelopeRow(RightOf):
+    """A box inside which the model is right at least so often."""
+
+    conditions: list[ConditionRow] = Field(description="all of which hold; empty for everything that was looked at")
+    accuracy: float = Field(description="what was asked for")
+    held: bool = Field(description="whether the rows that did not choose the box show it")
+
+
+class NearestRight(Fields):
+    """A failure and the nearest configuration that is right and differs in one value."""
+
+    values: dict[str, str | float] = Field(description="of the failure")
+    parameter: str = Field(description="the one that differs")
+    unit: str
+    wrong_at: str | float
+    right_at: str | float
+    answered: str = Field(description="what the model says of the failure")
+    answered_there: str = Field(description="what it says of the other")
+    pictures: list[str] = Field(description="files in the run's folder: of the failure, and of the other")
+
+
+class ExplainResult(RunResult, RightOf):
+    """Where a model is wrong and why, in words, from the rows of sweeps; `right` and `of` are those of all rows."""
+
+    command: ClassVar[str] = "explain"
+
+    sweeps: list[str] = Field(description="folders of the runs whose rows were read")
+    object: str
+    model: str
+    parameters: list[str] = Field(description="what varies in all of the rows")
+    rules: list[RuleRow]
+    explained: float | None = Field(
+        description="share of the variance of the answers that the importance accounts for; null where all are the same"
+    )
+    importance: list[ParameterWeight] = Field(description="empty where next to nothing is explained")
+    envelope: EnvelopeRow | None = Field(description="null where no box promises it")
+    pairs: list[NearestRight]
+    renders: int = Field(description="pictures that were rendered")
+    warnings: list[str] = Field(description="sentences that a reader has to know")
+
+    @property
+    def brief(self) -> str:
+        """How many rules there are."""
+        return f"{len(self.rules)} rules over {self.total} rows"

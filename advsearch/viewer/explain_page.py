@@ -1,0 +1,80 @@
+"""`report.html` of `explain`: rules, what decides, the envelope, and failures beside the nearest right answers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from advsearch.report import wording
+from advsearch.report.explanations import (
+    WEIGHT_HEADS,
+    conditions_text,
+    envelope_text,
+    explain_text,
+    pair_text,
+    share_text,
+    weight_rows,
+)
+from advsearch.report.markup import Html, element, join
+from advsearch.runs.results.explain import ExplainResult, NearestRight
+from advsearch.viewer.document import data_url, document
+from advsearch.viewer.study_page import again, facts_table, heading, table
+
+RULE_HEADS = ("rule", "right", "where no rule so far holds", "fresh renders inside")
+
+
+def explain_page(run: Path, result: ExplainResult) -> str:
+    """Return the page of an explanation in the folder `run`."""
+    rules = [
+        [
+            conditions_text(one.conditions),
+            share_text(one),
+            share_text(one.elsewhere),
+            "" if one.confirmed is None else share_text(one.confirmed),
+        ]
+        for one in result.rules
+    ]
+    note = (
+        "Chosen on one half of the rows and counted on the other, each beyond the rules before it; 95 % "
+        "Clopper-Pearson intervals. Chance alone would tell any rule in one of a thousand cases at most."
+    )
+    weights = weight_rows(result)
+    decides = (
+        "Sobol indices of a forest that was fitted to the rows: the share of the variance that a parameter decides "
+        f"alone (two: together), and with all others. It explains {result.explained or 0.0:.0%} of the variance of "
+        "answers that it was not fitted to."
+    )
+    main = element(
+        "main",
+        join(element("h2", "Rules"), table(RULE_HEADS, rules), element("p", note, class_="soft")) if rules else None,
+        join(element("h2", "What decides"), table(WEIGHT_HEADS, weights), element("p", decides, class_="soft"))
+        if weights
+        else None,
+        element("h2", "Where it can be relied on"),
+        element("p", envelope_text(result)),
+        join(element("h2", "One thing changed"), *(_pair(run, one) for one in result.pairs)) if result.pairs else None,
+        element("h2", "Cost and conditions"),
+        facts_table(
+            {
+                "Rows": f"right in {share_text(result)}",
+                "Sweeps": ", ".join(result.sweeps),
+                "Parameters": ", ".join(result.parameters),
+                "Renders": str(result.renders),
+                "Time": wording.seconds_text(result.seconds["total"]),
+                "Seed": str(result.seed),
+            }
+        ),
+        again(result.command_line),
+    )
+    header = heading(f"explain; {result.object}, {result.model}", explain_text(result), result.warnings)
+    return document(f"{run.name}, explained", header, main, footer=f"run {run.name}. This page needs no other file.")
+
+
+def _pair(run: Path, pair: NearestRight) -> Html:
+    """A failure beside the nearest right answer, pictures where they were kept."""
+    words = ("wrong: " + pair.answered, "right: " + pair.answered_there)
+    pictures = [
+        element("img", src=data_url((run / name).read_bytes(), "image/jpeg"), alt=text, width="192")
+        for name, text in zip(pair.pictures, words, strict=False)
+        if (run / name).is_file()
+    ]
+    return element("figure", *pictures, element("figcaption", pair_text(pair)))

@@ -1,0 +1,185 @@
+"""`explain` on stored sweeps, without a renderer: what it reads, what it would render, what it answers and prints."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from samples import sweep
+from stored_sweeps import described, make_sweep
+
+import advsearch
+from advsearch.api import explain as explaining
+from advsearch.cli.main import main
+from advsearch.config import SweepConfig
+from advsearch.errors import FileFormatError, InputError
+from advsearch.explanations.observations import Factor, Observations
+from advsearch.explanations.renders import along, inside, lies_inside
+from advsearch.explanations.rules import RuleCondition
+from advsearch.recipes.table import Answered
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.results.explain import ExplainResult
+from advsearch.runs.store import Row
+from advsearch.runs.summary import read_result
+
+HIGH = 60.0
+
+
+@pytest.fixture
+def swept(tmp_path: Path) -> Path:
+    """A sweep whose model is wrong from high above."""
+    return stored(tmp_path / "swept", lambda elevation: elevation > HIGH)
+
+
+def stored(path: Path, wrong: Any, rows: int = 600) -> Path:
+    config = SweepConfig(object="mug", controls="camera,light", samples=rows, run=str(path))
+    generator = np.random.default_rng(1)
+    with RunDirectory.create_for(config) as run:
+        made = []
+        for step in range(rows):
+            elevation, power = generator.uniform(5.0, 85.0), generator.uniform(0.0, 2.0)
+            is_wrong = bool(wrong(elevation)) ^ (generator.random() < 0.03)
+            values = {
+                "camera.elevation": described(elevation, "degrees"),
+                "light.power": described(power, "1"),
+                "model": described("reference"),
+            }
+            label = "bowl" if is_wrong else "mug"
+            made.append(Row("sweep", step, correct=not is_wrong, margin=0.5, label=label, values=values))
+        run.record(*made)
+        right = sum(bool(one.correct) for one in made)
+        counts = {"configurations": rows, "correct": right, "accuracy": right / rows, "interval": (0.0, 1.0)}
+        run.write_summary(sweep(**counts, planned=rows, run=str(path)))
+    return path
+
+
+def test_a_rule_is_found_in_stored_rows(swept: Path, tmp_path: Path) -> None:
+    result = advsearch.explain(swept, confirm=0, pairs=0, accuracy=0.9, run=tmp_path / "run")
+    (rule,) = result.rules
+    assert [one.parameter for one in rule.conditions] == ["camera.elevation"]
+    over = rule.conditions[0].over
+    assert over is not None and abs(over - HIGH) < 3.0 and rule.conditions[0].at_most is None
+    assert rule.right < 0.15 * rule.total and rule.elsewhere.right > 0.9 * rule.elsewhere.total and not rule.confirmed
+    assert result.importance[0].parameters == ["camera.elevation"] and result.envelope is not None
+    assert result.parameters == ["camera.elevation", "light.power"] and result.renders == 0
+    kept = read_result(tmp_path / "run")
+    assert isinstance(kept, ExplainResult) and kept.rules == result.rules
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert f"camera.elevation over {over:g} degrees" in page and "<script" not in page.split("<main")[1]
+
+
+def test_json_says_right_of_and_interval(swept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    asked = [
+        "explain",
+        str(swept),
+        "--confirm",
+        "0",
+        "--pairs",
+        "0",
+        "--accuracy",
+        "0.9",
+        "--run",
+        str(tmp_path / "run"),
+    ]
+    assert main([*asked, "--json"]) == 0
+    rule = json.loads(capsys.readouterr().out)["rules"][0]
+    assert rule["right"] < rule["of"] and rule["interval"][0] < rule["interval"][1] and rule["confirmed"] is None
+    assert rule["conditions"][0]["text"].startswith("camera.elevation over 6")
+    assert main([*asked, "--overwrite"]) == 0
+    text = capsys.readouterr().out
+    assert "1. camera.elevation over 6" in text and "Envelope. At least" in text
+
+
+def test_a_rule_is_confirmed_by_what_is_rendered_inside_it(
+    swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[SweepConfig] = []
+
+    def rendered(self: Any, name: str, config: SweepConfig) -> list[Answered]:
+        asked.append(config)
+        own = [Answered("", {"camera.elevation": 70.0, "light.power": 1.0}, {}, "bowl", False)] * 9
+        outside = Answered("", {"camera.elevation": 10.0, "light.power": 1.0}, {}, "mug", True)
+        return [*own, outside]
+
+    monkeypatch.setattr(explaining._Renders, "_rows", rendered)
+    result = advsearch.explain(swept, confirm=10, pairs=0, run=tmp_path / "run")
+    confirmed = result.rules[0].confirmed
+    assert confirmed is not None and (confirmed.right, confirmed.total) == (0, 9)  # what lies outside is not counted
+    low, high = np.asarray(asked[0].controls["camera"]["elevation"], dtype=float)
+    assert 57.0 < low < 63.0 and 84.0 < high <= 85.0 and asked[0].controls["light"] == {}
+    assert asked[0].samples == 10 and asked[0].seed != 0 and asked[0].trials == 0
+
+
+def test_the_nearest_right_answer_differs_in_one_value(
+    swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def rendered(self: Any, name: str, config: SweepConfig) -> list[Answered]:
+        values = config.grid["camera.elevation"]
+        assert isinstance(values, list) and len(config.grid["light.power"]) == 1  # type: ignore[arg-type]
+        return [
+            Answered(
+                "", {"camera.elevation": one, "light.power": 1.0}, {}, "bowl" if one > HIGH else "mug", one <= HIGH
+            )
+            for one in values
+        ]
+
+    monkeypatch.setattr(explaining._Renders, "_rows", rendered)
+    result = advsearch.explain(swept, confirm=0, pairs=1, run=tmp_path / "run")
+    (pair,) = result.pairs
+    assert pair.parameter == "camera.elevation" and float(pair.wrong_at) > HIGH >= float(pair.right_at) > 50.0
+    assert (pair.answered, pair.answered_there) == ("bowl", "mug")
+
+
+def test_what_cannot_be_explained_is_refused_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    few = make_sweep(tmp_path / "few")
+    with pytest.raises(InputError, match="expected at least 100 rows, got 24"):
+        advsearch.explain(few)
+    with pytest.raises(InputError, match="unknown run"):
+        advsearch.explain("nothing")
+    assert main(["explain"]) == 2 and "expected the run of a sweep" in capsys.readouterr().err
+    same = stored(tmp_path / "same", lambda elevation: False, rows=120)
+    kept = advsearch.explain(same, confirm=0, pairs=0, run=tmp_path / "run")
+    assert kept.rules == []
+    with pytest.raises(FileFormatError, match="expected the run of a sweep"):
+        advsearch.explain(tmp_path / "run")
+
+
+FOUND = Observations(
+    (Factor("pose.yaw", "degrees"), Factor("environment", "", ("noon", "studio")), Factor("light.power", "1")),
+    np.array([[yaw, lit, power] for yaw in (0.0, 90.0, 180.0) for lit in (0, 1) for power in (0.5, 1.5)]),
+    np.ones(12, dtype=bool),
+)
+
+
+def test_a_sweep_inside_conditions_keeps_what_they_leave() -> None:
+    config = SweepConfig(
+        object="mug", environment="studio,noon", grid={"pose.yaw": [0.0, 90.0, 180.0]}, controls={"light": {}}
+    )
+    conditions = (
+        RuleCondition(0, low=45.0),
+        RuleCondition(1, options=frozenset({1})),
+        RuleCondition(2, high=1.0),
+    )
+    made = inside(config, FOUND, conditions, 20, 7)
+    assert made.grid == {"pose.yaw": [90.0, 180.0]} and made.environment == "studio" and made.samples == 10
+    assert made.controls == {"light": {"power": [0.5, 1.0]}} and made.seed == 7 and made.spp == config.spp
+    assert lies_inside(conditions, FOUND.factors, {"pose.yaw": 90.0, "environment": "studio", "light.power": 0.7})
+    assert not lies_inside(conditions, FOUND.factors, {"pose.yaw": 90.0, "environment": "noon", "light.power": 0.7})
+
+
+def test_a_sweep_along_a_factor_keeps_the_rest() -> None:
+    config = SweepConfig(
+        object="mug,bowl", environment="studio,noon", controls={"light": {}}, set_={"light.power": 1.0}
+    )
+    row: dict[str, float | str] = {
+        "object": "bowl", "environment": "noon", "model": "reference", "pose.yaw": 90.0, "light.power": 0.5,
+    }  # fmt: skip
+    made = along(config, row, FOUND.factors[0], FOUND, 3)
+    assert made.object == "bowl" and made.environment == "noon" and made.controls == {} and made.keep_pictures == "all"
+    assert made.grid["pose.yaw"][0] == 90.0 and len(made.grid["pose.yaw"]) == 9  # type: ignore[index, arg-type]
+    assert made.grid["light.power"] == [0.5] and made.plain()["set"] == {}
+    lit = along(config, row, FOUND.factors[1], FOUND, 3)
+    assert lit.environment == "noon,studio" and lit.grid["pose.yaw"] == [90.0]
