@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 import advsearch
-from advsearch.api import carry_out
-from advsearch.api import subruns
+from advsearch.api import carry_out, subruns
 from advsearch.api import recipe as carrying_out
 from advsearch.cli.main import main
 from advsearch.config import RecipeConfig, SweepConfig
