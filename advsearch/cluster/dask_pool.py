@@ -64,7 +64,7 @@ class Site:
     where: str
     address: str = ""
     start: Callable[..., Any] | None = None
-    security: Mapping[str, Any] | None = None
+    security: Mapping[str, object] | None = None
     count: int | None = None
 
 

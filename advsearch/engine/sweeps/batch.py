@@ -9,7 +9,6 @@ import math
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from advsearch.attacks.draws import Seeds
 from advsearch.described import Value
@@ -51,7 +50,7 @@ class Batch:
     not_finite: bool
     sizes: int
     thumbnails: Mapping[int, bytes] = field(default_factory=dict)
-    layers: Mapping[int, tuple[Mapping[str, Any], Mapping[str, str]]] = field(default_factory=dict)
+    layers: Mapping[int, tuple[Mapping[str, object], Mapping[str, str]]] = field(default_factory=dict)
 
     @classmethod
     def lost(cls, models: int, values: list[dict[str, Value]], why: str) -> Batch:
