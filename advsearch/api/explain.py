@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -290,17 +290,13 @@ def _sweep_of(index: int, asked: Sequence[_Asked]) -> _Asked:
 
 def right_of(right: int, of: int) -> RightOf:
     """Return a count with the interval of its share."""
-    return RightOf(**_counts(right, of))
-
-
-def _counts(right: int, of: int) -> dict[str, Any]:
-    return {"right": right, "total": of, "interval": clopper_pearson(right, of)}
+    return RightOf(right=right, total=of, interval=clopper_pearson(right, of))
 
 
 def _rule_row(rule: CountedRule, factors: Sequence[Factor], confirmed: RightOf | None) -> RuleRow:
     return RuleRow(
         conditions=_condition_rows(rule.conditions, factors),
-        **_counts(rule.right, rule.of),
+        **vars(right_of(rule.right, rule.of)),
         elsewhere=right_of(rule.right_elsewhere, rule.of_elsewhere),
         confirmed=confirmed,
     )
@@ -308,7 +304,7 @@ def _rule_row(rule: CountedRule, factors: Sequence[Factor], confirmed: RightOf |
 
 def _envelope_row(one: Envelope, factors: Sequence[Factor], accuracy: float) -> EnvelopeRow:
     rows = _condition_rows(one.conditions, factors)
-    return EnvelopeRow(conditions=rows, **_counts(one.right, one.of), accuracy=accuracy, held=one.held)
+    return EnvelopeRow(conditions=rows, **vars(right_of(one.right, one.of)), accuracy=accuracy, held=one.held)
 
 
 def _condition_rows(conditions: Conditions, factors: Sequence[Factor]) -> list[ConditionRow]:

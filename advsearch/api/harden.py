@@ -20,7 +20,7 @@ from advsearch.config import AttackConfig, HardenConfig
 from advsearch.config.hardening import ALL
 from advsearch.engine.hardening.lessons import Lesson, lessons, plain_lessons
 from advsearch.engine.hardening.pictures import FOLDER
-from advsearch.engine.hardening.rounds import VALIDATION_VIEWS, WEIGHTS, Rounds
+from advsearch.engine.hardening.rounds import VALIDATION_VIEWS, WEIGHTS, TrainingRounds
 from advsearch.engine.hardening.split import HELD_OUT, TRAINING, VALIDATION, Split, check_disjoint
 from advsearch.engine.hardening.training import Course, Examples, MakeOptimiser, right_share
 from advsearch.engine.loading import Scene
@@ -218,7 +218,7 @@ class Hardening:
     def __post_init__(self) -> None:
         config = self.config
         amounts = (config.scenes, config.views, len(config.controls), config.clean_loss)
-        self.rounds = Rounds(self.run, self.course, self._drawn, *amounts, self.progress)
+        self.rounds = TrainingRounds(self.run, self.course, self._drawn, *amounts, self.progress)
         self.measured: dict[str, str] = json.loads(self.run.store.note(MEASURED) or "{}")
         self.clean: dict[str, Share] = {}
         self._set = scene_settings(self.config.set_, self.config.exposure)

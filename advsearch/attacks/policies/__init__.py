@@ -7,7 +7,7 @@ from dataclasses import is_dataclass
 from typing import Any
 
 from advsearch.attacks.policies.adam import Adam
-from advsearch.attacks.policies.archive import Archive
+from advsearch.attacks.policies.archive import MapElites
 from advsearch.attacks.policies.auto import Auto
 from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, seeded
 from advsearch.attacks.policies.choices import Choices, with_choices
@@ -35,7 +35,7 @@ POLICIES: Registry[type[Policy[Any]]] = Registry(
     "advsearch.policies",
     {
         "adam": Adam,
-        "archive": Archive,
+        "archive": MapElites,
         "auto": Auto,
         "cmaes": CMAES,
         "grid": Grid,
@@ -99,12 +99,12 @@ __all__ = [
     "PGD",
     "POLICIES",
     "Adam",
-    "Archive",
     "Auto",
     "Choices",
     "Evaluated",
     "Grid",
     "Halving",
+    "MapElites",
     "Policy",
     "Portfolio",
     "Proposal",

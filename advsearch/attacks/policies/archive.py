@@ -63,7 +63,7 @@ class ArchiveState:
 
 
 @dataclass(frozen=True)
-class Archive(Policy[ArchiveState]):
+class MapElites(Policy[ArchiveState]):
     """MAP-Elites (Mouret and Clune 2015, "Illuminating search spaces by mapping elites") with the package ribs.
 
     The archive is a grid over a few parameters. Each cell keeps the configuration with the largest objective that fell

@@ -31,7 +31,7 @@ Draw = Callable[[str, Sequence[int], int], list[Lesson]]
 
 
 @dataclass
-class Rounds:
+class TrainingRounds:
     """The rounds of a run.
 
     Attributes:

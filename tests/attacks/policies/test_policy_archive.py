@@ -13,7 +13,7 @@ import torch
 
 from advsearch.attacks import Block, Domain, Evaluation, make_policy
 from advsearch.attacks.policies import archive
-from advsearch.attacks.policies.archive import Archive, ArchiveState
+from advsearch.attacks.policies.archive import ArchiveState, MapElites
 from advsearch.errors import InputError, UnknownNameError
 
 NAMED = Domain(
@@ -61,7 +61,7 @@ def test_parameters_have_names_and_a_choice_has_its_options(over: str, places: l
 
 def test_a_cell_keeps_the_largest_objective_and_nothing_that_could_not_be_evaluated() -> None:
     domain = Domain(torch.tensor([0.5, 0.5]), (Block(1, name="a"), Block(1, name="b")))
-    policy = Archive(over="a", cells=2, population=4)
+    policy = MapElites(over="a", cells=2, population=4)
     state = policy.start(domain, torch.Generator().manual_seed(0), 100)
     points = [torch.tensor(point) for point in ([0.1, 0.2], [0.2, 0.9], [0.3, 0.4], [0.8, 0.8])]
     values = [1.0, 3.0, -math.inf, -math.inf]

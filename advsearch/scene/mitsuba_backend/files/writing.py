@@ -118,7 +118,7 @@ def _put(plugin: Plugin, key: list[str], values: list[float]) -> bool:
     return True
 
 
-def _part(part: ScenePart, left: dict[str, Any]) -> Plugin:
+def _part(part: ScenePart, left: Plugin) -> Plugin:
     """A part's dictionary; takes its inputs from what is left."""
     given = {name.partition(".")[2]: left.pop(name) for name in sorted(left) if name.startswith(f"{part.name}.")}
     if isinstance(part, MeshPart):
@@ -147,7 +147,7 @@ def _part(part: ScenePart, left: dict[str, Any]) -> Plugin:
     return found
 
 
-def _triples(given: dict[str, Any]) -> dict[str, Any]:
+def _triples(given: Plugin) -> Plugin:
     """Take all colours and places out of what is given, as the fields of a lamp."""
     return {name: tuple(map(float, given.pop(name))) for name in list(given)}
 
