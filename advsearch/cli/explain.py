@@ -46,6 +46,7 @@ def answer(result: ExplainResult) -> str:
         WEIGHT_HEADS,
         envelope_text,
         explain_text,
+        explained_text,
         pair_text,
         rule_text,
         share_text,
@@ -56,7 +57,7 @@ def answer(result: ExplainResult) -> str:
     parts = [explain_text(result)]
     parts += [f"{number + 1}. {rule_text(number, rule)}" for number, rule in enumerate(result.rules)]
     if result.importance:
-        heads = f"What decides (Sobol indices; {result.explained:.0%} of the answers' variance are explained):"
+        heads = f"What decides (Sobol indices; {explained_text(result)} of the answers' variance are explained):"
         parts.append(f"{heads}\n{output.columns([list(WEIGHT_HEADS), *weight_rows(result)])}")
     parts.append(f"Envelope. {envelope_text(result)}")
     parts += [f"One thing changed. {pair_text(pair)}" for pair in result.pairs]

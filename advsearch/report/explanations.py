@@ -26,8 +26,8 @@ def explain_text(result: ExplainResult) -> str:
 def rule_text(number: int, rule: RuleRow) -> str:
     """Return a rule as a sentence."""
     rest = "elsewhere" if number == 0 else "in what no rule before covers"
-    others = f"{rule.elsewhere.right / rule.elsewhere.total:.0%}"
-    text = f"{conditions_text(rule.conditions)}: right in {share_text(rule)}; {rest} {others}."
+    others = 100 * rule.elsewhere.right / rule.elsewhere.total
+    text = f"{conditions_text(rule.conditions)}: right in {share_text(rule)}; {rest} {others:.0f} %."
     fresh = rule.confirmed
     return text if fresh is None else f"{text} Fresh renders inside it: right in {share_text(fresh)}."
 
@@ -53,7 +53,7 @@ def envelope_text(result: ExplainResult) -> str:
     where = conditions_text(box.conditions)
     if not box.held:
         return f"Not shown: inside {where} the rows that did not choose it are right in {share_text(box)}."
-    return f"At least {box.accuracy:.0%} at 95 % confidence: {where}; right in {share_text(box)}."
+    return f"At least {100 * box.accuracy:g} % at 95 % confidence: {where}; right in {share_text(box)}."
 
 
 def pair_text(pair: NearestRight) -> str:
@@ -65,6 +65,11 @@ def pair_text(pair: NearestRight) -> str:
     )
 
 
+def explained_text(result: ExplainResult) -> str:
+    """Return how much of the answers' variance the importance accounts for."""
+    return f"{100 * (result.explained or 0.0):.0f} %"
+
+
 def weight_rows(result: ExplainResult) -> list[list[str]]:
     """Return a row for each parameter and each pair of them."""
     rows = []
@@ -73,9 +78,9 @@ def weight_rows(result: ExplainResult) -> list[list[str]]:
         rows.append(
             [
                 " with ".join(one.parameters),
-                f"{max(one.share, 0.0):.0%}",
+                f"{100 * max(one.share, 0.0):.0f} %",
                 _interval(one.interval),
-                f"{max(one.total or 0.0, 0.0):.0%}" if total else "",
+                f"{100 * max(one.total or 0.0, 0.0):.0f} %" if total else "",
                 _interval(one.total_interval) if one.total_interval else "",
             ]
         )

@@ -10,6 +10,7 @@ from advsearch.report.explanations import (
     conditions_text,
     envelope_text,
     explain_text,
+    explained_text,
     pair_text,
     share_text,
     weight_rows,
@@ -40,7 +41,7 @@ def explain_page(run: Path, result: ExplainResult) -> str:
     weights = weight_rows(result)
     decides = (
         "Sobol indices of a forest that was fitted to the rows: the share of the variance that a parameter decides "
-        f"alone (two: together), and with all others. It explains {result.explained or 0.0:.0%} of the variance of "
+        f"alone (two: together), and with all others. It explains {explained_text(result)} of the variance of "
         "answers that it was not fitted to."
     )
     main = element(
@@ -72,9 +73,13 @@ def explain_page(run: Path, result: ExplainResult) -> str:
 def _pair(run: Path, pair: NearestRight) -> Html:
     """A failure beside the nearest right answer, pictures where they were kept."""
     words = ("wrong: " + pair.answered, "right: " + pair.answered_there)
-    pictures = [
-        element("img", src=data_url((run / name).read_bytes(), "image/jpeg"), alt=text, width="192")
+    figures = [
+        element(
+            "figure",
+            element("img", src=data_url((run / name).read_bytes(), "image/jpeg"), alt=text),
+            element("figcaption", text),
+        )
         for name, text in zip(pair.pictures, words, strict=False)
         if (run / name).is_file()
     ]
-    return element("figure", *pictures, element("figcaption", pair_text(pair)))
+    return join(element("p", pair_text(pair)), element("div", *figures, class_="pictures pair") if figures else None)
