@@ -19,6 +19,12 @@ from advsearch.runs.store import Store
 from advsearch.tasks import Detection
 
 
+ALSO_SLOWLY = pytest.mark.parametrize(
+    "asked", ["detection", pytest.param("segmentation", marks=pytest.mark.slow)], indirect=True
+)
+"""What takes long is asked of segmentation among the slow tests."""
+
+
 @pytest.fixture(scope="module", params=["detection", "segmentation"])
 def asked(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     """The flags of a task with a model file, at a small size."""
@@ -97,7 +103,7 @@ def test_a_sweep_counts_and_keeps_the_worst(
     assert (tmp_path / "run" / "images" / "worst-answer.png").is_file()
 
 
-@pytest.mark.parametrize("asked", ["detection", pytest.param("segmentation", marks=pytest.mark.slow)], indirect=True)
+@ALSO_SLOWLY
 def test_an_answer_is_tried_on_other_models_and_under_other_conditions(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -130,6 +136,7 @@ def test_how_much_worse_than_the_average(asked: list[str], capsys: pytest.Captur
     assert found["table"][0]["average"]["configurations"] == 4
 
 
+@ALSO_SLOWLY
 def test_the_region_round_a_verdict(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     flags = ["--vary", "pose.yaw", "--denoise", "none", "--verify-spp", "4", "--samples", "20"]
     found = answer(
@@ -138,6 +145,7 @@ def test_the_region_round_a_verdict(asked: list[str], capsys: pytest.CaptureFixt
     assert found["verdict"] in ("right", "wrong") and found["box"][0]["name"] == "pose.yaw"
 
 
+@ALSO_SLOWLY
 def test_the_smallest_change(asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     flags = ["--epsilon", "0.3", "--smallest", "--steps", "8", "--trials", "6", "--run", str(tmp_path / "run")]
     found = answer(capsys, "attack", "--object", "mug", *asked, *SHORT, *flags)
