@@ -18,7 +18,6 @@ from advsearch.runs.images import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Detection
 
-
 ALSO_SLOWLY = pytest.mark.parametrize(
     "asked", ["detection", pytest.param("segmentation", marks=pytest.mark.slow)], indirect=True
 )
