@@ -113,7 +113,10 @@ class Coordinator:
         while True:
             self._give_out(source)
             if not self._todo and not any(one for _, one in self._tickets.values()):
-                return
+                numbers = next(source, None)  # there may be more, and nobody yet who is ready for it
+                if numbers is None:
+                    return
+                self._todo.append(_Range(numbers))
             for event in self._pool.events(POLL):
                 yield from self._happened(event)
             self._count_time()
@@ -140,10 +143,6 @@ class Coordinator:
             else:
                 self._free.popleft()
             self._submit(worker, one)
-        if not self._todo and not self._workers:  # nobody is there: is there anything to do?
-            numbers = next(source, None)
-            if numbers is not None:
-                self._todo.append(_Range(numbers))
 
     def _is_there(self, worker: _Worker) -> bool:
         return self._workers.get(worker.address) is worker

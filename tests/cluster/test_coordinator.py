@@ -79,6 +79,16 @@ def test_a_number_of_which_every_worker_dies_is_found_and_said(lag: float) -> No
     assert lost == {37: "no answer: 3 workers died of it", 212: "no answer: 3 workers died of it"}
 
 
+@pytest.mark.parametrize("deadly", range(37, 400, 40))
+def test_what_is_left_waits_for_a_worker_that_is_not_ready(deadly: int) -> None:
+    """The one that dies of a number was the only one that was ready, and another has not got ready yet."""
+    pool = Simulated(kill={deadly}, load=36.0, again=8.0, lag=0.6)
+    pool.add(2)
+    shared = coordinator(pool).results(range(first, first + 2) for first in range(0, 400, 2))
+    found = {number: done.lost for done in shared for number in done.numbers}
+    assert len(found) == 400 and [number for number, lost in found.items() if lost] == [deadly]
+
+
 def test_a_worker_that_hangs_is_ended_and_its_range_done_elsewhere() -> None:
     told: list[str] = []
     pool = Simulated(hang={90})
