@@ -167,6 +167,18 @@ class Domain:
         """Number of elements of u."""
         return self.start.numel()
 
+    @property
+    def names(self) -> list[str]:
+        """The name of each element of u: "pose.yaw"; "camera.target.0" of several numbers."""
+        names = []
+        for block in self.blocks:
+            names += [block.name + (f".{number}" if block.size > 1 else "") for number in range(block.size)]
+        return names
+
+    def block_of(self, place: int) -> Block:
+        """Return the block that an element of u belongs to."""
+        return next(block for block, part in self.parts() if place < part.stop)
+
     def parts(self) -> list[tuple[Block, slice]]:
         """Return every block with its slice of u."""
         parts, begin = [], 0

@@ -17,6 +17,7 @@ from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import TOLERANCE, Domain
 from advsearch.attacks.ending import Ending
 from advsearch.attacks.evaluation import Evaluate, Evaluation, usable
+from advsearch.attacks.failures import Failures
 from advsearch.attacks.policies.base import NO_COUNTS, Counts, Policy, Proposal, affordable
 from advsearch.attacks.policies.choices import with_choices
 from advsearch.errors import InputError
@@ -92,6 +93,7 @@ class SearchResult:
             them; none for gradients of zero.
         counts: what the policy had to do about gradients and steps.
         distribution: what the policy answers beside `best_u`, if it is one that answers with a distribution.
+        failures: what the policy knows of different failures, if it is one that looks for them.
     """
 
     best_u: Tensor
@@ -110,6 +112,7 @@ class SearchResult:
     agreement: tuple[float, ...] = ()
     counts: Counts = NO_COUNTS
     distribution: Distribution | None = None
+    failures: Failures | None = None
 
 
 def planned_renders(steps: int, candidates: int = 4, repeats: int = 2, close: int = 0) -> int:
@@ -211,6 +214,7 @@ class _Log:
     before: Tensor | None = None
     agreement: list[float] = field(default_factory=list)
     answer: Callable[[], Distribution | None] = lambda: None
+    failures: Callable[[], Failures | None] = lambda: None
     counts: Callable[[], Counts] = lambda: NO_COUNTS
 
     def render(self, proposal: Proposal, index: int, phase: Phase) -> Evaluation:
@@ -281,6 +285,7 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
         if log.renders < steps:
             state = policy.update(state, [(proposal.u, evaluation)])
             log.answer, log.counts = partial(policy.answer, state), partial(policy.counts, state)
+            log.failures = partial(policy.failures, state)
         if late(len(log.records)):
             break
     return Ending.BUDGET_SPENT
@@ -331,6 +336,7 @@ def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:
         agreement=tuple(log.agreement),
         counts=log.counts(),
         distribution=log.answer(),
+        failures=log.failures(),
     )
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from advsearch.cli.output import columns
 from advsearch.cli.question import QuestionCommand
 from advsearch.report import wording
+from advsearch.report.failures import FAILURE_HEADS, failure_rows, failures_text
 from advsearch.report.phrases import cells
 
 if TYPE_CHECKING:
@@ -31,6 +32,8 @@ def answer(summary: AttackSummary | CurveResult | MatrixResult) -> str:
         return gap.answer(summary)
     facts = [[name, text] for name, text in _facts(summary).items() if text]
     parts = [wording.verdict(summary), columns(_rates(summary)), columns(facts)]
+    if summary.failures and summary.failures.tried:
+        parts.append(columns([list(FAILURE_HEADS), *failure_rows(summary.failures, tried=True)]))
     return "\n\n".join(parts) + "".join(f"\n\nNote: {text}" for text in wording.remarks(summary))
 
 
@@ -66,6 +69,7 @@ def _facts(summary: AttackSummary) -> dict[str, str]:
         "changed": wording.changed_text(summary),
         "over": wording.over_text(summary),
         "smallest": wording.smallest_text(summary),
+        "failures": failures_text(summary.failures) if summary.failures else "",
         "search": f"{summary.policy}, {wording.count(summary.steps, 'step')}: {summary.ending}",
         "renders": wording.renders_text(summary),
         "time": wording.seconds_text(summary.seconds["total"]),

@@ -15,6 +15,7 @@ from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.smallest import Bracket
+from advsearch.engine.failures import described_failures, write_failures
 from advsearch.engine.pictures import write_artifacts, write_object, write_pictures
 from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
@@ -179,6 +180,7 @@ def summarise(
     warnings = [*warnings, *_remarks(findings, problem)]
     if run is not None:
         write_pictures(run, problem, findings, linear, {"clean": clean, "adversarial": adversarial}, u)
+        write_failures(run, problem, findings)
         write_artifacts(run, artifacts)
         write_object(run, problem, u)
         for name, data in space.files(u).items():
@@ -249,6 +251,7 @@ def _summary(
         smallest=None if findings.smallest is None else _smallest(findings.smallest, problem),
         printability=_printability(problem, findings),
         distribution=_distribution(search.distribution, problem) if search and search.distribution else None,
+        failures=described_failures(problem, findings),
         transport=_transport(findings),
         sample_count=None if count is None else VerificationSamples(spp=count.spp, converged=count.converged),
         claimed=None

@@ -42,6 +42,7 @@ class Findings:
         baseline_verification: of the random search's.
         beaten: verification of the policy's own answer, where the random search's turned out worse for the model and is
             the run's answer instead.
+        failures: verification of the first of the different failures that the policy answers with.
         average: trials of configurations drawn from the whole space.
         smallest: the least epsilon, where it was asked for.
         pictures: of the first trials, (H, W, 3) with 8-bit values in [0, 1], by kind and number; of a run that goes on
@@ -61,6 +62,7 @@ class Findings:
     verification: Verification | None = None
     baseline_verification: Verification | None = None
     beaten: Verification | None = None
+    failures: tuple[Verification, ...] = ()
     average: tuple[Judgement, ...] = ()
     smallest: Bracket | None = None
     pictures: dict[tuple[str, int], Tensor] = field(default_factory=dict)

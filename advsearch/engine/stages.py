@@ -11,6 +11,7 @@ from advsearch.attacks import Ending, Policy, SearchResult, Verification, count_
 from advsearch.attacks.smallest import scaled
 from advsearch.engine.bounces import WORTH, bounces_of, most_pictures
 from advsearch.engine.budget import Preparation, RenderBudget
+from advsearch.engine.failures import check_failures
 from advsearch.engine.gradients import inside
 from advsearch.engine.memory import PLAN, Memory
 from advsearch.engine.planning import cosine_samples, cosines, measured_plan, plan_gradients, tuned
@@ -203,6 +204,8 @@ class Attack:
                 "baseline verification", baseline, curtailed=decided
             )
             self._take_the_worse(found, baseline)
+        if not self.budget.smallest:
+            check_failures(self._verifier, found)
 
     def _take_the_worse(self, found: SearchResult, baseline: SearchResult) -> None:
         """Let the random search's answer be the run's if it is the worse one for the model, and remember that."""

@@ -111,8 +111,12 @@ class Verifier:
         """Whether the control group has been through its trials at this sample count."""
         return bool(self.findings.clean) and self._clean_spp == self.findings.spp
 
-    def verified(self, kind: str, found: SearchResult, *, curtailed: bool = False) -> Verification:
-        """Verify one search's answer against the control group; `curtailed` where only the verdict matters."""
+    def verified(
+        self, kind: str, found: SearchResult, *, trials: int | None = None, curtailed: bool = False
+    ) -> Verification:
+        """Verify one search's answer against the control group, by as many trials if no other number is given;
+        `curtailed` where only the verdict matters."""
+        trials = self.budget.trials if trials is None else trials
         return verify(
             self._numbered(kind),
             self.problem.domain,
@@ -120,8 +124,8 @@ class Verifier:
             claim=found.ending,
             spp=self.findings.spp,
             seed=self.problem.seed,
-            trials=self.budget.trials,
-            clean=self.findings.clean,
+            trials=trials,
+            clean=self.findings.clean[:trials],
             rule=self.problem.rule,
             on_trial=self._teller(kind, self.problem.domain.project(found.best_u)),
             curtailed=curtailed,

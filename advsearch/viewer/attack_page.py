@@ -14,6 +14,7 @@ import numpy as np
 from advsearch.files import JsonObject
 from advsearch.report import wording
 from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
+from advsearch.report.failures import FAILURE_HEADS, answered_text, failure_rows, failures_text, range_text
 from advsearch.report.markup import Html, element, join
 from advsearch.report.method import PLAN_HEADS, method_facts, plan_rows, plan_text
 from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, marks_text
@@ -100,6 +101,7 @@ def page(data: RunData) -> str:
         object_section(data.thing),
         _changes(summary),
         _textures(data),
+        _failures(data),
         _rates(summary),
         _curve(data),
         _cost(summary),
@@ -160,6 +162,25 @@ def _textures(data: RunData) -> Html:
         figures.append(_figure(data, original, "Original", "texture as it was"))
         figures.append(_figure(data, changed, "Adversarial", f"texture that was found; {changed}"))
     return _section("The textures" if len(before) > 1 else "The texture", figures, "pair")
+
+
+def _failures(data: RunData) -> Html:
+    """Many different failures, of a policy that looks for them: a table, and pictures of those that were tried."""
+    known = data.summary.failures
+    if known is None:
+        return Html("")
+    shown = [
+        _figure(data, one.picture, answered_text(one), range_text(one))
+        for one in known.listed
+        if one.picture and one.holds
+    ]
+    rows = failure_rows(known)
+    return join(
+        element("h2", "Different failures"),
+        element("p", f"Failures are {failures_text(known)}."),
+        element("div", *shown, class_="pictures") if shown else None,
+        table(FAILURE_HEADS, rows) if rows else None,
+    )
 
 
 def _rates(summary: AttackSummary) -> Html:

@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from advsearch.attacks.domain import Domain
+from advsearch.attacks.failures import Failures, FoundFailure, most_different
 from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, seeded
-from advsearch.attacks.policies.scaling import half_widths
+from advsearch.attacks.policies.scaling import half_widths, wraps
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.seeds import stream
 
@@ -144,6 +145,26 @@ class MapElites(Policy[ArchiveState]):
         state = replace(state, values=(*state.values, *values), wrong=(*state.wrong, *wrong))
         return state if len(state.values) < len(state.points) else self._next(_kept(state))
 
+    def failures(self, state: ArchiveState) -> Failures:
+        """Return the cells whose configuration is a success; those of a generation that is not whole yet count."""
+        archive = _kept(state).archive
+        kept = archive.data()
+        wrong = np.flatnonzero(kept["wrong"])
+        at = archive.int_to_grid_index(kept["index"][wrong])
+        discrete = torch.cat([torch.full((block.size,), block.options > 0) for block in state.domain.blocks])
+        objectives = kept["objective"][wrong].tolist()
+        picked = most_different(
+            torch.from_numpy(at / archive.dims), objectives, wraps(state.domain)[state.spanned], discrete[state.spanned]
+        )
+        listed = []
+        for number in picked:
+            ends = zip(archive.boundaries, at[number], strict=True)
+            ranges = [(float(edges[k]), float(edges[k + 1])) for edges, k in ends]
+            u = torch.from_numpy(kept["solution"][wrong[number]].copy())
+            listed.append(FoundFailure(u, objectives[number], dict(zip(state.spanned.tolist(), ranges, strict=True))))
+        over = tuple(state.spanned.tolist())
+        return Failures(tuple(listed), over, len(wrong), len(kept["objective"]), int(archive.cells))
+
     def _next(self, state: ArchiveState) -> ArchiveState:
         """Draw a generation; the archive belongs to nobody else yet."""
         number = state.generation + 1
@@ -181,12 +202,12 @@ class MapElites(Policy[ArchiveState]):
 
 
 def _kept(state: ArchiveState) -> ArchiveState:
-    """Let a copy of the archive take in a whole generation; what could not be evaluated has no cell."""
+    """Let a copy of the archive take in what is evaluated of a generation; what could not be has no cell."""
     values = np.array(state.values)
     finite = np.isfinite(values)
     archive = copy.deepcopy(state.archive)
     if finite.any():
-        points = state.points[torch.from_numpy(finite)]
+        points = state.points[: len(values)][torch.from_numpy(finite)]
         measures = points[:, state.spanned].double().numpy()
         archive.add(points.numpy(), values[finite], measures, wrong=np.array(state.wrong)[finite])
     return replace(state, archive=archive)
@@ -197,10 +218,7 @@ def _spanned(domain: Domain, over: str) -> Tensor:
     names = [name.strip() for name in over.split(",") if name.strip()]
     if not names:
         return torch.arange(min(2, domain.dim))
-    places: dict[str, int] = {}
-    for block, part in domain.parts():
-        for number in range(block.size):
-            places[block.name + (f".{number}" if block.size > 1 else "")] = part.start + number
+    places = {name: place for place, name in enumerate(domain.names)}
     for name in names:
         if name not in places:
             raise UnknownNameError("parameter in `over` of policy 'archive':", name, places)

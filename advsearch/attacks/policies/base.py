@@ -20,6 +20,7 @@ from torch import Tensor
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.evaluation import Evaluation, Wanted
+from advsearch.attacks.failures import Failures
 from advsearch.seeds import stream
 
 State = TypeVar("State")
@@ -132,6 +133,10 @@ class Policy(ABC, Generic[State]):
     def answer(self, state: State) -> Distribution | None:
         """Return the distribution that the search has reached, where that is its answer beside the best configuration
         that it met; None where there is none (yet)."""
+        return None
+
+    def failures(self, state: State) -> Failures | None:
+        """Return the different failures that the policy has met, if it looks for more than one."""
         return None
 
 

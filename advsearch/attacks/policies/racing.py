@@ -18,6 +18,7 @@ from typing import Any
 
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.domain import Domain
+from advsearch.attacks.failures import Failures
 from advsearch.attacks.policies.base import (
     NO_COUNTS,
     Counts,
@@ -171,6 +172,12 @@ def answer(race: Race) -> Distribution | None:
     return None if runner.state is None else runner.policy.answer(runner.state)
 
 
+def failures(race: Race) -> Failures | None:
+    """Return the different failures of the search that has met the most; None where none looks for such."""
+    begun = [runner.policy.failures(runner.state) for runner in race.runners if runner.state is not None]
+    return max((one for one in begun if one is not None), key=lambda one: one.found, default=None)
+
+
 def counts(race: Race) -> Counts:
     """Return the sum over all searches."""
     begun = [runner for runner in race.runners if runner.state is not None]
@@ -188,6 +195,9 @@ class Raced(Policy[Race]):
 
     def answer(self, state: Race) -> Distribution | None:
         return answer(state)
+
+    def failures(self, state: Race) -> Failures | None:
+        return failures(state)
 
     def counts(self, state: Race) -> Counts:
         return counts(state)

@@ -99,6 +99,29 @@ class AnswerDistribution(Fields):
     deviation: list[float] = Field(description="in u")
 
 
+class DifferentFailure(Fields):
+    """One of them: a configuration, and where those lie that it stands for."""
+
+    ranges: dict[str, tuple[float, float] | str] = Field(description="from, to; of a discrete choice its option")
+    configuration: dict[str, DescribedValue]
+    objective: Number = Field(description="of the one render that won; biased upwards")
+    holds: bool | None = Field(description="whether it is verified; null if it was not tried")
+    verified: VerifiedRate | None = Field(description="trials that ended as soon as that was clear; null: not tried")
+    picture: str | None = Field(description="the first of these trials; null if there is none")
+
+
+class DifferentFailures(Fields):
+    """Many different failures, of a policy that looks for them."""
+
+    over: list[str] = Field(description="the parameters that tell them apart")
+    found: int = Field(description="cells in which the search saw a success: its own claim")
+    seen: int = Field(description="cells that it looked at")
+    places: int = Field(description="cells that there are")
+    tried: int = Field(description="failures that were tried with fresh seeds")
+    held: int = Field(description="of these, verified")
+    listed: list[DifferentFailure] = Field(description="the worst, then whichever is farthest from all before it")
+
+
 class VerificationSamples(Fields):
     """The sample count of the verification."""
 
@@ -208,6 +231,7 @@ class AttackSummary(SceneResult):
     smallest: SmallestEpsilon | None = Field(default=None, description="only with `smallest`")
     printability: Printability | None = Field(default=None, description="only with `printable`")
     distribution: AnswerDistribution | None = Field(default=None, description="of a policy that answers with one")
+    failures: DifferentFailures | None = Field(default=None, description="of a policy that looks for different ones")
     sample_count: VerificationSamples | None = Field(default=None, description="of the verification")
     transport: LinearTransport | None = Field(
         default=None, description="whether [a matrix of light transport](transport.md) predicted the searches' pictures"

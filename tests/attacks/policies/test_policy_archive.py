@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 
-from advsearch.attacks import Block, Domain, Evaluation, make_policy
+from advsearch.attacks import Block, Domain, Evaluation, make_policy, search
 from advsearch.attacks.policies import archive
 from advsearch.attacks.policies.archive import ArchiveState, MapElites
 from advsearch.errors import InputError, UnknownNameError
@@ -113,3 +114,30 @@ def test_without_ribs_it_says_what_to_type(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(archive, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"needs ribs, which is not installed: pip install 'advsearch\[archive\]'"):
         make_policy("archive")
+
+
+def test_failing_cells_are_told_with_their_ends_and_those_of_a_generation_that_is_not_whole() -> None:
+    domain = Domain(torch.tensor([0.5, 0.5]), (Block(1, name="a"), Block(1, name="b", options=2)))
+    policy = MapElites(over="a,b", cells=4, population=5)
+    state = policy.start(domain, torch.Generator().manual_seed(0), 100)
+    points = [torch.tensor(point) for point in ([0.1, 0.25], [0.2, 0.25], [0.3, 0.25], [0.8, 0.75])]
+    state = replace(state, points=torch.stack([*points, points[0]]))
+    told = [(u, Evaluation(v, None, v > 1.5)) for u, v in zip(points, [2.0, 3.0, 1.0, 4.0], strict=True)]
+    known = policy.failures(policy.update(state, told))
+    assert (known.over, known.found, known.seen, known.places) == ((0, 1), 2, 3, 8)
+    assert [one.objective for one in known.listed] == [4.0, 3.0]
+    assert known.listed[1].u.tolist() == pytest.approx([0.2, 0.25])
+    assert [one.ranges for one in known.listed] == [{0: (0.75, 1.0), 1: (0.5, 1.0)}, {0: (0.0, 0.25), 1: (0.0, 0.5)}]
+
+
+@pytest.mark.parametrize("around", ["restarts", "portfolio"])
+def test_around_an_archive_its_failures_are_still_told(around: str) -> None:
+    inner: dict[str, Any] = {"policy": "archive"} if around == "restarts" else {"policies": ["nes", "archive"]}
+
+    def evaluate(u: torch.Tensor, *, index: int, gradient: object, samples: int = 1) -> Evaluation:
+        return Evaluation(float(u[0]) - 0.4, None, float(u[0]) > 0.4)
+
+    domain = Domain(torch.full((2,), 0.5), (Block(2),))
+    found = search(evaluate, domain, make_policy(around, **inner), steps=120, seed=0).failures
+    assert found is not None and found.found > 2
+    assert search(evaluate, domain, make_policy("nes"), steps=20, seed=0).failures is None

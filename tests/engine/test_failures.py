@@ -1,0 +1,114 @@
+"""The different failures of an archive: tried with fresh seeds by the rule of any answer, and told in words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from samples import attack, make_run
+from stand_ins import StandInProblem, attack_on, configuration
+from torch import Tensor
+
+from advsearch.attacks import Block, Domain, Ending, SearchResult, make_policy
+from advsearch.attacks.failures import Failures, FoundFailure
+from advsearch.attacks.verification import OVER_CONDITIONS, Rule
+from advsearch.cli.attack import answer
+from advsearch.engine.failures import TRIED, check_failures, described_failures
+from advsearch.engine.memory import Memory
+from advsearch.engine.record import Findings, Stages
+from advsearch.engine.stages import Attack
+from advsearch.progress import NullProgress
+from advsearch.report.failures import failure_rows, failures_text
+from advsearch.runs.results.attack import DifferentFailures
+from advsearch.tasks import Judgement
+from advsearch.viewer.attack_page import write_report
+
+NAMED = Domain(torch.full((3,), 0.5), (Block(1, name="u.0"), Block(1, name="u.1"), Block(1, name="kind", options=2)))
+
+
+class Coin(StandInProblem):
+    """Wrong wherever the first number is over 0.6, and where it is over 0.3 by a coin that the seed throws."""
+
+    def trial(self, u: Tensor, seed: int, spp: int, *, drawn: bool = True, keep: object = None) -> Judgement:
+        lucky = float(u[0]) > 0.3 and seed % 2 == 0
+        return super().trial(torch.linspace(0.3, 0.8, 6) if float(u[0]) > 0.6 or lucky else torch.zeros(6), seed, spp)
+
+    def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Any]:
+        said = {f"u.{number}": {"value": 90.0 * float(u[number]), "unit": "degrees"} for number in range(2)}
+        return {**said, "kind": {"value": "brass" if float(u[2]) < 0.5 else "wood", "unit": "name"}}
+
+
+def failure(first: float, objective: float = 1.0) -> FoundFailure:
+    return FoundFailure(torch.tensor([first, 0.5, 0.25]), objective, {0: (first - 0.05, first + 0.05), 2: (0.0, 0.5)})
+
+
+def checked(known: Failures, *, rule: Rule | None = None, trials: int = 20) -> Attack:
+    """An attack of which everything but the different failures has been checked."""
+    problem: Any = Coin(domain=NAMED)
+    problem.rule = rule or problem.rule
+    attacked = attack_on(problem, configuration(), make_policy("archive"), Memory(None), Stages(NullProgress()))
+    nothing = (0.0, 0.0, 0.0, Ending.FOUND, Ending.FOUND, (), (), 1, 0, 0, 0, 0.0)
+    found = SearchResult(torch.full((3,), 0.5), *nothing, failures=known)
+    attacked.findings.search = found
+    verifier = attacked._verifier
+    verifier.choose_spp({"clean": NAMED.start})
+    clean = tuple(StandInProblem().trial(torch.zeros(6), seed, 8) for seed in range(trials))
+    attacked.findings.clean = clean
+    check_failures(verifier, found)
+    return attacked
+
+
+def failures(*firsts: float) -> Failures:
+    return Failures(tuple(failure(first, 4.0 - first) for first in firsts), (0, 2), 30, 50, 100)
+
+
+def described(attacked: Attack) -> DifferentFailures:
+    told = described_failures(attacked.problem, attacked.findings)
+    assert told is not None
+    return told
+
+
+def test_each_is_tried_until_it_is_clear_and_a_lucky_one_does_not_hold() -> None:
+    attacked = checked(failures(0.9, 0.45, 0.8, 0.2))
+    told = described(attacked)
+    assert [one.holds for one in told.listed] == [True, False, True, False]
+    assert [one.verified.trials for one in told.listed if one.verified][0::2] == [6, 6]
+    assert told.listed[3].verified is not None and told.listed[3].verified.trials == 1
+    assert (told.tried, told.held, told.found) == (4, 2, 30)
+
+
+def test_no_more_are_tried_than_is_said_and_the_rest_is_a_claim() -> None:
+    told = described(checked(failures(*[0.95] * (TRIED + 3))))
+    assert told.tried == TRIED
+    assert [one.holds for one in told.listed[TRIED:]] == [None] * 3
+    assert failures_text(told).endswith(f"with fresh renders {TRIED} of the {TRIED} that were tried hold")
+    assert len(failure_rows(told)) == TRIED + 3 and len(failure_rows(told, tried=True)) == TRIED
+    assert failure_rows(told)[-1][2] == "not tried"
+
+
+def test_over_conditions_none_is_tried_and_that_is_said() -> None:
+    told = described(checked(failures(0.9), rule=OVER_CONDITIONS))
+    assert told.tried == 0 and told.listed[0].verified is None
+    assert failures_text(told).endswith("none of these was tried with fresh renders")
+
+
+def test_ranges_are_in_units_and_a_choice_has_its_option() -> None:
+    (one,) = described(checked(failures(0.9))).listed
+    assert one.ranges == {"u.0": pytest.approx((76.5, 85.5)), "kind": "brass"}
+    assert failure_rows(described(checked(failures(0.9))))[0][0] == "u.0 76.5 to 85.5 degrees, kind brass"
+
+
+def test_a_policy_that_looks_for_one_failure_has_none_of_it() -> None:
+    assert described_failures(Coin(domain=NAMED), Findings()) is None  # type: ignore[arg-type]
+    assert "failures" not in attack().to_dict()
+
+
+def test_the_page_and_the_table_have_them(tmp_path: Path) -> None:
+    known = described(checked(failures(0.9, 0.45)))
+    summary = attack(failures=known.to_dict())
+    page = write_report(make_run(tmp_path / "run", summary)).read_text(encoding="utf-8")
+    assert "Different failures" in page and "1 of the 2 that were tried hold" in page
+    assert "u.0 76.5 to 85.5 degrees, kind brass" in answer(summary)
+    assert "30 of 100 cells over u.0 and kind (50 were seen)" in answer(summary)
