@@ -10,7 +10,6 @@ else in a page is written by hand. `--check` writes nothing, names the files tha
 from __future__ import annotations
 
 import argparse
-import importlib
 import inspect
 import json
 import re
@@ -24,7 +23,7 @@ from typing import Any, get_args
 from pydantic.fields import FieldInfo
 
 from advsearch.cli.flags import SCENE, help_text
-from advsearch.cli.main import COMMANDS, _command
+from advsearch.cli.main import add_command
 from advsearch.config import CONFIGS, AttackConfig
 from advsearch.controls import OWN
 from advsearch.runs.results.attack import AttackSummary
@@ -130,10 +129,8 @@ def own_flags(command: str) -> Callable[[Record], str]:
 
 def flags_of(command: str) -> set[str]:
     """Return the flags that a command takes, as its help shows them."""
-    parser = argparse.ArgumentParser()
-    subparsers = parser.add_subparsers()
-    _command(importlib.import_module(COMMANDS[command])).add_parser(subparsers)
-    return set(re.findall(r"^  (--[a-z][a-z-]*)", subparsers.choices[command].format_help(), re.MULTILINE))
+    parser = add_command(argparse.ArgumentParser().add_subparsers(), command)
+    return set(re.findall(r"^  (--[a-z][a-z-]*)", parser.format_help(), re.MULTILINE))
 
 
 def _wrapped(text: str) -> str:

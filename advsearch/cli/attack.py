@@ -17,6 +17,12 @@ if TYPE_CHECKING:
     from advsearch.runs.results.matrix import MatrixResult
 
 HELP = "find the configuration of a scene that the model gets wrong most badly"
+MORE = ", and verify it with fresh renders"
+EXAMPLES = (
+    "attack --object mug --control texture",
+    "attack --object mug --control texture --epsilon 0.03 --set camera.azimuth=130 --seed 1",
+    "attack --object mug --model reference,torchvision:resnet18 --label mug,cup",
+)
 
 
 def answer(summary: AttackSummary | CurveResult | MatrixResult) -> str:
@@ -86,14 +92,4 @@ def _matrix(result: MatrixResult) -> str:
     return "\n\n".join(filter(None, parts)) + "".join(f"\n\nNote: {text}" for text in result.warnings)
 
 
-COMMAND = QuestionCommand(
-    "attack",
-    HELP,
-    answer,
-    (
-        "attack --object mug --control texture",
-        "attack --object mug --control texture --epsilon 0.03 --set camera.azimuth=130 --seed 1",
-        "attack --object mug --model reference,torchvision:resnet18 --label mug,cup",
-    ),
-    more=", and verify it with fresh renders",
-)
+COMMAND = QuestionCommand("attack", answer)

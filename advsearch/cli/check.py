@@ -13,6 +13,13 @@ if TYPE_CHECKING:
     from advsearch.runs.results.check import CheckedRow, CheckResult, DerivativeRow
 
 HELP = "check the gradient of every parameter of a scene against differences"
+MORE = ". Exit status 3 if one is biased or noisy"
+EXAMPLES = (
+    "check --object mug --control pose",
+    "check --object mug --control environment.rotation --loss linear --json",
+    "check --all --resolution 128 --loss linear --seconds 600 --run gradients",
+    "resume gradients",
+)
 READING = (
     "Each row sets a derivative as a search gets it (gradient) beside one that takes far more renders (reference).\n"
     "ok: they agree within 5 %, and one gradient scatters by less than 20 % (noise); biased: they disagree; noisy: it\n"
@@ -129,16 +136,4 @@ def _single(row: DerivativeRow) -> list[str]:
     ]
 
 
-COMMAND = QuestionCommand(
-    "check",
-    HELP,
-    answer,
-    (
-        "check --object mug --control pose",
-        "check --object mug --control environment.rotation --loss linear --json",
-        "check --all --resolution 128 --loss linear --seconds 600 --run gradients",
-        "resume gradients",
-    ),
-    more=". Exit status 3 if one is biased or noisy",
-    short=fell_short,
-)
+COMMAND = QuestionCommand("check", answer, short=fell_short)

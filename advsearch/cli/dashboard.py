@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from advsearch.cli import output
 from advsearch.errors import InputError
@@ -17,27 +17,18 @@ if TYPE_CHECKING:
     from advsearch.runs.results.photos import PhotoAgreement
 
 HELP = "serve the pages of runs to a browser on this machine"
+MORE = ". It keeps the photographs that are taken on a run's page, writes nothing else, and ends with Ctrl-C"
 
 PORT = 8265
+EXAMPLES = (
+    "dashboard",
+    "dashboard mug-sweep-001 mug-sweep-002",
+    "dashboard --host 0.0.0.0",
+)
 
-_EXAMPLES = """examples:
-  advsearch dashboard
-  advsearch dashboard mug-sweep-001 mug-sweep-002
-  advsearch dashboard --host 0.0.0.0
-"""
 
-
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    parser = subparsers.add_parser(
-        "dashboard",
-        help=HELP,
-        description=f"{HELP[0].upper()}{HELP[1:]}. It keeps the photographs that are taken "
-        "on a run's page, writes nothing else, and ends with Ctrl-C.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument("runs", nargs="*", metavar="RUN", help="names or folders of runs (default: all in runs/)")
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to listen at (default: %(default)s); others need the printed token"

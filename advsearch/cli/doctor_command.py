@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import Any
 
 from advsearch.cli import output
 
 HELP = "check every part that a run needs, with versions and what to do"
 
 
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    description = HELP[0].upper() + HELP[1:] + "."
-    output.add_flags(subparsers.add_parser("doctor", help=HELP, description=description, allow_abbrev=False))
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    output.add_flags(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -2,41 +2,20 @@
 
 from __future__ import annotations
 
-import argparse
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from advsearch.cli import output
-from advsearch.cli.question import QuestionCommand
-from advsearch.errors import InputError
+from advsearch.cli.question import Place, QuestionCommand
 
 if TYPE_CHECKING:
     from advsearch.runs.results.explain import ExplainResult
 
 HELP = "say in words where a model is wrong, from the rows of sweeps, and confirm it by fresh renders"
-
-
-class _Explain(QuestionCommand):
-    """The command, which takes the runs by their place, or by `--sweeps`."""
-
-    def add_parser(self, subparsers: argparse._SubParsersAction[Any]) -> argparse.ArgumentParser:
-        """Add the command."""
-        parser = super().add_parser(subparsers)
-        parser.add_argument("sweeps", metavar="RUN", nargs="*", default=argparse.SUPPRESS, help="as `--sweeps`")
-        output.add_code_flag(parser)
-        return parser
-
-    def run(self, args: argparse.Namespace) -> int:
-        """Explain the runs and print what is found."""
-        from advsearch.registry import only_named_code
-        from advsearch.runs.directory import CONFIG, find_run
-        from advsearch.settings import split_names
-
-        named = getattr(args, "sweeps", None)
-        if not named:
-            raise InputError("advsearch explain: expected the run of a sweep; see advsearch explain --help")
-        args.sweeps = named if isinstance(named, str) else ",".join(named)
-        with only_named_code(find_run(split_names(args.sweeps)[0]) / CONFIG, args.code):
-            return super().run(args)
+EXAMPLES = (
+    "explain mug-sweep-001",
+    "explain mug-sweep-001 mug-sweep-002 --confirm 200 --accuracy 0.9",
+    "explain mug-sweep-001 --confirm 0 --pairs 0 --json",
+)
 
 
 def answer(result: ExplainResult) -> str:
@@ -72,13 +51,4 @@ def answer(result: ExplainResult) -> str:
     return "\n\n".join(parts) + "".join(f"\n\nNote: {text}" for text in result.warnings)
 
 
-COMMAND = _Explain(
-    "explain",
-    HELP,
-    answer,
-    (
-        "explain mug-sweep-001",
-        "explain mug-sweep-001 mug-sweep-002 --confirm 200 --accuracy 0.9",
-        "explain mug-sweep-001 --confirm 0 --pairs 0 --json",
-    ),
-)
+COMMAND = QuestionCommand("explain", answer, about="sweeps", place=Place("RUN", "the run of a sweep", several=True))

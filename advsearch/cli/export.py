@@ -8,7 +8,6 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from advsearch.cli import output
 from advsearch.cli.screen import output_errors
@@ -24,28 +23,19 @@ HELP = (
     "write a run's evaluated configurations as a table (CSV, JSON or Parquet), its texture or patch for printing, its "
     "scene for Mitsuba, or its object as glTF"
 )
+EXAMPLES = (
+    "export mug-texture-001",
+    "export runs/mug-texture-001 --kind search --out search.parquet",
+    "export mug-sweep-001 --format 3db --out folder",
+    "export mug-sweep-001 --format fiftyone --out folder",
+    "export mug-patch-001 --format print --size 95 --out sheets.pdf",
+    "export mug-texture-001 --format mitsuba --out folder",
+    "export mug-texture-001 --format gltf --out mug.glb",
+)
 
-_EXAMPLES = """examples:
-  advsearch export mug-texture-001
-  advsearch export runs/mug-texture-001 --kind search --out search.parquet
-  advsearch export mug-sweep-001 --format 3db --out folder
-  advsearch export mug-sweep-001 --format fiftyone --out folder
-  advsearch export mug-patch-001 --format print --size 95 --out sheets.pdf
-  advsearch export mug-texture-001 --format mitsuba --out folder
-  advsearch export mug-texture-001 --format gltf --out mug.glb
-"""
 
-
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    parser = subparsers.add_parser(
-        "export",
-        help=HELP,
-        description=HELP[0].upper() + HELP[1:] + ".",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument("run", metavar="RUN", help="a run's name or folder")
     names = ", ".join([*WRITERS, "csv", "json", "parquet"])
     parser.add_argument("--format", help=f"{names} (default: by the name of --out, or csv)")

@@ -11,6 +11,10 @@ if TYPE_CHECKING:
     from advsearch.runs.results.gap import CurveResult, GapResult
 
 HELP = "compare the worst case with the average over the same space, for each object and each control"
+EXAMPLES = (
+    "gap --object mug --control pose,camera,texture",
+    "gap --object mug,bowl,bottle --control pose --average 500 --steps 80",
+)
 
 
 def answer(result: CurveResult | GapResult) -> str:
@@ -31,12 +35,4 @@ def answer(result: CurveResult | GapResult) -> str:
     return "\n\n".join(part for part in (*parts, columns(facts), ending) if part)
 
 
-COMMAND = QuestionCommand(
-    "gap",
-    HELP,
-    answer,
-    (
-        "gap --object mug --control pose,camera,texture",
-        "gap --object mug,bowl,bottle --control pose --average 500 --steps 80",
-    ),
-)
+COMMAND = QuestionCommand("gap", answer)

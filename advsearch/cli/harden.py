@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from advsearch.runs.results.harden import HardenResult
 
 HELP = "train a copy of a model on its worst cases, and measure it before and after on what training never saw"
+EXAMPLES = (
+    "harden --model reference --control texture --epsilon 0.03 --quick",
+    "harden --model mypackage:network@weights.safetensors --labels labels.json --control texture,pose,light",
+)
 
 
 def answer(result: HardenResult) -> str:
@@ -32,12 +36,4 @@ def answer(result: HardenResult) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
-COMMAND = QuestionCommand(
-    "harden",
-    HELP,
-    answer,
-    (
-        "harden --model reference --control texture --epsilon 0.03 --quick",
-        "harden --model mypackage:network@weights.safetensors --labels labels.json --control texture,pose,light",
-    ),
-)
+COMMAND = QuestionCommand("harden", answer)

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from advsearch.cli import output
 
 HELP = "read a folder that 3DB wrote into a run"
 
 
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    parser = subparsers.add_parser(
-        "import-3db",
-        help=HELP,
-        description="Read details.log, class_maps.json and images/ of 3DB into a run: rows, small pictures, a page.",
-        allow_abbrev=False,
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = (
+        "Read details.log, class_maps.json and images/ of 3DB into a run: rows, small pictures, a page."
     )
     parser.add_argument("folder", metavar="FOLDER", help="what 3DB wrote")
     parser.add_argument("--run", help="name or folder of the run (default: runs/FOLDER-3db-NNN)")

@@ -4,33 +4,24 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from advsearch.cli import output
 from advsearch.errors import InputError
 
 HELP = "say, and picture, what is understood of a mesh or scene file"
-
-_EXAMPLES = """examples:
-  advsearch import mug.obj
-  advsearch import room.glb --json
-  advsearch import room.glb --out room.png
-  advsearch import box.xml --json
-"""
+MORE = ". Nothing is written but the picture"
+EXAMPLES = (
+    "import mug.obj",
+    "import room.glb --json",
+    "import room.glb --out room.png",
+    "import box.xml --json",
+)
 VIEWS, SIDE = 4, 192
 """Views of the picture, and the side of each in pixels."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    parser = subparsers.add_parser(
-        "import",
-        help=HELP,
-        description=f"{HELP[0].upper()}{HELP[1:]}. Nothing is written but the picture.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument("file", metavar="FILE", help="a .glb, .gltf, .blend, .obj, .ply, .stl or Mitsuba's .xml file")
     parser.add_argument("--out", metavar="FILE", help="a picture of all that is in it, from four sides (.png)")
     output.add_flags(parser)

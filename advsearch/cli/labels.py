@@ -3,32 +3,23 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
 
 from advsearch.cli import output
 from advsearch.errors import InputError
 
 HELP = "find the names of a model's classes, as --label takes them"
+MORE = ". With --labels the model itself is not loaded"
+EXAMPLES = (
+    "labels",
+    "labels mug --labels labels.json",
+    "labels mug --model model.pt2 --labels labels.json --json",
+)
 
-_EXAMPLES = """examples:
-  advsearch labels
-  advsearch labels mug --labels labels.json
-  advsearch labels mug --model model.pt2 --labels labels.json --json
-"""
 
-
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     from advsearch.cli.flags import add_settings
 
-    parser = subparsers.add_parser(
-        "labels",
-        help=HELP,
-        description=f"{HELP[0].upper()}{HELP[1:]}. With --labels the model itself is not loaded.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
     parser.add_argument("word", metavar="WORD", nargs="?", help="what the names should be like; all without it")
     add_settings(parser, only=("model", "labels"))
     output.add_flags(parser)

@@ -27,9 +27,8 @@ REGISTRIES = {
 MODELS = {"reference": "the bundled classifier of household objects; models of your own are given as files"}
 
 
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    parser = subparsers.add_parser("list", help=HELP, description=HELP[0].upper() + HELP[1:] + ".", allow_abbrev=False)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument("kind", nargs="?", default="all", choices=[*REGISTRIES, "all"], help="default: all")
     output.add_flags(parser)
 

@@ -1,8 +1,8 @@
 """`advsearch`: find the command, run it, and turn what goes wrong into a message and an exit status.
 
-A command is a module with `HELP` (one line) and a `QuestionCommand` called `COMMAND`, or else with
-`add_parser(subparsers)` and `run(args) -> int`. It imports what is heavy inside functions, so that `advsearch --help`
-answers at once.
+A command is a module with `HELP` (one line), where there is more to say `MORE` (what the description says after that)
+and `EXAMPLES` (lines of a shell), and a `QuestionCommand` called `COMMAND`, or else `add_arguments(parser)` and
+`run(args) -> int`. It imports what is heavy inside functions, so that `advsearch --help` answers at once.
 
 Exit status: 0 the command did its work, 1 a bug, 2 bad input, 3 a check that fell short, 130 interrupted.
 """
@@ -142,12 +142,8 @@ def _parse(given: list[str], command: str | None) -> argparse.Namespace:
     )
     parser.add_argument("--version", action="version", version=f"advsearch {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", title="commands", parser_class=Parser)
-    for name, path in COMMANDS.items():
-        module = _module(path)
-        if name == command:
-            _command(module).add_parser(subparsers)
-        else:
-            subparsers.add_parser(name, help=module.HELP)
+    for name in COMMANDS:
+        add_command(subparsers, name, whole=name == command)
     args, unknown = parser.parse_known_args(given)
     if unknown:
         raise _unknown_argument(unknown[0], subparsers.choices[args.command] if args.command else parser)
@@ -155,6 +151,25 @@ def _parse(given: list[str], command: str | None) -> argparse.Namespace:
         parser.print_help()
         parser.exit()
     return args
+
+
+def add_command(
+    subparsers: argparse._SubParsersAction[Any], name: str, *, whole: bool = True
+) -> argparse.ArgumentParser:
+    """Return the new parser of a command; if not `whole` it has no arguments, and serves the list of commands."""
+    module = _module(COMMANDS[name])
+    examples = [f"  advsearch {line}\n" for line in getattr(module, "EXAMPLES", ())]
+    parser: argparse.ArgumentParser = subparsers.add_parser(
+        name,
+        help=module.HELP,
+        description=f"{module.HELP[0].upper()}{module.HELP[1:]}{getattr(module, 'MORE', '')}.",
+        epilog="".join(["examples:\n", *examples]) if examples else None,
+        formatter_class=argparse.RawDescriptionHelpFormatter if examples else argparse.HelpFormatter,
+        allow_abbrev=False,
+    )
+    if whole:
+        _command(module).add_arguments(parser)
+    return parser
 
 
 def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputError:

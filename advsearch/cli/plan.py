@@ -11,20 +11,17 @@ if TYPE_CHECKING:
     from advsearch.runs.results.plan import GroupDerivative, PlanResult
 
 HELP = "show how a search gets its derivatives and what it leaves out, measured on its scene, and why"
-
-
+EXAMPLES = (
+    "plan --object mug --control pose,texture",
+    "plan --object mug --control camera --seconds 60 --run derivatives",
+    "resume derivatives",
+)
 READING = (
     "How a search gets the derivative of each parameter, measured on this scene, and why. adjoint: a second render\n"
     "that carries all derivatives back at once; differences, secant: two renders with the parameter moved by a step\n"
     "(a share of its range). A cosine of 1 with the converged gradient means that a gradient points the right way."
 )
 """What a plan shows, and how to read it."""
-
-_EXAMPLES = """examples:
-  advsearch plan --object mug --control pose,texture
-  advsearch plan --object mug --control camera --seconds 60 --run derivatives
-  advsearch resume derivatives
-"""
 
 
 def _step(group: GroupDerivative) -> str:
@@ -132,13 +129,4 @@ def _agreement(share: float) -> str:
     return "not at all" if share == 0.0 else f"by {share:.2g} of its noise"
 
 
-COMMAND = QuestionCommand(
-    "plan",
-    HELP,
-    answer,
-    (
-        "plan --object mug --control pose,texture",
-        "plan --object mug --control camera --seconds 60 --run derivatives",
-        "resume derivatives",
-    ),
-)
+COMMAND = QuestionCommand("plan", answer)

@@ -21,6 +21,11 @@ if TYPE_CHECKING:
     )
 
 HELP = "draw error against run time: of the picture, of gradients and of policies, and what follows from it"
+EXAMPLES = (
+    "precision --object mug --control pose",
+    "precision --object mug --control texture --seconds 300 --error 0.1 --out diagrams",
+    "precision --object bowl --control camera --quantities gradient --loss model --json",
+)
 READING = (
     "Each row is a setting: its error beside a reference of far more samples, with the 95 % interval of that error,\n"
     "and the seconds that one picture or gradient takes. A margin is how far the wrong answer leads the right one, in\n"
@@ -157,13 +162,4 @@ def _percent(error: MeasuredError) -> str:
     return ("" if error.known else "< ") + f"{100 * error.value:.3g} %"
 
 
-COMMAND = QuestionCommand(
-    "precision",
-    HELP,
-    answer,
-    (
-        "precision --object mug --control pose",
-        "precision --object mug --control texture --seconds 300 --error 0.1 --out diagrams",
-        "precision --object bowl --control camera --quantities gradient --loss model --json",
-    ),
-)
+COMMAND = QuestionCommand("precision", answer)

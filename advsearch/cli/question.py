@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
+from advsearch.errors import InputError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -19,48 +21,96 @@ FELL_SHORT = 3
 
 
 @dataclass(frozen=True)
+class Place:
+    """How a setting is given without its flag.
+
+    Attributes:
+        metavar: what the help calls it.
+        expected: what is missing where neither is given.
+        more: what the help says of it.
+        several: whether there may be more than one.
+    """
+
+    metavar: str
+    expected: str
+    more: str = ""
+    several: bool = False
+
+
+@dataclass(frozen=True)
 class QuestionCommand:
     """A command that asks a question.
 
     Attributes:
         name: of the command; `advsearch.config.CONFIGS` has its settings, and `advsearch.api.carry_out` answers them.
-        help: what it does, in a line.
         answer: makes a text for a person of its result.
-        more: what the description says after that.
-        examples: lines of a shell.
         short: whether a result falls short of what was checked.
+        about: the setting that names runs, or a file, which the question is about; Python code that the first of them
+            names is imported only if `--code` or `--model` names it too.
+        place: how that setting is given without its flag.
     """
 
     name: str
-    help: str
     answer: Callable[[Any], str]
-    examples: tuple[str, ...]
-    more: str = ""
     short: Callable[[Any], bool] = lambda result: False
+    about: str = ""
+    place: Place | None = None
 
-    def add_parser(self, subparsers: argparse._SubParsersAction[Any]) -> argparse.ArgumentParser:
-        """Add the command, with a flag for each of its settings."""
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Add a flag for each of the settings, and those that commands share."""
         from advsearch.cli.flags import add_settings
         from advsearch.config import CONFIGS
 
-        parser: argparse.ArgumentParser = subparsers.add_parser(
-            self.name,
-            help=self.help,
-            description=f"{self.help[0].upper()}{self.help[1:]}{self.more}.",
-            epilog="\n  advsearch ".join(("examples:", *self.examples)) + "\n",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-            allow_abbrev=False,
-        )
         add_settings(parser, CONFIGS[self.name])
         output.add_flags(parser, quiet=True)
-        return parser
+        if self.place:
+            parser.add_argument(
+                self.about,
+                metavar=self.place.metavar,
+                nargs="*" if self.place.several else "?",
+                default=argparse.SUPPRESS,
+                help=f"as `--{self.about}`{self.place.more}",
+            )
+        if self.about:
+            output.add_code_flag(parser)
 
     def run(self, args: argparse.Namespace) -> int:
-        """Ask what the flags say."""
+        """Ask what the arguments say.
+
+        Raises:
+            InputError: what it is about is missing.
+        """
+        from advsearch.registry import only_named_code
+
+        named = getattr(args, self.about, None)
+        if self.place and named in (None, []):
+            command = f"advsearch {self.name}"
+            raise InputError(f"{command}: expected {self.place.expected}; see {command} --help")
+        if isinstance(named, list):
+            setattr(args, self.about, ",".join(named))
+        file = self.file(args)
+        models = [name.partition("@")[0].strip() for name in getattr(args, "model", "").split(",")]
+        with nullcontext() if file is None else only_named_code(file, [*args.code, *models]):
+            return self.carry_out(self.config(args), as_json=args.json, quiet=args.quiet)
+
+    def file(self, args: argparse.Namespace) -> Path | None:
+        """Return the settings of the first run that the question is about, if it is about one."""
+        from advsearch.runs.directory import CONFIG, find_run
+        from advsearch.settings import split_names
+
+        if self.about not in args:
+            return None
+        name = getattr(args, self.about)
+        if self.place and self.place.several:
+            name = next(iter(split_names(name)), name)
+        return find_run(name) / CONFIG
+
+    def config(self, args: argparse.Namespace) -> Config:
+        """Return the configuration that the arguments describe."""
         from advsearch.cli.flags import config_from
         from advsearch.config import CONFIGS
 
-        return self.carry_out(config_from(args, CONFIGS[self.name]), as_json=args.json, quiet=args.quiet)
+        return config_from(args, CONFIGS[self.name])
 
     def carry_out(self, config: Config, *, as_json: bool, quiet: bool, resumed: Path | None = None) -> int:
         """Ask what `config` describes, or go on with it; print the answer and return the exit status."""

@@ -3,51 +3,40 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from advsearch.cli import output
-from advsearch.cli.question import QuestionCommand
-from advsearch.errors import InputError
+from advsearch.cli.question import Place, QuestionCommand
 
 if TYPE_CHECKING:
     from advsearch.runs.results.recipe import RecipeResult
 
 HELP = "carry out an experiment that a recipe describes, with a page of figures and what they say"
+EXAMPLES = (
+    "recipe list",
+    "recipe backgrounds --quick",
+    'recipe backgrounds --object mug.obj --environment a.hdr,b.hdr --model model.pt2 --label "coffee mug,cup"',
+    "show recipe backgrounds > mine.yaml",
+    "recipe mine.yaml",
+)
 
 LIST = "list"
 """What lists the recipes instead."""
 
 
 class _Recipe(QuestionCommand):
-    """The command, which takes the recipe by its place, or by `--recipe`."""
-
-    def add_parser(self, subparsers: argparse._SubParsersAction[Any]) -> argparse.ArgumentParser:
-        """Add the command."""
-        parser = super().add_parser(subparsers)
-        parser.add_argument(
-            "recipe",
-            metavar="NAME",
-            nargs="?",
-            default=argparse.SUPPRESS,
-            help="as `--recipe`; list shows the recipes that there are",
-        )
-        output.add_code_flag(parser)
-        return parser
+    """The command, which can list the recipes too, and takes a file of one."""
 
     def run(self, args: argparse.Namespace) -> int:
         """Carry out the recipe and print what it says, or list the recipes."""
-        from advsearch.recipes.description import is_file_name
-        from advsearch.registry import only_named_code
+        return _listed(args.json) if getattr(args, "recipe", None) == LIST else super().run(args)
 
-        if "recipe" not in args:
-            raise InputError("advsearch recipe: expected a recipe, or list; see advsearch recipe --help")
-        if args.recipe == LIST:
-            return _listed(args.json)
-        if not is_file_name(args.recipe):
-            return super().run(args)
-        given = [name.strip() for name in getattr(args, "model", "").split(",")]
-        with only_named_code(args.recipe, [*args.code, *(one.partition("@")[0] for one in given)]):
-            return super().run(args)
+    def file(self, args: argparse.Namespace) -> Path | None:
+        """Return the recipe if it is a file."""
+        from advsearch.recipes.description import is_file_name
+
+        return Path(args.recipe) if is_file_name(args.recipe) else None
 
 
 def _listed(as_json: bool) -> int:
@@ -81,13 +70,7 @@ def answer(result: RecipeResult) -> str:
 
 COMMAND = _Recipe(
     "recipe",
-    HELP,
     answer,
-    (
-        "recipe list",
-        "recipe backgrounds --quick",
-        'recipe backgrounds --object mug.obj --environment a.hdr,b.hdr --model model.pt2 --label "coffee mug,cup"',
-        "show recipe backgrounds > mine.yaml",
-        "recipe mine.yaml",
-    ),
+    about="recipe",
+    place=Place("NAME", "a recipe, or list", "; list shows the recipes that there are"),
 )

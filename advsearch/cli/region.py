@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from advsearch.cli import output
 from advsearch.cli.question import QuestionCommand
@@ -11,37 +11,31 @@ from advsearch.errors import InputError
 
 if TYPE_CHECKING:
     from advsearch.runs.results.region import RegionResult
+    from advsearch.settings import Config
 
 HELP = "grow a box around a configuration in which the model's verdict stays the same"
+EXAMPLES = (
+    "region --object mug --control pose.yaw,camera.elevation --map 24",
+    "region --around mug-pose-001 --vary pose.yaw,pose.pitch",
+)
 
 
 class _Region(QuestionCommand):
     """The command, which may take scene and controls from the run that it goes around."""
 
-    def add_parser(self, subparsers: argparse._SubParsersAction[Any]) -> argparse.ArgumentParser:
-        """Add the command."""
-        parser = super().add_parser(subparsers)
-        output.add_code_flag(parser)
-        return parser
-
-    def run(self, args: argparse.Namespace) -> int:
-        """Grow the region and print it."""
-        if "around" not in args:
+    def config(self, args: argparse.Namespace) -> Config:
+        """Return what the flags describe over the scene and the controls of the run."""
+        file = self.file(args)
+        if file is None:
             if "object" not in args:
                 raise InputError(
                     "advsearch region: expected --object NAME, or --around RUN; see advsearch region --help"
                 )
-            return super().run(args)
+            return super().config(args)
         from advsearch.cli.flags import config_from
         from advsearch.config import AttackConfig, RegionConfig
-        from advsearch.registry import only_named_code
-        from advsearch.runs.directory import CONFIG, find_run
 
-        file = find_run(args.around) / CONFIG
-        theirs = AttackConfig.from_yaml(file)
-        with only_named_code(file, [*args.code, getattr(args, "model", "").partition("@")[0]]):
-            config = config_from(args, RegionConfig, **RegionConfig.shared(theirs))
-            return self.carry_out(config, as_json=args.json, quiet=args.quiet)
+        return config_from(args, RegionConfig, **RegionConfig.shared(AttackConfig.from_yaml(file)))
 
 
 def answer(result: RegionResult) -> str:
@@ -66,12 +60,4 @@ def answer(result: RegionResult) -> str:
     return "\n\n".join([verdict, output.columns(rows), output.columns(facts)])
 
 
-COMMAND = _Region(
-    "region",
-    HELP,
-    answer,
-    (
-        "region --object mug --control pose.yaw,camera.elevation --map 24",
-        "region --around mug-pose-001 --vary pose.yaw,pose.pitch",
-    ),
-)
+COMMAND = _Region("region", answer, about="around")

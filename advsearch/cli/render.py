@@ -11,6 +11,11 @@ if TYPE_CHECKING:
     from advsearch.runs.results.render import ClassAnswer, RenderResult
 
 HELP = "render a picture of a scene, and say what the model sees in it"
+EXAMPLES = (
+    "render --object mug --environment kitchen --out mug.png",
+    "render --object mug.obj --environment room.hdr --out around.png --around 8",
+    "render --object mug --control 'pose={yaw: 30}' --set camera.elevation=50 --out mug.exr",
+)
 
 
 def text(result: RenderResult) -> str:
@@ -32,13 +37,4 @@ def _percent(answer: ClassAnswer) -> str:
     return "" if answer.probability is None else f"{100 * answer.probability:.1f} %"
 
 
-COMMAND = QuestionCommand(
-    "render",
-    HELP,
-    text,
-    (
-        "render --object mug --environment kitchen --out mug.png",
-        "render --object mug.obj --environment room.hdr --out around.png --around 8",
-        "render --object mug --control 'pose={yaw: 30}' --set camera.elevation=50 --out mug.exr",
-    ),
-)
+COMMAND = QuestionCommand("render", text)

@@ -5,30 +5,21 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from advsearch.cli import output
 from advsearch.errors import InputError
 
 HELP = "go on with a run that was stopped, where it was stopped"
+MORE = "; what it has evaluated is not rendered again"
+EXAMPLES = (
+    "resume mug-texture-001",
+    "resume mug-plan-001 seconds=600",
+    "resume mug-sweep-001 surface=true",
+)
 
-_EXAMPLES = """examples:
-  advsearch resume mug-texture-001
-  advsearch resume mug-plan-001 seconds=600
-  advsearch resume mug-sweep-001 surface=true
-"""
 
-
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    parser = subparsers.add_parser(
-        "resume",
-        help=HELP,
-        description=HELP[0].upper() + HELP[1:] + "; what it has evaluated is not rendered again.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument("run", metavar="RUN", help="a run's name or folder")
     parser.add_argument(
         "change", metavar="NAME=VALUE", nargs="*", help="a setting to change that decides no number: threads=2"

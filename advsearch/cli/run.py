@@ -6,7 +6,7 @@ import argparse
 import importlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from advsearch.cli import output
 from advsearch.errors import UnknownNameError
@@ -22,9 +22,8 @@ COMMANDS = (
 """What the `command` of a file may say."""
 
 
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    parser = subparsers.add_parser("run", help=HELP, description=HELP[0].upper() + HELP[1:] + ".", allow_abbrev=False)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument("file", metavar="FILE", help="YAML with settings and values, such as a run's run.yaml")
     parser.add_argument("change", metavar="NAME=VALUE", nargs="*", help="a setting to change: steps=80")
     parser.add_argument("--run", help="where the run is kept: a name (kept in runs/) or the path of a folder")

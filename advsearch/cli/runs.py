@@ -6,7 +6,6 @@ import argparse
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from advsearch.cli import output
 from advsearch.errors import InputError
@@ -16,9 +15,8 @@ MOST_NAMES = 4
 HELP = "list the runs in a folder and how each ended"
 
 
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    parser = subparsers.add_parser("runs", help=HELP, description=HELP[0].upper() + HELP[1:] + ".", allow_abbrev=False)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument("folder", nargs="?", metavar="FOLDER", help="where to look (default: runs)")
     output.add_flags(parser)
 

@@ -20,14 +20,9 @@ if TYPE_CHECKING:
 HELP = "show what a run found, the parameters of a control, the options of a policy or a task, or a recipe"
 
 
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    parser = subparsers.add_parser(
-        "show",
-        usage="advsearch show [--json] RUN [--picture] | control NAME | policy NAME | task NAME | recipe NAME",
-        help=HELP,
-        description=HELP[0].upper() + HELP[1:] + ".",
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.usage = "advsearch show [--json] RUN [--picture] | control NAME | policy NAME | task NAME | recipe NAME"
     parser.add_argument(
         "what",
         nargs="+",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from advsearch.cli import output
 from advsearch.cli.question import QuestionCommand
@@ -15,16 +15,24 @@ if TYPE_CHECKING:
     from advsearch.runs.results.stability import StabilityResult
 
 HELP = "check numerical stability on stiff and extreme cases"
+MORE = ". Exit status 3 if one falls short"
+EXAMPLES = (
+    "stability",
+    "stability --group objective --group stiff",
+    "stability --case hdri-texel-100000 --json",
+    "stability --seconds 120 --run extremes",
+    "resume extremes",
+    "stability --list",
+)
 
 
 class _Stability(QuestionCommand):
     """The command, which can list its cases too."""
 
-    def add_parser(self, subparsers: argparse._SubParsersAction[Any]) -> argparse.ArgumentParser:
-        """Add the command."""
-        parser = super().add_parser(subparsers)
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Add the settings and the flag that lists."""
+        super().add_arguments(parser)
         parser.add_argument("--list", action="store_true", help="list the cases and run none")
-        return parser
 
     def run(self, args: argparse.Namespace) -> int:
         """Run the cases, or list them."""
@@ -101,18 +109,4 @@ def table(result: StabilityResult) -> str:
     return "\n\n".join(parts)
 
 
-COMMAND = _Stability(
-    "stability",
-    HELP,
-    answer,
-    (
-        "stability",
-        "stability --group objective --group stiff",
-        "stability --case hdri-texel-100000 --json",
-        "stability --seconds 120 --run extremes",
-        "resume extremes",
-        "stability --list",
-    ),
-    more=". Exit status 3 if one falls short",
-    short=fell_short,
-)
+COMMAND = _Stability("stability", answer, short=fell_short)

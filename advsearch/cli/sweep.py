@@ -15,6 +15,12 @@ if TYPE_CHECKING:
     from advsearch.runs.results.sweep import AxisRow, SharedWork, SweepSummary, WorstConfiguration
 
 HELP = "measure how often the model is right over a grid or a random sample of configurations"
+EXAMPLES = (
+    "sweep --object mug --grid pose.yaw=0:360:24 --grid camera.elevation=5:60:8",
+    "sweep --object mug,bowl --environment studio,noon --grid camera.azimuth=0,90,180,270",
+    "sweep --object mug --control pose,camera --samples 1000",
+    "sweep --object mug --control pose --samples 200 --surface",
+)
 READING = "How often it is right at each value, over all others, with the 95 % interval:"
 """What the tables show."""
 
@@ -129,14 +135,4 @@ def _said(worst: WorstConfiguration, task: str) -> str:
     return f"{text}; margin ({margin_text(task)}) {claim.margin:.3g}; {rate}"
 
 
-COMMAND = QuestionCommand(
-    "sweep",
-    HELP,
-    answer,
-    (
-        "sweep --object mug --grid pose.yaw=0:360:24 --grid camera.elevation=5:60:8",
-        "sweep --object mug,bowl --environment studio,noon --grid camera.azimuth=0,90,180,270",
-        "sweep --object mug --control pose,camera --samples 1000",
-        "sweep --object mug --control pose --samples 200 --surface",
-    ),
-)
+COMMAND = QuestionCommand("sweep", answer)

@@ -4,29 +4,19 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from advsearch.cli import output
 from advsearch.errors import InputError
 
 HELP = "make the page of a run anew, or a folder that any web server serves"
+EXAMPLES = (
+    "view mug-sweep-001",
+    "view mug-sweep-001 mug-sweep-002 --bundle site",
+)
 
-_EXAMPLES = """examples:
-  advsearch view mug-sweep-001
-  advsearch view mug-sweep-001 mug-sweep-002 --bundle site
-"""
 
-
-def add_parser(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add the command."""
-    parser = subparsers.add_parser(
-        "view",
-        help=HELP,
-        description=HELP[0].upper() + HELP[1:] + ".",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
     parser.add_argument("runs", nargs="+", metavar="RUN", help="a run's name or folder; several sweeps with --bundle")
     parser.add_argument("--bundle", metavar="DIR", help="write a folder: a page, the rows and the small pictures")
     output.add_flags(parser)

@@ -140,6 +140,7 @@ def test_what_cannot_be_explained_is_refused_in_words(tmp_path: Path, capsys: py
     with pytest.raises(InputError, match="unknown run"):
         advsearch.explain("nothing")
     assert main(["explain"]) == 2 and "expected the run of a sweep" in capsys.readouterr().err
+    assert main(["explain", ","]) == 2 and "unknown run ','" in capsys.readouterr().err
     same = stored(tmp_path / "same", lambda elevation: False, rows=120)
     kept = advsearch.explain(same, confirm=0, pairs=0, run=tmp_path / "run")
     assert kept.rules == []
