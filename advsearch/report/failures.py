@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from advsearch.report.wording import count, number_text
-from advsearch.runs.results.attack import DifferentFailure, DifferentFailures
+
+if TYPE_CHECKING:
+    from advsearch.runs.results.attack import DifferentFailure, DifferentFailures
 
 FAILURE_HEADS = ("failures", "most often answered", "holds in fresh renders", "objective")
 """Of the columns of `failure_rows`."""
