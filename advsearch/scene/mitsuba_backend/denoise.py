@@ -1,16 +1,26 @@
 """Intel Open Image Denoise on the CPU, guided by albedo and shading normals (package `mitsuba-oidn`).
 
-Deterministic: the same input gives the same bytes. It needs pixels with independent noise, hence the box filter. A
-search treats it as the identity when it differentiates; that is an approximation, and differences of pictures include
-it exactly.
+Deterministic: the same input gives the same bytes, at any number of threads. It needs pixels with independent noise,
+hence the box filter. A search treats it as the identity when it differentiates; that is an approximation, and
+differences of pictures include it exactly.
 """
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from advsearch.errors import EnvironmentSetupError
+
+KEY = 0.18
+"""Mean logarithmic luminance of a picture as the network sees it (as in Open Image Denoise's `autoexposure`)."""
+
+BIN, DARKEST = 16, 1e-8
+"""Pixels along a side of the squares whose mean luminances are averaged, and the least that counts; likewise."""
+
+LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
+"""Of red, green and blue (ITU-R BT.709); likewise."""
 
 
 class Denoiser:
@@ -44,7 +54,22 @@ class Denoiser:
                 f"the denoiser cannot be loaded ({error}): pip install mitsuba-oidn, or use `denoise=none`"
             ) from error
         color, guide, direction, output = self._buffers
-        for buffer, image in ((color, radiance), (guide, albedo), (direction, normal)):
+        gain = _gain(radiance.detach())
+        for buffer, image in ((color, radiance.detach() * gain), (guide, albedo), (direction, normal)):
             buffer.copy_(image.detach())
-        mitsuba_oidn.denoise(color, guide, direction, hdr=True, output=output)
-        return output.to(radiance.device, copy=True)
+        mitsuba_oidn.denoise(color, guide, direction, hdr=True, input_scale=1.0, output=output)
+        return (output / gain).to(radiance.device)
+
+
+def _gain(radiance: Tensor) -> float:
+    """Return the factor that gives a picture (H, W, 3) the mean logarithmic luminance `KEY`.
+
+    The denoiser would find it by itself, but adds up in an order that depends on the number of threads: by a few units
+    in the last place.
+    """
+    luminance = (radiance.cpu().numpy() * LUMINANCE).sum(axis=-1)
+    starts = [np.arange(-(-side // BIN)) * side // -(-side // BIN) for side in luminance.shape]
+    rows, columns = (np.diff(first, append=side) for first, side in zip(starts, luminance.shape, strict=True))
+    means = np.add.reduceat(np.add.reduceat(luminance, starts[0], axis=0), starts[1], axis=1) / np.outer(rows, columns)
+    means = means[means > DARKEST]
+    return float(KEY / np.exp2(np.log2(means).mean())) if means.size else 1.0
