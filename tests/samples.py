@@ -123,6 +123,48 @@ REGION: dict[str, Any] = {
     "box": [{"name": "pose.yaw", "unit": "degrees", "low": 10.0, "high": 55.5, "centre": 30.0}],
 }  # fmt: skip
 
+COUNTED = {"right": 3, "of": 97, "interval": [0.01, 0.09]}
+HIGH = {"parameter": "camera.elevation", "unit": "degrees", "over": 60.0, "at_most": None, "options": [],
+        "text": "camera.elevation over 60 degrees"}  # fmt: skip
+EXPLAIN: dict[str, Any] = {
+    **RUN, "run": "runs/mug-explain-001", "controls": ["camera"], "right": 396, "of": 600, "interval": [0.62, 0.7],
+    "sweeps": ["runs/mug-sweep-001"], "object": "mug", "model": "reference", "parameters": ["camera.elevation"],
+    "rules": [{**COUNTED, "conditions": [HIGH], "elsewhere": COUNTED, "confirmed": COUNTED}], "explained": 0.81,
+    "importance": [{"parameters": ["camera.elevation", "light.power"], "share": 0.9, "interval": [0.8, 1.0],
+                    "total": 0.9, "total_interval": [0.8, 1.0]}],
+    "envelope": {**COUNTED, "conditions": [HIGH], "accuracy": 0.9, "held": True}, "pairs": [], "renders": 0,
+}  # fmt: skip
+SHARE = {"accuracy": 0.75, "interval": [0.35, 0.97], "right": 6, "count": 8}
+SIDE = {"objects": ["mug", "bowl"], "environments": ["studio", "noon"], "scenes": 4, "views": 8}
+HARDEN: dict[str, Any] = {
+    **RUN, "run": "runs/harden-texture-001", "controls": ["texture", "pose"], "objects": ["mug", "bowl"],
+    "model": "reference", "task": "classification", "before": SHARE, "after": SHARE, "clean_before": SHARE,
+    "clean_after": SHARE,
+    "table": [{"control": name, "before": SHARE, "after": SHARE, "stronger": SHARE} for name in ("texture", "pose")],
+    "search": "auto, 16 steps", "stronger_search": "portfolio, 48 steps",
+    "split": {"training": SIDE, "validation": SIDE, "held out": SIDE},
+    "rounds": [{"lessons": 8 * number, "clean": 1.0, "robust": 0.5, "kept": number == 1} for number in range(2)],
+    "hardened": "reference@hardened.safetensors", "weights": "hardened.safetensors", "pictures": "artifacts/pictures",
+}  # fmt: skip
+REPLAY: dict[str, Any] = {
+    **RUN, "run": "runs/mug-replay-001", "controls": ["texture"], "answer": "runs/mug-texture-001", "answered": "found",
+    "object": "mug", "model": "reference", "task": "classification", "renders": 80,
+    "table": [
+        {"way": "curve", "condition": "reinhard, highlights rolled off, x / (1 + x)", "ending": "found",
+         "clean": ATTACK["clean"]["control"], "verified": rated()},
+        {"way": "cycles", "condition": "Blender's Cycles", "ending": "not done", "reason": "there is no Blender here"},
+    ],
+}  # fmt: skip
+RECIPE: dict[str, Any] = {
+    **RUN, "run": "runs/recipe-001", "controls": [], "recipe": "mine.yaml", "title": "Is the mug seen?", "about": "",
+    "quick": True, "objects": ["mug"], "model": "reference",
+    "parts": [{"name": "views-00", "part": "views", "command": "sweep", "object": "mug", "ending": "finished",
+               "renders": 8}],
+    "figures": [{"figure": "bars", "title": "Accuracy by environment", "text": ["All have the same share."],
+                 "by": "environment",
+                 "bars": [{"name": "studio", "configurations": 8, "correct": 6, **ACCURACY}]}],
+}  # fmt: skip
+
 
 def attack(**changes: Any) -> AttackSummary:
     """Return an attack's result with other fields."""

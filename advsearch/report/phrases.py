@@ -24,6 +24,13 @@ _WANTED = {
 SUCCESS_ABOVE_ZERO = ("margin", "score", "vanish", *_WANTED)
 """Objectives that are over 0 exactly where an answer is what is sought."""
 
+_UNITS = {
+    "logits": ("margin", "log_odds", "pixel_margin"),
+    "log-odds": ("vanish", "mislabel", "displace", "create"),
+    "nats": ("cross_entropy",),
+    "lengths of the clean features": ("feature_distance",),
+}
+
 _NONE, _ELSEWHERE = "no ", " elsewhere"
 
 
@@ -59,6 +66,11 @@ def with_article(name: str) -> str:
 def margin_text(task: str) -> str:
     """Return what the margin of a task is, as a clause."""
     return _MARGINS.get(task, "over 0 where the answer is wrong")
+
+
+def objective_label(objective: str) -> str:
+    """Return an objective with its unit, for an axis: ``margin [logits]``."""
+    return next((f"{objective} [{unit}]" for unit, names in _UNITS.items() if objective in names), objective)
 
 
 def marks_text(task: str) -> str:

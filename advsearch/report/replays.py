@@ -5,7 +5,7 @@ from __future__ import annotations
 from advsearch.report import wording
 from advsearch.runs.results.replay import NOT_DONE, ReplayResult, ReplayRow
 
-HEADS = ("changed", "to", "clean right", "95 % interval", "success", "95 % interval", "")
+HEADS = ("changed", "to", "clean right", "95 % interval", "success", "95 % interval", "answer")
 """Of the columns."""
 
 

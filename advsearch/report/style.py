@@ -3,9 +3,9 @@
 CSS = """
 :root { color-scheme: light dark; --paper: #fcfcfb; --card: #ffffff; --ink: #1c1d20; --soft: #5c606a; --line: #dfe0e3;
   --search: #1d5fd0; --baseline: #b4540a; --clean: #1f7a45; --track: #e6e7ea; --warn: #8a5300; --warn-paper: #fdf4e3; }
-@media (prefers-color-scheme: dark) { :root { --paper: #15171b; --card: #1d2025; --ink: #e8e9ec; --soft: #a3a8b3;
-  --line: #363a42; --search: #7aaaf8; --baseline: #f0a35e; --clean: #6cc792; --track: #353942; --warn: #f2c879;
-  --warn-paper: #2e2718; } }
+@media screen and (prefers-color-scheme: dark) { :root { --paper: #15171b; --card: #1d2025; --ink: #e8e9ec;
+  --soft: #a3a8b3; --line: #363a42; --search: #7aaaf8; --baseline: #f0a35e; --clean: #6cc792; --track: #353942;
+  --warn: #f2c879; --warn-paper: #2e2718; } }
 * { box-sizing: border-box; }
 html { -webkit-text-size-adjust: 100%; }
 body { margin: 0; background: var(--paper); color: var(--ink); 
@@ -59,5 +59,6 @@ footer { margin-top: 3rem; padding-top: 1rem; padding-bottom: 2.5rem; font-size:
 @media (max-width: 34rem) { .facts th { width: 7.5rem; } .hide-small, svg.wide { display: none; }
   svg.narrow { display: block; } .scroll th, .scroll td { padding-right: 0.5rem; font-size: 0.88rem; }
   .scroll thead th { white-space: normal; } }
-@media print { body { background: none; } h2 { break-after: avoid; } figure, table { break-inside: avoid; } }
+@media print { :root { color-scheme: light; } body { background: none; } .scroll { overflow: visible; }
+  h2 { break-after: avoid; } figure, table { break-inside: avoid; } }
 """

@@ -17,12 +17,12 @@ from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
 from advsearch.report.failures import FAILURE_HEADS, answered_text, failure_rows, failures_text, range_text
 from advsearch.report.markup import Html, element, join
 from advsearch.report.method import PLAN_HEADS, method_facts, plan_rows, plan_text
-from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, marks_text
+from advsearch.report.phrases import SUCCESS_ABOVE_ZERO, answer_text, marks_text, objective_label
 from advsearch.runs import directory, images, store
 from advsearch.runs.files import write_text
 from advsearch.runs.results.attack import AttackSummary, FoundValue, UsualAnswer
 from advsearch.runs.summary import attack_of
-from advsearch.viewer.document import data_script, data_url, document
+from advsearch.viewer.document import data_script, data_url, document, scrolled
 from advsearch.viewer.study_page import facts_table, table
 from advsearch.viewer.turning import object_data, object_section, read_object
 
@@ -142,7 +142,8 @@ def _pictures(data: RunData) -> Html:
     trials = [name for name in data.pictures if name.startswith("images/verification")]
     trials = ([name for name in trials if name.endswith("-answer.png")] or trials)[:MOST_TRIALS]
     compare = element("div", id="compare", hidden="hidden")
-    search = element("div", element("h2", "The search, step by step"), element("div", id="search"), hidden="hidden")
+    steps = join(element("h2", "The search, step by step"), element("div", id="search"))
+    search = element("div", steps, hidden="hidden", class_="screen")
     return join(
         element("h2", "What the model sees"),
         compare,
@@ -209,12 +210,12 @@ def _rates(summary: AttackSummary) -> Html:
     if not lines:
         return Html("")
     heads = ("Configuration", "Model is", "Renders", "95 % interval")
-    head = element("tr", *(element("th", text, scope="col") for text in heads), element("th", "", class_="hide-small"))
+    head = element("tr", *(element("th", text, scope="col") for text in heads), element("td", class_="hide-small"))
     spp = summary.verified.spp if summary.verified else None
     note = "Fresh seeds, pictures rounded to 8 bits, Clopper-Pearson intervals"
     return join(
         element("h2", "Verified rates"),
-        element("div", element("table", element("thead", head), element("tbody", *lines)), class_="scroll"),
+        scrolled(element("table", element("thead", head), element("tbody", *lines))),
         element("p", note + (f", {spp} samples per pixel." if spp else "."), class_="soft"),
     )
 
@@ -243,7 +244,7 @@ def _curve(data: RunData) -> Html:
     objective = data.summary.objective
     above = "right" if data.summary.minimises else wording.success(data.summary)
     zero = f"above: {above}" if objective in SUCCESS_ABOVE_ZERO else ""
-    charts = [objective_chart(curves, objective, zero, width) for width in (WIDE, NARROW)]
+    charts = [objective_chart(curves, objective_label(objective), zero, width) for width in (WIDE, NARROW)]
     note = "Lines: the best so far. Dots: each evaluation. These are the search's claims; the table above is verified."
     return join(
         element("h2", "The search"),
@@ -332,20 +333,24 @@ def _changes(summary: AttackSummary) -> Html:
     found = summary.configuration or {}
     if not found:
         return Html("")
-    heads = ("", "clean", "adversarial", "in its range")
-    lines = []
-    for name, one in found.items():
-        unit = "" if one.unit in ("", "1", "name") else f" {one.unit}"
-        clean = "" if one.clean is None else wording.number_text(one.clean)
-        cells = (element("td", clean), element("td", f"{_value_text(one.value)}{unit}"), element("td", _place(one)))
-        lines.append(element("tr", element("th", name, scope="row"), *cells))
-    head = element("thead", element("tr", *(element("th", text, scope="col") for text in heads)))
-    table = element("div", element("table", head, element("tbody", *lines)), class_="scroll")
-    return join(element("h2", "What was changed"), table)
+    columns: dict[str, list[str | None]] = {
+        "clean": [None if one.clean is None else wording.number_text(one.clean) for one in found.values()],
+        "adversarial": [_value_text(one) for one in found.values()],
+        "in its range": [_place(one) for one in found.values()],
+    }
+    shown = {head: cells for head, cells in columns.items() if any(cells)}
+    lines = [
+        element("tr", element("th", name, scope="row"), *(element("td", cells[row]) for cells in shown.values()))
+        for row, name in enumerate(found)
+    ]
+    head = element("thead", element("tr", *(element("th", text, scope="col") for text in ("parameter", *shown))))
+    return join(element("h2", "What was changed"), scrolled(element("table", head, element("tbody", *lines))))
 
 
-def _value_text(value: float | str | Sequence[float]) -> str:
-    return ", ".join(map(wording.number_text, value)) if isinstance(value, list) else wording.number_text(value)
+def _value_text(one: FoundValue) -> str:
+    values = one.value if isinstance(one.value, list) else [one.value]
+    unit = "" if one.unit in ("", "1", "name") else f" {one.unit}"
+    return ", ".join(map(wording.number_text, values)) + unit
 
 
 def _place(one: FoundValue) -> Html | None:

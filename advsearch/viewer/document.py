@@ -64,6 +64,11 @@ def data_url(data: bytes, kind: str) -> str:
     return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"
 
 
+def scrolled(inside: Html | None, css: str = "") -> Html:
+    """Return what scrolls sideways where it is too wide, by keys too."""
+    return element("div", inside, class_=f"scroll {css}".strip(), tabindex="0")
+
+
 @cache
 def asset(name: str) -> str:
     """Return a file of the viewer."""

@@ -10,12 +10,14 @@ from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.explain import ExplainResult
 from advsearch.runs.results.gap import CurveResult, GapResult
+from advsearch.runs.results.harden import HardenResult
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.recipe import RecipeResult
 from advsearch.runs.results.replay import ReplayResult
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.viewer import attack_page, study_page, sweep_page
 from advsearch.viewer.explain_page import explain_page
+from advsearch.viewer.harden_page import harden_page
 from advsearch.viewer.recipe_page import recipe_page
 from advsearch.viewer.result_page import result_page
 
@@ -46,6 +48,8 @@ def write_page(run: Path, result: Result) -> Path:
             text = study_page.replay_page(run, result)
         case ExplainResult():
             text = explain_page(run, result)
+        case HardenResult():
+            text = harden_page(run, result)
         case RecipeResult():
             text = recipe_page(run, result)
         case _:

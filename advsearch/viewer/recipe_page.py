@@ -9,7 +9,7 @@ from advsearch.report.markup import Html, element, join
 from advsearch.report.recipes import figure_table
 from advsearch.runs.directory import IMAGES, PARTS
 from advsearch.runs.results.recipe import AnyFigure, RecipePart, RecipeResult
-from advsearch.viewer.document import data_url, document
+from advsearch.viewer.document import data_url, document, scrolled
 from advsearch.viewer.study_page import again, facts_table, heading, table
 
 
@@ -57,7 +57,7 @@ def _section(made: AnyFigure, picture: Path) -> Html:
     return join(
         element("h2", made.title),
         *(element("p", text) for text in made.text),
-        element("figure", element("div", image, class_="scroll wide")) if image else None,
+        element("figure", scrolled(image, "wide")) if image else None,
         element("details", element("summary", "The numbers"), table(heads, rows)) if rows else None,
     )
 

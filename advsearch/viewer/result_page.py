@@ -8,7 +8,7 @@ from pathlib import Path
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
 from advsearch.runs.directory import IMAGES
-from advsearch.runs.results.base import Fields, Result
+from advsearch.runs.results.base import Fields, Formation, Result
 from advsearch.viewer.document import data_url, document
 from advsearch.viewer.study_page import again, facts_table, heading, table
 
@@ -41,6 +41,7 @@ def result_page(run: Path, result: Result) -> str:
         *_figures(run),
         *(join(element("h2", _words(name)), _folded(rows)) for name, rows in tables),
         join(element("h2", "Cost and conditions"), facts_table(plain)),
+        _meanings([result, *(row for _, rows in tables for row in rows[:1])], [*plain, *map(_words, _names(tables))]),
         again(str(values.get("command_line") or f"advsearch show {run.name}")),
     )
     said = result.brief or str(values.get("ending", "done"))
@@ -56,6 +57,22 @@ def _figures(run: Path) -> Iterable[Html]:
             alt = f"{_words(file.stem)}: a figure of the numbers in the tables below"
             picture = element("img", src=data_url(file.read_bytes(), "image/png"), alt=alt)
             yield element("figure", picture, class_="wide")
+
+
+def _names(tables: Iterable[tuple[str, Sequence[Fields]]]) -> Iterable[str]:
+    """The columns of tables."""
+    for _, rows in tables:
+        yield from type(rows[0]).model_fields
+
+
+def _meanings(described: Iterable[Fields], shown: Sequence[str]) -> Html | None:
+    """What the names on the page mean, as far as the fields say it; folded."""
+    found: dict[str, str] = {}
+    for one in described:
+        for name, field in type(one).model_fields.items():
+            if field.description and _words(name) in shown:
+                found.setdefault(_words(name), field.description.replace("`", ""))
+    return element("details", element("summary", "What these words mean"), facts_table(found)) if found else None
 
 
 def _rows(value: object) -> Sequence[Fields]:
@@ -83,6 +100,8 @@ def _text(value: object) -> str:
         return "yes" if value else "no"
     if isinstance(value, float):
         return "" if value != value else wording.number_text(value)
+    if isinstance(value, Formation):
+        return wording.formation_text(value)
     if isinstance(value, Fields):
         return _text({name: getattr(value, name) for name in type(value).model_fields})
     if isinstance(value, Mapping):

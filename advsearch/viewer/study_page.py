@@ -17,7 +17,7 @@ from advsearch.runs.directory import PARTS, REPORT
 from advsearch.runs.results.gap import CurveResult, GapResult, StudyResult
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.replay import ReplayResult
-from advsearch.viewer.document import document
+from advsearch.viewer.document import document, scrolled
 
 ROW_HEIGHT = 34
 """Height of a row of the chart of a gap, in CSS pixels."""
@@ -160,7 +160,7 @@ def table(
         lines.append(element("tr", element("th", name, scope="row"), *shown))
     head = element("tr", *(element("th", text, scope="col") for text in heads))
     made = element("table", element("thead", head), element("tbody", *lines))
-    return element("div", made, class_="scroll", tabindex=0)  # who has no mouse scrolls a wide one by keys
+    return scrolled(made)
 
 
 LONG = 32

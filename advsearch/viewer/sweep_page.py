@@ -24,7 +24,8 @@ from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.results.sweep import AxisRow, SurfaceTable, SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.viewer.columns import Columns, read_columns
-from advsearch.viewer.document import data_script, data_url, document
+from advsearch.viewer.document import data_script, data_url, document, scrolled
+from advsearch.viewer.study_page import facts_table, table
 from advsearch.viewer.thumbnails import Kept, kept_pictures
 
 MOST_EMBEDDED = 3_000_000
@@ -164,8 +165,8 @@ def _surface(path: Path, summary: SweepSummary) -> Html:
     if summary.surface is None:
         return Html("")
     said = surface_sentences(summary.surface)
-    figure = _figure(path / "images" / "surface.png", " ".join(said))
-    tables = [_parts(table) for table in summary.surface.tables if table.strongest]
+    figure = _figure(path / "images" / "surface.png", " ".join(said), wide=True)
+    tables = [_parts(one) for one in summary.surface.tables if one.strongest]
     return join(
         element("h2", "The surface that was seen"),
         element("div", figure, class_="pictures") if figure else element("p", " ".join(said)),
@@ -173,8 +174,8 @@ def _surface(path: Path, summary: SweepSummary) -> Html:
     )
 
 
-def _parts(table: SurfaceTable) -> Html:
-    """The parts of one table that are told most clearly."""
+def _parts(told: SurfaceTable) -> Html:
+    """The parts of one map that are told most clearly."""
     heads = ("middle (u, v)", "place (x, y, z)", "face", "wrong where seen", "wrong where not", "difference", "p")
     cells = [
         (
@@ -186,11 +187,11 @@ def _parts(table: SurfaceTable) -> Html:
             difference_text(one),
             f"{one.p:.2g}",
         )
-        for one in table.strongest
+        for one in told.strongest
     ]
-    who = f"{wording.short_name(table.object)}, {wording.short_name(table.model)}"
-    what = f"{who}: the {table.part}s that are told most clearly"
-    return element("details", element("summary", what), _grid(heads, cells))
+    who = f"{wording.short_name(told.object)}, {wording.short_name(told.model)}"
+    what = f"{who}: the {told.part}s that are told most clearly"
+    return element("details", element("summary", what), table(heads, cells))
 
 
 def _axes_text(summary: SweepSummary) -> str:
@@ -207,11 +208,11 @@ def _worst_text(summary: SweepSummary) -> str:
     return f"{told}; wrong in {rate.successes} of {rate.trials} fresh renders." if rate else f"{told}."
 
 
-def _figure(file: Path, caption: str) -> Html | None:
+def _figure(file: Path, caption: str, *, wide: bool = False) -> Html | None:
     if not file.is_file():
         return None
-    address = data_url(file.read_bytes(), "image/png")
-    return element("figure", element("img", src=address, alt=caption), element("figcaption", caption))
+    image = element("img", src=data_url(file.read_bytes(), "image/png"), alt=caption)
+    return element("figure", scrolled(image, "wide") if wide else image, element("figcaption", caption))
 
 
 def _axes(summary: SweepSummary) -> Html:
@@ -226,17 +227,7 @@ def _axes(summary: SweepSummary) -> Html:
 
 def _table(rows: Sequence[AxisRow]) -> Html:
     heads = ("value", "configurations", "right", "accuracy", "95 % interval")
-    return _grid(heads, [axis_cells(row)[1:] for row in rows])
-
-
-def _grid(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Html:
-    """A table whose first column names its rows."""
-    lines = [
-        element("tr", element("th", first, scope="row"), *(element("td", cell) for cell in rest))
-        for first, *rest in rows
-    ]
-    head = element("thead", element("tr", *(element("th", text, scope="col") for text in heads)))
-    return element("div", element("table", head, element("tbody", *lines)), class_="scroll")
+    return table(heads, [axis_cells(row)[1:] for row in rows])
 
 
 def _cost(path: Path, summary: SweepSummary) -> Html:
@@ -249,10 +240,7 @@ def _cost(path: Path, summary: SweepSummary) -> Html:
         "Again": shlex.join(["advsearch", "run", f"{summary.run or path}/{directory.CONFIG}"]),
         "Command": summary.command_line,
     }
-    lines = [
-        element("tr", element("th", name, scope="row"), element("td", value)) for name, value in facts.items() if value
-    ]
-    return join(element("h2", "Cost and conditions"), element("table", element("tbody", *lines), class_="facts"))
+    return join(element("h2", "Cost and conditions"), facts_table(facts))
 
 
 def result_of(run: Path) -> SweepSummary | None:

@@ -27,11 +27,12 @@ from samples import (
     rated,
 )
 
+from advsearch.attacks.objectives import OBJECTIVE_KINDS
 from advsearch.errors import FileFormatError
 from advsearch.report import wording
 from advsearch.report.charts import NARROW, WIDE, Curve, objective_chart
 from advsearch.report.markup import Html, element, join
-from advsearch.report.phrases import percent
+from advsearch.report.phrases import objective_label, percent
 from advsearch.report.studies import gap_figure
 from advsearch.report.style import CSS
 from advsearch.runs.directory import OBJECT_FILE
@@ -100,6 +101,7 @@ def test_the_page_says_it_all(tmp_path: Path) -> None:
         "Adversarial wrong 20 of 20 83-100 %",
         "Random search wrong 1 of 20 0.1-25 %",
         "64 samples per pixel",
+        "margin [logits]",
         "pgd, 40 steps",
         "texture within 0.1 (linf)",
         "40 of the search, 40 gradients, 21 of the verification",
@@ -191,6 +193,13 @@ def test_numbers_have_the_digits_that_mean_something(tmp_path: Path) -> None:
     assert "gain 0.4123" in page.text and not re.findall(r"\d\.\d{7,}", page.text)
 
 
+@pytest.mark.parametrize("name", [*OBJECTIVE_KINDS, "one of my own"])
+def test_an_objective_has_its_unit(name: str) -> None:
+    unit = OBJECTIVE_KINDS[name].unit.partition(" (")[0] if name in OBJECTIVE_KINDS else "none"
+    told = name if unit in ("none", "that of the task") else f"{name} [{unit}]"
+    assert objective_label(name) == told
+
+
 def test_names_cannot_become_markup(tmp_path: Path) -> None:
     evil = "\"><script>alert('x')</script>&lt;"
     answer = {"label": evil, "index": 3, "probability": 0.5}
@@ -205,7 +214,7 @@ def test_names_cannot_become_markup(tmp_path: Path) -> None:
     assert [script.get("type") for script in page.all("script")] == ["application/json", None]
     assert page.text.lower().count("alert('x')") > 15
     known = {"charset", "http-equiv", "content", "name", "lang", "class", "src", "alt", "scope", "role", "style"}
-    known |= {"rel", "href", "id", "hidden", "data-picture", "title", "type"}
+    known |= {"rel", "href", "id", "hidden", "data-picture", "title", "type", "tabindex"}
     for tag, attributes in page.tags:
         found = {name for name in attributes if not name.startswith("aria-")}
         assert tag in ("svg", "g", "path", "text") or found <= known

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from PIL import Image
-from samples import GAP, gap, keep_object, make_run
+from samples import EXPLAIN, GAP, HARDEN, RECIPE, REPLAY, curve, gap, keep_object, make_run, matrix, region
 from samples import attack as attack_with
 from stored_sweeps import described, make_sweep, serving
 
@@ -21,6 +21,11 @@ from advsearch.api.photos import Photographs
 from advsearch.config import AttackConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.replay import Entry, LoggedEvaluation
+from advsearch.runs.results.base import Result
+from advsearch.runs.results.explain import ExplainResult
+from advsearch.runs.results.harden import HardenResult
+from advsearch.runs.results.recipe import RecipeResult
+from advsearch.runs.results.replay import ReplayResult
 from advsearch.runs.store import Row, Store
 from advsearch.viewer import thumbnails
 from advsearch.viewer.attack_page import write_report
@@ -108,7 +113,7 @@ def explored(page: Page) -> None:
     assert page.locator("[data-cell]").count() == 6  # three yaws, two elevations
     assert "24 configurations" in page.locator("#explorer .status").inner_text()
     worst = page.locator('[data-cell="0,1,2"]')
-    assert "pose.yaw 90: right in 2 of 4 (50 %, 6.8 % to 93.2 %)" in str(worst.get_attribute("aria-label"))
+    assert "pose.yaw 90: right in 2 of 4 (50\xa0%, 6.8\xa0% to 93.2\xa0%)" in str(worst.get_attribute("aria-label"))
 
     worst.hover()
     until(page, lambda: page.locator(".card").count() == 4)
@@ -124,9 +129,10 @@ def explored(page: Page) -> None:
     page.locator(".card").first.click()
     assert "camera.elevation [degrees]" in page.locator("dialog").inner_text()
     page.locator("dialog button").click()
+    page.locator("h1").hover()  # away from the cells
 
     page.locator("#parameter-0").select_option("one value")  # environment
-    assert "24" in page.locator("#explorer .status").inner_text()
+    assert page.locator("#explorer .status").inner_text().startswith("12 of 24 configurations")
     page.locator("#parameter-0-value").fill("1")
     assert page.locator("output").inner_text() == "studio"
     assert page.locator(".card").count() == 0  # nothing is wrong in the studio
@@ -168,6 +174,15 @@ def test_the_arrow_keys_go_from_cell_to_cell(browser: Browser, sweep: Path) -> N
         assert page.evaluate("document.activeElement.dataset.cell") == "0,1,1"
         page.keyboard.press("Enter")
         assert page.evaluate("document.activeElement.getAttribute('aria-pressed')") == "true"
+
+
+def test_a_cell_that_was_pointed_at_does_not_outlive_its_map(browser: Browser, sweep: Path) -> None:
+    with opened(browser, (sweep / "report.html").as_uri()) as page:
+        page.wait_for_selector("[data-cell]")
+        page.locator('[data-cell="0,1,2"]').dispatch_event("pointerover", {"pointerType": "mouse"})
+        until(page, lambda: page.locator(".card").count() == 4)
+        page.get_by_label("Side by side").select_option("environment")
+        assert page.locator(".card").count() == 24
 
 
 def test_sweeps_stand_side_by_side(browser: Browser, sweep: Path, tmp_path: Path) -> None:
@@ -313,25 +328,71 @@ def test_a_study_leads_to_its_attacks(browser: Browser, study: Path) -> None:
         assert page.url.endswith("/parts/pose/report.html")
 
 
+def faults(page: Page) -> list[str]:
+    """What axe-core finds that keeps anybody from using a page as it is now, and whether all of it scrolls sideways."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+    page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
+    found = axe.Axe().run(page).response["violations"]
+    serious = [one for one in found if one["impact"] in ("serious", "critical")]
+    told = [f"{one['id']}: {one['nodes'][0]['html'][:200]}" for one in serious]
+    return told + ([] if page.evaluate("document.scrollingElement.scrollWidth <= innerWidth") else ["it is too wide"])
+
+
 @pytest.mark.parametrize("width", [390, 1440])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("which", ["sweep", "attack", "study"])
 def test_everybody_can_use_the_pages(
     browser: Browser, request: pytest.FixtureRequest, which: str, scheme: str, width: int
 ) -> None:
-    """By axe-core's rules, without sideways scrolling of the page."""
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
     run: Path = request.getfixturevalue(which)
     with opened(browser, (run / "report.html").as_uri(), width, color_scheme=scheme, bypass_csp=True) as page:
         page.wait_for_selector(
             {"sweep": "[data-cell]", "attack": "#object canvas", "study": "svg"}[which], state="attached"
         )
-        page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
-        found = axe.Axe().run(page).response["violations"]
-        assert [
-            (one["id"], one["nodes"][0]["html"][:200]) for one in found if one["impact"] in ("serious", "critical")
-        ] == []
+        assert faults(page) == []
+
+
+@pytest.mark.parametrize(
+    "result",
+    [
+        matrix(), curve(), region(), ExplainResult.of(EXPLAIN), HardenResult.of(HARDEN), RecipeResult.of(RECIPE),
+        ReplayResult.of(REPLAY),
+    ],
+    ids=lambda result: type(result).__name__,
+)  # fmt: skip
+def test_everybody_can_use_the_pages_of_answers(browser: Browser, tmp_path: Path, result: Result) -> None:
+    (tmp_path / "images").mkdir()
+    for name in ("figure-1.png", "harden.png"):  # wider than a phone
+        Image.new("RGB", (700, 40)).save(tmp_path / "images" / name)
+    with opened(browser, write_page(tmp_path, result).as_uri(), 390, bypass_csp=True, color_scheme="light") as page:
+        assert faults(page) == []
+        page.emulate_media(color_scheme="dark")
+        assert faults(page) == []
+        page.set_viewport_size({"width": 1440, "height": 900})
         assert page.evaluate("document.scrollingElement.scrollWidth <= innerWidth")
+
+
+def test_everybody_can_use_the_list_and_what_goes_on(browser: Browser, sweep: Path, tmp_path: Path) -> None:
+    with RunDirectory.create_for(AttackConfig(object="mug", run=str(tmp_path / "going"))) as run:
+        run.record(Row("search", 0, objective=1.0, label="mug", values={"pose.yaw": described(1.0, "degrees")}))
+        with serving(sweep, run.path, make_sweep(tmp_path / "second")) as server:
+            for path, there in (("", "button"), ("runs/going/", "svg circle")):
+                with opened(browser, server.address + path, 390, bypass_csp=True, color_scheme="light") as page:
+                    page.wait_for_selector(there)
+                    assert faults(page) == []
+                    page.emulate_media(color_scheme="dark")
+                    assert faults(page) == []
+
+
+def test_paper_is_white_whatever_the_screen_is(browser: Browser, attack: Path) -> None:
+    """And a heading stands over something."""
+    with opened(browser, (attack / "report.html").as_uri(), color_scheme="dark") as page:
+        heading = page.get_by_role("heading", name="The search, step by step")
+        assert heading.is_visible()
+        page.emulate_media(media="print", color_scheme="dark")
+        assert not heading.is_visible()
+        ink = page.locator("h1").evaluate("one => getComputedStyle(one).color")
+        assert ink == "rgb(28, 29, 32)"
 
 
 @pytest.mark.parametrize("which", ["sweep", "attack"])

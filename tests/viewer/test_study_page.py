@@ -112,7 +112,17 @@ def test_an_attack_without_a_page_has_no_link(tmp_path: Path) -> None:
     ("result", "said"),
     [
         (StabilityResult.of(STABILITY), ["1 of 1 hold.", "ties objective", "condition number 12.5", "0.0125"]),
-        (region(warnings=["Look out."]), ["Done.", "pose.yaw degrees 10 55.5 30", "0.982 to 1", "Look out."]),
+        (
+            region(warnings=["Look out."]),
+            [
+                "Wrong in 200 of 200 samples of the box.",
+                "128 x 128 pixels",
+                "pose.yaw degrees 10 55.5 30",
+                "0.982 to 1",
+                "Look out.",
+                "Volume share of the ranges that the box takes up",
+            ],
+        ),
     ],
 )
 def test_any_result_has_a_page(tmp_path: Path, result: Result, said: list[str]) -> None:

@@ -56,3 +56,8 @@ class RegionResult(GrownRegion, SceneResult):
     clean: CleanScene
     warnings: list[str] = Field(description="sentences that a reader has to know")
     renders: Annotated[dict[str, int], having("verification")] = Field(description="of the `verification`: everything")
+
+    @property
+    def brief(self) -> str:
+        """How sure the verdict is."""
+        return f"{self.verdict} in {self.same} of {self.samples} samples of the box" if self.samples else ""

@@ -39,7 +39,7 @@
 
   // ---- numbers -----------------------------------------------------------------------------------------------------
 
-  const percent = (share) => (share === null ? "none" : `${Math.abs(share * 100 - Math.round(share * 100)) < 0.05 ? Math.round(share * 100) : (share * 100).toFixed(1)} %`);
+  const percent = (share) => (share === null ? "none" : `${Math.abs(share * 100 - Math.round(share * 100)) < 0.05 ? Math.round(share * 100) : (share * 100).toFixed(1)}\u00a0%`);
   const short = (value) => (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(4))));
   const named = (name, unit) => (unit && unit !== "name" ? `${name} [${unit}]` : name);
 
@@ -402,6 +402,8 @@
       const shade = (value) => (state.measure === "margin" ? 1 - (value - low) / (high - low || 1) : (value - low) / (high - low || 1));
       const area = across.labels.length * up.labels.length, stop = [...(state.cell || [0, 0, 0])];
       this.cells = { across, up, by };
+      clearTimeout(this.waits);
+      this.hover = null; // it was a cell of other maps
       this.parts.maps.replaceChildren(...by.labels.map((label, part) => {
         const head = make("tr", {}, make("td", {}), ...across.labels.map((text) => make("th", { scope: "col" }, make("span", {}, text))));
         const rows = up.labels.map((text, row) => make("tr", {}, make("th", { scope: "row" }, text), ...across.labels.map((_, column) => {
@@ -440,7 +442,6 @@
         const button = at(event);
         if (!button) return;
         const same = this.state.cell && this.state.cell.join(",") === button.dataset.cell;
-        this.hover = null;
         this.change({ cell: same ? null : cell(button) });
         const again = maps.querySelector(`[data-cell="${button.dataset.cell}"]`);
         if (again) again.focus();
@@ -498,11 +499,11 @@
 
     along(axis, by) {
       const parts = by ? by.labels : [""], counts = this.counted(by ? [by, axis] : [axis]);
-      const wide = 420, high = 190, left = 34, bottom = 40, n = axis.labels.length;
+      const wide = 420, high = 190, left = 48, bottom = 40, n = axis.labels.length;
       const x = (level, part) => left + ((level + 0.5 + (parts.length > 1 ? (part - (parts.length - 1) / 2) * Math.min(0.12, 0.7 / parts.length) : 0)) * (wide - left - 8)) / n;
       const y = (share) => 8 + (1 - share) * (high - bottom - 8);
       const marks = [], rows = [];
-      for (const share of [0, 0.5, 1]) marks.push(drawn("line", { x1: left, x2: wide - 8, y1: y(share), y2: y(share), class: "rule" }), drawn("text", { x: left - 6, y: y(share) + 4, "text-anchor": "end" }, String(100 * share)));
+      for (const share of [0, 0.5, 1]) marks.push(drawn("line", { x1: left, x2: wide - 8, y1: y(share), y2: y(share), class: "rule" }), drawn("text", { x: left - 6, y: y(share) + 4, "text-anchor": "end" }, `${100 * share}\u00a0%`));
       const every = Math.ceil(n / Math.max(1, Math.floor(46 / Math.max(...axis.labels.map((text) => text.length + 1)))));
       axis.labels.forEach((text, level) => {
         if (level % every === 0) marks.push(drawn("text", { x: x(level, (parts.length - 1) / 2), y: high - 24, "text-anchor": "middle" }, text.length > 16 ? `${text.slice(0, 15)}…` : text));
