@@ -64,7 +64,7 @@ docs: $(STAMP) ## build the documentation into build/site; fails on a broken lin
 STUDIES := searches every_control rotation close_calls closed_form policies precision kill harden kill_cluster
 
 bench: $(STAMP) ## the benchmarks: ratios against a floor measured in the same run
-	@set -e; for file in $(filter-out $(STUDIES:%=benchmarks/%.py) benchmarks/golden.py,$(wildcard benchmarks/[!_]*.py)); do \
+	@set -e; for file in $(filter-out $(STUDIES:%=benchmarks/%.py) benchmarks/golden.py benchmarks/matrix.py,$(wildcard benchmarks/[!_]*.py)); do \
 	  echo "== $$file"; $(BIN)/python $$file $(ARGS); done
 
 study: $(STAMP) ## the slow studies: policies at equal renders, stated budgets, promised errors, kills (over an hour)

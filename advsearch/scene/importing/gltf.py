@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -16,10 +15,14 @@ from pydantic import ValidationError
 from advsearch import files
 from advsearch.scene.importing.files import damaged, looks_like, shown, text_of
 from advsearch.scene.importing.gltf_checks import check_header
-from advsearch.scene.importing.gltf_entries import Asset, Header, MaterialEntry
+from advsearch.scene.importing.gltf_entries import Asset, Header, MaterialEntry, Primitive
+from advsearch.scene.importing.references import GLOW, NORMAL_MAPS, TRANSPARENCY
 
 MOST_VALUES = 1_000_000
 """Lists, objects and values in a header; each takes hundreds of bytes of memory, and may take two of the file."""
+
+MAP = "TEXCOORD_0"
+"""The texture coordinates that are read of the header that is written."""
 
 NODE = "node "
 """Before the number of a node in its name, in the header that is written."""
@@ -59,6 +62,10 @@ def rewritten(path: Path, data: bytes, header: Header) -> bytes:
     """Return the file with a header of only what was read of it."""
     plain = header.model_copy(
         update={
+            "meshes": [
+                mesh.model_copy(update={"primitives": [_one_map(header, one) for one in mesh.primitives]})
+                for mesh in header.meshes
+            ],
             "materials": [material.plain() for material in header.materials],
             "textures": [texture.plain() for texture in header.textures],
             "nodes": [
@@ -79,26 +86,34 @@ def rewritten(path: Path, data: bytes, header: Header) -> bytes:
     return struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest
 
 
+def _one_map(header: Header, primitive: Primitive) -> Primitive:
+    """Return a primitive whose one set of texture coordinates is that by which its base colour is looked up."""
+    used = None if primitive.material is None else header.materials[primitive.material].base_color
+    if used is None or not used.texCoord:
+        return primitive
+    attributes = {name: index for name, index in primitive.attributes.items() if name != MAP}
+    if used.coordinates in attributes:
+        attributes[MAP] = attributes[used.coordinates]
+    return primitive.model_copy(update={"attributes": attributes})
+
+
 def base_color_image(header: Header, material: MaterialEntry) -> str | None:
     """Return a name for the base colour image of a material, or None when it has none."""
-    surface = material.plain().pbrMetallicRoughness
-    if surface is None or surface.baseColorTexture is None:
+    used = material.base_color
+    if used is None:
         return None
-    source = header.textures[surface.baseColorTexture.index].plain().source
+    source = header.textures[used.index].plain().source
     uri = None if source is None else header.images[source].uri
     return "(embedded)" if uri is None or uri.startswith("data:") else uri
 
 
-def not_carried_over(header: Header) -> Iterator[str]:
-    """Yield what materials have that is not read, each with how many of them, as the beginning of a sentence."""
-    counts = {
-        "the normal maps": sum(one.normalTexture is not None for one in header.materials),
-        "the glow": sum(bool(one.emissiveTexture or any(one.emissiveFactor)) for one in header.materials),
-        "the transparency": sum(one.alphaMode != "OPAQUE" for one in header.materials),
+def unread(header: Header) -> dict[str, int]:
+    """Return what materials have that is not read, each with how many of them."""
+    return {
+        NORMAL_MAPS: sum(one.normalTexture is not None for one in header.materials),
+        GLOW: sum(bool(one.emissiveTexture or any(one.emissiveFactor)) for one in header.materials),
+        TRANSPARENCY: sum(one.alphaMode != "OPAQUE" for one in header.materials),
     }
-    for what, count in counts.items():
-        if count:
-            yield f"{what} of {count} material{'s' if count > 1 else ''} {'are' if what.endswith('maps') else 'is'}"
 
 
 def _json_chunk(path: Path, data: bytes) -> bytes:

@@ -66,23 +66,24 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
     for index in (*primitive.attributes.values(), primitive.indices):
         _check_index(path, "accessors", index, header.accessors)
     _check_index(path, "materials", primitive.material, header.materials)
-    for name in ("POSITION", "NORMAL", "TEXCOORD_0"):
+    used = None if primitive.material is None else header.materials[primitive.material].base_color
+    for name in ("POSITION", "NORMAL", "TEXCOORD_0" if used is None else used.coordinates):
         if name not in primitive.attributes:
             continue
         accessor = header.accessors[primitive.attributes[name]]
         if accessor.componentType != _FLOAT:
             got = f"{name} values that are not 32-bit floats"
             raise FileFormatError(f"{path}: expected floats, got {got}; export it without quantization")
-        kind = "VEC2" if name == "TEXCOORD_0" else "VEC3"
+        kind = "VEC2" if name.startswith("TEXCOORD_") else "VEC3"
         if accessor.type != kind:
             raise damaged(path, f"{name} of type {kind}", accessor.type)
     if primitive.indices is not None and header.accessors[primitive.indices].type != "SCALAR":
         raise damaged(path, "indices of type SCALAR", header.accessors[primitive.indices].type)
     for index in (*primitive.attributes.values(), primitive.indices):
-        used = None if index is None else header.accessors[index]
-        if used is not None and used.sparse is not None:
+        values = None if index is None else header.accessors[index]
+        if values is not None and values.sparse is not None:
             raise FileFormatError(f"{path}: has sparse accessors, which are not supported; export it without them")
-        if used is not None and used.bufferView is None:
+        if values is not None and values.bufferView is None:
             raise damaged(path, "accessors with a bufferView", "one without values")
 
 

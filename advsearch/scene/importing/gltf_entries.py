@@ -124,6 +124,12 @@ class _Extensions(_Entry):
 
 class TextureUse(_Entry):
     index: Index
+    texCoord: Annotated[int, Field(ge=0, lt=256)] = 0
+
+    @property
+    def coordinates(self) -> str:
+        """Name of the attribute by which it is looked up."""
+        return f"TEXCOORD_{self.texCoord}"
 
 
 Factor = Annotated[list[float], Field(min_length=4, max_length=4)]
@@ -155,6 +161,12 @@ class MaterialEntry(_Entry):
     emissiveFactor: list[float] = []
     alphaMode: str = "OPAQUE"
     extensions: _MaterialExtensions | None = None
+
+    @property
+    def base_color(self) -> TextureUse | None:
+        """Where its base colour texture is, and by which coordinates it is looked up; None without one."""
+        surface = self.plain().pbrMetallicRoughness
+        return None if surface is None else surface.baseColorTexture
 
     def plain(self) -> MaterialEntry:
         """Return the material without extensions: the diffuse colour of an old one is its base colour."""

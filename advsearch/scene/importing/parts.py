@@ -169,8 +169,11 @@ def _file_notes(path: Path, data: bytes, header: Header | None, references: Refe
             )
     if header is not None and "KHR_texture_transform" in header.extensionsUsed:
         notes.append(f"{path.name} moves its textures with KHR_texture_transform, which is not applied")
-    if header is not None:
-        notes.extend(f"{path.name}: {what} left out" for what in gltf.not_carried_over(header))
+    unread = gltf.unread(header) if header else {what: len(names) for what, names in references.unread.items()}
+    for what, count in unread.items():
+        if count:
+            verb = "are" if what.endswith("maps") else "is"
+            notes.append(f"{path.name}: {what} of {count} material{'s' if count > 1 else ''} {verb} left out")
     return notes
 
 
