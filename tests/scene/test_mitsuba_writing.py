@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenEXR
 import pytest
 
 import advsearch
@@ -36,6 +39,33 @@ def test_a_dictionary_written_and_read_is_the_same(tmp_path: Path) -> None:
     assert ball == {"type": "sphere", "flip_normals": True, "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse"}}}
 
 
+WRITER = """
+import sys
+from pathlib import Path
+import numpy as np
+from advsearch import threads
+from advsearch.scene.mitsuba_backend.files.writing import write_xml
+from advsearch.scene.mitsuba_backend.variant import mitsuba
+threads.configure(1)
+values = np.linspace(0, 2, 8 * 16 * 4, dtype=np.float32).reshape(8, 16, 4)
+bitmaps = {f"picture-{n}": mitsuba().Bitmap(values[..., :n]) for n in (1, 3, 4)}
+pictures = {name: {"type": "bitmap", "bitmap": bitmap, "raw": True} for name, bitmap in bitmaps.items()}
+write_xml(Path(sys.argv[1]), {"type": "scene", **pictures}, {}, "")
+"""
+
+
+def test_pictures_are_written_in_a_pool_of_one_thread_too(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", WRITER, str(tmp_path / "scene.xml")]
+    subprocess.run(command, check=True, timeout=120)
+    values = np.linspace(0, 2, 8 * 16 * 4, dtype=np.float32).reshape(8, 16, 4)
+    for path in sorted(tmp_path.glob("*.exr")):
+        with OpenEXR.File(str(path)) as file:
+            (channel,) = file.channels().values()
+            found = channel.pixels.reshape(8, 16, -1)
+        np.testing.assert_array_equal(found, values[..., : found.shape[2]])
+    assert len(list(tmp_path.glob("*.exr"))) == 3
+
+
 SQUARE = """v -1 -1 0
 v 1 -1 0
 v 1 1 0
@@ -55,7 +85,8 @@ def test_a_picture_on_a_shape_is_where_mitsuba_has_it(tmp_path: Path, kind: str)
     (tmp_path / "square.obj").write_text(SQUARE)
     mi.load_dict({"type": "obj", "filename": str(tmp_path / "square.obj")}).write_ply(str(tmp_path / "square.ply"))
     colors = np.linspace(0.1, 0.9, 16 * 8 * 3, dtype=np.float32).reshape(16, 8, 3)
-    mi.Bitmap(colors).write(str(tmp_path / "colors.exr"))
+    with OpenEXR.File({}, {"RGB": colors}) as file:
+        file.write(str(tmp_path / "colors.exr"))
     picture = {"type": "bitmap", "filename": str(tmp_path / "colors.exr"), "raw": True}
     surface = {"type": "diffuse", "reflectance": picture}
     shape: dict[str, Any] = {"type": kind.partition(" ")[0], "bsdf": {"type": "twosided", "bsdf": surface}}

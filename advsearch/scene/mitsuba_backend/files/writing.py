@@ -14,6 +14,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+import OpenEXR
 import torch
 from torch import Tensor
 
@@ -201,7 +202,7 @@ class _Writer:
             self._mapping(into, name, value, top=top, within=within)
         elif isinstance(value, mi.Bitmap):
             path = self.free(within or name, ".exr")
-            value.write(str(path))
+            _write_picture(path, np.array(value, dtype=np.float32))
             ElementTree.SubElement(into, "string", name="filename", value=path.name)
         elif hasattr(value, "matrix"):
             matrix = np.array(value.matrix, dtype=np.float64).reshape(16)
@@ -246,6 +247,14 @@ class _Writer:
             for key, entry in value.items():
                 if key != "type":
                     self.put(one, key, entry, within=inside)
+
+
+def _write_picture(path: Path, values: np.ndarray) -> None:
+    """Write an EXR; Mitsuba's own writer waits forever where Dr.Jit has one thread."""
+    channels = values.shape[2] if values.ndim == 3 else 1
+    by_name = {"Y": values.reshape(values.shape[:2])} if channels == 1 else {"RGBA"[:channels]: values}
+    with OpenEXR.File({}, by_name) as picture:
+        picture.write(str(path))
 
 
 def _numbers(values: Any) -> str:
