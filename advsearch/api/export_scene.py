@@ -12,10 +12,10 @@ from torch import Tensor
 
 import advsearch
 from advsearch.api.attack import problem_from_config
+from advsearch.api.replay import kept_answer
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.errors import InputError
-from advsearch.runs.answer import read_answer
 from advsearch.runs.directory import CONFIG, find_run
 from advsearch.runs.files import placed_by, storage_errors, write_bytes, write_text
 from advsearch.runs.summary import attack_of
@@ -71,10 +71,7 @@ def answer_of(run: str | Path) -> AnsweredRun:
     if summary.adversarial is None:
         raise InputError(f"{folder}: ended with {summary.ending!r}, so that there is no answer to export")
     problem, _ = problem_from_config(AttackConfig.from_yaml(folder / CONFIG))
-    u = torch.from_numpy(read_answer(folder))
-    if u.shape != problem.domain.start.shape:
-        raise InputError(f"{folder}: the object or advsearch has changed since this run; do the run again")
-    return AnsweredRun(folder, problem, problem.whole(u))
+    return AnsweredRun(folder, problem, problem.whole(kept_answer(folder, problem)))
 
 
 def write_mitsuba(run: str | Path, out: Path) -> list[str]:

@@ -1,17 +1,21 @@
-"""Photographs of the real thing, aligned with a run's renderings: classified by its models, kept, and counted."""
+"""Photographs of the real thing, aligned with a run's renderings: judged by its models and task, kept, and counted."""
 
 from __future__ import annotations
 
 import io
-import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from advsearch import seeds
+from advsearch.api.attack import problem_from_config
+from advsearch.api.replay import kept_answer
+from advsearch.api.sweep import job_of
 from advsearch.attacks import clopper_pearson
 from advsearch.config import AttackConfig, SweepConfig
 from advsearch.described import Value
@@ -19,6 +23,8 @@ from advsearch.engine.answers import facts_of
 from advsearch.engine.loading import PictureSettings, load_scene
 from advsearch.engine.naming import load_models, scene_settings
 from advsearch.engine.rows import judged
+from advsearch.engine.sweeps.batch import Batches
+from advsearch.engine.sweeps.job import check_all
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
@@ -29,6 +35,7 @@ from advsearch.runs.store import NAME, Row, Store
 from advsearch.settings import read_yaml
 from advsearch.tasks import Judgement, Task, make_task
 from advsearch.tasks.base import Truth
+from advsearch.tasks.together import Together
 from advsearch.viewer.photos import FOLDER, photo_name, rendering_file, sound_photo
 
 KIND = "photo"
@@ -50,14 +57,14 @@ def photo_agreement(run: str | Path) -> PhotoAgreement:
 
 
 class Photographs:
-    """Takes photographs in for runs; one at a time, from any thread. The model of the last run stays loaded."""
+    """Takes photographs in for runs; one at a time, from any thread. What the last run was about stays loaded."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
         self._judges = lru_cache(maxsize=1)(_judges_of)
+        self._thread = ThreadPoolExecutor(1, "photographs")  # a scene is used by the thread that has loaded it
 
     def add(self, run: Path, rendering: str, data: bytes) -> PhotoAgreement:
-        """Classify a photograph by the models of a run, keep both beside the rendering, and return the new table.
+        """Judge a photograph by the models and the task of a run, keep both beside the rendering, and return the table.
 
         Args:
             run: its folder.
@@ -65,15 +72,19 @@ class Photographs:
             data: the file as it was sent.
 
         Raises:
-            InputError: there is no such rendering, it is no photograph, another process works on the run, or its task
-                cannot judge photographs.
+            InputError: there is no such rendering, it is no photograph, another process works on the run, or its scene
+                is another one now.
         """
         from PIL import Image
 
         file = rendering_file(run, rendering)
         with Image.open(file) as image:
             sound = sound_photo(data, image.size)
-        with self._lock, RunDirectory.resume(run) as held:
+        return self._thread.submit(self._add, run, rendering, file, sound).result()
+
+    def _add(self, run: Path, rendering: str, file: Path, sound: bytes) -> PhotoAgreement:
+        """Judge and keep a photograph that is sound."""
+        with RunDirectory.resume(run) as held:
             number = held.store.last_step(KIND) + 1
             name = photo_name(rendering, number)
             rows = []
@@ -81,10 +92,10 @@ class Photographs:
                 seen = held.store.row("sweep", int(rendering) * judge.several + place) if rendering.isdigit() else None
                 values: dict[str, Value] = {} if seen is None else dict(seen.values)
                 truth = str(values["object"]["value"]) if "object" in values else judge.object
-                right, label = _rendered(judge, truth, file, seen)
+                right, label = _rendered(judge, rendering, truth, file, seen)
                 kept: JsonObject = {"rendering": rendering, "right": right, "label": label, "file": name}
                 values["model"] = {"value": judge.model.name, "unit": ""}
-                row = judged(Row(KIND, number, values=values), judge.judgement(truth, sound))
+                row = judged(Row(KIND, number, values=values), judge.judgement(rendering, truth, sound))
                 rows.append(replace(row, payload={"photo": kept, "answer": row.payload}))
             write_bytes(run / IMAGES / FOLDER / name, sound)
             held.record(*rows)
@@ -103,42 +114,40 @@ class _PhotoJudge:
     """One of a run's models, and how it is shown pictures.
 
     Attributes:
-        config: of the run.
         object: what a rendering shows that says nothing else.
         model: loaded.
         task: on it.
+        size: (height, width) of the run's renderings, in pixels.
         several: models that the run has.
+        truth: what is true of a photograph, by the rendering that it was aligned with and the object.
     """
 
-    config: AttackConfig | SweepConfig
     object: str
     model: Model
     task: Task
+    size: tuple[int, int]
     several: int
+    truth: Callable[[str, str], Truth]
 
-    def judgement(self, name: str, data: bytes) -> Judgement:
+    def judgement(self, rendering: str, name: str, data: bytes) -> Judgement:
         """What is to be said of a picture, (any size), of an object; it is made as large as the run's renderings are.
 
         The picture is resized in 8 bits with Lanczos' filter, which averages where it shrinks.
         """
         from PIL import Image
 
-        config = self.config
-        height, width = PictureSettings(config.resolution, "none", config.pixel_sampler, 0).size(self.model)
+        height, width = self.size
         with Image.open(io.BytesIO(data)) as image:
             small = image.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
         pixels = torch.from_numpy(np.asarray(small, dtype=np.float32) / np.float32(255.0))
+        truth = self.truth(rendering, name)
         with torch.no_grad():
-            return self.task.judge(self.model(pixels), self._truth(name))[0]
-
-    def _truth(self, name: str) -> Truth:
-        config = self.config
-        given = scene_settings(config.set_, config.exposure)
-        scene = load_scene(name, up=config.up, settings=given, camera=config.camera)
-        return self.task.truth(facts_of(scene, name, config.label, dict))
+            return self.task.judge(self.model(pixels), truth)[0]
 
 
 def _judges_of(run: Path) -> Sequence[_PhotoJudge]:
+    """Who judges the photographs of a run. What depends on where the object is seen is judged by where the rendering
+    has it, with which the photograph was aligned."""
     command = read_yaml(run / CONFIG).get("command")
     if command not in ("attack", "sweep"):
         raise InputError(f"{run.name}: photographs belong to renderings of attacks and sweeps, not of {command}")
@@ -146,21 +155,71 @@ def _judges_of(run: Path) -> Sequence[_PhotoJudge]:
     config = (AttackConfig if command == "attack" else SweepConfig).from_yaml(run / CONFIG)
     made = make_task(config.task)
     if made.varies:
-        raise InputError(
-            f"task {config.task_name}: what is right depends on where the object is seen, which a photograph does not "
-            "say; photographs are judged for tasks such as classification"
-        )
+        return _by_sweep(config) if isinstance(config, SweepConfig) else _by_attack(run, config)
     models, _ = load_models(config.models, made, labels=config.labels, used_threads=config.used_threads)
-    return [_PhotoJudge(config, config.objects[0], model, made.on(model), len(models)) for model in models]
+    given, judges = scene_settings(config.set_, config.exposure), []
+    for model in models:
+        task = made.on(model)
+
+        def truth(rendering: str, name: str, task: Task = task) -> Truth:
+            scene = load_scene(name, up=config.up, settings=given, camera=config.camera)
+            return task.truth(facts_of(scene, name, config.label, dict))
+
+        judges.append(_PhotoJudge(config.objects[0], model, task, _size(config, model), len(models), truth))
+    return judges
 
 
-def _rendered(judge: _PhotoJudge, name: str, file: Path, row: Row | None) -> tuple[bool, str]:
+def _size(config: AttackConfig | SweepConfig, model: Model) -> tuple[int, int]:
+    return PictureSettings(config.resolution, "none", config.pixel_sampler, 0).size(model)
+
+
+def _by_sweep(config: SweepConfig) -> Sequence[_PhotoJudge]:
+    """Who judges by the configurations of a sweep."""
+    job = job_of(config)
+    count = check_all(job)[0].count
+    batches = Batches(job, count)
+
+    def truth(model: int, rendering: str, name: str) -> Truth:
+        scene, local = divmod(int(rendering), count)
+        if scene >= len(job.places):
+            raise InputError(f"rendering: the sweep has no picture {rendering}; it belongs to another run")
+        view = batches.open(scene)
+        points = view.points[job.sizes[model]]
+        picks = points.picks(local, 1, scene * count)
+        u = points.configurations(picks)
+        return view.truth(model, u[0], points.values(u, picks)[0])
+
+    return [
+        _PhotoJudge(config.objects[0], model, task, size, len(job.models), partial(truth, number))
+        for number, (model, task, size) in enumerate(zip(job.models, job.tasks, job.sizes, strict=True))
+    ]
+
+
+def _by_attack(run: Path, config: AttackConfig) -> Sequence[_PhotoJudge]:
+    """Who judges by the configurations of an attack: the clean one, the answer, and those of its trials."""
+    problem, _ = problem_from_config(config)
+    task = problem.task
+    alone = (task.models, task.tasks) if isinstance(task, Together) else ((problem.model,), (task,))
+
+    def truth(own: Task, rendering: str, name: str) -> Truth:
+        u = problem.domain.start if rendering == "clean" else kept_answer(run, problem)
+        trial = rendering.rpartition("verification-")[2]
+        whole = problem.whole(u, seeds.stream(problem.seed, "verification", int(trial)) if trial.isdigit() else None)
+        return own.truth(problem.facts(partial(problem.space.describe, whole), partial(problem.renderer.mask, whole)))
+
+    return [
+        _PhotoJudge(config.object, model, own, _size(config, model), len(alone[0]), partial(truth, own))
+        for model, own in zip(*alone, strict=True)
+    ]
+
+
+def _rendered(judge: _PhotoJudge, rendering: str, name: str, file: Path, row: Row | None) -> tuple[bool, str]:
     """Whether the model is right on a rendering, and its answer: a sweep's as it was stored, others' by its file."""
     if row is not None:
         return bool(row.correct), row.label or ""
     if file.suffix != ".png":
         raise InputError(f"rendering: the results have no row for {file.stem}; it belongs to another run")
-    judgement = judge.judgement(name, file.read_bytes())
+    judgement = judge.judgement(rendering, name, file.read_bytes())
     return judgement.right, judgement.answer.label
 
 

@@ -67,14 +67,11 @@ def replay_from_config(
     summary, theirs = attack_of(folder), AttackConfig.from_yaml(folder / CONFIG)
     if config.threads is not None:
         theirs = theirs.model_copy(update={"threads": config.threads})
-    u = _answer(folder, summary)
+    if summary.adversarial is None:
+        raise InputError(f"{folder}: ended with {summary.ending!r}, so that there is no answer to render again")
     different((OWN_MODEL, *config.models), "model")
     problem, warnings = problem_from_config(theirs)
-    if u.shape != problem.domain.start.shape:
-        raise InputError(
-            f"{folder}: its answer has {len(u)} numbers, and its scene has {problem.domain.dim} now: the object or "
-            "advsearch has changed since; do the run again"
-        )
+    u = kept_answer(folder, problem)
     ways = [*_ways(config, theirs, problem, summary), *_models(config, theirs, summary)]
     rows: list[ReplayRow] = []
     ending, renders = "done", 0
@@ -124,10 +121,20 @@ OWN_MODEL = "the run's own"
 """What no other model is called."""
 
 
-def _answer(folder: Path, summary: AttackSummary) -> torch.Tensor:
-    if summary.adversarial is None:
-        raise InputError(f"{folder}: ended with {summary.ending!r}, so that there is no answer to render again")
-    return torch.from_numpy(read_answer(folder))
+def kept_answer(folder: Path, problem: Problem) -> torch.Tensor:
+    """Return the configuration (d,) that a run answers with, of its problem loaded again.
+
+    Raises:
+        InputError: the scene is another one now.
+        FileFormatError: there is none.
+    """
+    u = torch.from_numpy(read_answer(folder))
+    if u.shape != problem.domain.start.shape:
+        raise InputError(
+            f"{folder}: its answer has {len(u)} numbers, and its scene has {problem.domain.dim} now: the object or "
+            "advsearch has changed since; do the run again"
+        )
+    return u
 
 
 def _spp(summary: AttackSummary) -> int:

@@ -33,7 +33,7 @@ class PhotoTaker(Protocol):
     """Takes photographs in; `advsearch.api.photos.Photographs` does."""
 
     def add(self, run: Path, rendering: str, data: bytes) -> PhotoAgreement:
-        """Classify and keep a photograph, and return the run's table; InputError says why it can't."""
+        """Judge and keep a photograph, and return the run's table; InputError says why it can't."""
 
     def agreement(self, run: Path) -> PhotoAgreement:
         """Return the run's table."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -9,14 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from small_models import SIDE, Finder, Painter, Slider
 from torch import nn
 
 import advsearch
+from advsearch.api.photos import Photographs
 from advsearch.cli.main import main
 from advsearch.runs.images import read_png
 from advsearch.runs.store import Store
 from advsearch.tasks import Detection
+from advsearch.viewer.photos import rendering_file
 
 ALSO_SLOWLY = pytest.mark.parametrize(
     "asked", ["detection", pytest.param("segmentation", marks=pytest.mark.slow)], indirect=True
@@ -52,13 +56,26 @@ def task_of(asked: list[str]) -> str:
     return asked[1].partition("=")[0]
 
 
+def photographed(taker: Photographs, run: Path, name: str, shift: int = 0) -> list[bool]:
+    """Whether the model is right on the rendering, and on a photograph that shows it further to the right by pixels."""
+    with Image.open(rendering_file(run, name)) as image, io.BytesIO() as sent:
+        Image.fromarray(np.roll(np.asarray(image), shift, axis=1)).save(sent, "PNG")
+        taker.add(run, name, sent.getvalue())
+    with Store(run / "results.sqlite", read_only=True) as store:
+        row = list(store.rows("photo"))[-1]
+    assert isinstance(row.payload, dict) and isinstance(row.payload["photo"], dict)
+    assert isinstance(row.payload["answer"], dict)
+    return [bool(row.payload["photo"]["right"]), bool(row.correct)]
+
+
 SHORT = ["--spp", "2", "--verify-spp", "4", "--measure", "no", "--denoise", "none"]
 
 
 def test_a_search_predicts_verifies_and_draws(
     asked: list[str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    """By a matrix of light transport; rows have the payload, and blue and orange are in the pictures."""
+    """By a matrix of light transport; rows have the payload, blue and orange are in the pictures, and photographs are
+    judged by where the object is seen in them."""
     run, detects = tmp_path / "run", task_of(asked) == "detection"
     flags = ["--epsilon", "0.2", "--steps", "16", "--trials", "6", "--spp", "2", "--verify-spp", "4", "--run", str(run)]
     found = answer(capsys, "attack", "--object", "mug", *asked, *flags)
@@ -76,6 +93,11 @@ def test_a_search_predicts_verifies_and_draws(
     assert "What it answers" in page and "trial 00" in page
     said = "(score" if detects else "accuracy over the object&#x27;s pixels"
     assert said in page.replace("'", "&#x27;")
+    taker = Photographs()
+    assert [photographed(taker, run, name) for name in ("clean", "adversarial", "verification-00")] == [
+        [True, True], [False, False], [False, False]
+    ]  # fmt: skip
+    assert photographed(taker, run, "clean", SIDE // 2) == [True, False]
 
 
 def test_a_stopped_search_goes_on_with_the_same_words(
@@ -94,12 +116,15 @@ def test_a_sweep_counts_and_keeps_the_worst(
 ) -> None:
     swept = answer(
         capsys, "sweep", "--object", "mug", *asked, "--grid", "pose.yaw=0,180", "--grid", "camera.elevation=25,85",
-        "--denoise", "none", "--spp", "2", "--trials", "6", "--verify-spp", "4", "--surface", "--run",
-        str(tmp_path / "run"),
+        "--denoise", "none", "--spp", "2", "--trials", "6", "--verify-spp", "4", "--surface", "--keep-pictures", "all",
+        "--run", str(tmp_path / "run"),
     )  # fmt: skip
     assert {table["part"]: table["seen"] > 500 for table in swept["surface"]["tables"]} == {"cell": True, "face": True}
     assert swept["configurations"] == 4 and swept["worst"]["claimed"]["payload"] is not None
     assert (tmp_path / "run" / "images" / "worst-answer.png").is_file()
+    taker = Photographs()
+    assert photographed(taker, tmp_path / "run", "0") == [True, True]
+    assert photographed(taker, tmp_path / "run", "0", SIDE // 2) == [True, False]
 
 
 @ALSO_SLOWLY

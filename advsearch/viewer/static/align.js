@@ -115,7 +115,7 @@
   }
   async function send(data) {
     photo.disabled = true;
-    say("The photograph is being classified; the first one waits for the model.");
+    say("The photograph is being judged; the first one waits for the model.");
     try {
       const answer = await fetch(address(chosen[at]), { method: "POST", body: data, headers: { "X-Advsearch-Key": key } });
       if (!answer.ok) throw new Error(await answer.text());
