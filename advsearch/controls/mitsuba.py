@@ -1,7 +1,8 @@
 """The `mitsuba` control: any number or colour of a scene by Mitsuba's own name.
 
 The names are the keys of `mitsuba.traverse` for the scene inside Mitsuba, where the object under test is called
-`object` whatever it was called in a file. Of a colour, each channel is a number of its own in the same range. Whether
+`object` whatever it was called in a file. Of a colour, each channel is a number of its own in the same range, and
+`KEY.red` is one of them. Whether
 Mitsuba's derivative of a number is right nobody knows beforehand: `advsearch check` compares it with differences, and a
 plan that is measured takes what is nearer to them.
 """
@@ -18,7 +19,7 @@ from torch import Tensor
 from advsearch.controls.base import Parameter
 from advsearch.controls.clean import Moved
 from advsearch.controls.numbers import BoundNumbers, NumberControl, Slot, Values
-from advsearch.controls.values import LARGEST
+from advsearch.controls.values import LARGEST, Fixed, OneOf
 from advsearch.errors import InputError
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.mitsuba_backend.keys import plugin_numbers
@@ -48,8 +49,14 @@ class MitsubaControl(NumberControl):
     def bind(self, scene: SceneDescription) -> BoundNumbers:
         slots: list[Slot] = []
         for one in self._numbers(scene):
+            whole = self.specs.get(one.key)
+            if isinstance(whole, OneOf) and len(one.values) > 1:
+                raise InputError(
+                    f"`controls` {self.name}:{one.key}: expected a range, because it is a colour; values one by one "
+                    f"are for one channel, such as {self.name}:{one.key}.{CHANNELS[0]}"
+                )
             for parameter, value in zip(_channels(one), one.values, strict=True):
-                spec = self.specs[one.key]
+                spec = self.specs.get(parameter.name, whole or Fixed(value))
                 slots.append(Slot(replace(parameter, default=value), spec, 1, sum(slot.width for slot in slots), value))
         return BoundNumbers(self, scene, tuple(slots))
 

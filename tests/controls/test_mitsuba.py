@@ -16,6 +16,7 @@ from advsearch.config import AttackConfig
 from advsearch.controls import make_space
 from advsearch.engine.gradients import smooth_loss
 from advsearch.engine.loading import as_controls
+from advsearch.engine.sweeps.axes import on_grid, read_axes
 from advsearch.errors import InputError
 from advsearch.scene.mitsuba_backend.files.writing import write_scene, write_xml
 from advsearch.scene.mitsuba_backend.files.xml import read_scene
@@ -110,6 +111,8 @@ def test_bundled_scenes_have_such_names_too() -> None:
         ({f"mitsuba:{RED}": [0, 1], "mitsuba": {RED: [0, 1]}}, "each of Mitsuba's names once"),
         ({f"mitsuba:{RED}": 0.5}, r"every parameter is fixed.* such as mitsuba:KEY=\[0\.2, 0\.8\]"),
         ({"mitsuba": {}}, "expected Mitsuba's names, as in mitsuba:KEY"),
+        ({f"mitsuba:{RED}": {"choices": [0.1, 0.9]}}, rf"because it is a colour; .* such as mitsuba:{RED}\.red"),
+        ({f"mitsuba:{WIDE}.red": [20, 60]}, r"Did you mean 'camera\.x_fov'"),
         ({f"mitsuba.{RED}": {}}, "expected a range, as in mitsuba:red"),
         ({"pose:small-box": {}}, r"make it the object, or .* mitsuba:small-box\.KEY=\[low, high\]"),
         ({"light": {}}, r"as in light:light-2, or vary what is there: mitsuba:light\.KEY"),
@@ -127,3 +130,35 @@ def test_the_command_line_gathers_ranges_by_key() -> None:
     args = _parse(words, "attack")
     config = config_from(args, AttackConfig)
     assert config.controls == {"pose": {}, "mitsuba": {RED: [0.1, 0.9], WIDE: 40}}
+
+
+def test_one_channel_of_a_colour_varies_and_the_others_stay(box: advsearch.Scene) -> None:
+    renderer = box.renderer({f"mitsuba:{RED}": [0.0, 1.0], f"mitsuba:{RED}.green": 0.25}, resolution=SIZE)
+    assert [group.name for group in renderer.plan.groups] == [f"mitsuba.{RED}.red", f"mitsuba.{RED}.blue"]
+    renderer = box.renderer({f"mitsuba:{RED}.green": [0.0, 1.0]}, resolution=SIZE)
+    inputs = renderer.space.inputs(torch.tensor([0.25]))
+    np.testing.assert_allclose(inputs[f"mitsuba.{RED}"], [0.570068, 0.25, 0.0443706], rtol=1e-5)
+
+
+def test_a_name_of_mitsuba_is_an_axis_of_a_grid(box: advsearch.Scene) -> None:
+    axes = read_axes({f"mitsuba:{RED}.red": "0:1:3", f"mitsuba:{WIDE}": [30, 50]}, ())
+    space = make_space(on_grid((), axes, box.description), box.description)
+    inputs = space.inputs(torch.tensor([0.5, 0.9]))
+    np.testing.assert_allclose(inputs[f"mitsuba.{RED}"], [0.5, 0.0430135, 0.0443706], rtol=1e-5)
+    assert float(inputs[f"mitsuba.{WIDE}"]) == 50.0
+    model = advsearch.load_model(
+        torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * SIZE**2, 2)), input_size=SIZE
+    )
+    grid = {f"mitsuba:{RED}.red": [0.0, 1.0], "pose.yaw": [0, 90]}
+    summary = advsearch.sweep(box, model, grid, label="#0", spp=1, denoise="none", verify_spp=1).summary
+    assert [one.axis for one in summary.axes] == [f"mitsuba.{RED}.red"] * 2 + ["pose.yaw"] * 2
+    assert summary.configurations == 4 and [one.value for one in summary.axes] == [0.0, 1.0, 0.0, 90.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("mitsuba", "as in mitsuba:KEY=FIRST:LAST:COUNT"), ("mitsuba:camera.x_fow", r"Did you mean 'camera\.x_fov'")],
+)
+def test_a_wrong_name_on_a_grid_says_what_to_do(box: advsearch.Scene, name: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        advsearch.sweep(box, "reference", {name: [1, 2]}, label="mug")

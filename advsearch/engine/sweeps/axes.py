@@ -16,6 +16,7 @@ import numpy as np
 from advsearch.controls import CONTROLS, Control, NumberControl, Parameter, check_instance, instance_of
 from advsearch.controls.values import Number, OneOf, read
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.options import BY_KEY
 from advsearch.scene.description import SceneDescription
 
 MOST_VALUES = 100_000
@@ -62,7 +63,7 @@ def read_axes(grid: Mapping[str, object], controls: Sequence[Control]) -> tuple[
 
     Args:
         grid: name to values: ``"FIRST:LAST:COUNT"``, or a list. A name is KIND.PARAMETER, INSTANCE.PARAMETER of one of
-            `controls`, or KIND:INSTANCE.PARAMETER.
+            `controls`, KIND:INSTANCE.PARAMETER, or mitsuba:KEY.
         controls: what is drawn by chance.
 
     Raises:
@@ -97,12 +98,9 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
     if control is None:
         hint = f"It stands in `grid` {name}; write `grid` CONTROL.PARAMETER=VALUES, such as pose.yaw=0:360:24."
         raise UnknownNameError("control", kind, {*CONTROLS, *instances}, hint)
+    if kind == BY_KEY:
+        return _axis_by_key(control, name, given)
     known = [one.name for one in control.parameters]
-    if not known:
-        raise InputError(
-            f"`grid` {name}: the scene names what {kind} varies; draw it by chance, with `controls` "
-            f"{kind}:{parameter_name or 'KEY'}=[low, high] and `samples=100`"
-        )
     if not parameter_name:
         raise InputError(
             f"`grid` {name}: expected CONTROL.PARAMETER, got no parameter; choose one of {', '.join(known)}"
@@ -117,6 +115,15 @@ def _read_axis(name: str, given: Any, instances: Mapping[str, Control]) -> Axis:
             f"by chance with `controls` {instance} `samples=100`"
         )
     return Axis(control.kind, instance, parameter, axis_values(f"`grid` {name}", parameter, given))
+
+
+def _axis_by_key(control: type[Control], name: str, given: Any) -> Axis:
+    """Return an axis whose parameter the scene names, which says later whether there is such a one."""
+    key = name.partition(":")[2]
+    if not key:
+        raise InputError(f"`grid` {name}: expected Mitsuba's name and values, as in {BY_KEY}:KEY=FIRST:LAST:COUNT")
+    (parameter,) = control.declared([key])
+    return Axis(BY_KEY, BY_KEY, parameter, axis_values(f"`grid` {name}", parameter, given))
 
 
 def axis_values(where: str, parameter: Parameter, given: Any) -> tuple[Number, ...]:

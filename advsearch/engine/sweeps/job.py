@@ -147,7 +147,11 @@ def check_scenes(places: Sequence[NamedScene], controls: Sequence[Control], axes
     """
     given = {name for place in places for name in place.scene.description.given}
     drawn = {control.name: control for control in controls}
-    varied = {axis: drawn.get(axis.instance) or make_control(axis.instance, {"kind": axis.control}) for axis in axes}
+    varied = {
+        axis: drawn.get(axis.instance)
+        or make_control(axis.instance, {"kind": axis.control, axis.parameter.name: axis.values[0]})
+        for axis in axes
+    }
     settings = {axis: control.setting(axis.parameter) for axis, control in varied.items()}
     for axis, setting in settings.items():
         if setting in given and setting != ENVIRONMENT:

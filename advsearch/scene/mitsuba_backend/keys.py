@@ -13,6 +13,7 @@ from advsearch.scene.mitsuba_backend.inputs import color, number
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.parts import PluginNumber
+from advsearch.scene.settings import CHANNELS
 
 SMALL = (8, 8)
 """Height and width of the picture of a scene that is only asked for its names."""
@@ -25,19 +26,21 @@ UNSURE = (*BEHIND, "adjoint")
 
 
 def plugin_numbers(description: SceneDescription, name: str, keys: tuple[str, ...]) -> tuple[PluginNumber, ...]:
-    """Return some numbers and colours of a scene.
+    """Return some numbers and colours of a scene, each once.
 
     Args:
         description: of the scene.
         name: of the part that they will be in, with which their inputs begin; but for those that the scene has as
             inputs of another name.
-        keys: Mitsuba's names of them.
+        keys: Mitsuba's names of them; `KEY.red` is a channel of the colour KEY.
 
     Raises:
         UnknownNameError: the scene has no such key; the message has near ones.
         InputError: it is something else than a number or a colour.
     """
     found, others = _all(description)
+    channels = {f"{key}.{one}": key for key in found for one in CHANNELS if len(found[key].values) > 1}
+    keys = tuple(dict.fromkeys(channels.get(key, key) for key in keys))
     for key in keys:
         if key in others:
             raise InputError(
