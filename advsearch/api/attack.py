@@ -434,7 +434,7 @@ def with_derivatives(policy: Policy[Any], config: AttackConfig) -> Policy[Any]:
 
 def _go_on(job: _Job, run: str | Path, progress: Progress) -> AttackResult:
     """Carry out what is left of a run."""
-    with RunDirectory.resume(run, job.config) as kept:
+    with RunDirectory.of(job.config, run) as kept:
         return _carry_out(job, progress, kept)
 
 
@@ -443,5 +443,5 @@ def _directory(job: _Job, run: RunDirectory | None) -> Iterator[RunDirectory | N
     if run is not None or not job.keep:
         yield run
         return
-    with RunDirectory.create_for(job.config) as made:
+    with RunDirectory.of(job.config) as made:
         yield made

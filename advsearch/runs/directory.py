@@ -130,12 +130,12 @@ class RunDirectory:
             raise
 
     @classmethod
-    def of(cls, config: Config, resumed: Path | None = None) -> RunDirectory:
+    def of(cls, config: Config, resumed: str | Path | None = None) -> RunDirectory:
         """Open the directory of the run that `config` describes: a new one, or the one to go on with.
 
         Args:
             config: what the run is carried out with.
-            resumed: the folder of the run to go on with; None for a new run.
+            resumed: the run to go on with, as for `find_run`; None for a new one.
 
         Raises:
             InputError: as for `create`, and for `resume`.
