@@ -143,7 +143,9 @@ HARDEN: dict[str, Any] = {
     "table": [{"control": name, "before": SHARE, "after": SHARE, "stronger": SHARE} for name in ("texture", "pose")],
     "search": "auto, 16 steps", "stronger_search": "portfolio, 48 steps",
     "split": {"training": SIDE, "validation": SIDE, "held out": SIDE},
-    "rounds": [{"lessons": 8 * number, "clean": 1.0, "robust": 0.5, "kept": number == 1} for number in range(2)],
+    "rounds": [
+        {"lessons": 8 * n, "part": 0.7 * n, "clean": 1.0, "robust": 0.5, "kept": n == 1} for n in range(2)
+    ],
     "hardened": "reference@hardened.safetensors", "weights": "hardened.safetensors", "pictures": "artifacts/pictures",
 }  # fmt: skip
 REPLAY: dict[str, Any] = {

@@ -60,7 +60,7 @@ OVER: dict[str, dict[str, object]] = {
 TRIES = 6
 """Random configurations of a view that is rendered, of which the worst is trained on."""
 CLEAN_VIEWS = 2
-PLAIN_VIEWS = 6
+PLAIN_VIEWS = 3
 """Further views of each scene as it is: clean accuracy is lost where there are too few."""
 CLEAN_SCENES = 4
 """Held-out scenes whose plain pictures are looked at, for each one that is attacked."""

@@ -73,8 +73,8 @@ class HardenConfig(AttackConfig):
     )
     layers: Literal["all", "last"] = setting("all", "training", "layers that are trained")
     rounds: int = setting(4, "training", "rounds of search and training", ge=1, le=1000)
-    scenes: int = setting(42, "training", "new scenes a round for each control", ge=1, le=100_000)
-    views: int = setting(4, "training", "views of each scene", ge=1, le=1000)
+    scenes: int = setting(84, "training", "new scenes a round for each control", ge=1, le=100_000)
+    views: int = setting(2, "training", "views of each scene", ge=1, le=1000)
     epochs: int = setting(8, "training", "how often a round looks at each view", ge=1, le=10_000)
     rate: float = setting(1e-3, "training", "the highest learning rate", gt=0.0, le=1.0)
     clean_loss: float = setting(

@@ -13,7 +13,7 @@ from advsearch.runs.results.harden import HardenResult
 from advsearch.viewer.document import data_url, document, scrolled
 from advsearch.viewer.study_page import again, facts_table, heading, table
 
-ROUND_HEADS = ("round", "views trained on", "plain pictures right", "worst pictures right", "kept")
+ROUND_HEADS = ("round", "views trained on", "part of the way", "plain pictures right", "worst pictures right", "kept")
 SPLIT_HEADS = ("side", "objects", "environments", "scenes", "views")
 
 
@@ -29,10 +29,20 @@ def harden_page(run: Path, result: HardenResult) -> str:
         f"Clopper-Pearson intervals over scenes. Search: {result.search}; the stronger one: {result.stronger_search}."
     )
     rounds = [
-        [str(number), str(one.lessons), percent(one.clean), percent(one.robust), "yes" if one.kept else ""]
+        [
+            str(number),
+            str(one.lessons),
+            percent(one.part),
+            percent(one.clean),
+            percent(one.robust),
+            "yes" if one.kept else "",
+        ]
         for number, one in enumerate(result.rounds)
     ]
-    trained = "Round 0 is the model as it was. Of scenes in the training's environments on which it was not trained."
+    trained = (
+        "Round 0 is the model as it was. Weights are part of the way from those to the trained ones. Judged on "
+        "scenes in the training's environments on which it was not trained."
+    )
     split = [
         [name, ", ".join(one.objects), ", ".join(one.environments), str(one.scenes), str(one.views)]
         for name, one in result.split.items()

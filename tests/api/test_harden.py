@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 import advsearch
 from advsearch.api import harden as hardening
@@ -16,11 +17,12 @@ from advsearch.cli.main import main
 from advsearch.config import AttackConfig, HardenConfig
 from advsearch.config.hardening import QUICK
 from advsearch.engine.hardening.rounds import ROUNDS
-from advsearch.engine.hardening.training import Course
+from advsearch.engine.hardening.training import Course, Score
 from advsearch.engine.loading import Scene
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.models.reference import load
+from advsearch.models.trainable import Trainable
 from advsearch.progress import NullProgress
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.summary import read_result
@@ -69,7 +71,7 @@ def test_a_run_trains_measures_and_goes_on(attacks: list[tuple[str, int]], monke
     assert attacks[2:] == [("ball", 40), ("book", 40), ("ball", 120)]  # what was found is not sought any harder
     assert result.rounds[:2] == [one.model_copy(update={"kept": result.rounds[k].kept}) for k, one in
                                  enumerate(first.rounds)]  # fmt: skip
-    assert [one.lessons for one in result.rounds] == [0, 7, 14] and sum(one.kept for one in result.rounds) == 1
+    assert [one.lessons for one in result.rounds] == [0, 4, 8] and sum(one.kept for one in result.rounds) == 1
     assert result.before is not None and (result.before.right, result.before.count) == (1, 2)
     assert result.clean_after is not None and result.clean_after.count == 4
     assert read_result(Path("runs/run")) == result
@@ -77,17 +79,17 @@ def test_a_run_trains_measures_and_goes_on(attacks: list[tuple[str, int]], monke
     assert not set(held.environments) & set(result.split["training"].environments)
     assert result.hardened == f"small_models:Colours@{result.weights}"
     assert advsearch.load_model(result.hardened, input_size=32).classes == 14
-    assert len(list(Path(str(result.pictures)).glob("*/*.png"))) == 2 * (2 + 6)
+    assert len(list(Path(str(result.pictures)).glob("*/*.png"))) == 2 * (2 + 3)
     assert "robust to texture" in answer(result)
     page = Path("runs/run/report.html").read_text("utf-8")
-    assert "Robust in 1 of 2 scenes, before 1." in page and "data:image/png" in page
+    assert "Of 2 held-out scenes the searches leave 1 right, before 1;" in page and "data:image/png" in page
 
 
 def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple[str, int]]) -> None:
     config = HardenConfig(**SMALL, labels="labels.json")
     rows = [(0.9, 0.2), (0.89, 0.5), (0.87, 0.8), (0.885, 0.5)]
     with RunDirectory.create_for(config) as run:
-        noted = [{"lessons": 1, "clean": clean, "robust": robust, "kept": False} for clean, robust in rows]
+        noted = [{"lessons": 1, "part": 1.0, "clean": clean, "robust": robust, "kept": False} for clean, robust in rows]
         run.store.set_note(ROUNDS, json.dumps(noted))
         course: Any = None
         work = hardening.Hardening(config, run, load(), course, {}, NullProgress())
@@ -96,6 +98,31 @@ def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple
         assert work.rounds.best == 2
         work.rounds.clean_loss = 0.0
         assert work.rounds.best == 0
+    shutil.rmtree(run.path)
+
+
+def test_a_round_ends_with_the_part_of_the_way_that_is_best(
+    attacks: list[tuple[str, int]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = HardenConfig(**SMALL, labels="labels.json")
+    net = torch.nn.Linear(2, 3)
+    student = Trainable(net, load())
+    given = {name: one.clone() for name, one in net.state_dict().items()}
+
+    def judged(model: Model, held_back: Any) -> Score:
+        part = float(net.weight.detach()[0, 0] - given["weight"][0, 0])
+        return Score(1.0 - 0.1 * part, 0.5 + 0.2 * part)
+
+    monkeypatch.setattr("advsearch.engine.hardening.rounds.score", judged)
+    with RunDirectory.create_for(config) as run:
+        work = hardening.Hardening(config, run, load(), Course(student, 0.1, 1, 0), {}, NullProgress())
+        work.rounds._keep(0, [], Score(1.0, 0.5), 0, 0.0)
+        for loss, expected in ((0.05, 0.4), (0.2, 1.0), (0.001, 0.25)):
+            net.load_state_dict({name: one + 1.0 for name, one in given.items()})
+            work.rounds.clean_loss = loss
+            found, part = work.rounds._mixed([])
+            assert part == expected and found.robust == pytest.approx(0.5 + 0.2 * part)
+            torch.testing.assert_close(net.bias.detach(), given["bias"] + part)
     shutil.rmtree(run.path)
 
 

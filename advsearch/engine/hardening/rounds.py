@@ -1,4 +1,9 @@
-"""Rounds of search and training, each kept in the run when it is done: its weights, its pictures and its score."""
+"""Rounds of search and training, each kept in the run when it is done: its weights, its pictures and its score.
+
+What a round learned costs clean accuracy; part of the way from the weights that were given to the trained ones costs
+less of it than of what was learned (Wortsman et al. 2022, arXiv 2109.01903), so that each round ends with the part that
+is best, and the next one begins there.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +17,7 @@ from safetensors import torch as safetensors
 from advsearch.engine.hardening.lessons import Lesson, harder
 from advsearch.engine.hardening.pictures import ARCHIVE, FOLDER, save_pictures, write_archive
 from advsearch.engine.hardening.split import TRAINING, VALIDATION
-from advsearch.engine.hardening.training import Course, score
+from advsearch.engine.hardening.training import Course, Score, score
 from advsearch.progress import Progress
 from advsearch.report.phrases import percent
 from advsearch.runs.directory import ARTIFACTS, RunDirectory
@@ -25,6 +30,8 @@ ROUNDS = "rounds"
 FIRST_STEPS = 4
 """Steps of each texture before a training."""
 VALIDATION_VIEWS = 2
+PARTS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
+"""Of the way from the weights that were given to the trained ones, which are judged."""
 
 Draw = Callable[[str, Sequence[int], int], list[Lesson]]
 """From the name of a split, numbers of its scenes and the views of each to lessons."""
@@ -68,9 +75,11 @@ class TrainingRounds:
     @property
     def best(self) -> int:
         """The round whose weights are kept: the most robust one whose clean accuracy is within what may be lost."""
-        least = self.done[0].clean - self.clean_loss - 1e-9
-        allowed = [number for number, one in enumerate(self.done) if one.clean >= least]
+        allowed = [number for number, one in enumerate(self.done) if self._allowed(one.clean)]
         return max(allowed, key=lambda number: (self.done[number].robust, number))
+
+    def _allowed(self, clean: float) -> bool:
+        return clean >= self.done[0].clean - self.clean_loss - 1e-9
 
     def carry_out(self, count: int) -> None:
         """Do what is left of so many rounds; the student has the best weights afterwards, which the run keeps."""
@@ -87,7 +96,7 @@ class TrainingRounds:
         self.progress.stage("drawing scenes to choose weights by", self.judged * self.controls)
         held_back = self.draw(VALIDATION, range(self.judged), VALIDATION_VIEWS)
         if not self.done:
-            self._keep(0, [], held_back, 0)
+            self._keep(0, [], score(student.model, held_back), 0, 0.0)
         for number in range(1, count + 1):
             self.progress.stage(f"round {number}: drawing scenes", self.each * self.controls)
             new = self.draw(TRAINING, range((number - 1) * self.each, number * self.each), self.views)
@@ -98,15 +107,39 @@ class TrainingRounds:
             self.progress.stage(f"round {number}: training", self.course.steps(len(pool)))
             harder(pool, student.model, FIRST_STEPS)
             self.course.round(number, pool, lambda: self.progress.advance(1))
-            self._keep(number, new, held_back, len(pool))
+            found, part = self._mixed(held_back)
+            self._keep(number, new, found, len(pool), part)
 
-    def _keep(self, number: int, new: Sequence[Lesson], held_back: Sequence[Lesson], trained: int) -> None:
-        """Judge the weights, and keep them and the round's pictures."""
+    def _mixed(self, held_back: Sequence[Lesson]) -> tuple[Score, float]:
+        """Leave the student with the best part of the way from the weights that were given; return its score and it.
+
+        The best one is right most often on the worst pictures among those that lose no more on plain ones than they
+        may; where all lose more, it is the one that loses least.
+        """
+        student, given = self.course.student, self._weights(0)
+        learned = {name: one.clone() for name, one in student.net.state_dict().items()}
+
+        def take(part: float) -> None:
+            mixed = {name: torch.lerp(given[name], one, part) if one.is_floating_point() else one
+                     for name, one in learned.items()}  # fmt: skip
+            student.net.load_state_dict(mixed)
+
+        found = dict[float, Score]()
+        for part in PARTS:
+            take(part)
+            found[part] = score(student.model, held_back)
+        allowed = [part for part in PARTS if self._allowed(found[part].clean)]
+        best = max(allowed, key=lambda part: found[part].robust, default=max(PARTS, key=lambda part: found[part].clean))
+        take(best)
+        return found[best], best
+
+    def _keep(self, number: int, new: Sequence[Lesson], found: Score, trained: int, part: float) -> None:
+        """Keep weights, what they came to, and the round's pictures."""
         model = self.course.student.model
-        found = score(model, held_back)
         self._save(_file(number))
         save_pictures(self.run.path / ARTIFACTS / FOLDER, number, new, model.labels)
-        self.done.append(TrainingRound(lessons=trained, clean=found.clean, robust=found.robust, kept=False))
+        done = TrainingRound(lessons=trained, part=part, clean=found.clean, robust=found.robust, kept=False)
+        self.done.append(done)
         self.run.store.set_note(ROUNDS, json.dumps([one.model_dump() for one in self.done]))
         clean, worst = percent(found.clean), percent(found.robust)
         self.progress.message(f"round {number}: {clean} of plain pictures right, {worst} of the worst")
