@@ -14,7 +14,7 @@ from pathlib import Path
 from advsearch import files
 from advsearch.scene.importing.files import damaged, looks_like, shown, text_of
 
-LARGEST_FACES = 500_000
+LARGEST_FACES = 2_000_000
 """Triangles that a mesh may have, before `advsearch.files.scaled`; each takes over 1 KB of memory to import."""
 
 MOST_CORNERS = 10_000

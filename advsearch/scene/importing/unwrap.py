@@ -18,6 +18,8 @@ _SCALE = 100.0  # xatlas takes faces under about 1e-7 square units for empty
 _FLUSH = 1.0 - 1.5e-4  # xatlas takes neighbours whose normals have a product over 1 - 1e-4 for one plane
 _PLANE = np.cos(np.radians(10.0))  # how far the normals of what it takes for a plane may stray before it matters
 _MANY = 20_000  # faces that xatlas gets at a time, about; its time grows faster than their number
+_LARGE = 200_000  # faces of a mesh from which on that is felt
+_PIECE = 1_500  # faces that xatlas then gets at a time, at most
 _MOST_PATCHES = 10_000  # more are no surface but a heap of faces, and xatlas would take minutes over them
 _SMOOTHING = 10  # rounds of averaging normals, so that noise does not fray the borders of patches
 
@@ -81,7 +83,32 @@ def _patches(soup: Soup) -> Ints:
     facing = _smoothed(unit, f, g) @ np.concatenate([axes, corners]).T
     direction = facing.argmax(axis=1)
     same = direction[f] == direction[g]
-    return _connected(len(unit), f[same], g[same])
+    patch = _connected(len(unit), f[same], g[same])
+    if len(unit) <= _LARGE:
+        return patch
+    cell = _cells(soup.points[soup.faces].mean(axis=1), patch)
+    near = same & (cell[f] == cell[g])
+    return _connected(len(unit), f[near], g[near])
+
+
+def _cells(middles: Array, patch: Ints) -> Ints:
+    """Halve patches until they are small; return the cell (F,) of each face.
+
+    Args:
+        middles: (F, 3) of faces.
+        patch: (F,) of each face.
+    """
+    cell, count = np.zeros(len(patch), dtype=np.int64), 0
+    left = np.split(np.argsort(patch, kind="stable"), np.cumsum(np.bincount(patch))[:-1])
+    while left:
+        group = left.pop()
+        if len(group) > _PIECE:
+            axis = np.ptp(middles[group], axis=0).argmax()
+            order = group[np.argsort(middles[group, axis], kind="stable")]
+            left += [order[: len(order) // 2], order[len(order) // 2 :]]
+        else:
+            cell[group], count = count, count + 1
+    return cell
 
 
 def _smoothed(unit: Array, f: Ints, g: Ints) -> Array:
