@@ -60,6 +60,25 @@ def test_a_real_detector_and_a_real_segmenter_are_fooled(case: str, real_data: P
     assert (tmp_path / "run" / "images" / "adversarial-answer.png").is_file()
 
 
+ELSEWHERE = {"displace": {"cup elsewhere"}, "create": {"dining table elsewhere"}}
+"""By objective: what the detector sees then, of a mug that stands on a table and which it sees where it is before."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("objective", ELSEWHERE)
+def test_a_real_detector_sees_a_box_where_the_object_is_not(objective: str, real_data: Path, tmp_path: Path) -> None:
+    network = real_data / "models" / "ssd_mobilenet_v1_coco_300"
+    command = [sys.executable, "-m", "advsearch", "attack", "--object", "mug", "--task", "detection", "--label", "cup"]
+    command += ["--model", f"{network}.pt2", "--labels", f"{network}.labels.json", "--objective", objective]
+    command += ["--trials", "6", "--verify-spp", "16", "--no-baseline", "--run", str(tmp_path / "run"), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    assert summary["ending"] == "found" and summary["clean"]["label"] == "cup"
+    assert summary["clean"]["control"]["correct"] == summary["verified"]["successes"] == 6
+    assert set(summary["verified"]["labels"]) <= ELSEWHERE[objective]
+
+
 @pytest.mark.parametrize(
     "case", [case if case == "small mug" else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
 )
