@@ -1,8 +1,9 @@
-"""How quick the pages of runs are: python benchmarks/viewer.py [--rows 1000000] [--attack].
+"""How quick the pages of runs are: python benchmarks/viewer.py [--rows 1000000] [--keep-pictures all] [--attack].
 
-The rows are made up; what is timed is reading them from the store when the sweep ends, and in Chromium (through
-Playwright, both of which `make test` sees to): the first paint of the page from `advsearch dashboard`, the map, and
-each interaction until the page is painted again. Seconds; medians of five for interactions.
+The rows are made up; with `--keep-pictures all` each has a small picture (links to a few files). What is timed is
+reading them from the store when the sweep ends, and in Chromium (through Playwright, both of which `make test` sees
+to): the first paint of the page from `advsearch dashboard`, the map, and each interaction until the page is painted
+again. Seconds; medians of five for interactions.
 
 With `--attack` it is the page of a real attack of 40 steps on a texture at 224 pixels: how large it is,
 how long it takes to be made, and until the object that can be turned is drawn.
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import random
 import shutil
 import statistics
@@ -20,13 +22,14 @@ import tempfile
 import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from advsearch.config import SweepConfig
 from advsearch.described import Value
 from advsearch.runs.directory import COLUMNS, RunDirectory
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.store import Row
+from advsearch.viewer import thumbnails
 from advsearch.viewer.server import Dashboard
 from advsearch.viewer.sweep_page import write_page
 
@@ -77,13 +80,29 @@ def row(step: int, chance: random.Random) -> Row:
     return Row("sweep", step, correct=not wrong, margin=margin, label=label, probability=0.9, values=values)
 
 
-def make(folder: Path, count: int) -> dict[str, float]:
+def keep(run: Path, numbers: range) -> None:
+    """Keep one picture under many numbers: by links, which a file system takes some ten thousand of."""
+    picture = thumbnails.thumbnail([[[random.random() for _ in range(3)] for _ in range(64)] for _ in range(64)])
+    for number in numbers:
+        path = thumbnails.path_of(run, number)
+        if number == numbers.start or number % thumbnails.A_FOLDER == 0:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        if number == numbers.start:
+            path.write_bytes(picture)
+        else:
+            os.link(thumbnails.path_of(run, numbers.start), path)
+
+
+def make(folder: Path, count: int, pictures: Literal["all", "none"]) -> dict[str, float]:
     """Make the run of a sweep that has ended, and say what that took."""
-    config = SweepConfig(object="mug", run=str(folder), grid={"pose.yaw": [0, 15]})
+    config = SweepConfig(object="mug", run=str(folder), grid={"pose.yaw": [0, 15]}, keep_pictures=pictures)
     chance, right = random.Random(0), 0
     with RunDirectory.create_for(config) as run:
         for begin in range(0, count, BATCH):
-            rows = [row(step, chance) for step in range(begin, min(begin + BATCH, count))]
+            numbers = range(begin, min(begin + BATCH, count))
+            if pictures == "all":
+                keep(folder, numbers)
+            rows = [row(step, chance) for step in numbers]
             right += sum(bool(one.correct) for one in rows)
             run.record(*rows)
         share = right / count
@@ -146,11 +165,11 @@ def of_attack(folder: Path) -> dict[str, float]:
     return found
 
 
-def of_sweep(folder: Path, rows: int) -> dict[str, float]:
+def of_sweep(folder: Path, rows: int, pictures: Literal["all", "none"]) -> dict[str, float]:
     """Make a sweep, open it from the server, and interact."""
     from playwright.sync_api import sync_playwright
 
-    found = make(folder, rows)
+    found = make(folder, rows, pictures)
     found["columns [MB]"] = (folder / COLUMNS).stat().st_size / 1e6
     server = Dashboard([folder])
     threading.Thread(target=server.serve_forever, daemon=True).start()
@@ -167,6 +186,7 @@ def main() -> int:
     """Make the run, open it, and print what was measured."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rows", type=int, default=1_000_000, help="rows of the sweep")
+    parser.add_argument("--keep-pictures", choices=["all", "none"], default="none", help="of the sweep")
     parser.add_argument("--attack", action="store_true", help="the page of an attack in place of a sweep's")
     parser.add_argument("--json", action="store_true", help="print JSON")
     args = parser.parse_args()
@@ -175,7 +195,7 @@ def main() -> int:
         return 2
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
-        found = of_attack(run) if args.attack else of_sweep(run, args.rows)
+        found = of_attack(run) if args.attack else of_sweep(run, args.rows, args.keep_pictures)
     if args.json:
         print(json.dumps(found if args.attack else {"rows": args.rows, **found}, indent=2))
         return 0

@@ -166,6 +166,13 @@ RECIPE: dict[str, Any] = {
                  "by": "environment",
                  "bars": [{"name": "studio", "configurations": 8, "correct": 6, **ACCURACY}]}],
 }  # fmt: skip
+STABILITY: dict[str, Any] = {
+    "run": "", "ending": "done", "not_run": [], "seconds": {"total": 9.0}, "command_line": "advsearch stability",
+    "rows": [
+        {"case": "ties", "group": "objective", "control": "pose", "finite": True, "relative_error": 0.0125,
+         "ending": "found", "rule": "<b>a tie is not wrong</b>", "status": "ok", "decides": "", "holds": "",
+         "checks": [], "measured": {"condition number": 12.5}, "seconds": 1.5}],
+}  # fmt: skip
 
 
 def attack(**changes: Any) -> AttackSummary:

@@ -10,7 +10,7 @@ from advsearch.report.recipes import figure_table
 from advsearch.runs.directory import IMAGES, PARTS
 from advsearch.runs.results.recipe import AnyFigure, RecipePart, RecipeResult
 from advsearch.viewer.document import data_url, document, scrolled
-from advsearch.viewer.study_page import again, facts_table, heading, table
+from advsearch.viewer.study_page import again, facts_table, heading, part_links, table
 
 
 def recipe_page(run: Path, result: RecipeResult) -> str:
@@ -32,7 +32,7 @@ def recipe_page(run: Path, result: RecipeResult) -> str:
         element("p", result.about) if result.about else None,
         *(_section(one, run / IMAGES / f"figure-{number}.png") for number, one in enumerate(result.figures, start=1)),
         join(element("h2", "Cost and conditions"), facts_table(facts)),
-        _runs(result.parts),
+        _runs(run, result.parts),
         again(result.command_line),
     )
     header = heading(
@@ -62,7 +62,8 @@ def _section(made: AnyFigure, picture: Path) -> Html:
     )
 
 
-def _runs(parts: list[RecipePart]) -> Html:
+def _runs(run: Path, parts: list[RecipePart]) -> Html:
     rows = [[one.name, one.command, one.ending, str(one.renders)] for one in parts]
-    listed = table([f"runs in {PARTS}/", "command", "ending", "renders"], rows)
+    links = part_links(run, [one.name for one in parts])
+    listed = table([f"runs in {PARTS}/", "command", "ending", "renders"], rows, links)
     return element("details", element("summary", wording.count(len(rows), "run")), listed)

@@ -41,7 +41,7 @@ def result_page(run: Path, result: Result) -> str:
         *_figures(run),
         *(join(element("h2", _words(name)), _folded(rows)) for name, rows in tables),
         join(element("h2", "Cost and conditions"), facts_table(plain)),
-        _meanings([result, *(row for _, rows in tables for row in rows[:1])], [*plain, *map(_words, _names(tables))]),
+        _meanings(result, plain, [rows for _, rows in tables]),
         again(str(values.get("command_line") or f"advsearch show {run.name}")),
     )
     said = result.brief or str(values.get("ending", "done"))
@@ -59,18 +59,14 @@ def _figures(run: Path) -> Iterable[Html]:
             yield element("figure", picture, class_="wide")
 
 
-def _names(tables: Iterable[tuple[str, Sequence[Fields]]]) -> Iterable[str]:
-    """The columns of tables."""
-    for _, rows in tables:
-        yield from type(rows[0]).model_fields
-
-
-def _meanings(described: Iterable[Fields], shown: Sequence[str]) -> Html | None:
+def _meanings(result: Result, plain: Mapping[str, str], tables: Sequence[Sequence[Fields]]) -> Html | None:
     """What the names on the page mean, as far as the fields say it; folded."""
+    of_rows = [(rows[0], set(map(_words, _columns(rows)))) for rows in tables]
+    described: list[tuple[Fields, set[str]]] = [(result, {name for name, text in plain.items() if text}), *of_rows]
     found: dict[str, str] = {}
-    for one in described:
+    for one, words in described:
         for name, field in type(one).model_fields.items():
-            if field.description and _words(name) in shown:
+            if field.description and _words(name) in words:
                 found.setdefault(_words(name), field.description.replace("`", ""))
     return element("details", element("summary", "What these words mean"), facts_table(found)) if found else None
 
@@ -84,12 +80,17 @@ def _rows(value: object) -> Sequence[Fields]:
 
 def _folded(rows: Sequence[Fields]) -> Html:
     """A table of what differs or is not empty; a long one is folded."""
-    names = list(dict.fromkeys(name for row in rows for name in type(row).model_fields))
-    lines = [[_text(getattr(row, name, None)) for name in names] for row in rows]
-    filled = [column for column in range(len(names)) if any(line[column] for line in lines)]
-    cells = [[line[column] for column in filled] for line in lines]
-    made = table([_words(names[column]) for column in filled], cells)
+    names = _columns(rows)
+    made = table(
+        [_words(name) for name in names], [[_text(getattr(row, name, None)) for name in names] for row in rows]
+    )
     return made if len(rows) <= LONG else element("details", element("summary", f"{len(rows)} rows"), made)
+
+
+def _columns(rows: Sequence[Fields]) -> list[str]:
+    """The fields that are not empty in every row."""
+    names = dict.fromkeys(name for row in rows for name in type(row).model_fields)
+    return [name for name in names if any(_text(getattr(row, name, None)) for row in rows)]
 
 
 def _text(value: object) -> str:

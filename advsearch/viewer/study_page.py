@@ -25,7 +25,7 @@ ROW_HEIGHT = 34
 
 def gap_page(run: Path, result: GapResult) -> str:
     """Return the page of a gap in the folder `run`."""
-    links = _links(run, [row.run for row in result.table])
+    links = part_links(run, [row.run for row in result.table])
     words = f"Accuracy on average and of the worst configuration. {gaps.gap_text(result)} The table has the numbers."
     high = 110 + ROW_HEIGHT * len(result.table)
     note = (
@@ -44,7 +44,7 @@ def gap_page(run: Path, result: GapResult) -> str:
 
 def curve_page(run: Path, result: CurveResult) -> str:
     """Return the page of robust accuracy against epsilon in the folder `run`."""
-    links = _links(run, [row.run for row in result.table])
+    links = part_links(run, [row.run for row in result.table])
     points = [one for one in result.curve if one.epsilon is not None and one.accuracy is not None]
     told = "; ".join(f"{one.robust} of {one.objects} at {one.epsilon:g}" for one in points)
     words = f"Robust accuracy over epsilon with 95 % intervals: {told}."
@@ -84,7 +84,7 @@ def matrix_page(run: Path, result: MatrixResult) -> str:
         for up, row in enumerate(result.table)
         for across, cell in enumerate(row.tested)
     }
-    links = [""] * before + _links(run, [row.run for row in result.table])
+    links = [""] * before + part_links(run, [row.run for row in result.table])
     body = [
         element("h2", "Attacked on, tested on"),
         table(matrix_heads(result), rows, links, rates),
@@ -178,8 +178,8 @@ def _charts(draw: Callable[[Any], object], words: str, height: int) -> Html:
     return element("div", *(study_chart(draw, words, width, height) for width in (WIDE, NARROW)))
 
 
-def _links(run: Path, parts: Sequence[str | None]) -> list[str]:
-    """Where the pages of the attacks are, seen from that of the study; empty of those that have none."""
+def part_links(run: Path, parts: Sequence[str | None]) -> list[str]:
+    """Return where the pages of a run's parts are, seen from its own; empty of those that have none."""
     found = []
     for part in parts:
         name = "" if part is None else Path(part).name
@@ -201,7 +201,7 @@ def _study_page(
         "Time": wording.seconds_text(result.seconds["total"]),
         "Seed": str(result.seed),
     }
-    links = _links(run, list(result.parts))
+    links = part_links(run, list(result.parts))
     named = zip(result.parts, links, strict=True)
     parts = [element("li", element("a", name, href=link) if link else name) for name, link in named]
     summary = element("summary", f"The attacks ({len(parts)})")

@@ -81,16 +81,18 @@ def page(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[Swe
     connects = any(isinstance(one.rows, str) for one in sources)
     summaries = [(path, summary) for path, summary in runs if summary is not None]
     title = ", ".join(path.name for path, _ in runs)
-    described, data = [], []
+    described, data, left_out = [], [], []
     sources = [one for one in sources if one.rows is not None]
     for number, source in enumerate(sources):
         described.append(_described(source, number))
         if isinstance(source.rows, Columns):
             packed = base64.b64encode(gzip.compress(source.rows.packed(), 6, mtime=0)).decode()
             data.append(element("script", Html(packed), type="application/octet-stream", id=f"rows-{number}"))
+            left_out.append(_left_out(described[-1], source))
     main = element(
         "main",
         element("div", id="explorer", hidden="hidden") if sources else _too_many(runs),
+        *left_out,
         *(_still(path, summary) for path, summary in summaries),
         *(_surface(path, summary) for path, summary in summaries),
         *(join(_axes(summary), _cost(path, summary)) for path, summary in summaries),
@@ -136,8 +138,31 @@ def _header(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
 
 
 def _too_many(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
-    names = shlex.join(["advsearch", "dashboard", *(directory.shown(path) for path, _ in runs)])
-    return element("p", f"More than {MOST_ROWS} rows are explored with: ", element("code", names))
+    """What stands in the explorer's place in a file that would take more rows along than it may."""
+    names = [directory.shown(path) for path, _ in runs]
+    served, bundled = (
+        shlex.join(["advsearch", *words]) for words in (["dashboard", *names], ["view", *names, "--bundle"])
+    )
+    counts = ", ".join(f"{summary.configurations:,}" for _, summary in runs if summary is not None)
+    return element(
+        "p",
+        f"This file leaves out the {counts} rows, and what pictures they have: it takes {MOST_ROWS:,} along at most. ",
+        element("code", served),
+        " explores them all; ",
+        element("code", f"{bundled} FOLDER"),
+        " makes a folder with them for any web server.",
+        class_="soft",
+    )
+
+
+def _left_out(described: JsonObject, source: SweepSource) -> Html | None:
+    """What a file says of the pictures that it does not take along."""
+    pictures, kept = described.get("pictures"), source.pictures
+    taken = len(pictures["embedded"]) if isinstance(pictures, dict) and isinstance(pictures["embedded"], dict) else 0
+    if kept is None or taken == len(kept.numbers):
+        return None
+    said = f"This file has {taken:,} of the {len(kept.numbers):,} pictures that were kept, those of the worst margins."
+    return element("p", said, class_="soft")
 
 
 def verdict(summary: SweepSummary) -> str:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import base64
 import io
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -64,17 +66,20 @@ class Kept:
 
     Attributes:
         run: its folder.
-        numbers: of the pictures, sorted.
         models: how many configurations in a row are of one picture.
         some: whether only some of the pictures were kept.
         suffix: of the files.
     """
 
     run: Path
-    numbers: tuple[int, ...]
     models: int
     some: bool
     suffix: str = "jpg"
+
+    @cached_property
+    def numbers(self) -> tuple[int, ...]:
+        """Of the pictures, sorted. Listing the files of a million takes seconds, so only who needs them asks."""
+        return tuple(sorted(_numbers(self.run)))
 
     def png_of(self, step: int) -> bytes | None:
         """Return the picture of a configuration as a PNG; None where it was not kept."""
@@ -106,11 +111,24 @@ class Kept:
 
 def kept_pictures(run: Path) -> Kept | None:
     """Return which thumbnails a sweep has; None where it has none."""
-    folder = run / "images" / FOLDER
-    files = [file for file in folder.glob("*/*.jpg") if file.stem.isdecimal() and not file.is_symlink()]
-    if not files:
+    if next(_numbers(run), None) is None:
         return None
-    numbers = sorted(int(file.stem) for file in files)
     settings = read_yaml(run / CONFIG) if (run / CONFIG).is_file() else {}
     models = len(split_names(str(settings.get("model", "one"))))
-    return Kept(run, tuple(numbers), models, settings.get("keep_pictures") != "all")
+    return Kept(run, models, settings.get("keep_pictures") != "all")
+
+
+def _numbers(run: Path) -> Iterator[int]:
+    """Yield the numbers of the pictures that are there; links are none."""
+    top = run / "images" / FOLDER
+    if not top.is_dir():
+        return
+    with os.scandir(top) as folders:
+        for folder in folders:
+            if not folder.is_dir(follow_symlinks=False):
+                continue
+            with os.scandir(folder) as files:
+                for file in files:
+                    stem, _, suffix = file.name.rpartition(".")
+                    if suffix == "jpg" and stem.isdecimal() and file.is_file(follow_symlinks=False):
+                        yield int(stem)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from PIL import Image
-from samples import EXPLAIN, GAP, HARDEN, RECIPE, REPLAY, curve, gap, keep_object, make_run, matrix, region
+from samples import EXPLAIN, GAP, HARDEN, RECIPE, REPLAY, STABILITY, curve, gap, keep_object, make_run, matrix, region
 from samples import attack as attack_with
 from stored_sweeps import described, make_sweep, serving
 
@@ -26,6 +26,7 @@ from advsearch.runs.results.explain import ExplainResult
 from advsearch.runs.results.harden import HardenResult
 from advsearch.runs.results.recipe import RecipeResult
 from advsearch.runs.results.replay import ReplayResult
+from advsearch.runs.results.stability import StabilityResult
 from advsearch.runs.store import Row, Store
 from advsearch.viewer import thumbnails
 from advsearch.viewer.attack_page import write_report
@@ -356,7 +357,7 @@ def test_everybody_can_use_the_pages(
     "result",
     [
         matrix(), curve(), region(), ExplainResult.of(EXPLAIN), HardenResult.of(HARDEN), RecipeResult.of(RECIPE),
-        ReplayResult.of(REPLAY),
+        ReplayResult.of(REPLAY), StabilityResult.of(STABILITY),
     ],
     ids=lambda result: type(result).__name__,
 )  # fmt: skip

@@ -12,6 +12,7 @@ from stored_sweeps import make_sweep
 
 from advsearch.cli.main import main
 from advsearch.errors import InputError
+from advsearch.viewer import sweep_page
 from advsearch.viewer.bundle import renewed, write_bundle
 from advsearch.viewer.document import asset
 
@@ -21,6 +22,21 @@ def test_the_page_needs_nothing_else(tmp_path: Path) -> None:
     assert not re.search(r"""(src|href)=["'](?!data:)""", page), "something is loaded from elsewhere"
     assert "connect-src" not in page
     assert page.count("data:image/jpeg") == 24
+
+
+def test_a_file_says_what_it_leaves_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = make_sweep(tmp_path / "run", keep="all")
+    assert "pictures that were kept" not in (run / "report.html").read_text()
+    monkeypatch.setattr(sweep_page, "MOST_EMBEDDED", 2000)
+    page = renewed(run).read_text()
+    taken = page.count("data:image/jpeg")
+    assert f"This file has {taken} of the 24 pictures that were kept" in page
+    assert 0 < taken < 24
+    monkeypatch.setattr(sweep_page, "MOST_ROWS", 23)
+    page = renewed(run).read_text()
+    assert "This file leaves out the 24 rows" in page
+    assert f"advsearch view {run} --bundle FOLDER" in page
+    assert "data:image/jpeg" not in page
 
 
 def test_without_a_script_the_page_says_what_was_found(tmp_path: Path) -> None:

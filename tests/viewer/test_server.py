@@ -17,6 +17,7 @@ from stored_sweeps import make_sweep, serving
 from advsearch.errors import InputError
 from advsearch.runs.directory import RunDirectory
 from advsearch.viewer.server import Dashboard
+from advsearch.viewer.thumbnails import Kept
 
 
 def ask(server: Dashboard, path: str, method: str = "GET", **headers: str) -> tuple[HTTPResponse, bytes]:
@@ -66,6 +67,22 @@ def test_rows_and_pictures(server: Dashboard, run: Path) -> None:
     answer, data = ask(server, "/runs/first/pictures/0000/3.jpg")
     assert (answer.status, answer.headers["Content-Type"]) == (200, "image/jpeg")
     assert data == (run / "images/rows/0000/3.jpg").read_bytes()
+
+
+def test_a_page_lists_no_pictures_where_all_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There may be a million; where only some are kept, it says which."""
+    every, wrong = (make_sweep(tmp_path / keep, keep=keep) for keep in ("all", "wrong"))
+    listed: list[str] = []
+
+    def numbers(kept: Kept) -> tuple[int, ...]:
+        listed.append(kept.run.name)
+        return 10, 11
+
+    monkeypatch.setattr(Kept, "numbers", property(numbers))
+    with serving(every, wrong) as server:
+        assert b'"kept":null' in ask(server, "/runs/all/")[1].replace(b" ", b"")
+        assert b'"kept":[10,11]' in ask(server, "/runs/wrong/")[1].replace(b" ", b"")
+    assert listed == ["wrong"]
 
 
 def test_a_sweep_that_goes_on_is_followed(tmp_path: Path) -> None:
@@ -155,7 +172,7 @@ def test_beyond_this_machine_the_token_is_asked_for(run: Path) -> None:
 
 
 def test_a_thousand_at_once_are_answered(server: Dashboard) -> None:
-    """All are connected and have asked before the first answer is read; the server has as many threads as before."""
+    """All are connected and have asked before the first answer is read; the server has no more threads than before."""
     asked = f"GET /runs/first/pictures/0000/1.jpg HTTP/1.0\r\nHost: 127.0.0.1:{server.server_port}\r\n\r\n".encode()
     threads, counts = threading.active_count(), []
     with ExitStack() as stack:
@@ -168,7 +185,7 @@ def test_a_thousand_at_once_are_answered(server: Dashboard) -> None:
         answers = [talk.makefile("rb").read() for talk in talks]
     assert all(one.startswith(b"HTTP/1.0 200") for one in answers)
     assert len(set(map(len, answers))) == 1
-    assert max(counts) == threads
+    assert max(counts) <= threads  # fewer where those of another test's server have ended meanwhile
     assert ask(server, "/")[0].status == 200
 
 

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 from urllib.error import HTTPError
 from urllib.request import urlopen
 
 import pytest
-from samples import AVERAGE, CURVE, GAP, curve, gap, make_run, matrix, region
+from samples import AVERAGE, CURVE, GAP, RECIPE, STABILITY, curve, gap, make_run, matrix, region
 from stored_sweeps import serving
 
 from advsearch.cli.main import main
@@ -17,17 +16,11 @@ from advsearch.config import AttackConfig
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import Result
 from advsearch.runs.results.gap import StudyResult
+from advsearch.runs.results.recipe import RecipeResult
 from advsearch.runs.results.stability import StabilityResult
 from advsearch.viewer.pages import write_page
 
 ACCURACIES = ((0.01, 7), (0.03, 4), (0.1, 1))
-STABILITY: dict[str, Any] = {
-    "run": "", "ending": "done", "not_run": [], "seconds": {"total": 9.0}, "command_line": "advsearch stability",
-    "rows": [
-        {"case": "ties", "group": "objective", "control": "pose", "finite": True, "relative_error": 0.0125,
-         "ending": "found", "rule": "<b>a tie is not wrong</b>", "status": "ok", "decides": "", "holds": "",
-         "checks": [], "measured": {"condition number": 12.5}, "seconds": 1.5}],
-}  # fmt: skip
 
 
 def make_study(path: Path, result: Result) -> Path:
@@ -99,6 +92,20 @@ def test_a_matrix_has_a_colour_for_each_share(tmp_path: Path) -> None:
     page = (make_study(tmp_path / "study", matrix()) / "report.html").read_text()
     assert re.findall(r'class="number share share-(\d+)"', page) == ["10", "2", "2", "10"]
     assert 'href="parts/other/report.html"' in page
+
+
+def test_a_recipe_leads_to_its_runs(tmp_path: Path) -> None:
+    page = tmp_path / "parts" / "views-00" / "report.html"
+    page.parent.mkdir(parents=True)
+    page.write_text("the sweep")
+    assert 'href="parts/views-00/report.html"' in write_page(tmp_path, RecipeResult.of(RECIPE)).read_text()
+
+
+def test_only_words_that_are_shown_are_explained(tmp_path: Path) -> None:
+    page = write_page(tmp_path, StabilityResult.of(STABILITY)).read_text()
+    meanings = page[page.index("What these words mean") :]
+    assert "every picture and gradient was finite" in meanings
+    assert "cases that were not begun" not in meanings
 
 
 def test_an_attack_without_a_page_has_no_link(tmp_path: Path) -> None:
