@@ -139,18 +139,17 @@ def _header(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
 
 def _too_many(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
     """What stands in the explorer's place in a file that would take more rows along than it may."""
-    names = [directory.shown(path) for path, _ in runs]
-    served, bundled = (
-        shlex.join(["advsearch", *words]) for words in (["dashboard", *names], ["view", *names, "--bundle"])
-    )
+    served = shlex.join(["advsearch", "dashboard", *(directory.shown(path) for path, _ in runs)])
     counts = ", ".join(f"{summary.configurations:,}" for _, summary in runs if summary is not None)
     return element(
         "p",
         f"This file leaves out the {counts} rows, and what pictures they have: it takes {MOST_ROWS:,} along at most. ",
         element("code", served),
-        " explores them all; ",
-        element("code", f"{bundled} FOLDER"),
-        " makes a folder with them for any web server.",
+        " explores them all, and so does the folder that ",
+        element("code", "advsearch view"),
+        " makes with its option ",
+        element("code", "bundle"),
+        ".",
         class_="soft",
     )
 

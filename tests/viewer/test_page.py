@@ -35,7 +35,7 @@ def test_a_file_says_what_it_leaves_out(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(sweep_page, "MOST_ROWS", 23)
     page = renewed(run).read_text()
     assert "This file leaves out the 24 rows" in page
-    assert f"advsearch view {run} --bundle FOLDER" in page
+    assert f"<code>advsearch dashboard {run}</code>" in page
     assert "data:image/jpeg" not in page
 
 
