@@ -57,6 +57,7 @@ class _Range:
 class _Worker:
     address: str
     ready: bool = False
+    sent: bool = False
     machine: str | None = None
     tickets: list[int] = field(default_factory=list)
     since: float = 0.0
@@ -205,12 +206,14 @@ class Coordinator:
             if one is not None and (value.unfit or value.forgotten):
                 self._todo.appendleft(one)
             if value.forgotten:
-                self._workers[worker.address] = again = _Worker(worker.address)
+                self._forget(worker)
                 self._requeue(worker)
+                self._workers[worker.address] = again = _Worker(worker.address)
                 self._submit(again, None)
-            elif value.missing:
+            elif value.missing and not worker.sent:
+                worker.sent = True
                 self._submit(worker, None, send=True)
-            elif value.unfit:
+            elif value.unfit or value.missing:
                 self._refuse(worker, value.text)
             elif value.trace:
                 raise RuntimeError(f"on {worker.address}:\n{value.trace}")

@@ -82,7 +82,7 @@ def placed(work: Work, files: Files, folder: Path) -> Work:
         for name, data in contents.items():
             path = folder / digest / name
             path.parent.mkdir(parents=True, exist_ok=True)
-            part = path.with_name(f".part-{os.getpid()}-{path.name}")
+            part = path.with_name(f"{path.name}.part-{os.getpid()}")  # no kind of file that goes along with another
             part.write_bytes(data)
             part.replace(path)
     new = {path: _here(path, digest, folder / digest / name) for path, (digest, name) in files.named.items()}

@@ -31,6 +31,7 @@ KERNELS, INPUTS = "kernels", "inputs"
 """Folders below the machine's own: Dr.Jit's kernels, and files that were sent."""
 
 _loaded: OrderedDict[str, Call] = OrderedDict()
+_known: dict[str, Work] = {}
 _one_at_a_time = threading.Lock()
 
 
@@ -98,12 +99,8 @@ def prepare(key: str, work: Work, files: Files, asked: str) -> Ready | Failure:
                 if "DRJIT_CACHE_DIR" not in os.environ:
                     (own / KERNELS).mkdir(exist_ok=True)
                     os.environ["DRJIT_CACHE_DIR"] = str(own / KERNELS)
-                threads.configure(work.threads)
                 this_machine()
-                _loaded[key] = _call(placed(work, files, own / INPUTS))
-                while len(_loaded) > MOST_LOADED:
-                    _loaded.popitem(last=False)
-            _loaded.move_to_end(key)
+                _load(key, placed(work, files, own / INPUTS))
             machine = this_machine()
     except MissingError as error:
         return Failure(f"it lacks {error}", missing=True)
@@ -117,10 +114,9 @@ def carry_out(key: str, first: int, last: int) -> Carried | Failure:
     begun = time.perf_counter()
     try:
         with _one_at_a_time:
-            if key not in _loaded:
+            if key not in _known:
                 return Failure("it is not ready", forgotten=True)
-            _loaded.move_to_end(key)
-            value = _loaded[key](range(first, last))
+            value = _load(key, _known[key])(range(first, last))
     except Exception as error:
         return _failure(error, unfit=isinstance(error, (OSError, StorageError)))
     return Carried(value, time.perf_counter() - begun)
@@ -135,10 +131,17 @@ def own_folder() -> Path:
     return folder if mine else Path(tempfile.mkdtemp(prefix="advsearch-"))
 
 
-def _call(work: Work) -> Call:
-    module, _, name = work.function.partition(":")
-    make: Callable[[Any], Call] = getattr(importlib.import_module(module), name)
-    return make(work.settings)
+def _load(key: str, work: Work) -> Call:
+    """Return what carries out a work, loaded if it is not; where several runs share a worker, each has its turn."""
+    if key not in _loaded:
+        threads.configure(work.threads)
+        module, _, name = work.function.partition(":")
+        make: Callable[[Any], Call] = getattr(importlib.import_module(module), name)
+        _loaded[key], _known[key] = make(work.settings), work
+        while len(_loaded) > MOST_LOADED:
+            _loaded.popitem(last=False)
+    _loaded.move_to_end(key)
+    return _loaded[key]
 
 
 def _failure(error: Exception, *, unfit: bool) -> Failure:

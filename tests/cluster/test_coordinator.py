@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import random
+from collections import OrderedDict
 from collections.abc import Callable, Iterator
 
 import pytest
 from simulated_cluster import Failure, Simulated, coordinator
 
-from advsearch.cluster.coordinator import DEPTH, PATIENCE
-from advsearch.cluster.executor import Done
-from advsearch.cluster.worker import Ready
+from advsearch import threads
+from advsearch.cluster.coordinator import DEPTH, PATIENCE, Coordinator
+from advsearch.cluster.executor import Done, Work
+from advsearch.cluster.inputs import Files
+from advsearch.cluster.machine import version
+from advsearch.cluster.worker import MOST_LOADED, Carried, Ready, carry_out, prepare
 from advsearch.errors import ClusterError
 
 COUNT, SIZE = 400, 16
@@ -186,10 +190,6 @@ def test_files_are_sent_only_to_a_worker_that_lacks_them() -> None:
                     self.answers[worker] = Ready({"processor": "here"}, 1.0) if sent[-1] else lacks
             super().submit(ticket, worker, function, *args)
 
-    from advsearch.cluster.coordinator import Coordinator
-    from advsearch.cluster.executor import Work
-    from advsearch.cluster.inputs import Files
-
     pool = Sending()
     pool.add(2)
     files = Files({"/a/mug.obj": ("d", "mug.obj")}, {"d": {"mug.obj": b"v"}})
@@ -216,3 +216,46 @@ def test_an_error_of_ours_ends_the_run_with_its_words_and_a_bug_with_its_trace()
         pool.add(1)
         with pytest.raises(error, match=text):
             carried(pool)
+
+
+def test_a_worker_that_forgot_gets_ready_again_and_is_counted_once() -> None:
+    class Forgetful(Simulated):
+        def submit(self, ticket: int, worker: str, function: Callable[..., object], *args: object) -> None:
+            if function is carry_out and args[1] in forgotten and worker in self._free_at:
+                forgotten.remove(args[1])
+                self._at[ticket] = worker
+                self._later(0.1, self._answer(ticket, Failure("it is not ready", forgotten=True)))
+            else:
+                super().submit(ticket, worker, function, *args)
+
+    forgotten: list[object] = [0, 96, 160]
+    pool = Forgetful()
+    pool.add(2)
+    shared = coordinator(pool)
+    assert len(list(shared.results(ranges()))) == COUNT // SIZE and not forgotten
+    assert shared.facts.workers == shared.facts.most == 2
+
+
+def test_a_worker_that_lacks_files_which_it_was_sent_is_refused() -> None:
+    pool = Simulated(answers={"w0": Failure("it lacks mug.obj", missing=True)})
+    pool.add(2)
+    told: list[str] = []
+    assert {done.worker for done in carried(pool, tell=told.append)} == {"w1"}
+    assert told == ["w0 is given nothing: it lacks mug.obj"]
+
+
+def test_runs_that_share_a_worker_all_get_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """More of them than works that a worker holds: each range finds its work loaded again, and none is sent away."""
+    monkeypatch.setattr("advsearch.cluster.worker._loaded", OrderedDict())
+    monkeypatch.setattr("advsearch.cluster.worker._known", {})
+    keys = [f"key {number}" for number in range(MOST_LOADED + 2)]
+    try:
+        for key in keys:
+            assert isinstance(prepare(key, Work("cluster_work:squares", {}), Files({}, {}), version()), Ready)
+        for key in keys * 2:
+            done = carry_out(key, 3, 5)
+            assert isinstance(done, Carried) and done.value == [9, 16]
+        unknown = carry_out("another", 3, 5)
+        assert isinstance(unknown, Failure) and unknown.forgotten
+    finally:
+        threads.configure()
