@@ -1,9 +1,10 @@
 """Kills workers, scheduler and the process that asked, in turn and at random moments; compares rows with a whole run's.
 
-    python benchmarks/kill_cluster.py [--kills 100] [--resolution 32] [--rows 2000]
+    python benchmarks/kill_cluster.py [--kills 100] [--seconds 3600] [--resolution 32]
 
-A scheduler and two workers are started by Dask's own command line, and again when they were killed; a sweep that was
-killed is resumed. Every row must agree in every column but times, and be there once. The exit status is 3 if not.
+A scheduler and two workers are started by Dask's own command line, and again when they were killed; a sweep and a `gap`
+take turns, and one that was killed is resumed. Every row of each must agree in every column but times, and be there
+once. After so many seconds nothing more is killed. The exit status is 3 if rows differ, or a run does not end.
 """
 
 from __future__ import annotations
@@ -22,11 +23,27 @@ from pathlib import Path
 
 from kill import rows_of
 
+from advsearch.runs.store import NAME, Row
+
+COMMANDS = {
+    "sweep": ["--grid", "pose.yaw=0:360:50", "--grid", "camera.elevation=5:60:16", "--trials", "6"],
+    "gap": ["--control", "camera,pose,light", "--steps", "8", "--average", "20", "--trials", "6", "--verify-spp", "8"],
+}
+"""What is carried out on bundled objects."""
+
+OBJECTS = {"sweep": "mug", "gap": "mug,bowl,teapot"}
+
 VICTIMS = ("worker", "scheduler", "coordinator", "workers")
 """Who is killed in turn; the last are all workers at once."""
 
-STARTUP, PAUSE = 20.0, 6.0
-"""Seconds until rows come at first, and the mean between two kills after that."""
+PAUSE, MORE = 4.0, 6.0
+"""Mean seconds between two kills, and those that are added unless one worker died: so long takes a start."""
+
+OF_A_RUN = 20
+"""Kills of a run at most, so that every command has its share."""
+
+LONGEST = 600.0
+"""Seconds that a run may take after the last kill."""
 
 QUIET = subprocess.DEVNULL
 
@@ -72,28 +89,78 @@ class Cluster:
             one.wait()
 
 
+class Kills:
+    """When who is killed.
+
+    Args:
+        wanted: how many.
+        seconds: after which nobody is.
+    """
+
+    def __init__(self, wanted: int, seconds: float) -> None:
+        self.counts = dict.fromkeys(VICTIMS, 0)
+        self.chance = random.Random(1)
+        self._wanted, self._end = wanted, time.monotonic() + seconds
+        self._next = time.monotonic()
+        self.wait(MORE)
+
+    @property
+    def total(self) -> int:
+        return sum(self.counts.values())
+
+    @property
+    def over(self) -> bool:
+        return self.total >= self._wanted or time.monotonic() > self._end
+
+    def wait(self, seconds: float) -> None:
+        """Kill nobody for so long and a while."""
+        self._next = time.monotonic() + seconds + self.chance.expovariate(1.0 / PAUSE)
+
+    def due(self) -> str | None:
+        """Return who is to be killed now."""
+        if self.over or time.monotonic() < self._next:
+            return None
+        victim = VICTIMS[self.total % len(VICTIMS)]
+        self.counts[victim] += 1
+        self.wait(0.0 if victim == "worker" else MORE)
+        return victim
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Kill, resume, compare; returns 0 if the rows agree, 3 otherwise."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--kills", type=int, default=100)
+    parser.add_argument("--seconds", type=float, default=3600.0)
     parser.add_argument("--resolution", type=int, default=32)
-    parser.add_argument("--rows", type=int, default=2000)
     args = parser.parse_args(argv)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(1))  # what was started ends too
-    grid = ["--grid", f"pose.yaw=0:360:{max(2, args.rows // 8)}", "--grid", "camera.elevation=5:60:8"]
-    words = ["sweep", "--object", "mug", *grid, "--resolution", str(args.resolution), "--trials", "6"]
+    shared = ["--resolution", str(args.resolution), "--spp", "2"]
+    commands = {name: [name, "--object", OBJECTS[name], *words, *shared] for name, words in COMMANDS.items()}
+    held = []
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        begin([*words, "--threads", "1", "--run", str(folder / "whole")]).wait()
+        folder, whole = Path(name), {}
+        for one, words in commands.items():
+            begin([*words, "--run", str(folder / one)]).wait()
+            whole[one] = rows_below(folder / one)
+        kills, turn = Kills(args.kills, args.seconds), 0
         cluster = Cluster(folder / "local")
         try:
-            kills = killed([*words, "--run", str(folder / "killed")], folder / "killed", cluster, args.kills)
+            while turn < len(commands) or not kills.over:
+                one, run, before = list(commands)[turn % len(commands)], folder / f"killed-{turn}", kills.total
+                ended = killed([*commands[one], "--run", str(run)], run, cluster, kills)
+                held.append(ended and rows_below(run) == whole[one])
+                rows, said = sum(map(len, whole[one].values())), "agree" if held[-1] else "DIFFER"
+                print(f"{one}: {rows} rows, {kills.total - before} kills, rows {said}", flush=True)
+                turn += 1
         finally:
             cluster.end()
-        whole, other = rows_of(folder / "whole"), rows_of(folder / "killed")
-    same = whole == other
-    print(f"sweep: {len(whole)} rows, kills {kills}, rows {'agree' if same else 'DIFFER'}")
-    return 0 if same else 3
+    print(f"{kills.total} kills: {kills.counts}; {sum(held)} of {len(held)} runs agree")
+    return 0 if all(held) else 3
+
+
+def rows_below(run: Path) -> dict[str, list[Row]]:
+    """Return the rows of a run and of its parts, by where they are."""
+    return {str(path.parent.relative_to(run)): rows_of(path.parent) for path in sorted(run.rglob(NAME))}
 
 
 def begin(words: Sequence[str]) -> subprocess.Popen[bytes]:
@@ -102,28 +169,30 @@ def begin(words: Sequence[str]) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, stdout=QUIET, stderr=QUIET)
 
 
-def killed(first: Sequence[str], run: Path, cluster: Cluster, wanted: int) -> dict[str, int]:
-    """Sweep until the end, killing on the way; return how often who was killed."""
-    chance, kills = random.Random(1), dict.fromkeys(VICTIMS, 0)
+def killed(first: Sequence[str], run: Path, cluster: Cluster, kills: Kills) -> bool:
+    """Carry out a command until its end, killing on the way; return whether there was one."""
     child: subprocess.Popen[bytes] | None = None
-    strike = time.monotonic() + STARTUP
-    while True:
+    before, end = kills.total, time.monotonic() + LONGEST
+    while time.monotonic() < end:
         cluster.see_to_it()
         if child is None or child.poll() is not None:
             if child is not None and child.returncode == 0:
-                return kills
+                return True
             known = (run / "run.yaml").is_file()
             child = begin(["resume", str(run)] if known else [*first, "--cluster", cluster.address])
         time.sleep(0.2)
-        if sum(kills.values()) < wanted and time.monotonic() > strike:
-            victim = VICTIMS[sum(kills.values()) % len(VICTIMS)]
-            kills[victim] += 1
+        victim = kills.due() if kills.total - before < OF_A_RUN else None
+        if victim is not None:
+            end = time.monotonic() + LONGEST
             if victim == "coordinator":
                 child.kill()
                 child.wait()
             else:
-                cluster.kill(victim, chance)
-            strike = time.monotonic() + chance.expovariate(1.0 / PAUSE) + (STARTUP if victim != "worker" else 0.0)
+                cluster.kill(victim, kills.chance)
+    if child is not None:
+        child.kill()
+        child.wait()
+    return False
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.attack import LOADING, attack_once, check_from_config, problem_from_config
 from advsearch.api.keywords import GapKeywords, asks, configured
-from advsearch.api.parts import parts_of, share
+from advsearch.api.parts import SETTLED, StudyAttack, chains_of, share
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
 from advsearch.config import AttackConfig, GapConfig
@@ -27,7 +27,7 @@ from advsearch.report.drawing import Figures
 from advsearch.report.studies import curve_figure, gap_figure, matrix_figure
 from advsearch.report.tables import CurveTable, GapTable
 from advsearch.runs.answer import read_answer
-from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, default_name, is_run
+from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, is_run
 from advsearch.runs.files import write_bytes
 from advsearch.runs.listing import finished
 from advsearch.runs.results.attack import AttackSummary, AverageCase
@@ -90,10 +90,9 @@ def curve_from_config(
 
     return _study(
         config,
-        lambda parts: _curve(config, epsilons, parts),
+        _curve,
         result,
         curve_figure,
-        most=len(config.objects) * len(epsilons),
         progress=progress or NullProgress(),
         resumed=resumed,
     )
@@ -107,10 +106,9 @@ def gap_from_config(config: GapConfig, *, progress: Progress | None = None, resu
 
     return _study(
         config,
-        lambda parts: _gap(config, parts),
+        _gap,
         result,
         gap_figure,
-        most=len(config.objects) * len(config.controls),
         progress=progress or NullProgress(),
         resumed=resumed,
     )
@@ -146,7 +144,6 @@ def matrix_from_config(
         lambda parts: _matrix(config, names, parts),
         result,
         matrix_figure,
-        most=len(names) if config.ensemble is None else 1,
         progress=progress,
         resumed=resumed,
     )
@@ -165,7 +162,6 @@ def _study(
     result_of: Callable[[Rows, StudyResult], Study],
     figure_of: Callable[[Study], Figures],
     *,
-    most: int,
     progress: Progress,
     resumed: Path | None,
 ) -> Study:
@@ -176,7 +172,6 @@ def _study(
         attacks: carries out the attacks and returns their rows.
         result_of: puts these into a result, beside what all studies have in common.
         figure_of: draws the result.
-        most: attacks that there will be at most.
         progress: told how far it is.
         resumed: folder of the run to go on with.
     """
@@ -185,7 +180,7 @@ def _study(
         notes = _label_for_all(config)
         for text in notes:
             progress.message(text)
-        parts = _Parts(run, progress, most)
+        parts = _Parts(config, run, progress)
         rows = attacks(parts)
         common = StudyResult(
             run=str(run.path),
@@ -223,9 +218,10 @@ def _label_for_all(config: AttackConfig) -> list[str]:
 
 
 class _Parts:
-    """Carries out attacks, each in a folder of its own, unless they are done already.
+    """Carries out attacks, each in a folder of its own, unless they are done already; first on workers, if asked to.
 
     Attributes:
+        chains: all that there are.
         run: of the study.
         progress: told how far it is.
         names: of the parts so far.
@@ -233,22 +229,26 @@ class _Parts:
         interrupted: whether one was; nothing more is carried out then.
     """
 
-    def __init__(self, run: RunDirectory, progress: Progress, most: int) -> None:
-        self.run, self.progress = run, progress
+    def __init__(self, config: AttackConfig, run: RunDirectory, progress: Progress) -> None:
+        self.chains, self.run, self.progress = chains_of(config), run, progress
         self.names: list[str] = []
         self.warnings: list[str] = []
         self.interrupted = False
-        self._most = most
+        try:
+            with interruptible():
+                share(config, self.chains, run.path, progress)
+        except KeyboardInterrupt:
+            self.interrupted = True
 
-    def attack(self, config: AttackConfig, name: str, clean: CleanMatrix | None = None) -> AttackSummary | None:
+    def attack(self, one: StudyAttack, clean: CleanMatrix | None = None) -> AttackSummary | None:
         """Return the summary of one attack, or None if there was an interrupt; `clean` as for `attack_once`."""
         if self.interrupted:
             return None
-        path = self.run.path / PARTS / name
-        self.names.append(name)
+        config, path = one.config, self.run.path / PARTS / one.name
+        self.names.append(one.name)
         budget = f", epsilon {config.epsilon:.3g}" if isinstance(config.epsilon, float) else ""
         what = f"{config.object} against {config.model}, {' and '.join(config.controls)}{budget}"
-        self.progress.message(f"attack {len(self.names)} of at most {self._most}: {what}")
+        self.progress.message(f"attack {len(self.names)} of at most {sum(map(len, self.chains))}: {what}")
         if is_run(path) and (path / CONFIG).is_file():
             began = None if finished(path) else AttackConfig.from_yaml(path / CONFIG)
             summary = (
@@ -267,20 +267,16 @@ class _Parts:
 # ---- robust accuracy against epsilon --------------------------------------------------------------------------------
 
 
-def _curve(config: AttackConfig, epsilons: Sequence[float | None], parts: _Parts) -> list[ObjectRow]:
+def _curve(parts: _Parts) -> list[ObjectRow]:
     rows = []
-    for place, name in enumerate(different(config.objects, "object")):
-        row, clean = ObjectRow(object=name, clean=None, flips_at=None), CleanMatrix()
-        for epsilon in epsilons:
-            label = f"{place:02d}-" + default_name(
-                name, [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")]
-            )
-            one = AttackConfig.of(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)
-            summary = parts.attack(one, label, clean)
+    for chain in parts.chains:
+        row, clean = ObjectRow(object=chain[0].of, clean=None, flips_at=None), CleanMatrix()
+        for one in chain:
+            summary = parts.attack(one, clean)
             if summary is None:
                 break
-            row = _seen(name, summary, epsilon)
-            if row.ending in ("found", "already wrong"):
+            row = _seen(one.of, summary, one.epsilon)
+            if row.ending in SETTLED:
                 break
         rows.append(row)
     return rows
@@ -309,7 +305,7 @@ def _known(row: ObjectRow, epsilon: float | None) -> bool:
     """
     if row.ending in (None, "non-finite objective"):
         return False
-    if row.ending in ("found", "already wrong"):
+    if row.ending in SETTLED:
         return True
     steady = row.clean is not None and row.clean.correct >= WORST_CASE.needed(row.clean.trials)
     return steady and (epsilon is None or (row.tried is not None and row.tried >= epsilon))
@@ -339,17 +335,12 @@ def _flips_within(row: ObjectRow, epsilon: float | None) -> bool:
 # ---- worst case beside the average ----------------------------------------------------------------------------------
 
 
-def _gap(config: GapConfig, parts: _Parts) -> list[GapRow]:
-    attacks, rows = parts_of(config), []
-    try:
-        with interruptible():
-            share(config, attacks, parts.run.path, parts.progress)
-    except KeyboardInterrupt:
-        parts.interrupted = True
-    for one in attacks:
-        summary = parts.attack(one.config, one.name)
+def _gap(parts: _Parts) -> list[GapRow]:
+    rows = []
+    for (one,) in parts.chains:
+        summary = parts.attack(one)
         if summary is not None and summary.average is not None:
-            rows.append(_compared(one.object, one.control, summary, summary.average))
+            rows.append(_compared(one.config.object, one.of, summary, summary.average))
     return rows
 
 
@@ -368,9 +359,6 @@ def _compared(name: str, control: str, summary: AttackSummary, average: AverageC
 
 # ---- attacked on against tested on -----------------------------------------------------------------------------------
 
-ALL = "all"
-"""What an ensemble is called among the models that were attacked."""
-
 LEAST_SPP = 64
 """Samples a pixel of the trials, where none of the attacks needed more and nothing was asked for."""
 
@@ -378,11 +366,10 @@ LEAST_SPP = 64
 def _matrix(config: AttackConfig, names: Sequence[str], parts: _Parts) -> tuple[list[MatrixModel], list[MatrixRow]]:
     """Attack, then try every answer on every model."""
     attacked: list[tuple[str, AttackSummary]] = []
-    for place, name in enumerate([ALL] if config.ensemble else names):
-        own = config if config.ensemble else AttackConfig.of(config, model=name)
-        summary = parts.attack(AttackConfig.of(own), f"{place:02d}-" + default_name(name, []))
+    for (one,) in parts.chains:
+        summary = parts.attack(one)
         if summary is not None:
-            attacked.append((name, summary))
+            attacked.append((one.of, summary))
     models: list[MatrixModel] = []
     cells: dict[str, list[MatrixCell]] = {}
     answers = {name: u for name, summary in attacked if (u := _answer(summary)) is not None}

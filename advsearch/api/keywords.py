@@ -91,6 +91,8 @@ class AttackKeywords(SearchKeywords, total=False):
     aov: str | None
     log: Literal["mlflow", "tensorboard", "wandb"] | None
     ensemble: Literal["mean", "worst"] | None
+    workers: int | None
+    cluster: str | None
     overwrite: bool
 
 

@@ -30,7 +30,7 @@ class AttackConfig(DerivativeConfig):
     command: ClassVar[str] = "attack"
     several: ClassVar[tuple[str, ...]] = ("object", "epsilon", "model")
 
-    free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "log")
+    free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "log", "workers", "cluster")
     clashes: ClassVar[tuple[Clash, ...]] = (
         *DerivativeConfig.clashes,
         Clash(
@@ -52,6 +52,14 @@ class AttackConfig(DerivativeConfig):
             "ensemble",
             lambda one: not one.is_matrix,
             "is of several models; name them in `model`, separated by commas, or leave `ensemble` out",
+        ),
+        *(
+            Clash(
+                name,
+                lambda one: one.command == "attack" and len(one.objects) < 2 and (not one.is_matrix or one.ensemble),
+                "one attack is not shared; name several in `object`, or in `model` without `ensemble`, or leave it out",
+            )
+            for name in ("workers", "cluster")
         ),
         Clash(
             "smallest",
@@ -201,6 +209,25 @@ class AttackConfig(DerivativeConfig):
         unit="renders",
         ge=FEWEST_TRIALS,
         le=100_000,
+    )
+
+    workers: int | None = setting(
+        None,
+        "run",
+        "processes that share the attacks of several objects or models",
+        otherwise="this one alone",
+        unit="processes",
+        ge=1,
+        le=100_000,
+    )
+    cluster: str | None = setting(
+        None,
+        "run",
+        "where these are",
+        "the address of a Dask scheduler, local, or a .yaml file",
+        metavar="PLACE",
+        otherwise="this machine, where there are `workers`",
+        min_length=1,
     )
 
     @model_validator(mode="before")

@@ -40,6 +40,8 @@ class HardenConfig(AttackConfig):
         "task",
         "measure",
         "estimators",
+        "workers",
+        "cluster",
     )
 
     object: str = setting_as_in(

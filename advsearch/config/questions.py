@@ -6,7 +6,6 @@ from typing import ClassVar
 
 from advsearch.config.attack import AttackConfig
 from advsearch.config.scene import SceneConfig
-from advsearch.config.sweep import SweepConfig
 from advsearch.settings import setting, setting_as_in
 
 FEWEST_SAMPLES = 8
@@ -18,14 +17,12 @@ class GapConfig(AttackConfig):
     """Everything that decides what `gap` does: the worst case beside the average, for each object and each control."""
 
     command: ClassVar[str] = "gap"
-    free: ClassVar[tuple[str, ...]] = (*AttackConfig.free, "workers", "cluster")
     several: ClassVar[tuple[str, ...]] = ("object",)
     without: ClassVar[tuple[str, ...]] = ("smallest", "ensemble", "printable", "aov", "log")
 
     model: str = setting_as_in(SceneConfig, "model")
     average: int = setting_as_in(AttackConfig, "average", default=200, ge=1)
-    workers: int | None = setting_as_in(SweepConfig, "workers", description="processes that share the attacks")
-    cluster: str | None = setting_as_in(SweepConfig, "cluster")
+    workers: int | None = setting_as_in(AttackConfig, "workers", description="processes that share the attacks")
 
 
 class RegionConfig(SceneConfig):

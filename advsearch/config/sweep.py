@@ -118,24 +118,12 @@ class SweepConfig(SceneConfig):
     verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", description="samples per pixel of these")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-sweep-NNN")
     log: Literal["mlflow", "tensorboard", "wandb"] | None = setting_as_in(AttackConfig, "log")
-    workers: int | None = setting(
-        None,
-        "run",
-        "processes that share the work, each on one thread unless `threads` says more",
-        otherwise="this one alone",
-        unit="processes",
-        ge=1,
-        le=100_000,
+    workers: int | None = setting_as_in(
+        AttackConfig,
+        "workers",
+        description="processes that share the work, each on one thread unless `threads` says more",
     )
-    cluster: str | None = setting(
-        None,
-        "run",
-        "where these are",
-        "the address of a Dask scheduler, local, or a .yaml file",
-        metavar="PLACE",
-        otherwise="this machine, where there are `workers`",
-        min_length=1,
-    )
+    cluster: str | None = setting_as_in(AttackConfig, "cluster")
 
     @property
     def title(self) -> tuple[str, ...]:

@@ -118,9 +118,12 @@ class Config(BaseModel):
 
     @classmethod
     def shared(cls, other: Config) -> dict[str, object]:
-        """Return the settings that this command and another's have from the same class, but for the run's place."""
+        """Return the settings that this command and another's have from the same class, but for the run's place.
+
+        Who shares the work is part of that place.
+        """
         both = next(one for one in cls.__mro__ if issubclass(one, Config) and isinstance(other, one))
-        apart = (*PLACE, *cls.without, *other.without)
+        apart = (*PLACE, "workers", "cluster", *cls.without, *other.without)
         return {name: getattr(other, name) for name in both.model_fields if name not in apart}
 
     @classmethod

@@ -1,4 +1,4 @@
-"""The attacks of a gap that others carry out: their folders come back as those of attacks that were made here."""
+"""The attacks of a study that others carry out: their folders come back as those of attacks that were made here."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 from advsearch.api import parts
-from advsearch.api.gap import gap_from_config
-from advsearch.api.parts import parts_of
+from advsearch.api.gap import curve_from_config, gap_from_config
+from advsearch.api.parts import chains_of
 from advsearch.cluster.executor import Done, Work, Workforce
-from advsearch.config import GapConfig
-from advsearch.errors import ClusterError
+from advsearch.config import AttackConfig, GapConfig
+from advsearch.errors import ClusterError, InputError
 from advsearch.runs.answer import read_answer
 from advsearch.runs.store import NAME, Store
 
@@ -69,7 +69,7 @@ def test_a_shared_gap_is_the_one_that_was_made_here(tmp_path: Path, monkeypatch:
     assert [(one.control, one.ending, one.margin) for one in shared.table] == [
         (one.control, one.ending, one.margin) for one in alone.table
     ]
-    for name in (part.name for part in parts_of(SMALL)):
+    for name in (part.name for (part,) in chains_of(SMALL)):
         here, there = (tmp_path / one / "parts" / name for one in ("alone", "shared"))
         assert rows(there) == rows(here) and (read_answer(there) == read_answer(here)).all()
         assert {one.name for one in there.iterdir()} >= {"run.yaml", "summary.json", "report.html", "images"}
@@ -86,11 +86,44 @@ def test_an_attack_of_which_every_worker_dies_ends_the_study_by_its_name(
 
 
 def test_a_gap_is_every_object_with_every_control() -> None:
-    found = parts_of(SMALL.model_copy(update={"object": "mug,bowl"}))
+    found = [part for (part,) in chains_of(SMALL.model_copy(update={"object": "mug,bowl", "workers": 2}))]
     assert [part.name for part in found] == [
         "00-00-mug-pose",
         "00-01-mug-camera-azimuth",
         "01-00-bowl-pose",
         "01-01-bowl-camera-azimuth",
     ]
-    assert {part.config.run for part in found} == {None} and [len(part.config.controls) for part in found] == [1] * 4
+    assert {part.config.run for part in found} == {part.config.workers for part in found} == {None}
+    assert [len(part.config.controls) for part in found] == [1] * 4
+
+
+def test_a_shared_curve_tries_no_epsilon_more_than_one_that_was_made_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = AttackConfig.of(SMALL, controls={"texture": {"resolution": 2}}, epsilon="0.02,0.01", average=0)
+    alone = curve_from_config(small.model_copy(update={"run": str(tmp_path / "alone")}))
+    elsewhere(monkeypatch)
+    shared = curve_from_config(small.model_copy(update={"run": str(tmp_path / "shared"), "workers": 2}))
+    assert shared.parts == alone.parts and shared.curve == alone.curve
+    for name in alone.parts:
+        assert rows(tmp_path / "shared" / "parts" / name) == rows(tmp_path / "alone" / "parts" / name)
+    assert {one.name for one in (tmp_path / "shared" / "parts").iterdir()} == set(alone.parts)
+
+
+def test_a_curve_is_a_chain_for_each_object_and_a_matrix_one_attack_for_each_model() -> None:
+    curve = chains_of(AttackConfig(object="mug,bowl", epsilon="0.2,0.1", workers=2))
+    assert [[(one.of, one.epsilon) for one in chain] for chain in curve] == [
+        [("mug", 0.1), ("mug", 0.2)],
+        [("bowl", 0.1), ("bowl", 0.2)],
+    ]
+    matrix = chains_of(AttackConfig(object="mug", model="a,b", workers=2))
+    assert [[(one.name, one.config.model) for one in chain] for chain in matrix] == [[("00-a", "a")], [("01-b", "b")]]
+    together = chains_of(AttackConfig(object="mug", model="a,b", ensemble="worst"))
+    assert [[(one.name, one.config.model) for one in chain] for chain in together] == [[("00-all", "a,b")]]
+
+
+@pytest.mark.parametrize("asked", [{"workers": 2}, {"cluster": "local"}])
+@pytest.mark.parametrize("one", [{}, {"epsilon": "0.1,0.2"}, {"model": "a,b", "ensemble": "worst"}])
+def test_a_single_attack_is_not_shared_and_says_so(asked: dict[str, Any], one: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match="one attack is not shared; name several in `object`"):
+        AttackConfig(object="mug", **asked, **one)

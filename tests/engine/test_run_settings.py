@@ -123,7 +123,7 @@ def test_a_sweep_and_a_render_give_every_texture_its_resolution(asked: Any, monk
 def test_a_gap_gives_each_control_what_it_takes(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
     seen: list[Any] = []
 
-    monkeypatch.setattr("advsearch.api.gap._Parts.attack", lambda self, config, name: _seen(config, seen))
+    monkeypatch.setattr("advsearch.api.gap._Parts.attack", lambda self, one: _seen(one.config, seen))
     config = GapConfig(object="mug", controls="texture,pose,geometry", run=str(tmp_path / "gap"), **ALL)
     gap_from_config(config)
     assert seen == [(0.07, "l2", 16), (None, None, None), (0.07, None, None)]
