@@ -105,7 +105,8 @@ def _objects_of(config: AttackConfig) -> list[Chain]:
     chains: list[Chain] = []
     for place, name in enumerate(different(config.objects, "object")):
         chains.append([])
-        for epsilon in sorted(config.epsilons) or [None]:
+        epsilons: list[float | None] = [*sorted(config.epsilons)] or [None]
+        for epsilon in epsilons:
             words = [] if epsilon is None else [f"epsilon {epsilon:g}".replace(".", "_")]
             one = AttackConfig.of(config, object=name, epsilon=config.epsilon if epsilon is None else epsilon)
             chains[-1].append(StudyAttack(one, f"{place:02d}-" + default_name(name, words), name, epsilon))
@@ -114,7 +115,9 @@ def _objects_of(config: AttackConfig) -> list[Chain]:
 
 def attacks_of(settings: JsonObject) -> Call:
     """Return what carries out the attacks of the study that the settings describe: what a worker does."""
-    chains = chains_of(CONFIGS[str(settings["command"])](**{k: v for k, v in settings.items() if k != "command"}))
+    config = CONFIGS[str(settings["command"])](**{k: v for k, v in settings.items() if k != "command"})
+    assert isinstance(config, AttackConfig)
+    chains = chains_of(config)
 
     def call(numbers: range) -> list[tuple[str, str, dict[str, bytes]]]:
         found, clean = [], CleanMatrix()

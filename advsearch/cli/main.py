@@ -177,7 +177,18 @@ def _unknown_argument(argument: str, parser: argparse.ArgumentParser) -> InputEr
     if not name.startswith("--"):
         return InputError(f"expected flags, got {argument!r}; see {parser.prog} --help")
     known = re.findall(r"(?<!\S)--[a-z][a-z-]*", parser.format_help())
+    owners = _owners(name)
+    if owners:
+        return InputError(f"{parser.prog} has no {name}, a flag of advsearch {', '.join(owners)}; leave it out")
     return UnknownNameError("flag", name, set(known))
+
+
+def _owners(flag: str) -> list[str]:
+    """Commands that have a flag."""
+    from advsearch.config import CONFIGS
+    from advsearch.settings import settings
+
+    return [name for name, config in CONFIGS.items() if flag in (one.flag for one in settings(config))]
 
 
 def _module(path: str) -> ModuleType:

@@ -88,6 +88,8 @@ WRONG: dict[str, tuple[Any, str]] = {
     "threads": (0, "expected a whole number from 1 to 1024, got 0"),
     "deterministic": (3, "expected true or false, got 3"),
     "run": ("", "expected a name (kept in runs/) or the path of a folder, got ''"),
+    "workers": (0, "expected a whole number from 1 to 100000, got 0"),
+    "cluster": ("", "expected the address of a Dask scheduler, local, or a .yaml file, got ''"),
     "overwrite": ([], "expected true or false, got []"),
 }
 
@@ -106,7 +108,7 @@ GIVEN: dict[str, Any] = {
     "pixel_sampler": "independent",
     "specialise": False,
     "baseline": False, "verify_spp": 32, "trials": 7, "seed": 9, "threads": 1, "deterministic": True, "run": "x/y",
-    "overwrite": True,
+    "overwrite": True, "workers": None, "cluster": None,
 }  # fmt: skip
 
 
@@ -182,6 +184,7 @@ def test_every_setting_of_every_command_says_what_it_is(config: type[Config]) ->
 @pytest.mark.parametrize(
     "config",
     [
+        AttackConfig(object="mug,bowl", workers=2, cluster="local"),
         GapConfig(object="mug,bowl", controls=["pose", "camera"], average=50, run="x", steps=9),
         RegionConfig(
             object="mug", controls="pose", vary="pose.yaw,pose.pitch", map=24, samples=50, around="mug-pose-001"
@@ -291,6 +294,8 @@ CLASHES: tuple[tuple[type[Config], dict[str, Any], str], ...] = (
     (AttackConfig, {"smallest": True, "printable": True}, "smallest: cannot be combined with `printable`"),
     (AttackConfig, {"smallest": True, "seconds": 5}, "smallest: takes several searches"),
     (AttackConfig, {"smallest": True, "over": "camera"}, "smallest: cannot be combined with `over` yet"),
+    (AttackConfig, {"workers": 2, "epsilon": "0.1,0.2"}, "workers: one attack is not shared; name several"),
+    (AttackConfig, {"cluster": "local", "model": "a,b", "ensemble": "worst"}, "cluster: one attack is not shared"),
     (AttackConfig, {"minimise": True, "object": "mug,bowl"}, "minimise: has no robust accuracy"),
     (AttackConfig, {"minimise": True, "target": "bowl"}, "minimise: makes the right answer easier to give"),
     (AttackConfig, {"minimise": True, "smallest": True}, "minimise: has no smallest change"),

@@ -250,4 +250,4 @@ def test_settings_of_derivatives_are_refused_beside_a_policy_that_takes_none(giv
 
 def test_a_region_has_no_samples_of_a_search(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["region", "--object", "mug", "--spp", "4"]) == 2
-    assert "unknown flag '--spp'" in capsys.readouterr().err
+    assert "advsearch region has no --spp, a flag of advsearch" in capsys.readouterr().err
