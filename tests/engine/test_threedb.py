@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,26 @@ def test_a_sweep_is_written_as_its_dashboard_reads_it(tmp_path: Path, capsys: py
         assert (out / "images" / f"{line['id']}_rgb.png").is_file() == (not row.correct)
     assert main(["export", str(run), "--format", "3db", "--out", str(out)]) == 2
     assert "not empty" in capsys.readouterr().err
+
+
+def test_3dbs_own_dashboard_opens_what_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its program, up to where it would listen."""
+    pytest.importorskip("threedboard", reason="no threedboard here: pip install threedboard")
+    run = make_sweep(tmp_path / "run", keep="wrong")
+    assert main(["export", str(run), "--format", "3db", "--out", str(tmp_path / "out")]) == 0
+    started: list[Any] = []
+    monkeypatch.setattr("flask.Flask.run", lambda app, **settings: started.append(app.test_client()))
+    monkeypatch.setattr("sys.argv", ["threedboard", "--no-browser", str(tmp_path / "out")])
+    runpy.run_module("threedboard", run_name="__main__")
+    (client,) = started
+    told = client.get("/log.json").get_json()
+    rows = [dict(zip(told["parameters"], row, strict=True)) for row in told["data"]]
+    assert [row["is_correct"] for row in rows] == [row.correct for row in rows_of(run)]
+    assert "render_args.pose.yaw" in told["parameters"]
+    wrong = next(row for row in rows if not row["is_correct"])
+    assert told["class_map"][wrong["prediction"][0]] == "cup"
+    with client.get(f"/images/{wrong['id']}") as picture:
+        assert picture.data[:4] == b"\x89PNG"
 
 
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
