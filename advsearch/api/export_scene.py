@@ -22,7 +22,8 @@ from advsearch.runs.summary import attack_of
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.description import OBJECT
 from advsearch.scene.exporting.gltf import PLAIN, glb, posed
-from advsearch.scene.mitsuba_backend.files.writing import NAME, write_scene
+from advsearch.scene.mitsuba_backend.files.writing import NAME, SCATTERINGS, write_scene
+from advsearch.scene.parts import HazePart
 
 GLB, XML = ".glb", ".xml"
 
@@ -97,8 +98,11 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     renderer = answer.problem.renderer
     inputs = answer.inputs
     on_picture = {name: inputs.pop(name) for name in ON_PICTURE if name in inputs}
-    if "backdrop.color" in on_picture:
-        raise InputError(f"{answer.folder}: a plain background is no part of a Mitsuba scene; export a run without it")
+    backdrop = on_picture.get("backdrop.color")
+    hazes = [part.name for part in renderer.scene.made[0].parts if isinstance(part, HazePart)]
+    hazy = any(float(inputs[f"{name}.density"]) > 0.0 for name in hazes)
+    if hazy and backdrop is not None:
+        raise InputError(f"{answer.folder}: haze before a plain background is no part of a Mitsuba scene")
     gain = renderer.formation.gain
     if "camera.exposure" in on_picture:
         gain *= float(torch.exp2(on_picture["camera.exposure"]))
@@ -107,6 +111,11 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
         f"The sensor has {width} x {height} pixels, and light paths have at most {renderer.scene.max_depth} segments.",
         f"The run's picture is the sRGB curve of {gain:.9g} times this radiance, cut off at 1.",
     ]
+    if backdrop is not None:
+        red, green, blue = (f"{one:.9g}" for one in (backdrop / renderer.formation.gain).tolist())
+        notes.append(f"Where its alpha is under 1, add 1 - alpha times the plain background ({red}, {green}, {blue}).")
+    if hazy:
+        notes.append(f"Haze scatters light, which Mitsuba counts as a segment: {SCATTERINGS} more are for that.")
     if renderer.formation.denoiser != "none":
         notes.append("Not in it: the denoiser. Take many samples a pixel.")
     if answer.on_picture:
@@ -116,7 +125,7 @@ def write_mitsuba(run: str | Path, out: Path) -> list[str]:
     with placed_by("out"), storage_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".export-", dir=path.parent) as made:
-            write_scene(renderer.scene, inputs, Path(made) / path.name, " ".join(notes))
+            write_scene(renderer.scene, inputs, Path(made) / path.name, " ".join(notes), hide=backdrop is not None)
             for one in sorted(Path(made).iterdir()):
                 os.replace(one, path.parent / one.name)
         text = f"The answer of {answer.folder.name} as a scene for Mitsuba 3 (advsearch {advsearch.__version__}).\n"

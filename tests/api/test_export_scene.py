@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -63,6 +64,47 @@ def test_stock_mitsuba_renders_the_adversarial_scene(
         one, two, shown = (linear_to_srgb(np.float32(np.clip(gain * found, 0, 1))) for found in (ours, again, other))
         assert np.abs(one - shown).mean() < 1.2 * np.abs(one - two).mean()
         np.testing.assert_allclose(one, renderer.formation.display(torch.from_numpy(ours)).numpy(), atol=1e-5)
+
+
+def answered_by(controls: dict[str, Any], path: Path) -> Path:
+    """A small run over a mug with a configuration a little above the middle as its answer."""
+    config = AttackConfig(object="mug", controls=controls, resolution=16, denoise="none")
+    size = advsearch.load_scene("mug").renderer(controls, resolution=16).start.numel()
+    return make_answered(path, config, np.full(size, 0.6))
+
+
+HAZE: dict[str, Any] = {"haze": {"density": [0.1, 0.3]}}
+
+
+@pytest.mark.parametrize("controls", [HAZE, {"background": {}}], ids=["haze", "background"])
+def test_stock_mitsuba_renders_haze_and_a_plain_background(
+    controls: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = answered_by(controls, tmp_path / "mug-001")
+    assert main(["export", str(run), "--out", str(tmp_path / "scene.xml"), "--json"]) == 0
+    note = json.loads(capsys.readouterr().out)["notes"][2]
+    answer = answer_of(run)
+    renderer = answer.problem.renderer
+    ours, again = (renderer.radiance(answer.u, seed, 128).numpy() for seed in (0, 1))
+    mi = mitsuba()
+    scene = mi.load_file(str(tmp_path / "scene.xml"))
+    theirs, once_more = (np.array(mi.render(scene, seed=seed, spp=128)) for seed in (2, 3))
+    noise = max(np.abs(ours - again).mean(), np.abs(theirs - once_more)[..., :3].mean())
+    if controls is HAZE:
+        assert "Haze scatters light" in note
+    else:
+        color = [float(one) for one in note.partition("(")[2].partition(")")[0].split(",")]
+        theirs = theirs[..., :3] + (1.0 - theirs[..., 3:]) * color
+    assert theirs.mean() == pytest.approx(ours.mean(), rel=0.03)
+    assert np.abs(ours - theirs).mean() < 1.2 * noise
+    clean = renderer.radiance(renderer.start, 0, 128).numpy()
+    assert np.abs(clean - ours).mean() > 1.5 * noise
+
+
+def test_haze_before_a_plain_background_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = answered_by({**HAZE, "background": {}}, tmp_path / "mug-001")
+    assert main(["export", str(run), "--out", str(tmp_path / "scene.xml")]) == 2
+    assert "haze before a plain background is no part of a Mitsuba scene" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("given", "message"), [([], "give its name"), (["--kind", "search"], "tables of rows")])

@@ -216,6 +216,8 @@ def _left_out(tree: Mapping[str, object], shape: Mapping[str, object]) -> Iterat
             yield f"the sensor {name} is sharp at all distances: its lens is left out"
         elif kind in INTEGRATORS - {"path", "prb", "volpath", "prbvolpath", "volpathmis", "prb_projective"}:
             yield f"the integrator {name} is left out: a {kind}; light takes all paths of up to 6 segments"
+        if kind in SENSORS and "medium" in one:
+            yield f"the sensor {name} sees nothing of its medium up to the first surface"
         if kind in SENSORS and any("principal_point" in key for key in one):
             yield f"the sensor {name} looks along its middle: its principal point is left out"
     for inner in shape.values():

@@ -27,13 +27,15 @@ from advsearch.scene.mitsuba_backend.parts import translation
 from advsearch.scene.mitsuba_backend.plugins import loadable
 from advsearch.scene.mitsuba_backend.scene import NO_ROULETTE, MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
-from advsearch.scene.parts import BallLamp, MeshPart, PluginNumbers, PluginPart, PointLamp, ScenePart
+from advsearch.scene.parts import BallLamp, HazePart, MeshPart, PluginNumbers, PluginPart, PointLamp, ScenePart
 
 NAME = "scene.xml"
 
 TAGS = {"ReconstructionFilter": "rfilter", "PhaseFunction": "phase"}
 """Elements that are not called as Mitsuba calls the type, in small letters."""
 MATERIAL = ("roughness", "metallic", "specular", "clearcoat")
+SCATTERINGS = 3
+"""Segments that paths in haze have beyond those between surfaces: stock Mitsuba counts both alike."""
 BAKED = ("filename", "to_world", "flip_tex_coords")
 """Entries of a mesh from a file that are in the mesh that is written."""
 CAMERA = {
@@ -46,7 +48,9 @@ CAMERA = {
 }
 
 
-def write_scene(scene: MitsubaScene, inputs: Mapping[str, Tensor], path: Path, note: str) -> None:
+def write_scene(
+    scene: MitsubaScene, inputs: Mapping[str, Tensor], path: Path, note: str, *, hide: bool = False
+) -> None:
     """Write a scene as XML that stock Mitsuba loads, with meshes and pictures beside it.
 
     Args:
@@ -54,13 +58,14 @@ def write_scene(scene: MitsubaScene, inputs: Mapping[str, Tensor], path: Path, n
         inputs: as in `MitsubaScene.radiance`.
         path: of the XML file, in a folder that is there.
         note: for a comment at the beginning.
+        hide: as in `MitsubaScene.radiance`.
 
     Raises:
         InputError: something in it is no part of stock Mitsuba.
     """
     description, filter = scene.made
-    kind = "volpath" if scene.volumetric else "path"
-    integrator: Plugin = {"type": kind, "max_depth": scene.max_depth, "rr_depth": NO_ROULETTE}
+    kind = "volpath" if scene.volumetric else "path"  # not `prbvolpath`, which starts outside of all media
+    integrator: Plugin = {"type": kind, "max_depth": scene.max_depth, "rr_depth": NO_ROULETTE, "hide_emitters": hide}
     base = scene_dict(description, scene.resolution, filter, scene.sampler)
     plugins = described(base, description, inputs, integrator)
     meshes = {shape.id(): shape for shape in scene.held(inputs).shapes() if shape.is_mesh()}
@@ -92,7 +97,9 @@ def described(base: Plugin, description: SceneDescription, inputs: Mapping[str, 
         base_color = description.photograph.base.numpy()
         scene[GROUND] = {"type": "ply", "bsdf": matt(left.pop("ground.reflectance", base_color))}
     for part in (description.meshes[OBJECT], *description.parts):
-        if not isinstance(part, PluginNumbers):
+        if isinstance(part, HazePart):
+            _put_haze(scene, part, left)
+        elif not isinstance(part, PluginNumbers):
             scene[part.name] = _part(description.meshes.get(part.name, part), left)
     for part in description.parts:
         if isinstance(part, PluginNumbers):
@@ -102,6 +109,19 @@ def described(base: Plugin, description: SceneDescription, inputs: Mapping[str, 
     if left:
         raise InputError(f"out: stock Mitsuba has nothing for {', '.join(sorted(left))}; export another run")
     return scene
+
+
+def _put_haze(scene: Plugin, haze: HazePart, left: Plugin) -> None:
+    """Fill a ball and the camera in it with haze, unless its density is 0; takes its inputs from what is left."""
+    density, albedo = (left.pop(f"{haze.name}.{name}", np.zeros(3)).tolist() for name in ("density", "albedo"))
+    if not density[0] > 0.0:
+        return
+    medium = f"{haze.name}-medium"
+    inside = {"type": "ref", "id": medium}
+    scene[medium] = {"type": "homogeneous", "sigma_t": density[0], "albedo": {"type": "rgb", "value": albedo}}
+    scene[haze.name] = {"type": "sphere", "radius": haze.radius, "bsdf": {"type": "null"}, "interior": inside}
+    scene["camera"]["medium"] = inside
+    scene["integrator"]["max_depth"] += SCATTERINGS
 
 
 def _put(plugin: Plugin, key: list[str], values: list[float]) -> bool:
