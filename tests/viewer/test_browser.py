@@ -113,6 +113,8 @@ def explored(page: Page) -> None:
     page.wait_for_selector("[data-cell]")
     assert page.locator("[data-cell]").count() == 6  # three yaws, two elevations
     assert "24 configurations" in page.locator("#explorer .status").inner_text()
+    said = page.locator("#explorer").inner_text()
+    assert "camera.elevation [degrees]" in said and "light.power" in said and "[1]" not in said
     worst = page.locator('[data-cell="0,1,2"]')
     assert "pose.yaw 90: right in 2 of 4 (50\xa0%, 6.8\xa0% to 93.2\xa0%)" in str(worst.get_attribute("aria-label"))
 
@@ -175,6 +177,18 @@ def test_the_arrow_keys_go_from_cell_to_cell(browser: Browser, sweep: Path) -> N
         assert page.evaluate("document.activeElement.dataset.cell") == "0,1,1"
         page.keyboard.press("Enter")
         assert page.evaluate("document.activeElement.getAttribute('aria-pressed')") == "true"
+
+
+def test_keys_reach_every_map(browser: Browser, sweep: Path) -> None:
+    with opened(browser, (sweep / "report.html").as_uri(), 390, bypass_csp=True) as page:
+        page.wait_for_selector("[data-cell]")
+        page.get_by_label("Side by side").select_option("environment")
+        stops = [page.locator(f'figure.map:nth-of-type({one}) [data-cell][tabindex="0"]') for one in (1, 2)]
+        assert [one.count() for one in stops] == [1, 1]
+        stops[1].focus()
+        page.keyboard.press("ArrowRight")
+        assert page.evaluate("document.activeElement.dataset.cell") == "1,0,1"
+        assert faults(page) == []
 
 
 def test_a_cell_that_was_pointed_at_does_not_outlive_its_map(browser: Browser, sweep: Path) -> None:

@@ -41,7 +41,7 @@
 
   const percent = (share) => (share === null ? "none" : `${Math.abs(share * 100 - Math.round(share * 100)) < 0.05 ? Math.round(share * 100) : (share * 100).toFixed(1)}\u00a0%`);
   const short = (value) => (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(4))));
-  const named = (name, unit) => (unit && unit !== "name" ? `${name} [${unit}]` : name);
+  const named = (name, unit) => (unit && unit !== "name" && unit !== "1" ? `${name} [${unit}]` : name);
 
   const factorials = [0];
   function logFactorial(n) {
@@ -412,7 +412,7 @@
           const pinned = state.cell && state.cell.every((one, k) => one === cell[k]);
           const words = this.words(cell, counts, place, value);
           const written = value === null ? "" : state.measure === "accuracy" ? String(Math.round(100 * value)) : short(Number(value.toPrecision(2)));
-          return make("td", {}, make("button", { type: "button", class: value === null ? "cell none" : "cell", style: value === null ? {} : colour(shade(value)), "aria-label": words, "aria-pressed": pinned ? "true" : "false", title: words, tabindex: cell.every((one, k) => one === stop[k]) ? 0 : -1, "data-cell": cell.join(",") }, written));
+          return make("td", {}, make("button", { type: "button", class: value === null ? "cell none" : "cell", style: value === null ? {} : colour(shade(value)), "aria-label": words, "aria-pressed": pinned ? "true" : "false", title: words, tabindex: row === stop[1] && column === stop[2] ? 0 : -1, "data-cell": cell.join(",") }, written));
         })));
         rows.reverse();
         const table = make("table", { class: "map", style: { "min-width": `${6.2 + 2 * across.labels.length}rem` } }, make("thead", {}, head), make("tbody", {}, ...rows));
