@@ -37,9 +37,15 @@ def attack(data: Path, run: Path, case: str) -> dict[str, Any]:
 TASKS = {
     "texture of a cup": ("mug", "detection", "ssd_mobilenet_v1_coco_300", "cup", ["--objective", "vanish"], "texture"),
     "patch on a cup": ("mug", "detection", "ssd_mobilenet_v1_coco_300", "cup", ["--objective", "vanish"], "patch"),
+    "texture of a detected bottle": (
+        "bottle", "detection", "ssd_mobilenet_v1_coco_300", "bottle", ["--objective", "vanish"], "texture",
+    ),
+    "patch on a detected bottle": (
+        "bottle", "detection", "ssd_mobilenet_v1_coco_300", "bottle", ["--objective", "vanish"], "patch",
+    ),
     "texture of a bottle": ("bottle", "segmentation", "deeplabv3_mnv2_dm05_pascal_257", "bottle", [], "texture"),
     "patch on a bottle": ("bottle", "segmentation", "deeplabv3_mnv2_dm05_pascal_257", "bottle", [], "patch"),
-}
+}  # fmt: skip
 """By name: object, task, model, right answer, more flags, control."""
 
 

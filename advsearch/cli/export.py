@@ -16,6 +16,9 @@ from advsearch.errors import InputError
 Written = tuple[dict[str, object], str]
 """What to tell of a file, as JSON and in words."""
 
+USUAL_SIZE = 100.0
+"""Longest side of a printed object where nobody says it, in millimetres."""
+
 SUFFIXES = {"pdf": "print", "xml": "mitsuba", "glb": "gltf"}
 """Formats that are not called as their files end."""
 
@@ -44,7 +47,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--json", action="store_true", help="the same as --format json; with --out, tell what was written"
     )
     parser.add_argument("--kind", help="only rows of this kind: search, baseline, sweep, ... (default: all)")
-    parser.add_argument("--size", metavar="MM", type=float, help="print: the real object's longest side in millimetres")
+    parser.add_argument(
+        "--size", metavar="MM", type=float,
+        help=f"print: the real object's longest side in millimetres (default: {USUAL_SIZE:g})",
+    )  # fmt: skip
     parser.add_argument("--paper", help="print: a4, a3 or letter (default: a4)")
     parser.add_argument("--icc", metavar="FILE", help="print: ICC profile of an RGB printer (default: sRGB)")
 
@@ -130,21 +136,22 @@ def _print(args: argparse.Namespace, out: Path) -> Written:
     """Write the sheets."""
     from advsearch.cli.progress import at_work
 
-    if args.size is None:
-        raise InputError("--size: how large is the real object? Give its longest side in millimetres: --size 95")
+    longest = USUAL_SIZE if args.size is None else args.size
     with at_work(as_json=True, quiet=False):
         from advsearch.engine.printing import printable
         from advsearch.report.sheets import write_sheets
         from advsearch.runs.files import placed_by, replacing
 
-        pieces = printable(args.run, args.size)
+        pieces = printable(args.run, longest)
         profile = None if args.icc is None else Path(args.icc)
-        title = f"{Path(args.run).name}, object of {args.size:g} mm"
+        title = f"{Path(args.run).name}, object of {longest:g} mm"
         with placed_by("out"), replacing(out) as part:
             pages = write_sheets(part, pieces, title, paper=(args.paper or "a4").lower(), profile=profile)
     sizes = [{"name": piece.name, "width_mm": piece.size[0], "height_mm": piece.size[1]} for piece in pieces]
     text = f"{pages} pages in {out}; print them at 100 % and measure the square on the first"
-    return {"pages": pages, "pieces": sizes}, text
+    if args.size is None:
+        text += f"\nThe real object's longest side is taken for {longest:g} mm; --size says otherwise."
+    return {"pages": pages, "size_mm": longest, "pieces": sizes}, text
 
 
 def _mitsuba(args: argparse.Namespace, out: Path) -> Written:

@@ -154,10 +154,11 @@ def test_the_command_writes_a_pdf_and_says_what_it_needs(
     run = str(runs["patch"])
     assert main(["export", run, "--format", "print", "--out", str(out), "--json", "--size", "95"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert told["pages"] == len(pypdf.PdfReader(out).pages) == 2
+    assert told["pages"] == len(pypdf.PdfReader(out).pages) == 2 and told["size_mm"] == 95.0
+    assert main(["export", run, "--format", "print", "--out", str(tmp_path / "usual.pdf")]) == 0
+    assert "longest side is taken for 100 mm; --size says otherwise" in capsys.readouterr().err
     for wrong, message in (
         (["--format", "print", "--size", "95"], "--out"),
-        (["--format", "print", "--out", str(out)], "--size"),
         (["--format", "print", "--out", str(out), "--size", "0"], "size: expected the object's longest side"),
         (["--format", "csv", "--size", "95"], "--size: belongs to --format print"),
     ):
