@@ -5,8 +5,11 @@ from __future__ import annotations
 import io
 import itertools
 import shutil
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +33,7 @@ from advsearch.runs.results.stability import StabilityResult
 from advsearch.runs.store import Row, Store
 from advsearch.viewer import thumbnails
 from advsearch.viewer.attack_page import write_report
+from advsearch.viewer.bundle import write_bundle
 from advsearch.viewer.document import asset
 from advsearch.viewer.pages import write_page
 
@@ -108,6 +112,13 @@ def until(page: Page, happened: Callable[[], object]) -> None:
     raise AssertionError("it did not happen")
 
 
+class QuietHandler(SimpleHTTPRequestHandler):
+    """Serves a folder as any server would, and says nothing of it."""
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Keep quiet."""
+
+
 def explored(page: Page) -> None:
     """Try everything that the explorer has."""
     page.wait_for_selector("[data-cell]")
@@ -166,6 +177,20 @@ def test_a_sweep_is_explored_from_the_server(browser: Browser, sweep: Path) -> N
     with serving(sweep) as server, opened(browser, f"{server.address}runs/first/") as page:
         explored(page)
         assert page.locator(".card img").first.evaluate("image => image.complete && image.naturalWidth") == 16
+
+
+def test_a_sweep_is_explored_from_a_folder_that_any_server_serves(
+    browser: Browser, sweep: Path, tmp_path: Path
+) -> None:
+    write_bundle([sweep], tmp_path / "site")
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(QuietHandler, directory=str(tmp_path / "site"))) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+        thread.start()
+        with opened(browser, f"http://127.0.0.1:{server.server_port}/") as page:
+            explored(page)
+            assert page.locator(".card img").first.evaluate("image => image.complete && image.naturalWidth") == 16
+        server.shutdown()
+        thread.join()
 
 
 def test_the_arrow_keys_go_from_cell_to_cell(browser: Browser, sweep: Path) -> None:
