@@ -79,7 +79,15 @@ f 1/1 3/3 4/4
 """
 
 
-@pytest.mark.parametrize("kind", ["rectangle", "obj", "ply", "obj as it is", "ply turned"])
+SIDE = {"cube": [2, 3, 4], "sphere": [3, -3, 3], "cylinder": [4, 3, 2]}
+"""Where the camera is, if not right before the shape."""
+
+
+@pytest.mark.parametrize(
+    "kind", [
+        "rectangle", "obj", "ply", "obj as it is", "ply turned", "cube", "sphere", "cylinder", "disk",
+    ],
+)  # fmt: skip
 def test_a_picture_on_a_shape_is_where_mitsuba_has_it(tmp_path: Path, kind: str) -> None:
     mi = mitsuba()
     (tmp_path / "square.obj").write_text(SQUARE)
@@ -90,8 +98,10 @@ def test_a_picture_on_a_shape_is_where_mitsuba_has_it(tmp_path: Path, kind: str)
     picture = {"type": "bitmap", "filename": str(tmp_path / "colors.exr"), "raw": True}
     surface = {"type": "diffuse", "reflectance": picture}
     shape: dict[str, Any] = {"type": kind.partition(" ")[0], "bsdf": {"type": "twosided", "bsdf": surface}}
-    if kind != "rectangle":
+    if shape["type"] in ("obj", "ply"):
         shape["filename"] = str(tmp_path / f"square.{shape['type']}")
+    if kind == "cylinder":
+        shape |= {"p0": [-0.5, 0.2, -0.6], "p1": [0.4, -0.3, 0.7], "radius": 0.6}
     if " " in kind:
         shape["flip_tex_coords"] = kind == "ply turned"
     scene = {
@@ -100,7 +110,7 @@ def test_a_picture_on_a_shape_is_where_mitsuba_has_it(tmp_path: Path, kind: str)
         "front": {
             "type": "perspective",
             "fov": 30.0,
-            "to_world": mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]),
+            "to_world": mi.ScalarTransform4f().look_at(SIDE.get(kind, [0, 0, 5]), [0, 0, 0], [0, 1, 0]),
             "film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}},
         },
         "light": {"type": "constant"},

@@ -144,7 +144,7 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     bsdf = _bsdf(shape, named)
     color, surface = surface_of(bsdf)
     frame = _Frame(shape, wanted, z_up=_is_z_up(named))
-    part = replace(mesh_of(shape, wanted), surface=color)
+    part = replace(mesh_of(shape, wanted, painted=color.texture is not None), surface=color)
     turned = replace(
         part,
         vertices=part.vertices @ frame.turn.T,

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-import trimesh
 
 from advsearch.errors import InputError
 from advsearch.scene.color import linear_to_srgb
@@ -32,12 +31,27 @@ COLORS = {
     "pplastic": "diffuse_reflectance",
 }
 """Surfaces with a base colour, and its name there."""
+SIDES = (
+    ((1, -1, -1), (1, -1, 1), (-1, -1, 1), (-1, -1, -1)),
+    ((1, 1, -1), (-1, 1, -1), (-1, 1, 1), (1, 1, 1)),
+    ((1, -1, -1), (1, 1, -1), (1, 1, 1), (1, -1, 1)),
+    ((1, -1, 1), (1, 1, 1), (-1, 1, 1), (-1, -1, 1)),
+    ((-1, -1, 1), (-1, 1, 1), (-1, 1, -1), (-1, -1, -1)),
+    ((1, 1, -1), (1, -1, -1), (-1, -1, -1), (-1, 1, -1)),
+)
+"""Corners of each side of Mitsuba's cube, in the order of those of a picture: (0, 1), (1, 1), (1, 0), (0, 0)."""
 GREY = 0.5
 """Reflectance where a surface says none: Mitsuba's default."""
 
 
-def mesh_of(shape: Mapping[str, object], name: str) -> ImportedPart:
+def mesh_of(shape: Mapping[str, object], name: str, *, painted: bool = False) -> ImportedPart:
     """Return a shape's triangles in its scene, without a surface.
+
+    Args:
+        shape: its dictionary.
+        name: of it.
+        painted: it shows a picture. Without one, texture coordinates of a solid shape are left out: on a cube they
+            repeat.
 
     Raises:
         InputError: it has none.
@@ -53,6 +67,8 @@ def mesh_of(shape: Mapping[str, object], name: str) -> ImportedPart:
     else:
         part, own = _solid(kind, shape)
         matrix = matrix @ own
+        if not (painted or kind == "rectangle"):
+            part = replace(part, uvs=None)
     if part.uvs is not None and not shape.get("flip_tex_coords", kind == "obj"):
         part = replace(part, uvs=part.uvs * (1.0, -1.0) + (0.0, 1.0))  # Mitsuba has row 0 of a picture at v = 0
     vertices = part.vertices @ matrix[:3, :3].T + matrix[:3, 3]
@@ -67,48 +83,62 @@ def mesh_of(shape: Mapping[str, object], name: str) -> ImportedPart:
 def _solid(kind: str, shape: Mapping[str, object]) -> tuple[ImportedPart, Doubles]:
     """A shape of Mitsuba's around the origin, and its own transform (4, 4) before `to_world`."""
     own = np.eye(4)
+    round_ = np.linspace(0.0, 1.0, SECTIONS + 1)
     if kind == "sphere":
-        found = trimesh.creation.uv_sphere(radius=1.0, count=[SECTIONS // 2, SECTIONS])
+        uvs, faces = _grid(round_, round_[::2])
+        down = np.pi * uvs[:, 1]
+        vertices = np.stack([*(np.sin(down) * _circle(uvs[:, 0])), np.cos(down)], axis=1)
         own[:3, :3] *= _number(shape.get("radius", 1.0))
         own[:3, 3] = np.asarray(shape.get("center", (0.0, 0.0, 0.0)), dtype=np.float64)
-        normals: Doubles | None = np.array(found.vertices)
     elif kind == "cylinder":  # open at both ends, as Mitsuba's
-        angles = np.arange(SECTIONS) * (2.0 * np.pi / SECTIONS)
-        ring = np.stack([np.cos(angles), np.sin(angles), np.zeros(SECTIONS)], axis=1)
-        here, there = np.arange(SECTIONS), np.roll(np.arange(SECTIONS), -1)
-        faces = np.concatenate(
-            [
-                np.stack([here, there, there + SECTIONS], axis=1),
-                np.stack([here, there + SECTIONS, here + SECTIONS], axis=1),
-            ]
-        )
-        found = trimesh.Trimesh(np.concatenate([ring, ring + np.array([0.0, 0.0, 1.0])]), faces, process=False)
-        normals = np.concatenate([ring, ring])
-        low = np.asarray(shape.get("p0", (0.0, 0.0, 0.0)), dtype=np.float64)
-        high = np.asarray(shape.get("p1", (0.0, 0.0, 1.0)), dtype=np.float64)
-        length = float(np.linalg.norm(high - low))
-        along = (high - low) / max(length, 1e-30)
-        aside = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
-        aside /= np.linalg.norm(aside)
-        radius = _number(shape.get("radius", 1.0))
-        own[:3] = np.stack([aside * radius, np.cross(along, aside) * radius, along * length, low], axis=1)
+        uvs, faces = _grid(round_, np.array([0.0, 1.0]))
+        vertices = np.stack([*_circle(uvs[:, 0]), uvs[:, 1]], axis=1)
+        own = _along(shape)
     elif kind == "cube":
-        found = trimesh.creation.box((2.0, 2.0, 2.0))
-        normals = None
+        vertices = np.array(SIDES, dtype=np.float64).reshape(-1, 3)
+        uvs = np.tile([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]], (6, 1))
+        faces = (np.arange(0, 24, 4)[:, None, None] + np.array([[0, 1, 2], [3, 0, 2]])).reshape(-1, 3)
     elif kind == "disk":
-        angles = np.arange(SECTIONS) * (2.0 * np.pi / SECTIONS)
-        rim = np.stack([np.cos(angles), np.sin(angles), np.zeros(SECTIONS)], axis=1)
-        here = np.arange(SECTIONS)
-        faces = np.stack([here, np.roll(here, -1), np.full(SECTIONS, SECTIONS)], axis=1)
-        found = trimesh.Trimesh(np.concatenate([rim, np.zeros((1, 3))]), faces, process=False)
-        normals = None
+        uvs, faces = _grid(round_[::8], round_)
+        vertices = np.stack([*(uvs[:, 0] * _circle(uvs[:, 1])), np.zeros(len(uvs))], axis=1)
     else:
-        corners = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
-        found = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
-        normals = None
-    vertices, faces = np.array(found.vertices, dtype=np.float64), np.array(found.faces, dtype=np.int64)
-    uvs = vertices[:, :2] / 2.0 + 0.5 if kind == "rectangle" else None
+        uvs, faces = _grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+        vertices = np.column_stack([uvs * 2.0 - 1.0, np.zeros(4)])
+    normals = {"sphere": vertices, "cylinder": vertices * (1.0, 1.0, 0.0)}.get(kind)
+    ends = vertices[faces]
+    faces = faces[np.linalg.norm(np.cross(ends[:, 1] - ends[:, 0], ends[:, 2] - ends[:, 0]), axis=1) > 1e-9]
     return ImportedPart(vertices, faces, normals, uvs, None, ImportedSurface()), own
+
+
+def _grid(u: Doubles, v: Doubles) -> tuple[Doubles, npt.NDArray[np.int64]]:
+    """The points (N, 2) of a grid of texture coordinates, and its triangles (F, 3)."""
+    points = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    first = (np.arange(len(v) - 1)[:, None] * len(u) + np.arange(len(u) - 1)).reshape(-1)
+    above = first + len(u)
+    triangles = [[first, first + 1, above + 1], [first, above + 1, above]]
+    return points, np.concatenate([np.stack(one, axis=1) for one in triangles])
+
+
+def _circle(share: Doubles) -> Doubles:
+    """Points (2, N) of the unit circle, at shares (N,) of a whole turn."""
+    found: Doubles = np.stack([np.cos(2.0 * np.pi * share), np.sin(2.0 * np.pi * share)])
+    return found
+
+
+def _along(shape: Mapping[str, object]) -> Doubles:
+    """The transform (4, 4) of a cylinder between its two points; around it as Mitsuba's (Duff et al. 2017)."""
+    low = np.asarray(shape.get("p0", (0.0, 0.0, 0.0)), dtype=np.float64)
+    high = np.asarray(shape.get("p1", (0.0, 0.0, 1.0)), dtype=np.float64)
+    length = float(np.linalg.norm(high - low))
+    x, y, z = along = (high - low) / max(length, 1e-30)
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    aside = np.array([1.0 + sign * x * x * a, sign * x * y * a, -sign * x])
+    across = np.array([x * y * a, sign + y * y * a, -y])
+    radius = _number(shape.get("radius", 1.0))
+    own = np.eye(4)
+    own[:3] = np.stack([aside * radius, across * radius, along * length, low], axis=1)
+    return own
 
 
 def _number(value: object) -> float:
