@@ -38,6 +38,7 @@ COMMANDS = {
     "runs": "advsearch.cli.runs",
     "dashboard": "advsearch.cli.dashboard",
     "view": "advsearch.cli.view",
+    "report": "advsearch.cli.report",
     "export": "advsearch.cli.export",
     "check": "advsearch.cli.check",
     "plan": "advsearch.cli.plan",

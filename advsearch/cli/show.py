@@ -63,7 +63,7 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
         return _show_unfinished(described(path), as_json)
     result = read_result(path)
     answer = importlib.import_module(f"advsearch.cli.{result.command}").answer
-    photos = _photos(path)
+    photos = photos_of(path)
     if as_json:
         output.print_json({**result.to_dict(), "photos": photos.to_dict()} if photos else result)
     else:
@@ -75,8 +75,8 @@ def show_run(name: str, as_json: bool, *, picture: bool = False) -> int:
     return 0
 
 
-def _photos(run: Path) -> PhotoAgreement | None:
-    """How photographs agree with the run's renderings; None where there are none."""
+def photos_of(run: Path) -> PhotoAgreement | None:
+    """Return how photographs agree with the run's renderings; None where there are none."""
     from advsearch.runs.directory import IMAGES
     from advsearch.viewer.photos import FOLDER
 

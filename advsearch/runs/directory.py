@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, final
 
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, RunExistsError, UnknownNameError
 from advsearch.files import JsonObject, open_regular
-from advsearch.runs import images, lock, replay, store, summary, tracking
+from advsearch.runs import images, lock, made_with, replay, store, summary, tracking
 from advsearch.runs.files import PART, replacing, storage_errors, write_text
 from advsearch.yaml_text import LARGEST
 
@@ -184,6 +184,7 @@ class RunDirectory:
         try:
             if config is not None:
                 opened._check_same(config)
+                opened._note_sitting(config)
         except BaseException:
             opened.close()
             raise
@@ -230,7 +231,16 @@ class RunDirectory:
         What decides the numbers is noted in the store too, so that a file that was edited since is noticed.
         """
         self.store.set_note(BEGUN_WITH, json.dumps(config.deciding()))
+        self._note_sitting(config)
         return write_text(self.path / CONFIG, config.to_repeat().to_yaml())
+
+    def _note_sitting(self, config: Config) -> None:
+        """Note what this sitting is made with, after those before it."""
+        noted = self.store.noted(made_with.NOTE)
+        before = noted if isinstance(noted, list) else []
+        now = made_with.made_with(config.plain())
+        if now not in before:
+            self.store.set_note(made_with.NOTE, json.dumps([*before, now]))
 
     def record(self, *rows: store.Row) -> None:
         """Add evaluated configurations to the results; they survive a kill when this returns (see `store`).

@@ -1,0 +1,58 @@
+"""`advsearch report`: runs as evidence, from their folders."""
+
+from __future__ import annotations
+
+import json
+from hashlib import sha256
+from pathlib import Path
+
+import pytest
+from samples import attack, make_run
+
+from advsearch.cli.main import main
+from advsearch.config import AttackConfig
+from advsearch.runs.directory import RunDirectory
+from advsearch.runs.made_with import NOTE
+
+
+def test_runs_become_a_page_markdown_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    good = make_run(tmp_path / "good", pictures=False, rows=False)
+    with RunDirectory.create_for(AttackConfig(object="bowl", run=str(tmp_path / "killed"))):
+        pass
+    out = tmp_path / "card"
+    asked = ["report", str(good), str(tmp_path / "killed"), str(good), "--evidence", "--out", str(out)]
+    assert main([*asked, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [run["claims"][0]["kind"] for run in told["runs"]] == ["found", "nothing claimed"], "each run once"
+    assert {"advsearch", "torch", "mitsuba"} <= set(told["runs"][0]["made_with"])
+    assert json.loads((out / "evidence.json").read_text()) == told
+    assert all("a vase in 20 of 20" in (out / f"evidence.{kind}").read_text() for kind in ("md", "json"))
+    assert main(asked) == 2 and "--overwrite" in capsys.readouterr().err
+    assert main([*asked, "--overwrite"]) == 0 and "nothing claimed" in capsys.readouterr().out
+    assert main(["report", str(good)]) == 2 and "--evidence" in capsys.readouterr().err
+
+
+def test_a_model_file_that_changed_between_runs_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = tmp_path / "model.pt2"
+    runs = []
+    for number in range(2):
+        model.write_bytes(bytes([number]))
+        folder = tmp_path / str(number)
+        with RunDirectory.create_for(AttackConfig(object="mug", model=str(model), run=str(folder))) as run:
+            run.write_summary(attack(model=str(model)))
+        runs.append(str(folder))
+    assert main(["report", *runs, "--evidence", "--out", str(tmp_path / "card"), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["runs"][1]["made_with"][str(model)] == sha256(b"\1").hexdigest()
+    assert "not the same in all runs" in told["warnings"][0]
+
+
+def test_each_sitting_that_differs_is_noted_once(tmp_path: Path) -> None:
+    config = AttackConfig(object="mug", run=str(tmp_path / "run"))
+    with RunDirectory.create_for(config) as run:
+        first = run.store.noted(NOTE)
+        run.store.set_note(NOTE, json.dumps([{**first[0], "torch": "0.1"}]))
+    for _ in range(2):
+        with RunDirectory.resume(tmp_path / "run", config) as run:
+            noted = run.store.noted(NOTE)
+    assert [one["torch"] for one in noted] == ["0.1", first[0]["torch"]]
