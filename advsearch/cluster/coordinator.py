@@ -97,7 +97,7 @@ class Coordinator:
         self._workers: dict[str, _Worker] = {}
         self._refused: dict[str, str] = {}
         self._tickets: dict[int, tuple[_Worker, _Range | None]] = {}
-        self._next_ticket = 0
+        self._next_ticket = self._under_way = 0
         self._todo: deque[_Range] = deque()
         self._free: deque[_Worker] = deque()
         self._per_number: deque[float] = deque(maxlen=MEDIAN_OF)
@@ -113,7 +113,7 @@ class Coordinator:
         source = iter(ranges)
         while True:
             self._give_out(source)
-            if not self._todo and not any(one for _, one in self._tickets.values()):
+            if not self._todo and not self._under_way:
                 numbers = next(source, None)  # there may be more, and nobody yet who is ready for it
                 if numbers is None:
                     return
@@ -155,6 +155,7 @@ class Coordinator:
             worker.since = self._clock()
         worker.tickets.append(ticket)
         self._tickets[ticket] = worker, one
+        self._under_way += one is not None
         if one is None:
             files = self._files if send else self._files.named_only
             self._pool.submit(ticket, worker.address, prepare, self._key, self._work, files, self._version)
@@ -191,6 +192,7 @@ class Coordinator:
         worker, one = self._tickets.pop(event.ticket, (None, None))
         if worker is None:
             return  # late
+        self._under_way -= one is not None
         worker.tickets.remove(event.ticket)
         worker.since = self._clock()
         value = event.value
@@ -290,6 +292,7 @@ class Coordinator:
             _, one = self._tickets.pop(ticket, (None, None))
             self._pool.forget(ticket)
             if one is not None:
+                self._under_way -= 1
                 self.facts.retried += 1
                 self._todo.appendleft(one)
         worker.tickets.clear()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -45,7 +46,7 @@ class Space:
         """(d,) float32 in [0, 1]: the configuration that leaves the scene as it is."""
         return torch.cat([control.start for control in self.controls]) if self.controls else torch.zeros(0)
 
-    @property
+    @cached_property
     def groups(self) -> tuple[Group, ...]:
         """Every group of coordinates in the order of u, without an estimator yet.
 

@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 from advsearch.attacks import Trials
 from advsearch.described import Value
@@ -23,14 +24,16 @@ def trial_row(
     values: Mapping[str, Value] | None = None,
     *,
     sought: bool = True,
+    **more: Any,
 ) -> Row:
     """Return what the store keeps of a trial; arguments as for `Recorder.trial`.
 
     Args:
         values: that describe it.
         sought: whether a search sought some answer there, so that there is a success.
+        **more: of the row.
     """
-    row = Row(
+    return Row(
         kind=kind,
         step=number,
         seed=seed,
@@ -38,23 +41,25 @@ def trial_row(
         objective=_number(trial.score),
         success=trial.success if sought else None,
         values=values or {},
-        renders=1,
+        **{"renders": 1, **_said(trial), **more},
     )
-    return judged(row, trial)
 
 
 def judged(row: Row, judgement: Judgement) -> Row:
     """Return the row with what a task said of its picture."""
+    return replace(row, **_said(judgement))
+
+
+def _said(judgement: Judgement) -> dict[str, Any]:
     answer = judgement.answer
-    return replace(
-        row,
-        correct=judgement.right,
-        margin=_number(judgement.margin),
-        label=answer.label,
-        label_index=answer.index,
-        probability=answer.probability,
-        payload=judgement.payload,
-    )
+    return {
+        "correct": judgement.right,
+        "margin": _number(judgement.margin),
+        "label": answer.label,
+        "label_index": answer.index,
+        "probability": answer.probability,
+        "payload": judgement.payload,
+    }
 
 
 def _number(value: float) -> float | None:

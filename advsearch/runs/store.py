@@ -401,7 +401,8 @@ def _check_version(db: sqlite3.Connection, path: Path) -> None:
         raise FileFormatError(f"{path}: expected version {len(MIGRATIONS)} of the results, got {version}; {advice}")
 
 
-_NAMES = tuple(one.name for one in fields(Row) if one.name != "id")
+_FIELDS = tuple(one.name for one in fields(Row))
+_NAMES = _FIELDS[:-1]  # without the id
 _FRONT = _NAMES[: _NAMES.index("payload")]
 _BACK = _NAMES[_NAMES.index("values") + 1 : -1]  # the last is the time
 _SIMPLE = frozenset({str, int, bool, type(None)})
@@ -439,7 +440,7 @@ _TYPES = _column_types()
 
 
 def _decode(values: tuple[Any, ...], path: Path) -> Row:
-    given = dict(zip((one.name for one in fields(Row)), values, strict=True))
+    given = dict(zip(_FIELDS, values, strict=True))
     wrong = [name for name, value in given.items() if not isinstance(value, _TYPES[name])]
     if not wrong:
         given["values"] = _values(given["values"])

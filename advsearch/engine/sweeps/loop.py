@@ -12,6 +12,7 @@ import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 from advsearch.attacks.draws import Seeds
 from advsearch.attacks.product import batches
@@ -62,6 +63,9 @@ PICTURE_SPP = 64
 
 TELL_SECONDS = 0.1
 """Least time between two reports of progress."""
+
+MOST_WAITING = 10_000
+"""Batches that wait for an earlier one to be counted; where there are more, all rows are counted again at the end."""
 
 READ_AT_ONCE = 256
 """Pictures whose places are worked out at once when rows are read back."""
@@ -145,16 +149,18 @@ class Sweep:
 
     def _go_through(self, left: Sequence[range], tally: Tally) -> Tally:
         """Have what is left carried out, store and count it; return the counts."""
+        waiting: dict[int, Done] = {}  # it is counted in order: sums and the first of equals depend on that
         expected = left[0].start // self.models if left else 0
         self._begun = time.monotonic()
         in_order = not left or (len(left) == 1 and left[0].stop == self.total)
         for done in self._executor.results(self._pieces(left)):
-            in_order, expected = in_order and done.numbers.start >= expected, done.numbers.stop
-            self._take(done, tally)
-        if in_order:
-            return tally
+            waiting[done.numbers.start] = self._take(done)
+            in_order = in_order and len(waiting) <= MOST_WAITING
+            while waiting and (expected in waiting or not in_order):
+                expected = self._count_all(tally, waiting.pop(expected if in_order else next(iter(waiting))))
+            self._tell(len(done.numbers) * self.models, tally)
         self._kept.sort(key=lambda row: row.step)
-        return self._counted()  # sums of margins depend on the order, and so does which of equals is the worst
+        return tally if in_order else self._counted()
 
     def _pieces(self, left: Sequence[range]) -> Iterator[range]:
         """Yield the pictures of batches, each of one scene."""
@@ -167,15 +173,12 @@ class Sweep:
                     yield range(before + piece.start, before + piece.stop)
                 first = before + self.per_scene
 
-    def _take(self, done: Done, tally: Tally) -> None:
-        """Store what came of a batch, and count it."""
+    def _take(self, done: Done) -> Done:
+        """Store what came of a batch; return what is to be counted of it."""
         numbers, batch = done.numbers, done.value if done.value is not None else self._missed(done)
+        more = {"seconds": batch.seconds, "machine": done.machine}
         rows = [
-            replace(
-                self._row(number, model, batch.judgements[model][k], batch.values[model][k], batch.shown[model][k]),
-                seconds=batch.seconds,
-                machine=done.machine,
-            )
+            self._row(number, model, batch.judgements[model][k], batch.values[model][k], batch.shown[model][k], **more)
             for k, number in enumerate(numbers)
             for model in range(self.models)
         ]
@@ -188,21 +191,15 @@ class Sweep:
                 write_layers(self.run.path / AOV_FOLDER / f"{number:06d}.exr", layers, notes)
             self.run.record(*rows)
         self._spend(rows)
-        scene = numbers.start // self.per_scene
-        before = scene * self.per_scene
-        picks = self.points.picks(numbers.start - before, len(numbers), before)
-        for k in range(len(numbers)):
-            for model in range(self.models):
-                self._count(tally, scene, picks, k, model, batch.judgements[model][k])
         self._rendered += len(numbers) * batch.sizes
-        self._transport[done.worker, scene] = batch.light
+        self._transport[done.worker, numbers.start // self.per_scene] = batch.light
         if batch.not_finite and not self._not_finite:
             self._not_finite = True
             if self.run is not None:
                 self.run.store.set_note(NOT_FINITE, "yes")
         if done.machine is not None and done.machine not in self._machines:
             self._meet(done.machine)
-        self._tell(len(rows), tally)
+        return Done(numbers, batch.judgements, done.worker)
 
     def _meet(self, name: str) -> None:
         """Keep what another machine is."""
@@ -225,7 +222,13 @@ class Sweep:
         return f"about {size}" if self.job.keep_pictures == "all" else f"at most about {size}"
 
     def _row(
-        self, number: int, model: int, trial: Judgement, values: dict[str, Value], shown: tuple[bool, int] = (False, 1)
+        self,
+        number: int,
+        model: int,
+        trial: Judgement,
+        values: dict[str, Value],
+        shown: tuple[bool, int] = (False, 1),
+        **more: Any,
     ) -> store.Row:
         """What is stored of a configuration; a predicted picture has no seed of its own."""
         place, (predicted, traced) = self.job.places[number // self.per_scene], shown
@@ -235,8 +238,8 @@ class Sweep:
             named["environment"] = {"value": lit_by, "unit": ""}
         named |= {"model": {"value": self.job.models[model].name, "unit": ""}, **values}
         step = number * self.models + model
-        row = trial_row(KIND, step, self._seeds(number), self.samples, trial, named, sought=False)
-        row = replace(row, id=step + 1, renders=traced if self._is_first_of_size(model) else 0)
+        more |= {"id": step + 1, "renders": traced if self._is_first_of_size(model) else 0}
+        row = trial_row(KIND, step, self._seeds(number), self.samples, trial, named, sought=False, **more)
         return replace(row, seed=None, spp=BASIS_SPP) if predicted else row
 
     def _is_first_of_size(self, model: int) -> bool:
@@ -247,7 +250,7 @@ class Sweep:
         self._untold += count
         now = time.monotonic()
         if now - self._told >= TELL_SECONDS:
-            facts, info = self._executor.facts, {"accuracy": tally.correct / tally.seen}
+            facts, info = self._executor.facts, {"accuracy": tally.correct / tally.seen} if tally.seen else {}
             if facts is not None:
                 info |= {"workers": facts.workers, "a second": self._rendered / max(1e-9, now - self._begun)}
                 info |= {name: count for name in ("lost", "retried") if (count := getattr(facts, name))}
@@ -280,6 +283,15 @@ class Sweep:
             self._traced += int(first) if row.renders is None else row.renders
             self._predicted += row.seed is None and first
             self._lost += row.label == LOST
+
+    def _count_all(self, tally: Tally, done: Done) -> int:
+        """Count a batch, of which there are the judgements; return the number after it."""
+        scene, local = divmod(done.numbers.start, self.per_scene)
+        picks = self.points.picks(local, len(done.numbers), scene * self.per_scene)
+        for k in range(len(done.numbers)):
+            for model in range(self.models):
+                self._count(tally, scene, picks, k, model, done.value[model][k])
+        return done.numbers.stop
 
     def _count(self, tally: Tally, scene: int, picks: Picks, k: int, model: int, trial: Judgement) -> None:
         tally.add((picks.number + k) * self.models + model, (*self._places[scene], model), picks, k, trial)
