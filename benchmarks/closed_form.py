@@ -89,6 +89,13 @@ BUDGETS: Mapping[str, Mapping[str, tuple[int | None, ...]]] = {
         "quadratic, box": (None, None, None, None),
         "hills, box": (1000, None),
     },
+    "mixture": {
+        "linear, linf": (200, None, None, None),
+        "linear, l2": (100, 5000, None, None),
+        "linear, box": (200, None, None, None),
+        "quadratic, box": (1000, 2000, None, None),
+        "hills, box": (500, 1000),
+    },
     "nes": {
         "linear, linf": (50, 500, 10_000, None),
         "linear, l2": (50, 200, 2000, None),

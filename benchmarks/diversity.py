@@ -1,17 +1,22 @@
 """Distinct failures that `archive` finds beside random search at equal renders: cells in which the model is wrong.
 
     python benchmarks/diversity.py [--policy archive] [--renders 1000] [--noise 0.2] [--seeds 10]
+    python benchmarks/diversity.py --rendered banana chair hammer [--renders 300] [--seeds 1] [--resolution 64]
 
-A cell is one of 10 x 10 over two parameters; it fails where at least one evaluated configuration in it is wrong,
-without the noise. Nothing is rendered. Four closed forms over six parameters stand
-for what is met; in three failures are rare, and beside the two parameters of the cells four others have to be right:
+A cell is one of 10 x 10 over two parameters. In the first, nothing is rendered: a cell fails where at least one
+evaluated configuration in it is wrong, without the noise. Four closed forms over six parameters stand for what is met;
+in three failures are rare, and beside the two parameters of the cells four others have to be right:
 
 - ball: wrong within a distance of 0.25 of a point of the four others, which moves with the cell;
 - corner: wrong where all four are over 0.65, more or less by cell;
 - choice: one of six options is wrong, where two numbers lie in a band that moves with the cell;
 - common: wrong in a third of all configurations, where no policy can find three times as many cells.
 
-Prints the medians of both over the seeds, the ratio of these, and the smallest ratio.
+The second renders bundled objects with the reference model, over the ten parameters of pose and camera; cells are over
+pose.yaw and camera.elevation. A cell fails where the worst configuration that was met in it is wrong in each of two
+fresh renders of 16 samples a pixel. It also prints the share of failures in the random search.
+
+Both print the medians of both over the seeds, the ratio of these, and the smallest ratio.
 """
 
 from __future__ import annotations
@@ -21,14 +26,25 @@ import math
 import sys
 from collections.abc import Callable, Sequence
 from statistics import median
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from advsearch.attacks import Block, Domain, Evaluation, make_policy, search
+from advsearch import threads
+from advsearch.api.attack import problem_from_config
+from advsearch.attacks import Block, Domain, Evaluation, Policy, StepRecord, make_policy, search
+from advsearch.config import AttackConfig
+from advsearch.engine.problem import Problem
+from advsearch.seeds import stream
 
 SIDE = 10
 """Parts of the range of each of the two parameters."""
+
+OVER = "pose.yaw,camera.elevation"
+"""The two parameters, where pictures are rendered."""
+
+TRIALS, TRIAL_SPP = 2, 16
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -38,19 +54,73 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--renders", type=int, default=1000)
     parser.add_argument("--noise", type=float, default=0.2, help="of the objective, as a share of its deviation")
     parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--rendered", nargs="+", default=[], metavar="OBJECT")
+    parser.add_argument("--resolution", type=int, default=64)
     args = parser.parse_args(argv)
-    torch.set_num_threads(1)
     print("| scene | cells by the policy | by random search | ratio | smallest ratio |")
     print("| --- | --- | --- | --- | --- |")
+    seeds = range(args.seeds)
+    if args.rendered:
+        threads.configure(None)
+        for name in args.rendered:
+            problem = _problem(name, args.resolution)
+            pairs, rates = [], []
+            for seed in seeds:
+                theirs, rate = rendered_cells(problem, make_policy("random"), args.renders, seed)
+                ours, _ = rendered_cells(problem, make_policy(args.policy, over=OVER), args.renders, seed)
+                pairs.append((len(ours), len(theirs)))
+                rates.append(rate)
+            _print(f"{name}, {100 * median(rates):.0f} % wrong", pairs)
+        return 0
+    torch.set_num_threads(1)
     for scene in SCENES:
-        pairs = [
-            tuple(len(failing_cells(scene, one, args.renders, args.noise, seed)) for one in (args.policy, "random"))
-            for seed in range(args.seeds)
+        both = [
+            [failing_cells(scene, one, args.renders, args.noise, k) for k in seeds] for one in (args.policy, "random")
         ]
-        ours, theirs = median(one for one, _ in pairs), median(other for _, other in pairs)
-        least = min(one / max(other, 1) for one, other in pairs)
-        print(f"| {scene} | {ours:g} | {theirs:g} | {ours / max(theirs, 1):.1f} | {least:.1f} |", flush=True)
+        _print(scene, [(len(ours), len(theirs)) for ours, theirs in zip(*both, strict=True)])
     return 0
+
+
+def _print(scene: str, pairs: Sequence[tuple[int, int]]) -> None:
+    """Print a row: cells of the policy and of random search by seed."""
+    ours, theirs = median(one for one, _ in pairs), median(other for _, other in pairs)
+    least = min(one / max(other, 1) for one, other in pairs)
+    print(f"| {scene} | {ours:g} | {theirs:g} | {ours / max(theirs, 1):.1f} | {least:.1f} |", flush=True)
+
+
+# ---- rendered -------------------------------------------------------------------------------------------------------
+
+
+def _problem(name: str, resolution: int) -> Problem:
+    config = AttackConfig(object=name, controls={"pose": {}, "camera": {}}, resolution=resolution, measure="no")
+    return problem_from_config(config)[0]
+
+
+def rendered_cells(
+    problem: Problem, policy: Policy[Any], renders: int, seed: int
+) -> tuple[set[tuple[int, int]], float]:
+    """Return the cells over `OVER` in which a search met a failure that holds, and the share of its wrong renders."""
+    problem.seed = stream(31, "diversity", seed)
+    first, second = (problem.domain.names.index(name) for name in OVER.split(","))
+    worst: dict[tuple[int, int], tuple[float, Tensor]] = {}
+    wrong = 0
+
+    def note(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
+        nonlocal wrong
+        at = cell(float(u[first]), float(u[second]))
+        wrong += evaluation.success
+        if evaluation.success and (at not in worst or evaluation.objective > worst[at][0]):
+            worst[at] = evaluation.objective, u.clone()
+
+    evaluate = problem.evaluator(policy.name)
+    search(evaluate, problem.domain, policy, steps=renders, seed=seed, candidates=0, on_step=note)
+
+    def holds(u: Tensor) -> bool:
+        return all(
+            problem.trial(u, stream(problem.seed, "again", number), TRIAL_SPP).success for number in range(TRIALS)
+        )
+
+    return {at for at, (_, u) in worst.items() if holds(u)}, wrong / renders
 
 
 # ---- closed forms ---------------------------------------------------------------------------------------------------

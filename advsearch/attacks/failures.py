@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from advsearch.attacks.failure_share import FailureShare
+
 MOST = 24
 """Failures that an answer lists, at most."""
 
@@ -32,18 +34,20 @@ class Failures:
     """What a search knows of different failures.
 
     Attributes:
-        listed: at most `MOST`, the worst first and then whichever is farthest from all before it.
-        over: positions in u of what tells them apart.
-        found: how many different ones there are, those that are not listed included.
-        seen: how many places were looked at, failures or not.
-        places: how many there are.
+        listed: at most `MOST`.
+        over: positions in u of what tells cells apart; none where there are no cells.
+        found: how many failing cells there are; without cells, failing draws.
+        seen: how many cells, or draws, were looked at, failing or not.
+        places: how many cells there are; None without cells.
+        share: how large a part of all configurations fails, where that can be told.
     """
 
     listed: tuple[FoundFailure, ...]
     over: tuple[int, ...]
     found: int
     seen: int
-    places: int
+    places: int | None
+    share: FailureShare | None = None
 
 
 def most_different(at: Tensor, worst: Sequence[float], around: Tensor, apart: Tensor, most: int = MOST) -> list[int]:

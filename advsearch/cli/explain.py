@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from advsearch.cli import output
-from advsearch.cli.question import Place, QuestionCommand
+from advsearch.cli.question import Positional, QuestionCommand
 
 if TYPE_CHECKING:
     from advsearch.runs.results.explain import ExplainResult
@@ -51,4 +51,6 @@ def answer(result: ExplainResult) -> str:
     return "\n\n".join(parts) + "".join(f"\n\nNote: {text}" for text in result.warnings)
 
 
-COMMAND = QuestionCommand("explain", answer, about="sweeps", place=Place("RUN", "the run of a sweep", several=True))
+COMMAND = QuestionCommand(
+    "explain", answer, about="sweeps", place=Positional("RUN", "the run of a sweep", several=True)
+)

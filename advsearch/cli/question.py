@@ -21,7 +21,7 @@ FELL_SHORT = 3
 
 
 @dataclass(frozen=True)
-class Place:
+class Positional:
     """How a setting is given without its flag.
 
     Attributes:
@@ -54,7 +54,7 @@ class QuestionCommand:
     answer: Callable[[Any], str]
     short: Callable[[Any], bool] = lambda result: False
     about: str = ""
-    place: Place | None = None
+    place: Positional | None = None
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Add a flag for each of the settings, and those that commands share."""

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.cli import output
-from advsearch.cli.question import Place, QuestionCommand
+from advsearch.cli.question import Positional, QuestionCommand
 
 if TYPE_CHECKING:
     from advsearch.runs.results.recipe import RecipeResult
@@ -72,5 +72,5 @@ COMMAND = _Recipe(
     "recipe",
     answer,
     about="recipe",
-    place=Place("NAME", "a recipe, or list", "; list shows the recipes that there are"),
+    place=Positional("NAME", "a recipe, or list", "; list shows the recipes that there are"),
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from advsearch.cli import output
-from advsearch.cli.question import Place, QuestionCommand
+from advsearch.cli.question import Positional, QuestionCommand
 
 if TYPE_CHECKING:
     from advsearch.runs.results.replay import ReplayResult
@@ -32,4 +32,4 @@ def answer(result: ReplayResult) -> str:
     return "\n\n".join(parts) + "".join(f"\n\nNote: {text}" for text in result.warnings)
 
 
-COMMAND = QuestionCommand("replay", answer, about="answer", place=Place("RUN", "a run"))
+COMMAND = QuestionCommand("replay", answer, about="answer", place=Positional("RUN", "a run"))

@@ -15,7 +15,7 @@ from advsearch.engine.record import Findings
 from advsearch.engine.rows import verified_rate
 from advsearch.engine.verifier import Verifier
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.attack import DescribedValue, DifferentFailure, DifferentFailures
+from advsearch.runs.results.attack import DescribedValue, DifferentFailure, DifferentFailures, FailingShare
 
 TRIED = 8
 """Different failures that are tried, at most: the first of the list."""
@@ -65,6 +65,7 @@ def described_failures(problem: Problem, findings: Findings) -> DifferentFailure
         found=known.found,
         seen=known.seen,
         places=known.places,
+        share=None if known.share is None else FailingShare.of(known.share),
         tried=len(findings.failures),
         held=sum(one.ending is Ending.FOUND for one in findings.failures),
         listed=listed,

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from advsearch.report.wording import count, number_text
+from advsearch.report.phrases import percent
+from advsearch.report.wording import count, interval_text, number_text
 
 if TYPE_CHECKING:
-    from advsearch.runs.results.attack import DifferentFailure, DifferentFailures
+    from advsearch.runs.results.attack import DifferentFailure, DifferentFailures, FailingShare
 
 FAILURE_HEADS = ("failures", "most often answered", "holds in fresh renders", "objective")
 """Of the columns of `failure_rows`."""
@@ -15,10 +16,19 @@ FAILURE_HEADS = ("failures", "most often answered", "holds in fresh renders", "o
 
 def failures_text(known: DifferentFailures) -> str:
     """Return how many different failures there are, and which of that is verified."""
-    where = f"{known.found} of {known.places} cells over {' and '.join(known.over)} ({known.seen} were seen)"
+    where = f"{known.found} of {count(known.seen, 'draw')}"
+    if known.places is not None:
+        where = f"{known.found} of {known.places} cells over {' and '.join(known.over)} ({known.seen} were seen)"
+    share = "" if known.share is None else f"; {share_text(known.share)}"
     if not known.tried:
-        return f"claimed in {where}; none of these was tried with fresh renders"
-    return f"claimed in {where}; with fresh renders {known.held} of the {known.tried} that were tried hold"
+        return f"claimed in {where}{share}; none of these was tried with fresh renders"
+    return f"claimed in {where}{share}; with fresh renders {known.held} of the {known.tried} that were tried hold"
+
+
+def share_text(share: FailingShare) -> str:
+    """Return how large a part of all configurations fails."""
+    interval = f"of all configurations {interval_text(share.interval)} fail in one render (95 % interval)"
+    return interval if share.estimate is None else f"{interval}, {percent(share.estimate)} by the estimate"
 
 
 def failure_rows(known: DifferentFailures, *, tried: bool = False) -> list[list[str]]:
@@ -29,7 +39,7 @@ def failure_rows(known: DifferentFailures, *, tried: bool = False) -> list[list[
 
 def range_text(one: DifferentFailure) -> str:
     """Return where a failure lies: ``pose.yaw 36 to 72 degrees, material.kind brass``."""
-    return ", ".join(f"{name} {_ends(one, name)}" for name in one.ranges)
+    return ", ".join(f"{name} {_ends(one, name)}" for name in one.ranges) or "anywhere"
 
 
 def _ends(one: DifferentFailure, name: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from stand_ins import StandInProblem, attack_on, configuration
 from torch import Tensor
 
 from advsearch.attacks import Block, Domain, Ending, SearchResult, make_policy
+from advsearch.attacks.failure_share import FailureShare
 from advsearch.attacks.failures import Failures, FoundFailure
 from advsearch.attacks.verification import OVER_CONDITIONS, Rule
 from advsearch.cli.attack import answer
@@ -92,6 +94,22 @@ def test_over_conditions_none_is_tried_and_that_is_said() -> None:
     told = described(checked(failures(0.9), rule=OVER_CONDITIONS))
     assert told.tried == 0 and told.listed[0].verified is None
     assert failures_text(told).endswith("none of these was tried with fresh renders")
+
+
+def test_without_cells_it_is_draws_and_the_share_of_all_that_fails() -> None:
+    share = FailureShare(0.034, (0.021, 0.08), 22.5, 500)
+    known = replace(failures(0.9), over=(), found=70, seen=500, places=None, share=share)
+    told = described(checked(known))
+    assert failures_text(told).startswith(
+        "claimed in 70 of 500 draws; of all configurations 2-8 % fail in one render (95 % interval), 3 % by the "
+    )
+    assert told.to_dict()["share"] == {"estimate": 0.034, "interval": [0.021, 0.08], "effective": 22.5, "draws": 500}
+    few = described(checked(replace(known, share=replace(share, estimate=None))))
+    assert "2-8 % fail in one render (95 % interval); with fresh" in failures_text(few)
+    assert (
+        failure_rows(described(checked(Failures((replace(failure(0.9), ranges={}),), (), 1, 9, None))))[0][0]
+        == "anywhere"
+    )
 
 
 def test_ranges_are_in_units_and_a_choice_has_its_option() -> None:

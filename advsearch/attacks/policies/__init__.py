@@ -14,6 +14,7 @@ from advsearch.attacks.policies.choices import Choices, with_choices
 from advsearch.attacks.policies.cmaes import CMAES
 from advsearch.attacks.policies.grid import Grid
 from advsearch.attacks.policies.halving import Halving
+from advsearch.attacks.policies.mixture import Mixture
 from advsearch.attacks.policies.nes import NES
 from advsearch.attacks.policies.pgd import PGD
 from advsearch.attacks.policies.portfolio import Portfolio
@@ -40,6 +41,7 @@ POLICIES: Registry[type[Policy[Any]]] = Registry(
         "cmaes": CMAES,
         "grid": Grid,
         "halving": Halving,
+        "mixture": Mixture,
         "nes": NES,
         "pgd": PGD,
         "portfolio": Portfolio,
@@ -105,6 +107,7 @@ __all__ = [
     "Grid",
     "Halving",
     "MapElites",
+    "Mixture",
     "Policy",
     "Portfolio",
     "Proposal",

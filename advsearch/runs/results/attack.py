@@ -110,13 +110,23 @@ class DifferentFailure(Fields):
     picture: str | None = Field(description="the first of these trials; null if there is none")
 
 
+class FailingShare(Fields):
+    """How large a part of all configurations, drawn evenly, fails in one render of the search."""
+
+    estimate: float | None = Field(description="null where too few draws failed to say")
+    interval: Interval = Field(description="95 %, however the draws were chosen")
+    effective: float = Field(description="failures of equal weight that would say as much")
+    draws: int
+
+
 class DifferentFailures(Fields):
     """Many different failures, of a policy that looks for them."""
 
-    over: list[str] = Field(description="the parameters that tell them apart")
-    found: int = Field(description="cells in which the search saw a success: its own claim")
-    seen: int = Field(description="cells that it looked at")
-    places: int = Field(description="cells that there are")
+    over: list[str] = Field(description="the parameters that tell cells apart; empty where there are no cells")
+    found: int = Field(description="cells in which the search saw a success, or such draws: its own claim")
+    seen: int = Field(description="cells, or draws, that it looked at")
+    places: int | None = Field(description="cells that there are; null where there are none")
+    share: FailingShare | None = Field(default=None, description="null where it can't be told")
     tried: int = Field(description="failures that were tried with fresh seeds")
     held: int = Field(description="of these, verified")
     listed: list[DifferentFailure] = Field(description="the worst, then whichever is farthest from all before it")

@@ -402,6 +402,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "cmaes": {"sigma": 1.0, "population": 4},
     "grid": {"points": 2},
     "halving": {"policy": "pgd", "eta": 2, "starts": 2},
+    "mixture": {"components": 2, "even": 0.5, "population": 4},
     "nes": {"sigma": 0.1, "population": 4},
     "pgd": {"step_size": 0.5, "momentum": 0.9, "random_start": True},
     "portfolio": {"policies": ["pgd", "nes", {"name": "restarts", "policy": "adam", "times": 2}]},

@@ -1,0 +1,133 @@
+"""The mixture that learns where failures lie: how large a share it says that they are, and where."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from advsearch.attacks import Block, Domain, Evaluation, make_policy, search
+from advsearch.attacks.failure_share import FailureShare, failure_share
+from advsearch.attacks.failures import Failures
+from advsearch.attacks.policies.base import one_thread
+from advsearch.errors import InputError
+
+BOX = Domain(
+    torch.full((4,), 0.5),
+    (
+        Block(1, name="yaw", periodic=True),
+        Block(1, name="height"),
+        Block(1, name="light"),
+        Block(1, name="kind", options=4),
+    ),
+)
+Margin = Callable[[Tensor], Tensor]
+"""Over 0 where the model is wrong."""
+
+
+def corner(u: Tensor) -> Tensor:
+    """A fifth of two numbers each: a share of 0.04."""
+    return torch.minimum(u[1] - 0.8, 0.2 - u[2])
+
+
+def across(u: Tensor) -> Tensor:
+    """Round the end of an angle, for one of four options: a share of 0.2 / 4."""
+    return torch.minimum((u[0] - 0.5).abs() - 0.4, torch.where(u[3] > 0.75, 1.0, -0.2))
+
+
+def two(u: Tensor) -> Tensor:
+    """Two places apart: a share of 0.02."""
+    low = torch.minimum(0.1 - u[1], 0.1 - u[2])
+    return torch.maximum(low, torch.minimum(u[1] - 0.9, u[2] - 0.9))
+
+
+def learnt(margin: Margin, seed: int, renders: int = 400) -> Failures:
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+        value = float(margin(u))
+        return Evaluation(value, None, value > 0.0)
+
+    policy = make_policy("mixture")
+    found = search(evaluate, BOX, policy, steps=renders, seed=seed, candidates=0).failures
+    assert found is not None
+    return found
+
+
+def share(known: Failures) -> FailureShare:
+    assert known.share is not None
+    return known.share
+
+
+@pytest.mark.parametrize(("margin", "truth"), [(corner, 0.04), (across, 0.05), (two, 0.02)])
+def test_its_share_is_the_true_one_with_less_error_than_even_draws(margin: Margin, truth: float) -> None:
+    found = [share(learnt(margin, seed)) for seed in range(8)]
+    estimates = torch.tensor([one.estimate for one in found])
+    assert all(one.interval[0] <= truth <= one.interval[1] for one in found)
+    error = float((estimates / truth - 1.0).square().mean().sqrt())
+    assert error < math.sqrt((1.0 - truth) / truth / 400)  # of even draws
+    assert abs(float(estimates.mean()) / truth - 1.0) < 3.0 * error / math.sqrt(8)
+
+
+def test_it_answers_with_a_failure_for_each_place_and_what_tells_it_apart() -> None:
+    known = learnt(two, 1)
+    assert known.found > 5 * 0.02 * known.seen and known.places is None
+    heights = [float(one.u[1]) for one in known.listed]
+    assert all(two(one.u) > 0.0 for one in known.listed)
+    assert min(heights) < 0.2 and max(heights) > 0.8
+    assert all(set(one.ranges) == {1, 2} for one in known.listed)
+    (options,) = {one.ranges.get(3) for one in learnt(across, 0).listed}
+    assert options == (0.75, 1.0)
+
+
+def test_an_interval_covers_as_often_as_it_says() -> None:
+    """Draws from two densities in turn, of which the second depends on what the first saw."""
+    missed, truth = 0, 0.1
+    for seed in range(100):
+        rng = torch.Generator().manual_seed(seed)
+        even = torch.rand(150, generator=rng)
+        often = 0.5 if bool((even[:50] < truth).any()) else 0.0  # share that is drawn from below 0.2
+        inside = torch.rand(150, generator=rng) < often
+        x = torch.where(inside, 0.2 * even, even)
+        density = torch.where(x < 0.2, 1.0 - often + 5.0 * often, 1.0 - often)
+        x[:50], density[:50] = even[:50], 1.0
+        bounds = torch.cat([torch.ones(50), torch.full((100,), 1.0 / (1.0 - often))])
+        with one_thread():
+            told = failure_share(1.0 / density, bounds, x < truth, torch.zeros(150, dtype=torch.bool))
+        missed += not told.interval[0] <= truth <= told.interval[1]
+    assert missed <= 5
+
+
+def test_nothing_is_estimated_from_few_failures_and_what_is_unknown_widens_the_interval() -> None:
+    weights, none = torch.ones(100), torch.zeros(100, dtype=torch.bool)
+    few = none.clone()
+    few[:5] = True
+    told = failure_share(weights, weights, few, none)
+    assert told.estimate is None and told.effective == pytest.approx(5.0)
+    assert told.interval[0] < 0.05 < told.interval[1] < 0.2
+    unknown = none.clone()
+    unknown[50:] = True
+    wide = failure_share(weights, weights, few, unknown)
+    assert wide.interval[0] == pytest.approx(told.interval[0]) and wide.interval[1] > 0.55
+    assert failure_share(weights, weights, none, none).interval == pytest.approx((0.0, 0.05), abs=0.04)
+    assert failure_share(weights, weights, ~none, none).interval[1] == 1.0
+
+
+def test_options_that_no_search_can_have_are_refused() -> None:
+    for given in ({"components": 0}, {"even": 0.01}, {"even": 1.5}, {"population": 1}):
+        with pytest.raises(InputError, match=next(iter(given))):
+            make_policy("mixture", **given)
+    domain = Domain(torch.full((51,), 0.5), (Block(51),))
+    with pytest.raises(InputError, match="at most 50 numbers, got 51; use pgd or auto"):
+        make_policy("mixture").start(domain, torch.Generator().manual_seed(0), 10)
+
+
+def test_no_share_is_told_of_a_ball_whose_draws_are_projected() -> None:
+    domain = Domain(torch.full((2,), 0.5), (Block(2, "l2", 0.1),))
+
+    def evaluate(u: Tensor, *, index: int, gradient: bool | str, samples: int = 1) -> Evaluation:
+        return Evaluation(float(u[0]), None, bool(u[0] > 0.55))
+
+    known = search(evaluate, domain, make_policy("mixture"), steps=60, seed=0, candidates=0).failures
+    assert known is not None and known.share is None and known.found > 0
