@@ -3,25 +3,34 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from advsearch import seeds
 from advsearch.api.keywords import ExplainKeywords, asks, configured
 from advsearch.api.subruns import carry_out_part
+from advsearch.api.sweep import job_of
 from advsearch.attacks import clopper_pearson
 from advsearch.config import ExplainConfig, SweepConfig
 from advsearch.config.explain import FEWEST_ROWS
-from advsearch.errors import FileFormatError, InputError
+from advsearch.engine.sweeps.batch import Batches
+from advsearch.engine.sweeps.job import check_all
+from advsearch.errors import FileFormatError, InputError, ModelError
+from advsearch.explanations.clusters import find_clusters
 from advsearch.explanations.envelope import Envelope, find_envelope
 from advsearch.explanations.importance import Importance, find_importance
 from advsearch.explanations.observations import Factor, Observations, observed
 from advsearch.explanations.renders import along, inside, lies_inside
 from advsearch.explanations.rules import Conditions, CountedRule, RuleCondition, covered, find_rules
+from advsearch.interrupts import interruptible
+from advsearch.models.features import Features, features_of
 from advsearch.progress import NullProgress, Progress
 from advsearch.recipes.table import Answered, rows_of
 from advsearch.runs.directory import CONFIG, PARTS, RunDirectory, find_run
@@ -30,6 +39,8 @@ from advsearch.runs.results.explain import (
     ConditionRow,
     EnvelopeRow,
     ExplainResult,
+    FailureCluster,
+    FailureClusters,
     NearestRight,
     ParameterWeight,
     RightOf,
@@ -92,6 +103,7 @@ def explain_from_config(
         renders = _Renders(run.path, progress, config, found)
         table = [_rule_row(rule, found.factors, renders.confirmed(rule, n, asked)) for n, rule in enumerate(rules)]
         pairs = list(renders.pairs(rules, rows, asked))
+        clusters = renders.clusters(asked[0], run)
         first = asked[0].summary
         right = int(found.right.sum())
         result = ExplainResult(
@@ -110,6 +122,7 @@ def explain_from_config(
             importance=[] if importance is None else _weights(importance, found.factors),
             envelope=None if envelope is None else _envelope_row(envelope, found.factors, config.accuracy),
             pairs=pairs,
+            clusters=clusters,
             renders=renders.count,
             ending=INTERRUPTED if renders.interrupted else "done",
             warnings=[*renders.warnings, *_cautions(rows, importance)],
@@ -222,6 +235,42 @@ class _Renders:
             if near:
                 yield min(near, key=self._moved)
 
+    def clusters(self, one: _Asked, run: RunDirectory) -> FailureClusters | None:
+        """Render failures of a sweep again, and group them by what its model decides by."""
+        failing = [number for number, row in enumerate(one.rows) if not row.correct]
+        if self.interrupted or not self.config.clusters or len(one.config.models) > 1 or not failing:
+            return None
+        generator = np.random.default_rng(seeds.stream(self.config.seed, "clusters"))
+        numbers = sorted(int(n) for n in generator.permutation(failing)[: self.config.clusters])
+        self.progress.stage("rendering failures again", len(numbers), hint="`clusters` says how many")
+        try:
+            with interruptible():
+                pictures, features = pictures_again(one.config, numbers, self.progress)
+        except KeyboardInterrupt:
+            self.interrupted = True
+            return None
+        except (InputError, ModelError) as error:
+            self.warnings.append(f"No failures were grouped: {error}")
+            return None
+        self.count += len(numbers)
+        found = find_clusters(features(pictures).double().numpy(), self.config.seed)
+        listed = []
+        for place, members in enumerate(found.members):
+            own = [one.rows[numbers[k]] for k in members]
+            path = run.save_image(f"cluster-{place + 1}", pictures[members[0]])
+            answers = dict(Counter(row.answer for row in own).most_common())
+            picture = str(path.relative_to(self.folder))
+            listed.append(
+                FailureCluster(failures=len(own), answers=answers, values=dict(own[0].values), picture=picture)
+            )
+        return FailureClusters(
+            features=features.source,
+            failures=len(numbers),
+            silhouette=found.silhouette,
+            apart=found.apart,
+            listed=listed,
+        )
+
     def _moved(self, pair: NearestRight) -> float:
         """How far the value moved, as a share of what the rows have; another name is as far as it goes."""
         place = next(k for k, one in enumerate(self.found.factors) if one.name == pair.parameter)
@@ -283,6 +332,23 @@ def _sweep_of(index: int, asked: Sequence[_Asked]) -> _Asked:
             return one
         index -= len(one.rows)
     raise IndexError(index)
+
+
+def pictures_again(config: SweepConfig, numbers: Sequence[int], progress: Progress) -> tuple[Tensor, Features]:
+    """Return pictures (n, H, W, 3) of a sweep of one model, as the model saw them, and what reads its features.
+
+    Raises:
+        InputError: the scene is not to be had any more, or the task is another than classification.
+    """
+    job = job_of(config)
+    if job.tasks[0].varies:
+        raise InputError(f"task {config.task_name}: features are read of classifiers")
+    count, pictures = check_all(job)[0].count, []
+    batches = Batches(job, count)
+    for number in numbers:
+        pictures.append(batches.pictures(range(number, number + 1))[0])
+        progress.advance(1)
+    return torch.stack(pictures), features_of(job.models[0])
 
 
 # ---- rows of the answer ---------------------------------------------------------------------------------------------

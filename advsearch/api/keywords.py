@@ -210,6 +210,7 @@ class ExplainKeywords(RunKeywords, total=False):
 
     confirm: int
     pairs: int
+    clusters: int
     accuracy: float
     seed: int
     threads: int | None

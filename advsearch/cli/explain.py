@@ -23,6 +23,8 @@ def answer(result: ExplainResult) -> str:
     from advsearch.report import wording
     from advsearch.report.explanations import (
         WEIGHT_HEADS,
+        cluster_text,
+        clusters_text,
         envelope_text,
         explain_text,
         explained_text,
@@ -40,6 +42,9 @@ def answer(result: ExplainResult) -> str:
         parts.append(f"{heads}\n{output.columns([list(WEIGHT_HEADS), *weight_rows(result)])}")
     parts.append(f"Envelope. {envelope_text(result)}")
     parts += [f"One thing changed. {pair_text(pair)}" for pair in result.pairs]
+    if result.clusters is not None:
+        parts.append(f"Kinds. {clusters_text(result.clusters)}")
+        parts.append(output.columns([[one.picture, cluster_text(one)] for one in result.clusters.listed]))
     facts = [
         ["rows", f"right in {share_text(result)}"],
         ["renders", str(result.renders)],

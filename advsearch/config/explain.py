@@ -42,6 +42,14 @@ class ExplainConfig(Config):
         ge=0,
         le=100,
     )
+    clusters: int = setting(
+        100,
+        "explain",
+        "failures that are rendered again and grouped by what the model decides by; 0 for none",
+        unit="failures",
+        ge=0,
+        le=10_000,
+    )
     accuracy: float = setting(
         0.95,
         "explain",

@@ -141,7 +141,7 @@ def written(value: float | str) -> str:
 
 
 def rows_of(part: str, folder: Path, summary: AttackSummary | SweepSummary) -> list[Answered]:
-    """Return the answers that a sweep has stored, or the trials of an attack.
+    """Return the answers that a sweep has stored, without the trials of its worst, or the trials of an attack.
 
     Args:
         part: of the recipe.
@@ -152,10 +152,10 @@ def rows_of(part: str, folder: Path, summary: AttackSummary | SweepSummary) -> l
         FileFormatError: the rows cannot be read.
     """
     outer = {"object": summary.object, "environment": summary.environment, "model": summary.model}
-    rows = []
+    rows, kinds = [], ("sweep",) if isinstance(summary, SweepSummary) else tuple(TRIALS)
     with Store(folder / NAME, read_only=True) as store:
         for row in store.rows():
-            if row.kind != "sweep" and row.kind not in TRIALS:
+            if row.kind not in kinds:
                 continue
             values = {name: one["value"] for name, one in row.values.items()}
             values |= {TRIAL: TRIALS[row.kind]} if row.kind in TRIALS else {}

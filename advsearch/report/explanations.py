@@ -5,12 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from advsearch.report import wording
-from advsearch.runs.results.explain import ConditionRow, ExplainResult, NearestRight, RightOf, RuleRow
+from advsearch.runs.results.explain import (
+    ConditionRow,
+    ExplainResult,
+    FailureCluster,
+    FailureClusters,
+    NearestRight,
+    RightOf,
+    RuleRow,
+)
 
 WEIGHT_HEADS = ("parameters", "decides", "95 %", "with others", "95 %")
 """Of the columns of the importance."""
 MOST_WEIGHTS = 12
 """Rows of it that are shown."""
+MOST_ANSWERS = 3
+"""Answers of a cluster that are named."""
 
 
 def explain_text(result: ExplainResult) -> str:
@@ -63,6 +73,22 @@ def pair_text(pair: NearestRight) -> str:
         f"{pair.parameter} {_value(pair.wrong_at)}{unit}: {pair.answered}; at {_value(pair.right_at)}{unit}: "
         f"{pair.answered_there}."
     )
+
+
+def clusters_text(found: FailureClusters) -> str:
+    """Return how many kinds of failures there are."""
+    again = f"the {found.failures} failures that were rendered again"
+    if found.silhouette is None:
+        return f"One kind: {again} are alike by {found.features}."
+    shading = "" if found.apart else "; they shade into one another: groups of any cloud may be as far apart"
+    kinds = f"{len(found.listed)} kinds among {again}, by {found.features}"
+    return f"{kinds} (silhouette {found.silhouette:.2f}{shading})."
+
+
+def cluster_text(one: FailureCluster) -> str:
+    """Return how many failures a cluster has, and what the model calls them."""
+    answers = ", ".join(f"{name} {number}" for name, number in list(one.answers.items())[:MOST_ANSWERS])
+    return f"{one.failures}: {answers}"
 
 
 def explained_text(result: ExplainResult) -> str:

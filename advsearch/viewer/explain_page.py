@@ -7,6 +7,8 @@ from pathlib import Path
 from advsearch.report import wording
 from advsearch.report.explanations import (
     WEIGHT_HEADS,
+    cluster_text,
+    clusters_text,
     conditions_text,
     envelope_text,
     explain_text,
@@ -16,7 +18,7 @@ from advsearch.report.explanations import (
     weight_rows,
 )
 from advsearch.report.markup import Html, element, join
-from advsearch.runs.results.explain import ExplainResult, NearestRight
+from advsearch.runs.results.explain import ExplainResult, FailureCluster, NearestRight
 from advsearch.viewer.document import data_url, document
 from advsearch.viewer.study_page import again, facts_table, heading, table
 
@@ -53,6 +55,13 @@ def explain_page(run: Path, result: ExplainResult) -> str:
         element("h2", "Where it can be relied on"),
         element("p", envelope_text(result)),
         join(element("h2", "One thing changed"), *(_pair(run, one) for one in result.pairs)) if result.pairs else None,
+        join(
+            element("h2", "Kinds of failures"),
+            element("p", clusters_text(result.clusters)),
+            element("div", *(_cluster(run, one) for one in result.clusters.listed), class_="pictures"),
+        )
+        if result.clusters is not None
+        else None,
         element("h2", "Cost and conditions"),
         facts_table(
             {
@@ -70,16 +79,31 @@ def explain_page(run: Path, result: ExplainResult) -> str:
     return document(f"{run.name}, explained", header, main, footer=f"run {run.name}. This page needs no other file.")
 
 
+def _kept(run: Path, name: str) -> Path | None:
+    """The file of a picture in the folder of the run; None where there is none, or a summary names one elsewhere."""
+    file = (run / name).resolve()
+    return file if file.is_relative_to(run.resolve()) and file.is_file() else None
+
+
+def _cluster(run: Path, one: FailureCluster) -> Html | None:
+    """The most typical failure of a cluster."""
+    file = _kept(run, one.picture)
+    if file is None:
+        return None
+    image = element("img", src=data_url(file.read_bytes(), "image/png"), alt=cluster_text(one))
+    return element("figure", image, element("figcaption", cluster_text(one)))
+
+
 def _pair(run: Path, pair: NearestRight) -> Html:
     """A failure beside the nearest right answer, pictures where they were kept."""
     words = ("wrong: " + pair.answered, "right: " + pair.answered_there)
     figures = [
         element(
             "figure",
-            element("img", src=data_url((run / name).read_bytes(), "image/jpeg"), alt=text),
+            element("img", src=data_url(file.read_bytes(), "image/jpeg"), alt=text),
             element("figcaption", text),
         )
         for name, text in zip(pair.pictures, words, strict=False)
-        if (run / name).is_file()
+        if (file := _kept(run, name)) is not None
     ]
     return join(element("p", pair_text(pair)), element("div", *figures, class_="pictures pair") if figures else None)

@@ -6,8 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
+import torch
 from samples import sweep
 from stored_sweeps import described, make_sweep
 
@@ -22,7 +24,7 @@ from advsearch.explanations.rules import RuleCondition
 from advsearch.recipes.table import Answered
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.explain import ExplainResult
-from advsearch.runs.store import Row
+from advsearch.runs.store import NAME, Row, Store
 from advsearch.runs.summary import read_result
 
 HIGH = 60.0
@@ -49,7 +51,7 @@ def stored(path: Path, wrong: Any, rows: int = 600) -> Path:
             }
             label = "bowl" if is_wrong else "mug"
             made.append(Row("sweep", step, correct=not is_wrong, margin=0.5, label=label, values=values))
-        run.record(*made)
+        run.record(*made, *(Row("verification", step, correct=False, label="bowl") for step in range(20)))
         right = sum(bool(one.correct) for one in made)
         counts = {"configurations": rows, "correct": right, "accuracy": right / rows, "interval": (0.0, 1.0)}
         run.write_summary(sweep(**counts, planned=rows, run=str(path)))
@@ -57,7 +59,7 @@ def stored(path: Path, wrong: Any, rows: int = 600) -> Path:
 
 
 def test_a_rule_is_found_in_stored_rows(swept: Path, tmp_path: Path) -> None:
-    result = advsearch.explain(swept, confirm=0, pairs=0, accuracy=0.9, run=tmp_path / "run")
+    result = advsearch.explain(swept, confirm=0, pairs=0, clusters=0, accuracy=0.9, run=tmp_path / "run")
     (rule,) = result.rules
     assert [one.parameter for one in rule.conditions] == ["camera.elevation"]
     over = rule.conditions[0].over
@@ -78,6 +80,8 @@ def test_json_says_right_of_and_interval(swept: Path, tmp_path: Path, capsys: py
         "--confirm",
         "0",
         "--pairs",
+        "0",
+        "--clusters",
         "0",
         "--accuracy",
         "0.9",
@@ -105,7 +109,7 @@ def test_a_rule_is_confirmed_by_what_is_rendered_inside_it(
         return [*own, outside]
 
     monkeypatch.setattr(explaining._Renders, "_rows", rendered)
-    result = advsearch.explain(swept, confirm=10, pairs=0, run=tmp_path / "run")
+    result = advsearch.explain(swept, confirm=10, pairs=0, clusters=0, run=tmp_path / "run")
     confirmed = result.rules[0].confirmed
     assert confirmed is not None and (confirmed.right, confirmed.total) == (0, 9)  # what lies outside is not counted
     low, high = np.asarray(asked[0].controls["camera"]["elevation"], dtype=float)
@@ -127,7 +131,7 @@ def test_the_nearest_right_answer_differs_in_one_value(
         ]
 
     monkeypatch.setattr(explaining._Renders, "_rows", rendered)
-    result = advsearch.explain(swept, confirm=0, pairs=1, run=tmp_path / "run")
+    result = advsearch.explain(swept, confirm=0, pairs=1, clusters=0, run=tmp_path / "run")
     (pair,) = result.pairs
     assert pair.parameter == "camera.elevation" and float(pair.wrong_at) > HIGH >= float(pair.right_at) > 50.0
     assert (pair.answered, pair.answered_there) == ("bowl", "mug")
@@ -184,3 +188,41 @@ def test_a_sweep_along_a_factor_keeps_the_rest() -> None:
     assert made.grid["light.power"] == [0.5] and made.plain()["set"] == {}
     lit = along(config, row, FOUND.factors[1], FOUND, 3)
     assert lit.environment == "noon,studio" and lit.grid["pose.yaw"] == [90.0]
+
+
+class Read:
+    """Features that tell the lighter pictures from the darker ones."""
+
+    source = "twelve numbers"
+
+    def __call__(self, images: torch.Tensor) -> torch.Tensor:
+        sides = (images[:, 0, 0, :1] - 0.5) * torch.linspace(-8.0, 8.0, 12)
+        return sides + torch.randn(sides.shape, generator=torch.Generator().manual_seed(0))
+
+
+def test_failures_are_grouped_by_what_the_model_decides_by(
+    swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[int] = []
+
+    def again(config: SweepConfig, numbers: Any, progress: Any) -> tuple[torch.Tensor, Read]:
+        """Dark pictures of even rows and light ones of odd rows."""
+        asked.extend(numbers)
+        shades = torch.tensor([0.2 + 0.6 * (number % 2) for number in numbers])
+        return shades[:, None, None, None].expand(-1, 4, 4, 3), Read()
+
+    monkeypatch.setattr(explaining, "pictures_again", again)
+    result = advsearch.explain(swept, confirm=0, pairs=0, clusters=50, run=tmp_path / "run")
+    found = result.clusters
+    assert found is not None and found.apart and found.failures == 50 == len(set(asked)) and result.renders == 50
+    with Store(swept / NAME, read_only=True) as store:
+        assert all(not row.correct for row in store.rows("sweep") if row.step in asked)
+    odd = sum(number % 2 for number in asked)
+    assert sorted(one.failures for one in found.listed) == sorted([odd, 50 - odd])
+    assert all(sum(one.answers.values()) == one.failures and "bowl" in one.answers for one in found.listed)
+    shades = {round(float(iio.imread(tmp_path / "run" / one.picture).mean()) / 255.0, 1) for one in found.listed}
+    assert shades == {0.2, 0.8}
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert "2 kinds among the 50 failures" in page and page.count("data:image/png") == 2
+    assert main(["show", str(tmp_path / "run")]) == 0
+    assert "images/cluster-1.png" in capsys.readouterr().out

@@ -10,10 +10,13 @@ import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
+from torch import Tensor
+
 from advsearch.attacks.draws import Seeds
 from advsearch.described import Value
 from advsearch.engine.sweeps.job import Job
-from advsearch.engine.sweeps.swept_scene import SweptScene
+from advsearch.engine.sweeps.points import Picks
+from advsearch.engine.sweeps.swept_scene import Seen, SweptScene
 from advsearch.runs.results.attack import LinearTransport
 from advsearch.scene.description import OBJECT
 from advsearch.tasks import Answer, Judgement
@@ -89,12 +92,9 @@ class Batches:
 
     def __call__(self, numbers: range) -> Batch:
         """Carry out the pictures with these numbers, all of one scene."""
-        scene = numbers.start // self._per_scene
-        view, before = self.open(scene), scene * self._per_scene
+        view = self.open(numbers.start // self._per_scene)
         begun = time.perf_counter()
-        points = next(iter(view.points.values()))
-        picks = points.picks(numbers.start - before, len(numbers), before)
-        seen = view.look(picks, [self._seeds(number) for number in numbers])
+        picks, seen = self._look(numbers)
         seconds = (time.perf_counter() - begun) / (len(numbers) * len(self._job.models))
         pictures, layers = {}, {}
         for k, number in enumerate(numbers):
@@ -115,6 +115,17 @@ class Batches:
             thumbnails=pictures,
             layers=layers,
         )
+
+    def pictures(self, numbers: range) -> Tensor:
+        """Return the pictures (n, H, W, 3) with these numbers, all of one scene, as the first model sees them."""
+        return self._look(numbers)[1].pictures
+
+    def _look(self, numbers: range) -> tuple[Picks, Seen]:
+        scene = numbers.start // self._per_scene
+        view, before = self.open(scene), scene * self._per_scene
+        points = next(iter(view.points.values()))
+        picks = points.picks(numbers.start - before, len(numbers), before)
+        return picks, view.look(picks, [self._seeds(number) for number in numbers])
 
     def _is_kept(self, seen: Iterable[Judgement]) -> bool:
         """Whether the thumbnail of a picture of which the models say this is kept."""

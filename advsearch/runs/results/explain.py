@@ -67,6 +67,25 @@ class NearestRight(Fields):
     pictures: list[str] = Field(description="files in the run's folder: of the failure, and of the other")
 
 
+class FailureCluster(Fields):
+    """Failures that look alike to the model."""
+
+    failures: int = Field(description="how many of those that were rendered again")
+    answers: dict[str, int] = Field(description="what the model says of them, and how often")
+    values: dict[str, str | float] = Field(description="of the most typical one")
+    picture: str = Field(description="of it: a file in the run's folder")
+
+
+class FailureClusters(Fields):
+    """Failures, grouped by the numbers that the model decides by."""
+
+    features: str = Field(description="what these are")
+    failures: int = Field(description="failures that were rendered again")
+    silhouette: float | None = Field(description="how well they are apart, -1 to 1; null where all are one cluster")
+    apart: bool = Field(description="whether they are farther apart than groups of a cloud without any")
+    listed: list[FailureCluster] = Field(description="the largest first")
+
+
 class ExplainResult(RunResult, RightOf):
     """Where a model is wrong and why, in words, from the rows of sweeps; `right` and `of` are those of all rows."""
 
@@ -83,6 +102,7 @@ class ExplainResult(RunResult, RightOf):
     importance: list[ParameterWeight] = Field(description="empty where next to nothing is explained")
     envelope: EnvelopeRow | None = Field(description="null where no box promises it")
     pairs: list[NearestRight]
+    clusters: FailureClusters | None = Field(default=None, description="null where nothing was rendered for them")
     renders: int = Field(description="pictures that were rendered")
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
