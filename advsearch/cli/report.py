@@ -101,6 +101,12 @@ def _with_parts(folder: Path) -> Iterator[Path]:
         yield folder
 
 
+def _of_quick_recipe(folder: Path) -> bool:
+    """Whether a run is a part of a recipe that was made with `quick`."""
+    outer = _settings(folder.resolve().parent.parent)
+    return outer.get("command") == "recipe" and outer.get("quick") is True
+
+
 def _settings(folder: Path) -> Mapping[str, object]:
     """What its run.yaml says; nothing where there is none that can be read."""
     from advsearch.runs.directory import CONFIG
@@ -113,7 +119,7 @@ def _settings(folder: Path) -> Mapping[str, object]:
 
 def _run(folder: Path) -> EvidenceRun:
     """One run; of one that has no summary, that it claims nothing."""
-    from advsearch.report.evidence import claims_of, nothing_there
+    from advsearch.report.evidence import QUICK, claims_of, nothing_there
     from advsearch.report.evidence_runs import NOT_NOTED, evidence_of
     from advsearch.runs.directory import CONFIG, shown
     from advsearch.runs.results.evidence import EvidenceRun
@@ -138,7 +144,9 @@ def _run(folder: Path) -> EvidenceRun:
             command_line=f"advsearch run {folder / CONFIG}",
         )
     result = read_result(folder)
-    return evidence_of(name, result, [*claims_of(result), *_photos(folder)], settings, made)
+    found = evidence_of(name, result, [*claims_of(result), *_photos(folder)], settings, made)
+    few = [QUICK] if _of_quick_recipe(folder) else []
+    return found.model_copy(update={"excluded": [*few, *found.excluded]})
 
 
 def _photos(folder: Path) -> list[Claim]:

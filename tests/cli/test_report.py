@@ -10,8 +10,9 @@ import pytest
 from samples import attack, make_run
 
 from advsearch.cli.main import main
-from advsearch.config import AttackConfig
-from advsearch.runs.directory import RunDirectory
+from advsearch.config import AttackConfig, RecipeConfig
+from advsearch.report.evidence import QUICK
+from advsearch.runs.directory import PARTS, RunDirectory
 from advsearch.runs.made_with import NOTE
 
 
@@ -56,3 +57,17 @@ def test_each_sitting_that_differs_is_noted_once(tmp_path: Path) -> None:
         with RunDirectory.resume(tmp_path / "run", config) as run:
             noted = run.store.noted(NOTE)
     assert [one["torch"] for one in noted] == ["0.1", first[0]["torch"]]
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_parts_of_a_quick_recipe_say_that_they_are_no_result(
+    quick: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = tmp_path / "recipe"
+    with RunDirectory.create_for(RecipeConfig(recipe="pose-space", quick=quick, run=str(recipe))):
+        pass
+    make_run(recipe / PARTS / "0-mug", pictures=False, rows=False)
+    assert main(["report", str(recipe), "--evidence", "--out", str(tmp_path / "card"), "--json"]) == 0
+    (part,) = json.loads(capsys.readouterr().out)["runs"]
+    assert (QUICK in part["excluded"]) == quick
+    assert (QUICK in (tmp_path / "card" / "evidence.md").read_text()) == quick
