@@ -42,7 +42,7 @@ RULES = (
 )
 """How claims are to be read."""
 
-QUICK = "Made by a recipe with `quick`: few and small pictures, to see what comes out; no result."
+QUICK = "Made by a quick recipe: few and small pictures, to see what comes out; no result."
 NOTHING = "Nothing is claimed"
 NO_PROOF = "This does not show that there is none."
 ENDED = ("budget spent", "stalled")
