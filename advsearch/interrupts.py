@@ -8,15 +8,22 @@ from types import FrameType
 
 
 class Interrupts:
-    """A handler of Ctrl-C as Python's own, which counts."""
+    """A handler of Ctrl-C as Python's own, which counts.
+
+    Attributes:
+        count: signals that have come.
+        ended: whether further ones are only counted, since nothing is left to interrupt.
+    """
 
     def __init__(self) -> None:
         self.count = 0
+        self.ended = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         """Take a signal."""
         self.count += 1
-        raise KeyboardInterrupt
+        if not self.ended:
+            raise KeyboardInterrupt
 
     def check(self) -> None:
         """Raise an interrupt that has come already."""

@@ -15,7 +15,6 @@ import re
 import signal
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from types import ModuleType
 from typing import Any, NoReturn
 
@@ -76,13 +75,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. An exception that is a bug of ours passes through."""
     if argv is None:  # this process is ours
         open_descriptors()
-        signal.signal(signal.SIGINT, INTERRUPTS)
     with screens():
-        status = _status(list(sys.argv[1:] if argv is None else argv))
-        if argv is None:  # what is left is the end of the process, which no further Ctrl-C hastens
+        status = _interruptible(sys.argv[1:]) if argv is None else _status(list(argv))
+        if argv is None:  # native code knows no handler of ours
             signal.signal(signal.SIGINT, signal.SIG_IGN)
         end_output()
     return status
+
+
+def _interruptible(given: list[str]) -> int:
+    """As `_status`, with Ctrl-C for as long as there is something to interrupt, and never a traceback of it."""
+    try:
+        signal.signal(signal.SIGINT, INTERRUPTS)
+        status = _status(given)
+        INTERRUPTS.ended = True
+        return status
+    except KeyboardInterrupt:  # while `_status` told of another
+        INTERRUPTS.ended = True
+        return INTERRUPTED
 
 
 def _status(given: list[str]) -> int:
@@ -96,8 +106,7 @@ def _status(given: list[str]) -> int:
         # Modules that are being imported, and native code, make other errors of an interrupt.
         if not INTERRUPTS.count and not isinstance(error, KeyboardInterrupt):
             raise
-        with suppress(KeyboardInterrupt):  # one more
-            print("advsearch: interrupted", file=sys.stderr)
+        print("advsearch: interrupted", file=sys.stderr)
         return INTERRUPTED
 
 

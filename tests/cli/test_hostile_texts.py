@@ -244,3 +244,29 @@ def test_two_quick_interrupts_leave_no_traceback(delay: float, tmp_path: Path) -
     error = process.communicate(timeout=60)[1]
     assert process.returncode in (130, -2)  # the second: before our own code began
     assert "Traceback" not in error and "Exception ignored" not in error
+
+
+STRUCK = """
+import os, signal, sys
+sys.argv = ["advsearch", "nope"]
+from advsearch import __main__
+from advsearch.cli import main
+before = {where}
+def struck(*values):
+    if signal.SIG_DFL not in values and main.INTERRUPTS not in values:  # these two are where Ctrl-C begins to count
+        os.kill(os.getpid(), signal.SIGINT)
+    return before(*values)
+{where} = struck
+sys.exit(__main__.start())
+"""
+
+
+@pytest.mark.parametrize(
+    "where, status",
+    [("main._status", 130), ("main._run_and_tell", 130), ("main.signal.signal", 2), ("main.end_output", 2)],
+)
+def test_an_interrupt_at_either_end_leaves_no_traceback(where: str, status: int, tmp_path: Path) -> None:
+    """Before a command begins, inside it, and when it is over: then its own status stands."""
+    words = [sys.executable, "-c", STRUCK.format(where=where)]
+    result = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert result.returncode == status and "Traceback" not in result.stderr
