@@ -39,6 +39,7 @@ SHOWN = {
     "common-corruptions": (1,),
     "physical": (1,),
     "parts": (1,),
+    "realism": (1, 2),
 }
 """The figures of each recipe that the page shows, from 1."""
 
@@ -53,6 +54,7 @@ COUNTS: dict[str, dict[str, Any]] = {
     "pose-space": {"poses": {"samples": 60}},
     "common-corruptions": {"clean": {"samples": 40}, "corrupted": {"samples": 2}},
     "parts": {"views": {"samples": 200}},
+    "realism": {"renderings": {"samples": 60}, "finer": {"samples": 60}},
     "physical": {"texture": {"draws": 4, "steps": 80, "trials": 60, "verify_spp": 16}},
 }
 """Settings of the parts on data of one's own."""

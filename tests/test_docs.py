@@ -67,6 +67,7 @@ from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.axes import read_axes
 from advsearch.evaluation.stability.suite import chosen
 from advsearch.models import loading, reference
+from advsearch.recipes.description import names as recipes
 from advsearch.recipes.description import read_recipe
 from advsearch.recipes.parts import planned
 from advsearch.runs import directory, export, store
@@ -429,11 +430,12 @@ def check_advsearch(words: list[str], folder: Path) -> None:
         otherwise = {"object": "mug"} if "around" in args and args.command == "region" else {}
         check_names(config_from(args, CONFIGS[args.command], **otherwise))
     if args.command in ("run", "resume"):
-        recipe = folder / "run.yaml"
-        recipe.write_text("object: mug\n", encoding="utf-8")
-        of_a_sweep = args.command == "resume" and "-sweep-" in args.run
-        config = SweepConfig if of_a_sweep else AttackConfig
-        check_names(config.from_yaml(recipe, dict(parse_assignment(text, text) for text in args.change)))
+        run = Path(args.run).name if args.command == "resume" else ""
+        of_a_recipe = run.rpartition("-")[0] in recipes()
+        file = folder / "run.yaml"
+        file.write_text(f"recipe: {run.rpartition('-')[0]}\n" if of_a_recipe else "object: mug\n", encoding="utf-8")
+        config = RecipeConfig if of_a_recipe else SweepConfig if "-sweep-" in run else AttackConfig
+        check_names(config.from_yaml(file, dict(parse_assignment(text, text) for text in args.change)))
     if args.command == "export":
         assert args.format in (None, *WRITERS, *export.FORMATS)
 

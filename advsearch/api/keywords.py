@@ -186,6 +186,7 @@ class RecipeKeywords(RunKeywords, total=False):
     """Of `recipe`."""
 
     quick: bool
+    photographs: str | Path | None
     object: Path | Names | None
     environment: Path | Names | None
     up: Literal["y", "z"] | None

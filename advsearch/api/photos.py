@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -26,20 +27,23 @@ from advsearch.engine.rows import judged
 from advsearch.engine.sweeps.batch import Batches
 from advsearch.engine.sweeps.job import check_all
 from advsearch.errors import FileFormatError, InputError
-from advsearch.files import JsonObject
+from advsearch.files import JsonObject, read_bytes
 from advsearch.models import Model
 from advsearch.runs.directory import CONFIG, IMAGES, RunDirectory, find_run
 from advsearch.runs.files import write_bytes
-from advsearch.runs.results.photos import PhotoAgreement, PhotographedRendering
+from advsearch.runs.results.photos import LOOSE_PHOTO, PHOTO, PhotoAgreement, PhotographedRendering
 from advsearch.runs.store import NAME, Row, Store
 from advsearch.settings import read_yaml
 from advsearch.tasks import Judgement, Task, make_task
 from advsearch.tasks.base import Truth
 from advsearch.tasks.together import Together
-from advsearch.viewer.photos import FOLDER, photo_name, rendering_file, sound_photo
+from advsearch.viewer.photos import FOLDER, LARGEST, photo_name, rendering_file, sound_photo
 
-KIND = "photo"
-"""Rows of photographs in a run's store: `step` counts them, each model has a row for each."""
+SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
+"""Of the files in a folder that are photographs."""
+
+_ALIGNED = re.compile(r"rendering-([0-9]{1,12})(?:-.*)?")
+"""The name of a file with a photograph that was aligned with a rendering."""
 
 
 def photo_agreement(run: str | Path) -> PhotoAgreement:
@@ -53,7 +57,13 @@ def photo_agreement(run: str | Path) -> PhotoAgreement:
         FileFormatError: what was kept of a photograph is something else.
     """
     with Store(find_run(run) / NAME, read_only=True) as store:
-        return _agreement(list(store.rows(KIND)))
+        return _agreement(list(store.rows(PHOTO)))
+
+
+def photographs_in(folder: Path) -> list[Path]:
+    """Return the files in a folder that are photographs by their names; none where there is no such folder."""
+    files = sorted(folder.iterdir()) if folder.is_dir() else []
+    return [file for file in files if file.suffix.lower() in SUFFIXES and file.is_file()]
 
 
 class Photographs:
@@ -75,17 +85,43 @@ class Photographs:
             InputError: there is no such rendering, it is no photograph, another process works on the run, or its scene
                 is another one now.
         """
+        return self._thread.submit(self._add, run, rendering, data, "").result()
+
+    def add_files(self, run: Path, files: Sequence[Path]) -> None:
+        """Judge the photographs among some that the run does not have yet, known by the names of their files.
+
+        A file ``rendering-12.jpg``, or ``rendering-12-`` and anything, was aligned with the rendering 12. All others
+        show the object as it stood by chance: they are judged, but are compared with no single rendering.
+
+        Args:
+            run: its folder, of a sweep of one object.
+            files: in JPEG, PNG or WebP.
+
+        Raises:
+            InputError: as for `add`; the message names the file.
+        """
+        with Store(run / NAME, read_only=True) as store:
+            known = {_source(row) for kind in (PHOTO, LOOSE_PHOTO) for row in store.rows(kind)}
+        for file in files:
+            if file.name in known:
+                continue
+            aligned = _ALIGNED.fullmatch(file.stem)
+            add = partial(self._add, run, aligned[1]) if aligned else partial(self._add_loose, run)
+            data = read_bytes(file, "a photograph", LARGEST)
+            try:
+                self._thread.submit(add, data, file.name).result()
+            except InputError as error:
+                raise InputError(f"{file.name}: {error}") from None
+
+    def _add(self, run: Path, rendering: str, data: bytes, source: str) -> PhotoAgreement:
+        """Judge and keep a photograph that was aligned with a rendering; `source` is the name of its file."""
         from PIL import Image
 
         file = rendering_file(run, rendering)
         with Image.open(file) as image:
             sound = sound_photo(data, image.size)
-        return self._thread.submit(self._add, run, rendering, file, sound).result()
-
-    def _add(self, run: Path, rendering: str, file: Path, sound: bytes) -> PhotoAgreement:
-        """Judge and keep a photograph that is sound."""
         with RunDirectory.resume(run) as held:
-            number = held.store.last_step(KIND) + 1
+            number = held.store.last_step(PHOTO) + 1
             name = photo_name(rendering, number)
             rows = []
             for place, judge in enumerate(self._judges(run)):
@@ -95,11 +131,25 @@ class Photographs:
                 right, label = _rendered(judge, rendering, truth, file, seen)
                 kept: JsonObject = {"rendering": rendering, "right": right, "label": label, "file": name}
                 values["model"] = {"value": judge.model.name, "unit": ""}
-                row = judged(Row(KIND, number, values=values), judge.judgement(rendering, truth, sound))
-                rows.append(replace(row, payload={"photo": kept, "answer": row.payload}))
+                row = judged(Row(PHOTO, number, values=values), judge.judgement(rendering, truth, sound))
+                rows.append(replace(row, payload={"photo": {**kept, "source": source}, "answer": row.payload}))
             write_bytes(run / IMAGES / FOLDER / name, sound)
             held.record(*rows)
-            return _agreement(list(held.store.rows(KIND)))
+            return _agreement(list(held.store.rows(PHOTO)))
+
+    def _add_loose(self, run: Path, data: bytes, source: str) -> None:
+        """Judge a photograph that was aligned with no rendering; only what the models say of it is kept."""
+        with RunDirectory.resume(run) as held:
+            number = held.store.last_step(LOOSE_PHOTO) + 1
+            rows = []
+            for judge in self._judges(run):
+                if judge.varies:
+                    raise InputError("the task asks where the object is; name the file rendering-NUMBER.jpg after one")
+                values: dict[str, Value] = {"model": {"value": judge.model.name, "unit": ""}}
+                sound = sound_photo(data, judge.size[::-1])
+                row = judged(Row(LOOSE_PHOTO, number, values=values), judge.judgement("", judge.object, sound))
+                rows.append(replace(row, payload={"photo": {"source": source}, "answer": row.payload}))
+            held.record(*rows)
 
     def agreement(self, run: Path) -> PhotoAgreement:
         """Return the table of a run; see `photo_agreement`."""
@@ -120,6 +170,7 @@ class _PhotoJudge:
         size: (height, width) of the run's renderings, in pixels.
         several: models that the run has.
         truth: what is true of a photograph, by the rendering that it was aligned with and the object.
+        varies: whether that differs between renderings of one object.
     """
 
     object: str
@@ -128,6 +179,7 @@ class _PhotoJudge:
     size: tuple[int, int]
     several: int
     truth: Callable[[str, str], Truth]
+    varies: bool = True
 
     def judgement(self, rendering: str, name: str, data: bytes) -> Judgement:
         """What is to be said of a picture, (any size), of an object; it is made as large as the run's renderings are.
@@ -165,7 +217,9 @@ def _judges_of(run: Path) -> Sequence[_PhotoJudge]:
             scene = load_scene(name, up=config.up, settings=given, camera=config.camera)
             return task.truth(facts_of(scene, name, config.label, dict))
 
-        judges.append(_PhotoJudge(config.objects[0], model, task, _size(config, model), len(models), truth))
+        judges.append(
+            _PhotoJudge(config.objects[0], model, task, _size(config, model), len(models), truth, varies=False)
+        )
     return judges
 
 
@@ -261,6 +315,12 @@ def _rendering(name: str, model: str, group: Sequence[tuple[Row, JsonObject]]) -
         labels=[row.label or "" for row, _ in group],
         files=[str(kept["file"]) for _, kept in group],
     )
+
+
+def _source(row: Row) -> str:
+    """The name of the file that a photograph came from; empty for one from a browser."""
+    photo = row.payload.get("photo") if isinstance(row.payload, dict) else None
+    return str(photo.get("source", "")) if isinstance(photo, dict) else ""
 
 
 def _kept(row: Row) -> JsonObject:

@@ -10,22 +10,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from advsearch.api.keywords import RecipeKeywords, asks, configured
+from advsearch.api.photos import Photographs, photographs_in
 from advsearch.api.subruns import carry_out_part
-from advsearch.config import RecipeConfig
+from advsearch.config import RecipeConfig, SweepConfig
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.controls import CONTROLS
+from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
 from advsearch.recipes.description import Recipe, read_recipe, recipe_of
 from advsearch.recipes.figures import compute, draw, read_options
 from advsearch.recipes.parts import Planned, listed, made_of, planned
-from advsearch.recipes.table import Answered, Table, rows_of
+from advsearch.recipes.table import Answered, Table, photographs_of, rows_of
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import AnswerDistribution, AttackSummary, DescribedValue, FoundValue
 from advsearch.runs.results.base import INTERRUPTED, Result
 from advsearch.runs.results.recipe import RecipeFigure, RecipePart, RecipeResult
 from advsearch.runs.results.sweep import SweepSummary
-from advsearch.runs.summary import attack_of
+from advsearch.runs.summary import NAME as SUMMARY
+from advsearch.runs.summary import attack_of, read_result
 from advsearch.viewer.pages import write_page
 
 if TYPE_CHECKING:
@@ -69,8 +72,7 @@ def recipe_from_config(
     """
     begun = time.perf_counter()
     described = read_recipe(config.recipe) if resumed is None else None
-    if described is not None:
-        _check(described, config)
+    _check(described, config)
     with RunDirectory.of(config, resumed) as run:
         if described is None:
             described = recipe_of(run.store.noted(NOTE) or {}, f"{run.path}: the recipe that it began with")
@@ -78,18 +80,38 @@ def recipe_from_config(
         notes: list[str] = []
         results = _carried_out(planned(described, config), run, progress or NullProgress(), notes)
         interrupted = any(one.goes_on for _, one in results)
+        if config.photographs is not None and not interrupted:
+            notes += _take(Path(config.photographs), _photographed(described, [one for one, _ in results]), run)
         figures = [] if interrupted else list(_figures(described, config, results, run))
-        result = _result(described, config, run, results, figures, notes, time.perf_counter() - begun)
+        seconds = time.perf_counter() - begun + (_seconds(run.path) if resumed is not None else 0.0)
+        result = _result(described, config, run, results, figures, notes, seconds)
         run.write_summary(result)
         write_page(run.path, result)
         return result
 
 
-def _check(described: Recipe, config: RecipeConfig) -> None:
+def _seconds(path: Path) -> float:
+    """What a run that is gone on with took so far; a run that was killed has not noted it."""
+    before = read_result(path) if (path / SUMMARY).is_file() else None
+    return before.seconds["total"] if isinstance(before, RecipeResult) else 0.0
+
+
+def _check(described: Recipe | None, config: RecipeConfig) -> None:
     """Read everything that a recipe says, so that what is wrong in it is told before anything is rendered."""
-    planned(described, config)
+    if config.photographs is not None and not Path(config.photographs).is_dir():
+        raise InputError(f"photographs: expected a folder, got {config.photographs}")
+    if described is None:
+        return
+    if config.photographs is not None and not _photographed(described, planned(described, config)):
+        raise InputError(f"photographs: {config.recipe} keeps no pictures to compare them with; recipe realism does")
     for one in described.figures:
         read_options(one, config.recipe)
+
+
+def _photographed(described: Recipe, runs: Iterable[Planned]) -> list[Planned]:
+    """The runs that photographs are compared with: they keep all pictures, with which those can be aligned."""
+    own = [one for one in runs if described.parts[one.part].drawn_as is None]
+    return [one for one in own if isinstance(one.config, SweepConfig) and one.config.keep_pictures == "all"]
 
 
 # ---- the runs -------------------------------------------------------------------------------------------------------
@@ -159,6 +181,23 @@ def _range(name: str, mean: DescribedValue, searched: FoundValue, deviation: flo
     return [math.exp(end) for end in ends] if declared.log else ends
 
 
+def _take(folder: Path, wanted: Sequence[Planned], run: RunDirectory) -> Iterable[str]:
+    """Take the photographs in a folder into the runs that are compared with some; return what is missing.
+
+    Raises:
+        InputError: there are none at all, or one cannot be read.
+    """
+    photographs, missing = Photographs(), list[str]()
+    for one in wanted:
+        inside = folder / Path(one.config.object).stem
+        photographs.add_files(run.path / PARTS / one.name, files := photographs_in(inside))
+        missing += [] if files else [f"{one.config.object}: {inside} has no photographs."]
+    if len(missing) == len(wanted):
+        names = ", ".join(Path(one.config.object).stem for one in wanted[:8])
+        raise InputError(f"photographs: expected some in a folder for each object ({names}) in {folder}, got none")
+    return missing
+
+
 # ---- what they come to ----------------------------------------------------------------------------------------------
 
 
@@ -170,6 +209,8 @@ def _figures(
     for one, result in results:
         if isinstance(result, (AttackSummary, SweepSummary)):
             rows += rows_of(one.part, run.path / PARTS / one.name, result)
+        if isinstance(result, SweepSummary):
+            rows += photographs_of(run.path / PARTS / one.name, result)
     surfaces = {
         one.name: result.surface for one, result in results if isinstance(result, SweepSummary) and result.surface
     }

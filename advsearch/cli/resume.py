@@ -15,6 +15,7 @@ EXAMPLES = (
     "resume mug-texture-001",
     "resume mug-plan-001 seconds=600",
     "resume mug-sweep-001 surface=true",
+    "resume realism-001 photographs=my-photographs",
 )
 
 
@@ -48,8 +49,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _adds(path: Path, changes: Mapping[str, object]) -> bool:
-    """Whether the changes ask for what the rows of a run that is done still give: the map of a sweep's surface."""
+    """Whether a run that is done still gives something: the map of a sweep's surface, or a recipe's figures anew, with
+    the photographs that were taken since."""
     from advsearch.cli.run import command_in
     from advsearch.runs.directory import CONFIG
 
-    return changes.get("surface") is True and command_in(path / CONFIG) == "sweep"
+    command = command_in(path / CONFIG)
+    return command == "recipe" or (changes.get("surface") is True and command == "sweep")

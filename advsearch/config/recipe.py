@@ -18,6 +18,7 @@ class RecipeConfig(Config):
     """Everything that decides what `recipe` does: which recipe, and on what objects, environments and models."""
 
     command: ClassVar[str] = "recipe"
+    free: ClassVar[tuple[str, ...]] = (*Config.free, "photographs")
     clashes: ClassVar[tuple[Clash, ...]] = SceneConfig.clashes
 
     recipe: str = setting(
@@ -27,6 +28,13 @@ class RecipeConfig(Config):
         False,
         "recipe",
         "small pictures and few of them, to see what comes out",
+    )
+    photographs: str | None = setting(
+        None,
+        "recipe",
+        "photographs to compare with renderings, of each object in a folder of its name",
+        "a folder",
+        otherwise="those taken with advsearch dashboard",
     )
     object: str | None = setting_as_in(
         SceneConfig,
@@ -70,7 +78,7 @@ class RecipeConfig(Config):
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RECIPE-NNN")
     overwrite: bool = setting_as_in(SceneConfig, "overwrite")
 
-    @field_validator("recipe", "object", "environment", "model", "labels", "run", mode="before")
+    @field_validator("recipe", "photographs", "object", "environment", "model", "labels", "run", mode="before")
     @classmethod
     def _as_text(cls, value: Any) -> Any:
         """Accept a path for a file and a list of names for names; refuse what can't be a name."""
@@ -80,6 +88,12 @@ class RecipeConfig(Config):
         if isinstance(text, str) and (not text.strip(" ,\t\n") or "\0" in text):
             raise ValueError("an empty name")
         return text
+
+    @field_validator("photographs")
+    @classmethod
+    def _folder_from_anywhere(cls, value: str | None) -> str | None:
+        """A run is gone on with from any folder."""
+        return None if value is None else str(Path(value).expanduser().resolve())
 
     @field_validator("label", mode="before")
     @classmethod

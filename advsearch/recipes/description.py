@@ -21,6 +21,9 @@ COMMANDS = ("attack", "sweep")
 OWN = (*PLACE, "object", "seed", "threads", "deterministic", "label")
 """Settings that a part has from the recipe's command and may not say itself."""
 
+PHOTOGRAPHS = "photographs"
+"""What stands for the part of photographs, which none renders."""
+
 MOST_PARTS, MOST_FIGURES = 64, 32
 
 Settings = dict[str, object]
@@ -37,11 +40,13 @@ class Part(_Described):
         command: one of `COMMANDS`.
         settings: of that command, over those that all parts have.
         around: a part whose searches answer with distributions: what this one draws is drawn from those.
+        drawn_as: a part with the same ranges: this one draws the very configurations that that one does.
     """
 
     command: str
     settings: Settings = Field(default_factory=dict)
     around: str | None = None
+    drawn_as: str | None = None
 
     @field_validator("command")
     @classmethod
@@ -101,8 +106,11 @@ class Recipe(_Described):
         for number, (name, part) in enumerate(value.items()):
             if not re.fullmatch(r"[a-z0-9][a-z0-9-]{0,39}", name):
                 raise ValueError(f"expected names of small letters, digits and hyphens, got {name[:40]!r}")
-            if part.around is not None and part.around not in list(value)[:number]:
-                raise ValueError(f"{name}: around: expected a part before it, got {part.around[:40]!r}")
+            if name == PHOTOGRAPHS:
+                raise ValueError(f"expected another name than {name!r}, which photographs have")
+            for key, other in (("around", part.around), ("drawn_as", part.drawn_as)):
+                if other is not None and other not in list(value)[:number]:
+                    raise ValueError(f"{name}: {key}: expected a part before it, got {other[:40]!r}")
         return value
 
     def made_quick(self) -> Recipe:

@@ -78,7 +78,8 @@ def _runs(recipe: Recipe, name: str, config: RecipeConfig) -> Iterator[Planned]:
     for number, values in enumerate(product(*axes.values())):
         one = dict(zip(axes, values, strict=True))
         words = [value for axis, value in one.items() if axis == "object" or len(axes[axis]) > 1]
-        made = _config(part, {**settings, **one}, f"{config.recipe}: parts: {name}", config, f"{name} {number}")
+        where, stream = f"{config.recipe}: parts: {name}", f"{part.drawn_as or name} {number}"
+        made = _config(part, {**settings, **one}, where, config, stream)
         yield Planned(_folder(name, number, words), name, made, part.around and _folder(part.around, number, words))
 
 

@@ -9,8 +9,10 @@ from pathlib import Path
 
 from advsearch.attacks import clopper_pearson
 from advsearch.errors import InputError
+from advsearch.recipes.description import PHOTOGRAPHS
 from advsearch.report.wording import short_name
 from advsearch.runs.results.attack import AttackSummary
+from advsearch.runs.results.photos import LOOSE_PHOTO, PHOTO
 from advsearch.runs.results.recipe import NamedCount
 from advsearch.runs.results.sweep import SurfaceMap, SweepSummary
 from advsearch.runs.store import NAME, Store
@@ -54,7 +56,7 @@ class Table:
     """All answers of a recipe.
 
     Attributes:
-        rows: of its sweeps, and the trials of its attacks.
+        rows: of its sweeps, the trials of its attacks, and photographs (part `PHOTOGRAPHS`).
         groups: names of groups, each with the names of objects in it.
         surfaces: by the names of runs, which parts of the object go with wrong answers.
     """
@@ -64,8 +66,9 @@ class Table:
     surfaces: Mapping[str, SurfaceMap] = field(default_factory=dict)
 
     def of(self, parts: Sequence[str]) -> Table:
-        """Return the answers of some parts; of all where none is named."""
-        return Table([row for row in self.rows if not parts or row.part in parts], self.groups, self.surfaces)
+        """Return the answers of some parts; of all that were rendered where none is named."""
+        rows = [row for row in self.rows if (row.part in parts if parts else row.part != PHOTOGRAPHS)]
+        return Table(rows, self.groups, self.surfaces)
 
     def value(self, row: Answered, column: str) -> float | str:
         """Return what a row has in a column: a value, the answer, or the group of its object.
@@ -151,14 +154,27 @@ def rows_of(part: str, folder: Path, summary: AttackSummary | SweepSummary) -> l
     Raises:
         FileFormatError: the rows cannot be read.
     """
+    return _rows(part, folder, summary, ("sweep",) if isinstance(summary, SweepSummary) else tuple(TRIALS))
+
+
+def photographs_of(folder: Path, summary: SweepSummary) -> list[Answered]:
+    """Return the answers about the photographs that a sweep has; arguments and errors as for `rows_of`.
+
+    One that was aligned with a rendering has all values of that, others have no parameters.
+    """
+    return _rows(PHOTOGRAPHS, folder, summary, (PHOTO, LOOSE_PHOTO))
+
+
+def _rows(part: str, folder: Path, summary: AttackSummary | SweepSummary, kinds: Sequence[str]) -> list[Answered]:
     outer = {"object": summary.object, "environment": summary.environment, "model": summary.model}
-    rows, kinds = [], ("sweep",) if isinstance(summary, SweepSummary) else tuple(TRIALS)
+    rows = []
     with Store(folder / NAME, read_only=True) as store:
         for row in store.rows():
             if row.kind not in kinds:
                 continue
             values = {name: one["value"] for name, one in row.values.items()}
             values |= {TRIAL: TRIALS[row.kind]} if row.kind in TRIALS else {}
+            values |= {"model": summary.model} if part == PHOTOGRAPHS and "," not in summary.model else {}
             named = {name: written(str(values.get(name, of_all))) for name, of_all in outer.items()}
             units = {name: one["unit"] for name, one in row.values.items() if one["unit"]}
             rows.append(Answered(part, {**values, **named}, units, row.label or "none", bool(row.correct)))

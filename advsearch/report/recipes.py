@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from advsearch.report.phrases import percent
 from advsearch.report.wording import interval_text, short_name
 from advsearch.runs.results.recipe import (
+    AgreementFigure,
     AnswersFigure,
     AnyFigure,
     BarsFigure,
@@ -45,6 +46,8 @@ def figure_table(made: AnyFigure) -> Numbers:
             return _ternary(made)
         case CorruptionFigure():
             return _corruptions(made)
+        case AgreementFigure():
+            return _agreement(made)
         case SurfaceFigure():
             return _surface(made)
 
@@ -74,6 +77,17 @@ def _answers(made: AnswersFigure) -> Numbers:
         for one in row.answers
     ]
     return [made.by, "answer", "given in", "95 % interval", "right"], rows
+
+
+def _agreement(made: AgreementFigure) -> Numbers:
+    rows = [
+        [one.name, row.name, *map(str, (row.right_right, row.right_wrong, row.wrong_right, row.wrong_wrong)),
+         str(row.same_answer), *_counts([row.agreeing])[0][1:]]
+        for one in made.series
+        for row in [*one.rows, one.total]
+    ]  # fmt: skip
+    both = ["right, right", "right, wrong", "wrong, right", "wrong, wrong", "same answer"]
+    return ["rendering and", "object", *both, "agree", "share", "95 % interval"], rows
 
 
 def _corruptions(made: CorruptionFigure) -> Numbers:

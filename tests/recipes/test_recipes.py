@@ -14,6 +14,7 @@ import pytest
 import advsearch
 from advsearch.api import carry_out, subruns
 from advsearch.api import recipe as carrying_out
+from advsearch.attacks import clopper_pearson
 from advsearch.cli.main import main
 from advsearch.config import RecipeConfig, SweepConfig
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
@@ -71,7 +72,8 @@ def test_every_bundled_recipe_is_one_that_can_be_carried_out(name: str, quick: b
     described = read_recipe(name)
     runs = planned(described, RecipeConfig(recipe=name, quick=quick))
     assert runs and len({one.name for one in runs}) == len(runs)
-    assert len({one.config.seed for one in runs}) == len(runs)
+    drawn = [one.config.seed for one in runs if described.parts[one.part].drawn_as is None]
+    assert len(set(drawn)) == len(drawn) and set(drawn) == {one.config.seed for one in runs}
     assert described.figures and all(read_options(one, name) for one in described.figures)
     assert titles()[name] == described.title and described.title.endswith("?")
 
@@ -85,6 +87,8 @@ def test_every_bundled_recipe_is_one_that_can_be_carried_out(name: str, quick: b
         ("title: a\nparts: {../a: {command: sweep}}", "expected names of small letters, digits and hyphens"),
         ("title: a\nparts: {a: {command: sweep}}\nsettings: {overwrite: true}", "'overwrite' is said with the command"),
         ("title: a\nparts: {a: {command: sweep, around: b}}", "around: expected a part before it, got 'b'"),
+        ("title: a\nparts: {photographs: {command: sweep}}", "expected another name than 'photographs'"),
+        ("title: a\nparts: {a: {command: sweep, drawn_as: a}}", "drawn_as: expected a part before it, got 'a'"),
         ("title: a\nparts: {a: {command: sweep, shell: rm}}", "parts.a.shell: Extra inputs are not permitted"),
         ("title: !!python/object:os.system a\nparts: {}", "expected YAML"),
         ("- a", "expected settings and values"),
@@ -202,6 +206,38 @@ def test_a_recipe_is_carried_out_and_goes_on_where_it_was_stopped(
     assert json.loads(capsys.readouterr().out)["figures"][1]["by"] == "environment"
 
 
+def test_photographs_come_from_a_folder_and_their_figure_is_made_anew(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, run, folder = tmp_path / "mine.yaml", tmp_path / "run", tmp_path / "photographs"
+    controls = "controls: {camera: {}}, samples: 2, sampler: random, trials: 0, keep_pictures: all"
+    path.write_text(f"""
+title: Is the mug seen?
+settings: {{object: mug, resolution: 16, spp: 1}}
+parts:
+  renderings: {{command: sweep, settings: {{{controls}}}}}
+  finer: {{command: sweep, drawn_as: renderings, settings: {{{controls}, spp: 2}}}}
+figures: [{{figure: agreement, of: [renderings, finer]}}]
+""")
+    with pytest.raises(InputError, match="photographs: expected a folder"):
+        advsearch.recipe(path, run=run, photographs=folder)
+    (folder / "mug").mkdir(parents=True)
+    advsearch.recipe(path, run=run)
+    assert main(["resume", str(run), f"photographs={folder}"]) == 2
+    assert "expected some in a folder for each object (mug)" in capsys.readouterr().err
+    for name in ("rendering-1", "rendering-1-again", "any"):
+        write_png(folder / "mug" / f"{name}.png", np.full((20, 30, 3), 0.5))
+    for _ in range(2):  # those that it has are not taken again
+        assert main(["resume", str(run), f"photographs={folder}", "--json"]) == 0
+        printed = json.loads(capsys.readouterr().out)
+        ((photographs, finer),) = (one["series"] for one in printed["figures"])
+        assert (photographs["total"]["agreeing"]["configurations"], photographs["alone"]) == (2, 1)
+        assert finer["total"]["agreeing"]["configurations"] == 2
+    write_png(folder / "mug" / "rendering-9.png", np.full((20, 30, 3), 0.5))
+    assert main(["resume", str(run), f"photographs={folder}"]) == 2
+    assert "rendering-9.png: rendering: " in capsys.readouterr().err
+
+
 def test_what_is_drawn_has_the_mean_and_the_deviation_that_a_search_answers_with() -> None:
     searched = {
         "camera.elevation": {"value": 30.0, "unit": "degrees", "low": 0.0, "high": 80.0},
@@ -278,6 +314,30 @@ def test_a_mixture_is_counted_in_the_triangle_that_it_lies_in() -> None:
     assert [one.accuracy for one in bowl.by_most] == [0.0, pytest.approx(15 / bowl.by_most[1].configurations), 0.0]
 
 
+def test_photographs_agree_with_the_renderings_whose_configurations_they_show() -> None:
+    made = figure(EXAMPLES["agreement"], PICTURED)
+    photographs, again = made.series
+    total = photographs.total
+    assert (total.right_right, total.right_wrong, total.wrong_right, total.wrong_wrong) == (5, 1, 0, 2)
+    assert (photographs.alone, total.same_answer, again.total.agreeing.correct) == (1, 7, 10)
+    assert total.agreeing.interval == clopper_pearson(7, 8)
+    assert "right about both or wrong about both in 7 of 8 (88 %, 95 % interval 47-99.7 %)" in made.text[0]
+    assert "it is right in 5 of 6" in made.text[0] and "wrong in 2 of 2" in made.text[0]
+    assert made.text[2].startswith("1 of the photographs belongs to no rendering")
+
+
+def test_without_photographs_nothing_is_said_of_reality_and_they_are_in_no_figure_that_does_not_ask_for_them() -> None:
+    rendered = [row for row in PICTURED if row.part != "photographs"]
+    made = figure(EXAMPLES["agreement"], rendered)
+    assert (
+        made.text[0].startswith("There are no photographs yet: nothing is said about reality") and len(made.text) == 2
+    )
+    bars: dict[str, object] = {"figure": "bars", "by": "object"}
+    assert figure(bars, PICTURED) == figure(bars, rendered)
+    with pytest.raises(InputError, match="expected again to have the configurations of renderings"):
+        figure(EXAMPLES["agreement"], rendered[1:])
+
+
 def test_the_mean_corruption_error_is_relative_to_the_first_model() -> None:
     errors = {"one": {"fog": 4, "jpeg": 2}, "two": {"fog": 8, "jpeg": 1}}
     answered = [
@@ -304,7 +364,7 @@ def test_a_curve_puts_each_value_in_its_part_of_the_range() -> None:
 @pytest.mark.parametrize("kind", FIGURES)
 def test_every_figure_is_drawn_and_is_a_table(kind: str, tmp_path: Path) -> None:
     write_png(tmp_path / "parts" / "views-00-mug" / "images" / "surface.png", np.zeros((8, 8, 3)))
-    table = Table(EXAMPLE_ROWS, {"round": ["mug"]}, {"views-00-mug": SURFACE})
+    table = Table(EXAMPLE_ROWS if kind != "agreement" else PICTURED, {"round": ["mug"]}, {"views-00-mug": SURFACE})
     made: Any = compute(table, *read_options(EXAMPLES[kind], "here"))
     assert made.figure == kind and made.title and made.text and all(one.endswith(".") for one in made.text)
     heads, lines = figure_table(made)
@@ -336,6 +396,17 @@ SURFACE = SurfaceMap.of(
     }
 )  # fmt: skip
 MIXTURE = ("water", "milk", "coffee")
+PICTURED = [
+    Answered(part, {"object": "mug", "model": "m", **values}, {}, "mug" if right else "cup", right)
+    for part, values, right in [
+        *(("renderings", {"yaw": float(at)}, at < 6) for at in range(10)),
+        *(("again", {"yaw": float(at), "sensor.shot": 0.1}, at < 6) for at in range(10)),
+        *(("photographs", {"yaw": float(at)}, at < 5) for at in range(8)),
+        ("photographs", {}, True),
+    ]
+]
+"""Ten renderings, the same ones through a sensor, photographs of eight of them, and one of none."""
+
 EXAMPLES: dict[str, dict[str, object]] = {
     "curve": {"figure": "curve", "along": "yaw", "by": "environment", "bins": 3},
     "points": {"figure": "points", "by": "object", "series": "environment", "names": {"noon": "at noon"}},
@@ -346,4 +417,5 @@ EXAMPLES: dict[str, dict[str, object]] = {
     "corruption error": {"figure": "corruption error", "which": "environment"},
     "bars": {"figure": "bars", "by": "group"},
     "heat map": {"figure": "heat map", "rows": "object", "columns": "environment"},
+    "agreement": {"figure": "agreement", "of": ["renderings", "again"], "names": {"again": "through a sensor"}},
 }

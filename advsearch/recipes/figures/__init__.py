@@ -9,6 +9,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from advsearch.errors import FileFormatError, UnknownNameError
+from advsearch.recipes.figures.agreement import AGREEMENT
 from advsearch.recipes.figures.answers import ANSWERS
 from advsearch.recipes.figures.bars import BARS
 from advsearch.recipes.figures.base import Kind, Options
@@ -32,6 +33,7 @@ FIGURES: dict[str, Kind[Any, Any]] = {
     "cues": CUES,
     "ternary": TERNARY,
     "corruption error": CORRUPTION_ERROR,
+    "agreement": AGREEMENT,
     "surface": SURFACE,
 }
 
@@ -65,7 +67,7 @@ def compute(table: Table, kind: str, options: Options) -> RecipeFigure:
     Raises:
         InputError: it needs what the answers do not have.
     """
-    made: RecipeFigure = FIGURES[kind].compute(table.of(options.of), options)
+    made: RecipeFigure = FIGURES[kind].compute(table.of(options.parts), options)
     return made
 
 

@@ -31,6 +31,11 @@ class Options(BaseModel):
     title: str = Field(default="", max_length=200)
     of: tuple[str, ...] = ()
 
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """The parts whose answers it is made from; none for all that were rendered."""
+        return self.of
+
 
 Chosen = TypeVar("Chosen", bound=Options)
 Made = TypeVar("Made", bound=RecipeFigure)

@@ -6,6 +6,9 @@ from pydantic import Field
 
 from advsearch.runs.results.base import Fields, Interval
 
+PHOTO, LOOSE_PHOTO = "photo", "loose photo"
+"""Kinds of rows in a run's store: photographs that were aligned with a rendering, and ones that were with none."""
+
 
 class PhotographedRendering(Fields):
     """One rendering, what one model says of it, and of the photographs that were aligned with it."""

@@ -172,6 +172,36 @@ class CorruptionFigure(RecipeFigure):
     models: list[CorruptionModel]
 
 
+class AgreementCount(Fields):
+    """Pairs of a rendering and another picture of the same configuration, by where the model is right in them."""
+
+    name: str
+    right_right: int = Field(description="right in the rendering, right in the other")
+    right_wrong: int = Field(description="right in the rendering, wrong in the other")
+    wrong_right: int = Field(description="wrong in the rendering, right in the other")
+    wrong_wrong: int = Field(description="wrong in the rendering, wrong in the other")
+    same_answer: int = Field(description="the same answer to both, right or wrong")
+    agreeing: NamedCount = Field(description="of all pairs: right in both or wrong in both")
+
+
+class AgreementSeries(Fields):
+    """What renderings are compared with."""
+
+    part: str = Field(description="`photographs`, or a part of the recipe")
+    name: str
+    alone: int = Field(description="pictures that belong to no rendering, which are in no pair")
+    total: AgreementCount
+    rows: list[AgreementCount] = Field(description="by object")
+
+
+class AgreementFigure(RecipeFigure):
+    """How often a model is right, or wrong, in a rendering and in another picture of the same configuration alike."""
+
+    figure: Literal["agreement"]
+    renderings: str = Field(description="the part whose pictures the others are compared with")
+    series: list[AgreementSeries]
+
+
 class SurfaceOf(Fields):
     """What goes with wrong answers on the surface of one object."""
 
@@ -195,6 +225,7 @@ AnyFigure = Annotated[
     | CuesFigure
     | TernaryFigure
     | CorruptionFigure
+    | AgreementFigure
     | SurfaceFigure,
     Field(discriminator="figure"),
 ]
