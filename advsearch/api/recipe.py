@@ -6,6 +6,7 @@ import json
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,7 +21,7 @@ from advsearch.progress import NullProgress, Progress
 from advsearch.recipes.description import Recipe, read_recipe, recipe_of
 from advsearch.recipes.figures import compute, draw, read_options
 from advsearch.recipes.parts import Planned, listed, made_of, planned
-from advsearch.recipes.table import Answered, Table, photographs_of, rows_of
+from advsearch.recipes.table import WORKERS, Answered, Table, photographs_of, rows_of
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import AnswerDistribution, AttackSummary, DescribedValue, FoundValue
@@ -29,6 +30,7 @@ from advsearch.runs.results.recipe import RecipeFigure, RecipePart, RecipeResult
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import NAME as SUMMARY
 from advsearch.runs.summary import attack_of, read_result
+from advsearch.threads import cores
 from advsearch.viewer.pages import write_page
 
 if TYPE_CHECKING:
@@ -208,13 +210,15 @@ def _figures(
     rows: list[Answered] = []
     for one, result in results:
         if isinstance(result, (AttackSummary, SweepSummary)):
-            rows += rows_of(one.part, run.path / PARTS / one.name, result)
+            found = rows_of(one.part, run.path / PARTS / one.name, result)
+            count = getattr(one.config, WORKERS, None)
+            rows += found if count is None else [replace(row, values={**row.values, WORKERS: count}) for row in found]
         if isinstance(result, SweepSummary):
             rows += photographs_of(run.path / PARTS / one.name, result)
     surfaces = {
         one.name: result.surface for one, result in results if isinstance(result, SweepSummary) and result.surface
     }
-    table = Table(rows, described.groups, surfaces)
+    table = Table(rows, described.groups, surfaces, cores())
     for number, figure in enumerate(described.figures):
         made = compute(table, *read_options(figure, config.recipe))
         for suffix, data in draw(made, run.path).items():

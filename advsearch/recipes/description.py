@@ -65,10 +65,17 @@ class Part(_Described):
 
 
 class Changes(_Described):
-    """What `quick` makes different."""
+    """What `quick` makes different.
+
+    Attributes:
+        settings: of all parts.
+        parts: settings of each.
+        without: parts that are left out.
+    """
 
     settings: Settings = Field(default_factory=dict)
     parts: dict[str, Settings] = Field(default_factory=dict)
+    without: list[str] = Field(default_factory=list)
 
 
 class Recipe(_Described):
@@ -115,12 +122,13 @@ class Recipe(_Described):
 
     def made_quick(self) -> Recipe:
         """Return it with what `quick` makes different."""
-        unknown = [name for name in self.quick.parts if name not in self.parts]
+        unknown = [name for name in (*self.quick.parts, *self.quick.without) if name not in self.parts]
         if unknown:
             raise UnknownNameError("part", unknown[0], self.parts, "It stands under `quick` in the recipe.")
         parts = {
             name: part.model_copy(update={"settings": merged(part.settings, self.quick.parts.get(name, {}))})
             for name, part in self.parts.items()
+            if name not in self.quick.without
         }
         return self.model_copy(update={"settings": merged(self.settings, self.quick.settings), "parts": parts})
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from advsearch.attacks import clopper_pearson
@@ -28,6 +28,9 @@ TRIALS = {
 }
 """The rows of an attack that are in the table, and what figures call them."""
 
+WORKERS = "workers"
+"""The number of processes that shared a sweep, in whole; only of sweeps that say it."""
+
 OTHERS = "others"
 """The group of objects that are in none."""
 
@@ -42,6 +45,7 @@ class Answered:
         units: of the parameters.
         answer: in words.
         correct: whether it is right.
+        time: when it was stored, seconds since 1970.
     """
 
     part: str
@@ -49,6 +53,7 @@ class Answered:
     units: Mapping[str, str]
     answer: str
     correct: bool
+    time: float | None = None
 
 
 @dataclass(frozen=True)
@@ -59,16 +64,18 @@ class Table:
         rows: of its sweeps, the trials of its attacks, and photographs (part `PHOTOGRAPHS`).
         groups: names of groups, each with the names of objects in it.
         surfaces: by the names of runs, which parts of the object go with wrong answers.
+        cores: that this process may use.
     """
 
     rows: Sequence[Answered]
     groups: Mapping[str, Sequence[str]]
     surfaces: Mapping[str, SurfaceMap] = field(default_factory=dict)
+    cores: int = 1
 
     def of(self, parts: Sequence[str]) -> Table:
         """Return the answers of some parts; of all that were rendered where none is named."""
         rows = [row for row in self.rows if (row.part in parts if parts else row.part != PHOTOGRAPHS)]
-        return Table(rows, self.groups, self.surfaces)
+        return replace(self, rows=rows)
 
     def value(self, row: Answered, column: str) -> float | str:
         """Return what a row has in a column: a value, the answer, or the group of its object.
@@ -177,5 +184,5 @@ def _rows(part: str, folder: Path, summary: AttackSummary | SweepSummary, kinds:
             values |= {"model": summary.model} if part == PHOTOGRAPHS and "," not in summary.model else {}
             named = {name: written(str(values.get(name, of_all))) for name, of_all in outer.items()}
             units = {name: one["unit"] for name, one in row.values.items() if one["unit"]}
-            rows.append(Answered(part, {**values, **named}, units, row.label or "none", bool(row.correct)))
+            rows.append(Answered(part, {**values, **named}, units, row.label or "none", bool(row.correct), row.time))
     return rows

@@ -17,6 +17,7 @@ from advsearch.runs.results.recipe import (
     HeatMapFigure,
     NamedCount,
     PointsFigure,
+    ScalingFigure,
     SurfaceFigure,
     TernaryFigure,
 )
@@ -48,6 +49,8 @@ def figure_table(made: AnyFigure) -> Numbers:
             return _corruptions(made)
         case AgreementFigure():
             return _agreement(made)
+        case ScalingFigure():
+            return _scaling(made)
         case SurfaceFigure():
             return _surface(made)
 
@@ -137,6 +140,14 @@ def _ternary(made: TernaryFigure) -> Numbers:
         for one in made.answers
     ]
     return ["answer", "given", *(f"where most is {bare(name)}" for name in made.shares)], rows
+
+
+def _scaling(made: ScalingFigure) -> Numbers:
+    rows = [
+        [str(one.workers), *(", ".join(f"{value:.3g}" for value in values) for values in (one.rates, one.gains))]
+        for one in made.points
+    ]
+    return ["workers", "pictures a second", "over the fewest workers"], rows
 
 
 def _surface(made: SurfaceFigure) -> Numbers:

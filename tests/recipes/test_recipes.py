@@ -326,6 +326,28 @@ def test_photographs_agree_with_the_renderings_whose_configurations_they_show() 
     assert made.text[2].startswith("1 of the photographs belongs to no rendering")
 
 
+def test_the_rate_of_workers_is_that_after_the_first_quarter_and_their_gain_is_over_the_same_object() -> None:
+    one, two = figure(EXAMPLES["scaling"], TIMED).points
+    assert one.rates == pytest.approx([4.0, 8.0]) and two.rates == pytest.approx([8.0, 16.0])
+    assert two.gains == pytest.approx([2.0, 2.0])
+    said = figure(EXAMPLES["scaling"], TIMED).text
+    assert "2 workers: 12 (8 to 16) pictures a second, 2 (2 to 2) times as many as 1 worker (100 % of linear)." in said
+    assert "with a confidence of 50 %" in said[2]
+    at_once = [replace(row, time=1.0) for row in TIMED]
+    for few, message in ((at_once, "expected runs of several batches"), (PICTURED, "expected sweeps with `workers`")):
+        with pytest.raises(InputError, match=message):
+            figure(EXAMPLES["scaling"], few)
+
+
+def test_a_quick_recipe_is_without_the_parts_that_it_leaves_out() -> None:
+    described = read_recipe("scaling")
+    runs = planned(described, RecipeConfig(recipe="scaling", quick=True, object="mug"))
+    assert [one.part for one in runs] == ["workers-1", "workers-2"] and runs[0].config.seed == runs[1].config.seed
+    assert len(planned(described, RecipeConfig(recipe="scaling", object="mug"))) == 4
+    with pytest.raises(UnknownNameError, match="unknown part 'b'"):
+        Recipe(title="a", parts={"a": {"command": "sweep"}}, quick={"without": ["b"]}).made_quick()
+
+
 def test_without_photographs_nothing_is_said_of_reality_and_they_are_in_no_figure_that_does_not_ask_for_them() -> None:
     rendered = [row for row in PICTURED if row.part != "photographs"]
     made = figure(EXAMPLES["agreement"], rendered)
@@ -364,7 +386,8 @@ def test_a_curve_puts_each_value_in_its_part_of_the_range() -> None:
 @pytest.mark.parametrize("kind", FIGURES)
 def test_every_figure_is_drawn_and_is_a_table(kind: str, tmp_path: Path) -> None:
     write_png(tmp_path / "parts" / "views-00-mug" / "images" / "surface.png", np.zeros((8, 8, 3)))
-    table = Table(EXAMPLE_ROWS if kind != "agreement" else PICTURED, {"round": ["mug"]}, {"views-00-mug": SURFACE})
+    own = {"agreement": PICTURED, "scaling": TIMED}
+    table = Table(own.get(kind, EXAMPLE_ROWS), {"round": ["mug"]}, {"views-00-mug": SURFACE})
     made: Any = compute(table, *read_options(EXAMPLES[kind], "here"))
     assert made.figure == kind and made.title and made.text and all(one.endswith(".") for one in made.text)
     heads, lines = figure_table(made)
@@ -395,6 +418,14 @@ SURFACE = SurfaceMap.of(
         ],
     }
 )  # fmt: skip
+TIMED = [
+    Answered(f"workers-{workers}", {"object": name, "workers": workers}, {}, "mug", True, 100.0 + at / (rate * workers))
+    for workers in (1, 2)
+    for name, rate in (("mug", 4), ("bowl", 8))
+    for at in (*(0,) * 5, *range(16))
+]
+"""Five rows at once, then some at an even rate, in runs of two objects: two workers are twice as fast as one."""
+
 MIXTURE = ("water", "milk", "coffee")
 PICTURED = [
     Answered(part, {"object": "mug", "model": "m", **values}, {}, "mug" if right else "cup", right)
@@ -414,6 +445,7 @@ EXAMPLES: dict[str, dict[str, object]] = {
     "cues": {"figure": "cues", "texture": "environment", "classes": {"noon": ["cup"]}},
     "ternary": {"figure": "ternary", "shares": list(MIXTURE), "normalised": True},
     "surface": {"figure": "surface"},
+    "scaling": {"figure": "scaling"},
     "corruption error": {"figure": "corruption error", "which": "environment"},
     "bars": {"figure": "bars", "by": "group"},
     "heat map": {"figure": "heat map", "rows": "object", "columns": "environment"},

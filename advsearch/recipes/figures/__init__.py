@@ -18,6 +18,7 @@ from advsearch.recipes.figures.cues import CUES
 from advsearch.recipes.figures.curve import CURVE
 from advsearch.recipes.figures.heat_map import HEAT_MAP
 from advsearch.recipes.figures.points import POINTS
+from advsearch.recipes.figures.scaling import SCALING
 from advsearch.recipes.figures.surface import SURFACE
 from advsearch.recipes.figures.ternary import TERNARY
 from advsearch.recipes.table import Table
@@ -34,6 +35,7 @@ FIGURES: dict[str, Kind[Any, Any]] = {
     "ternary": TERNARY,
     "corruption error": CORRUPTION_ERROR,
     "agreement": AGREEMENT,
+    "scaling": SCALING,
     "surface": SURFACE,
 }
 

@@ -202,6 +202,22 @@ class AgreementFigure(RecipeFigure):
     series: list[AgreementSeries]
 
 
+class ScalingPoint(Fields):
+    """Runs on as many workers, one of each object."""
+
+    workers: int
+    rates: list[float] = Field(description="pictures a second of each run")
+    gains: list[float] = Field(description="over the run of the same object on the fewest workers")
+
+
+class ScalingFigure(RecipeFigure):
+    """Pictures a second against the number of workers."""
+
+    figure: Literal["scaling"]
+    cores: int = Field(description="that this process may use")
+    points: list[ScalingPoint] = Field(description="by number of workers")
+
+
 class SurfaceOf(Fields):
     """What goes with wrong answers on the surface of one object."""
 
@@ -226,6 +242,7 @@ AnyFigure = Annotated[
     | TernaryFigure
     | CorruptionFigure
     | AgreementFigure
+    | ScalingFigure
     | SurfaceFigure,
     Field(discriminator="figure"),
 ]
