@@ -49,7 +49,7 @@ COUNTS: dict[str, dict[str, Any]] = {
     "backgrounds": {"views": {"samples": 40}},
     "texture-shape": {"materials": {"samples": 8}},
     "orientation-scale": {"views": {"samples": 60}},
-    "liquid": {"mixtures": {"samples": 120}},
+    "liquid": {"mixtures": {"samples": 400}},
     "viewpoints": {"all": {"samples": 80}, "search": {"steps": 200, "trials": 6}, "worst": {"samples": 80}},
     "pose-space": {"poses": {"samples": 60}},
     "common-corruptions": {"clean": {"samples": 40}, "corrupted": {"samples": 2}},

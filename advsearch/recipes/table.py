@@ -46,6 +46,7 @@ class Answered:
         answer: in words.
         correct: whether it is right.
         time: when it was stored, seconds since 1970.
+        margin: of the task; over 0 where the answer is wrong.
     """
 
     part: str
@@ -54,6 +55,7 @@ class Answered:
     answer: str
     correct: bool
     time: float | None = None
+    margin: float | None = None
 
 
 @dataclass(frozen=True)
@@ -184,5 +186,6 @@ def _rows(part: str, folder: Path, summary: AttackSummary | SweepSummary, kinds:
             values |= {"model": summary.model} if part == PHOTOGRAPHS and "," not in summary.model else {}
             named = {name: written(str(values.get(name, of_all))) for name, of_all in outer.items()}
             units = {name: one["unit"] for name, one in row.values.items() if one["unit"]}
-            rows.append(Answered(part, {**values, **named}, units, row.label or "none", bool(row.correct), row.time))
+            answer = row.label or "none", bool(row.correct)
+            rows.append(Answered(part, {**values, **named}, units, *answer, row.time, row.margin))
     return rows

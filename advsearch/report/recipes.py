@@ -135,6 +135,9 @@ def _points(made: PointsFigure) -> Numbers:
 
 
 def _ternary(made: TernaryFigure) -> Numbers:
+    if made.leads:
+        rows = [[one.name, str(one.configurations), f"{one.mean:.3g}", f"{one.error:.2g}"] for one in made.leads]
+        return ["where most is", "pictures", "mean lead of the right answer", "standard error"], rows
     rows = [
         [one.answer, str(one.given), *(f"{count.correct} of {count.configurations}" for count in one.by_most)]
         for one in made.answers

@@ -311,7 +311,34 @@ def test_a_mixture_is_counted_in_the_triangle_that_it_lies_in() -> None:
     assert sum(cell.configurations for cell in bowl.cells) == len(shares) and len(bowl.cells) == 9
     assert sum(cell.given for cell in bowl.cells) == bowl.given == 15
     assert all(corner[1] >= 1 / 3 for cell in bowl.cells if cell.given for corner in cell.corners)
+    assert made.leads == [] and not any("things" in text for text in made.text)
     assert [one.accuracy for one in bowl.by_most] == [0.0, pytest.approx(15 / bowl.by_most[1].configurations), 0.0]
+
+
+def test_where_a_mixture_has_one_answer_it_is_shown_how_far_that_leads() -> None:
+    """A lead of 1 where most is milk and of 5 elsewhere, a little more or less; no picture with much coffee."""
+    shares = [(a / 20, b / 20, (20 - a - b) / 20) for a in range(21) for b in range(21 - a) if a + b > 7]
+    answered = [
+        Answered(
+            "a", {"object": "mug", "w": w, "m": m, "c": c}, {}, "mug", True, 0.0, -(1.0 if m > 0.5 else 5.0) - c / 9
+        )
+        for w, m, c in shares
+    ]
+    made = figure({"figure": "ternary", "shares": ["w", "m", "c"], "side": 4}, answered)
+    assert [one.name for one in made.leads] == ["w", "m", "c"] and made.leads[1].mean < 2.5 < 4.0 < made.leads[0].mean
+    assert made.text[0].startswith("mug is every answer") and "most of the mixture is m: 2." in made.text[1]
+    assert "The difference is shown" in made.text[1]
+    cells = made.answers[0].cells
+    empty = sum(cell.lead is None for cell in cells)
+    assert empty == sum(not cell.configurations for cell in cells) == 1
+    assert made.text[2] == "No picture was drawn in 1 of 16 parts of the diagram, which are hatched."
+    assert draw(made, Path())["png"] and figure_table(made)[1][1][0] == "m"
+    same = figure({"figure": "ternary", "shares": ["w", "m", "c"]}, [replace(one, margin=-3.0) for one in answered])
+    assert "No difference is shown" in same.text[1]
+    unknown = figure({"figure": "ternary", "shares": ["w", "m", "c"]}, [replace(one, margin=None) for one in answered])
+    assert unknown.text[0] == (
+        "mug, 100 % of all answers, is given as often whatever most of the mixture is: no difference is shown."
+    )
 
 
 def test_photographs_agree_with_the_renderings_whose_configurations_they_show() -> None:

@@ -133,6 +133,16 @@ class TernaryCell(Fields):
     corners: list[tuple[float, float, float]] = Field(description="the three shares at each of its corners")
     configurations: int
     given: int = Field(description="how often the answer was given in it")
+    lead: float | None = Field(None, description="mean lead of the right answer in it; null where that is not known")
+
+
+class MixtureLead(Fields):
+    """How far the right answer leads, where most of a mixture is one ingredient."""
+
+    name: str
+    configurations: int
+    mean: float = Field(description="of the margin with its sign turned: for classes, logits over the best wrong one")
+    error: float = Field(description="its standard error")
 
 
 class TernaryAnswer(Fields):
@@ -151,6 +161,9 @@ class TernaryFigure(RecipeFigure):
     shares: tuple[str, str, str] = Field(description="the three parameters")
     normalised: bool = Field(description="whether the colours of each answer end at its own largest share")
     answers: list[TernaryAnswer]
+    leads: list[MixtureLead] = Field(
+        default_factory=list, description="by what most of the mixture is; empty where there are several answers"
+    )
 
 
 class CorruptionModel(Fields):
