@@ -165,11 +165,17 @@ def _cautions(rows: Sequence[Answered], importance: Importance | None) -> list[s
     if right in (0, len(rows)):
         return [f"The model is {'right' if right else 'wrong'} in every row: there is nothing to tell apart."]
     if importance is not None and not importance.weights:
-        return [
-            "What varies explains next to nothing of the answers, so that no importance is given "
-            f"({importance.explained:.1%} of their variance, on rows that were not fitted to)."
-        ]
+        return [_unexplained(importance.explained)]
     return []
+
+
+def _unexplained(share: float) -> str:
+    """Say of a small share of the variance that it is one; it is under 0 where the mean answer would have told more."""
+    if share > 0.0:
+        text = f"told {100 * share:.1f} % of the variance of the others"
+    else:
+        text = "told the others no better than how often they are right does"
+    return f"No importance is given: a forest that was fitted to some of the rows {text}."
 
 
 # ---- renders --------------------------------------------------------------------------------------------------------

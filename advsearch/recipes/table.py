@@ -31,7 +31,7 @@ TRIALS = {
 WORKERS = "workers"
 """The number of processes that shared a sweep, in whole; only of sweeps that say it."""
 
-OTHERS = "others"
+OTHERS = "other objects"
 """The group of objects that are in none."""
 
 

@@ -17,6 +17,7 @@ BLUE, RED, GREY = "#1d5fd0", "#b3261e", "#5c606a"
 STYLE: dict[Any, Any] = {
     "font.family": ["DejaVu Sans"],
     "font.size": 9.0,
+    "axes.axisbelow": True,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.edgecolor": GREY,

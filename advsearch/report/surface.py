@@ -107,7 +107,7 @@ def surface_figure(panels: Sequence[SurfacePanel]) -> Figures:
 
 
 def _percent(value: float, _: object) -> str:
-    return f"{100.0 * value:+.0f} %"
+    return f"{100.0 * value:+.3g} %" if value else "0 %"
 
 
 def _coloured(panel: SurfacePanel, scale: Any) -> Doubles:

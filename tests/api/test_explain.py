@@ -18,6 +18,7 @@ from advsearch.api import explain as explaining
 from advsearch.cli.main import main
 from advsearch.config import SweepConfig
 from advsearch.errors import FileFormatError, InputError
+from advsearch.explanations.importance import Importance
 from advsearch.explanations.observations import Factor, Observations
 from advsearch.explanations.renders import along, inside, lies_inside
 from advsearch.explanations.rules import RuleCondition
@@ -157,6 +158,16 @@ FOUND = Observations(
     np.array([[yaw, lit, power] for yaw in (0.0, 90.0, 180.0) for lit in (0, 1) for power in (0.5, 1.5)]),
     np.ones(12, dtype=bool),
 )
+
+
+@pytest.mark.parametrize(
+    ("share", "text"),
+    [(0.031, "told 3.1 % of the variance of the others."), (-0.203, "no better than how often they are right does.")],
+)
+def test_a_share_of_the_variance_under_0_is_no_share(share: float, text: str) -> None:
+    rows = [Answered("", {"object": "mug"}, {}, "mug", right) for right in (True, False)]
+    (caution,) = explaining._cautions(rows, Importance(share, ()))
+    assert caution.endswith(text) and "-" not in caution
 
 
 def test_a_sweep_inside_conditions_keeps_what_they_leave() -> None:

@@ -274,6 +274,26 @@ def test_a_difference_is_claimed_where_intervals_are_apart_and_not_where_they_ov
     assert same.text == ["All 2 environments have the same share, 40 %: no difference is shown."]
 
 
+def test_sentences_call_values_what_they_are() -> None:
+    """Numbers by their parameter, named things by what they are, and lines by the names that a recipe gives."""
+    fogs = [
+        answered({"object": "mug", "fog.which": kind, "fog.severity": level, "yaw": level, "trial": kind}, right)
+        for kind, level, right in [
+            ("thin", 1.0, True),
+            ("thin", 2.0, True),
+            ("thick", 1.0, True),
+            ("thick", 2.0, False),
+        ]
+    ]
+    pairs = figure({"figure": "heat map", "rows": "fog.which", "columns": "fog.severity"}, fogs)
+    assert pairs.text[0].startswith("The lowest pair is thick with severity 2: right in 0 of 1")
+    assert pairs.text[1].startswith("No difference between the pairs of fogs and values of fog.severity is shown")
+    names = {"thin": "the object as it is", "thick": "the object in fog"}
+    curve = figure({"figure": "curve", "along": "yaw", "by": "trial", "bins": 2, "names": names}, fogs)
+    assert curve.text[1].startswith("For the object in fog, accuracy is lowest")
+    assert curve.text[-1].startswith("No difference between the kinds of trials is shown")
+
+
 def test_two_of_many_have_to_be_further_apart_than_two_of_two() -> None:
     two = {"noon": (6, 20), "studio": (18, 20)}
     many = {**two, **{f"room {number}": (14, 20) for number in range(18)}}

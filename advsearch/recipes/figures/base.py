@@ -10,7 +10,7 @@ from typing import Any, Generic, TypeVar
 from pydantic import BaseModel, ConfigDict, Field
 
 from advsearch.attacks import clopper_pearson
-from advsearch.recipes.table import Table, counted
+from advsearch.recipes.table import TRIAL, Table, counted
 from advsearch.report.phrases import percent
 from advsearch.report.wording import interval_text
 from advsearch.runs.results.recipe import NamedCount, RecipeFigure
@@ -114,5 +114,8 @@ def counted_by(table: Table, column: str) -> list[NamedCount]:
 
 
 def plural(column: str) -> str:
-    """Return what several values of a column are called: ``environments``, ``values of material.which``."""
-    return f"{column}s" if column in ("object", "environment", "model", "group", "answer") else f"values of {column}"
+    """Return what several values of a column are called: ``environments``, ``materials``, ``values of pose.yaw``."""
+    if column == TRIAL:
+        return "kinds of trials"
+    control, _, parameter = column.partition(".")
+    return f"values of {column}" if parameter not in ("", "which") else f"{control}s"

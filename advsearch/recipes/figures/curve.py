@@ -26,12 +26,14 @@ class CurveOptions(Options):
         by: what the lines differ in: object, group, model, trial, ...; one line where it is not given.
         bins: parts of the range.
         range: its ends; by default the least and the largest value.
+        names: what the lines are called, where not by their values.
     """
 
     along: str
     by: str | None = None
     bins: int = Field(default=12, ge=1, le=100)
     range: tuple[float, float] | None = None
+    names: dict[str, str] = Field(default_factory=dict)
 
 
 def _compute(table: Table, options: CurveOptions) -> CurveFigure:
@@ -42,7 +44,8 @@ def _compute(table: Table, options: CurveOptions) -> CurveFigure:
     edges = [low + (high - low) * number / options.bins for number in range(options.bins + 1)]
     groups = table.by(options.by) if options.by else {"all": list(table.rows)}
     lines = [
-        _line(name, rows, Table(rows, table.groups).numbers(options.along), edges) for name, rows in groups.items()
+        _line(options.names.get(name, name), rows, Table(rows, table.groups).numbers(options.along), edges)
+        for name, rows in groups.items()
     ]
     unit = table.unit(options.along)
     return CurveFigure(

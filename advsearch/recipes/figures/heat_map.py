@@ -7,7 +7,11 @@ from typing import Any
 
 from advsearch.recipes.figures.base import Kind, Options, extremes, plural
 from advsearch.recipes.table import Table, count_of
+from advsearch.report.recipes import bare
 from advsearch.runs.results.recipe import HeatMapFigure, NamedCount
+
+SHORT = 4
+"""Letters that stand level under a column."""
 
 
 class HeatMapOptions(Options):
@@ -28,7 +32,7 @@ def _compute(table: Table, options: HeatMapOptions) -> HeatMapFigure:
     seen = [[len(by_row[row].get(column, ())) for column in columns] for row in rows]
     correct = [[sum(one.correct for one in by_row[row].get(column, ())) for column in columns] for row in rows]
     cells = [
-        count_of(f"{row} with {column}", correct[up][across], seen[up][across])
+        count_of(f"{row} with {_named(column, options.columns)}", correct[up][across], seen[up][across])
         for up, row in enumerate(rows)
         for across, column in enumerate(columns)
     ]
@@ -43,6 +47,11 @@ def _compute(table: Table, options: HeatMapOptions) -> HeatMapFigure:
         configurations=seen,
         correct=correct,
     )
+
+
+def _named(value: str, column: str) -> str:
+    """A number says what it is of: ``severity 3``."""
+    return f"{bare(column)} {value}" if value[:1].isdigit() or value[:1] == "-" else value
 
 
 def _said(cells: list[NamedCount], rows: str, columns: str) -> list[str]:
@@ -65,10 +74,12 @@ def _draw(made: HeatMapFigure, figure: Any, run: Path) -> None:
             if share == share:
                 colour = "white" if abs(share - 0.5) > 0.3 else "black"
                 axes.text(across, up, f"{100 * share:.0f}", ha="center", va="center", color=colour, fontsize=7.5)
-    axes.set_xticks(range(len(made.columns)), made.columns, rotation=35, ha="right", rotation_mode="anchor")
+    turned = {"rotation": 35, "ha": "right", "rotation_mode": "anchor"} if max(map(len, made.columns)) > SHORT else {}
+    axes.set_xticks(range(len(made.columns)), made.columns, **turned)
     axes.set_yticks(range(len(made.rows)), made.rows)
-    axes.set_title(f"{made.title} [%]")
-    figure.colorbar(shown, ax=axes, label="accuracy")
+    axes.set(xlabel=made.column, ylabel=made.row)
+    axes.set_title(made.title)
+    figure.colorbar(shown, ax=axes, label="accuracy [%]", format=lambda share, _: f"{100 * share:.0f}")
 
 
 HEAT_MAP = Kind(
@@ -76,5 +87,5 @@ HEAT_MAP = Kind(
     HeatMapFigure,
     _compute,
     _draw,
-    lambda made: (max(2.6 + 0.42 * len(made.columns), 5.2), 1.7 + 0.28 * len(made.rows)),
+    lambda made: (max(2.8 + 0.42 * len(made.columns), 5.4), 1.9 + 0.28 * len(made.rows)),
 )

@@ -12,7 +12,7 @@ from advsearch.report.surface_words import surface_sentences
 from advsearch.runs.directory import IMAGES, PARTS
 from advsearch.runs.results.recipe import SurfaceFigure, SurfaceOf
 
-SIZE = 6.4, 2.9
+SIZE = 6.4, 2.65
 """Of one object's map, width and height in inches."""
 
 
@@ -33,7 +33,6 @@ def _draw(made: SurfaceFigure, figure: Any, run: Path) -> None:
 
     for axes, one in zip(figure.subplots(len(made.maps), squeeze=False)[:, 0], made.maps, strict=True):
         axes.imshow(imread(run / PARTS / one.run / IMAGES / "surface.png"))
-        axes.set_title(", ".join(dict.fromkeys(table.object for table in one.tables)))
         axes.axis("off")
 
 
