@@ -108,7 +108,7 @@ class Simulated:
             self._free_at[worker] = begin + self.load
             self._later(begin + self.load - self.now, self._answer(ticket, told))
             return
-        _, first, last = args
+        _, first, last, *given = args
         numbers = range(first, last)
         self.given.append(numbers)
         seconds = sum(map(self.seconds, numbers))
@@ -118,8 +118,8 @@ class Simulated:
         elif any(number in self.hang for number in numbers):
             self._free_at[worker] = float("inf")
         elif begin + seconds < float("inf"):
-            until = begin + seconds + self.lag - self.now
-            self._later(until, self._answer(ticket, lambda: Carried(self.call(numbers), seconds)))
+            until, asked = begin + seconds + self.lag - self.now, given[0] if given else numbers
+            self._later(until, self._answer(ticket, lambda: Carried(self.call(asked), seconds)))
 
     def _answer(self, ticket: int, value: Any) -> Any:
         def answer() -> Event | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -15,11 +15,14 @@ from advsearch import seeds
 from advsearch.api.keywords import AttackKeywords, asks
 from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import check_objective
+from advsearch.cluster.executor import Call, Executor, Work
+from advsearch.cluster.opening import executor_of
 from advsearch.config import AttackConfig, SceneConfig
 from advsearch.config.scene import one_only
 from advsearch.controls import make_space
 from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
+from advsearch.engine.ahead import Ahead, seen_by
 from advsearch.engine.answers import Described, Looked, check_truth, facts_of
 from advsearch.engine.budget import Preparation, RenderBudget, verification_ladder
 from advsearch.engine.loading import (
@@ -33,7 +36,7 @@ from advsearch.engine.loading import (
     settings_of,
 )
 from advsearch.engine.memory import Memory
-from advsearch.engine.naming import AnyModel, load_models, model_name, scene_settings, several
+from advsearch.engine.naming import AnyModel, check_not_spread, load_models, model_name, scene_settings, several
 from advsearch.engine.objective import Wanted, objective_for, task_for
 from advsearch.engine.outcome import AttackResult, Question, summarise
 from advsearch.engine.print_terms import print_terms
@@ -54,6 +57,7 @@ from advsearch.runs.results.matrix import MatrixResult
 from advsearch.scene.leaving_out import EVERYTHING, NOTHING
 from advsearch.scene.mitsuba_backend.samplers import next_count
 from advsearch.scene.surfaces import aovs_of
+from advsearch.settings import FILES
 from advsearch.tasks import AnyTask, Facts, Task, make_task
 from advsearch.tasks.together import Together
 
@@ -106,6 +110,8 @@ def attack(
         InputError: anything that the caller can put right; nothing is written then.
     """
     options = {name: value for name, value in settings.items() if value is not None}
+    if callable(objective) or not all(isinstance(one, (str, Path)) for one in (scene, *several(model))):
+        check_not_spread(options)
     scene = _scene(scene, object, settings)
     described = {
         "object": scene.description.object_name,
@@ -407,10 +413,23 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
     policy = _policy(job, problem)
     with _directory(job, run) as kept:
         memory = Memory(kept)
-        recorder, prepared = Recorder(kept, problem, memory), preparation_of(job.config)
-        attack = Attack(problem, budget_of(job.config), policy, recorder, memory, stages, prepared, clean=job.clean)
-        findings = attack.carry_out()
+        with _executor(job.config, progress) as executor:
+            recorder = Recorder(kept, problem, memory, Ahead(executor))
+            spent = (budget_of(job.config), policy, recorder, memory, stages, preparation_of(job.config))
+            findings = Attack(problem, *spent, clean=job.clean).carry_out()
         return summarise(_question(job), problem, findings, recorder, stages, warnings)
+
+
+def announced_of(settings: JsonObject) -> Call:
+    """Return what carries out trials and evaluations of the attack that the settings describe: what a worker does."""
+    return seen_by(_problem(_job(AttackConfig(**settings))))
+
+
+def _executor(config: AttackConfig, progress: Progress) -> AbstractContextManager[Executor | None]:
+    """What carries out beforehand what does not wait; None for this process."""
+    settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
+    work = Work("advsearch.api.attack:announced_of", settings, FILES, config.used_threads or 1)
+    return executor_of(work, workers=config.workers, cluster=config.cluster, tell=progress.message)
 
 
 def _policy(job: _Job, problem: Problem) -> Policy[Any]:

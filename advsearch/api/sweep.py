@@ -15,7 +15,15 @@ from advsearch.config import SweepConfig
 from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.budget import verification_ladder
 from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, named_camera, settings_of
-from advsearch.engine.naming import AnyModel, different, load_models, model_name, scene_settings, several
+from advsearch.engine.naming import (
+    AnyModel,
+    check_not_spread,
+    different,
+    load_models,
+    model_name,
+    scene_settings,
+    several,
+)
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.answer import SweepResult
 from advsearch.engine.sweeps.axes import read_axes
@@ -100,12 +108,8 @@ def sweep(
     if config.surface and config.run is None:
         raise InputError("surface: expected `run` beside it, the folder that keeps the map; name one")
     progress = progress or NullProgress()
-    spread = config.workers is not None or config.cluster is not None
-    if spread and (loaded or not all(isinstance(one, (str, Path)) for one in networks)):
-        raise InputError(
-            "workers: expected names of objects and models beside it, which other processes can load, got ones that "
-            "are loaded; give their names or files"
-        )
+    if loaded or not all(isinstance(one, (str, Path)) for one in networks):
+        check_not_spread(options)
     resumed = _stopped(config)
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)

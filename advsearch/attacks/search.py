@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
@@ -68,6 +69,10 @@ Late = Callable[[int], bool]
 
 OnStep = Callable[[StepRecord, Tensor, Evaluation], None]
 """Called after every evaluation, ranking included, with its record, u, and the (usable) evaluation."""
+
+Announce = Callable[[Sequence[tuple[Tensor, int]]], None]
+"""Told configurations (d,) with their seed indices that are evaluated next, in this order, and do not wait for each
+other; all of them without derivative, with the search's own samples."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +138,8 @@ def search(
     on_step: OnStep | None = None,
     seconds: float | None = None,
     late: Late | None = None,
+    announce: Announce | None = None,
+    together: int = 1,
 ) -> SearchResult:
     """Run one policy on one domain and return the worst configuration it found.
 
@@ -168,6 +175,8 @@ def search(
             is always one evaluation, and step 2 comes on top. Policies still plan for `steps`.
         late: says, after so many evaluations, whether the time is over; in place of `seconds`, for a run that goes on
             after it was stopped.
+        announce: told beforehand what is going to be evaluated, where that does not depend on the evaluations before.
+        together: how many configurations it is told of at once, at most.
 
     Raises:
         InputError: steps, candidates, repeats, close or seconds out of range, or the policy cannot search this domain.
@@ -182,7 +191,7 @@ def search(
     if seconds is not None and not seconds > 0.0:
         raise InputError(f"seconds: expected a number over 0, got {seconds}")
     begun = time.perf_counter()
-    log = _Log(evaluate, domain, on_step, max(1, candidates))
+    log = _Log(evaluate, domain, on_step, max(1, candidates), announce or (lambda coming: None), together)
     try:
         with interruptible():
             in_time = math.inf if seconds is None else begun + seconds
@@ -204,6 +213,8 @@ class _Log:
     domain: Domain
     on_step: OnStep | None
     size: int
+    announce: Announce
+    together: int
     pool: tuple[Candidate, ...] = ()
     last: Candidate | None = None
     best: float = math.nan
@@ -268,9 +279,13 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
     generator = torch.Generator().manual_seed(stream(seed, "search"))
     name, policy = policy.name, with_choices(policy, log.domain)
     state = policy.start(log.domain, generator, steps)
-    in_a_row = 0
+    in_a_row = told = 0
     while log.renders < steps:
         step = len(log.records)
+        if step >= told and log.together > 1:
+            upcoming = _upcoming(policy, state, min(log.together, steps - log.renders))
+            log.announce([(u, step + place) for place, u in enumerate(upcoming)])
+            told = step + len(upcoming)
         proposals, state = policy.propose(state, 1)
         if not proposals:
             return Ending.STALLED
@@ -291,6 +306,14 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
     return Ending.BUDGET_SPENT
 
 
+def _upcoming(policy: Policy[Any], state: Any, n: int) -> list[Tensor]:
+    """Return up to n configurations that the policy proposes next whatever comes of them, and wants no more of than a
+    picture."""
+    proposals, _ = policy.propose(state, n)
+    plain = itertools.takewhile(lambda one: not one.gradient and one.samples == 1, proposals)
+    return [one.u for one in plain]
+
+
 def _rank(log: _Log, first_index: int, repeats: int, close: int) -> None:
     """Render every candidate again, all with the same new seeds, and those that are close once more and once more."""
     _look(log, range(first_index, first_index + repeats))
@@ -302,6 +325,7 @@ def _rank(log: _Log, first_index: int, repeats: int, close: int) -> None:
 
 
 def _look(log: _Log, indices: range) -> None:
+    log.announce([(candidate.u, index) for candidate in log.pool for index in indices])
     for candidate in log.pool:
         evaluations = [log.render(Proposal(candidate.u), index, "ranking") for index in indices]
         again = (*candidate.again, *(e.objective for e in evaluations))

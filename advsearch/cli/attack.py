@@ -78,6 +78,7 @@ def _facts(summary: AttackSummary) -> dict[str, str]:
         "failures": failures_text(summary.failures) if summary.failures else "",
         "search": f"{summary.policy}, {wording.count(summary.steps, 'step')}: {summary.ending}",
         "renders": wording.renders_text(summary),
+        "workers": wording.workers_text(summary.shared),
         "time": wording.seconds_text(summary.seconds["total"]),
         "pictures": summary.run or "",
     }

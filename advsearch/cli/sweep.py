@@ -12,7 +12,7 @@ from advsearch.report.phrases import answer_text, margin_text, percent
 from advsearch.report.surface_words import surface_sentences
 
 if TYPE_CHECKING:
-    from advsearch.runs.results.sweep import AxisRow, SharedWork, SweepSummary, WorstConfiguration
+    from advsearch.runs.results.sweep import AxisRow, SweepSummary, WorstConfiguration
 
 HELP = "measure how often the model is right over a grid or a random sample of configurations"
 EXAMPLES = (
@@ -101,23 +101,11 @@ def _facts(summary: SweepSummary) -> dict[str, str]:
         "worst": _configuration(worst) if worst else "",
         "": _said(worst, summary.task) if worst else "",
         "renders": f"{summary.renders['sweep']}" + (f", {speed:.3g} a second" if speed else ""),
-        "workers": _workers(summary.shared) if summary.shared else "",
+        "workers": wording.workers_text(summary.shared),
         "time": wording.seconds_text(summary.seconds["total"]),
         "map of the surface": f"{summary.run}/images/surface.png" if summary.surface else "",
         "kept in": summary.run or "",
     }
-
-
-def _workers(shared: SharedWork) -> str:
-    """How many shared the work, and where their time went."""
-    told = [f"{shared.most} at most"]
-    if shared.utilisation is not None:
-        told.append(f"busy {percent(shared.utilisation)} of {wording.seconds_text(shared.alive)}")
-    told.append(f"loading took {wording.seconds_text(shared.loading)}")
-    told += [f"{shared.lost} lost"] if shared.lost else []
-    told += [f"{shared.refused} refused"] if shared.refused else []
-    told += [f"{shared.retried} given out again"] if shared.retried else []
-    return ", ".join(told)
 
 
 def _configuration(worst: WorstConfiguration) -> str:

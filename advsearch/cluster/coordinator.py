@@ -11,8 +11,9 @@ from __future__ import annotations
 import statistics
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from advsearch.cluster.executor import Done, Work, Workforce
 from advsearch.cluster.inputs import Files
@@ -51,6 +52,7 @@ class _Range:
     numbers: range
     alone: bool = False
     deaths: int = 0
+    wanted: bool = True
 
 
 @dataclass(eq=False)
@@ -99,29 +101,42 @@ class Coordinator:
         self._tickets: dict[int, tuple[_Worker, _Range | None]] = {}
         self._next_ticket = self._under_way = 0
         self._todo: deque[_Range] = deque()
+        self._given: Sequence[Any] | None = None
+        self._events: deque[Event] = deque()
         self._free: deque[_Worker] = deque()
         self._per_number: deque[float] = deque(maxlen=MEDIAN_OF)
         self._load_deaths = self._seen = 0
         self._counted_at = self._alone_since = self._looked_at = clock()
 
-    def results(self, ranges: Iterable[range]) -> Iterator[Done]:
+    def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
         """See `Executor.results`.
 
         Raises:
             ClusterError: nobody can carry them out, or the scheduler has gone.
         """
-        source = iter(ranges)
-        while True:
-            self._give_out(source)
-            if not self._todo and not self._under_way:
-                numbers = next(source, None)  # there may be more, and nobody yet who is ready for it
-                if numbers is None:
-                    return
-                self._todo.append(_Range(numbers))
-            for event in self._pool.events(POLL):
-                yield from self._happened(event)
-            self._count_time()
-            yield from self._look_at_clock()
+        source, self._given = iter(ranges), given
+        self._per_number.clear()  # those before may have taken other times
+        if not self._workers:
+            self._alone_since = self._clock()
+        try:
+            while True:
+                self._give_out(source)
+                if not self._todo and not self._under_way:
+                    numbers = next(source, None)  # there may be more, and nobody yet who is ready for it
+                    if numbers is None:
+                        return
+                    self._todo.append(_Range(numbers))
+                if not self._events:
+                    self._events.extend(self._pool.events(POLL))
+                while self._events:
+                    yield from self._happened(self._events.popleft())
+                self._count_time()
+                yield from self._look_at_clock()
+        finally:
+            self._todo.clear()
+            for _, one in self._tickets.values():
+                if one is not None:
+                    one.wanted = False
 
     # ---- giving out -------------------------------------------------------------------------------------------------
 
@@ -160,7 +175,9 @@ class Coordinator:
             files = self._files if send else self._files.named_only
             self._pool.submit(ticket, worker.address, prepare, self._key, self._work, files, self._version)
         else:
-            self._pool.submit(ticket, worker.address, carry_out, self._key, one.numbers.start, one.numbers.stop)
+            first, last = one.numbers.start, one.numbers.stop
+            given = () if self._given is None else (self._given[first:last],)
+            self._pool.submit(ticket, worker.address, carry_out, self._key, first, last, *given)
 
     # ---- what happens -----------------------------------------------------------------------------------------------
 
@@ -203,9 +220,10 @@ class Coordinator:
             self.facts.busy += value.seconds
             self._per_number.append(value.seconds / max(1, len(one.numbers)))
             self._free.extend([worker] * (self._depth if one.alone else 1))
-            yield Done(one.numbers, value.value, worker.address, worker.machine)
+            if one.wanted:
+                yield Done(one.numbers, value.value, worker.address, worker.machine)
         elif isinstance(value, Failure):
-            if one is not None and (value.unfit or value.forgotten):
+            if one is not None and one.wanted and (value.unfit or value.forgotten):
                 self._todo.appendleft(one)
             if value.forgotten:
                 self._forget(worker)
@@ -260,7 +278,8 @@ class Coordinator:
             self._load_deaths += 1
             if self._load_deaths >= LOADS * max(2, self._seen) and not self.facts.workers:
                 self._give_up(f"{self._load_deaths} workers died while they loaded the scene and the model")
-        suspects = [one for ticket in worker.tickets if (one := self._tickets[ticket][1])] if died else []
+        held = [self._tickets[ticket][1] for ticket in worker.tickets] if died else []
+        suspects = [one for one in held if one is not None and one.wanted]
         self._requeue(worker)
         for one in suspects:
             one.alone = True
@@ -293,6 +312,7 @@ class Coordinator:
             self._pool.forget(ticket)
             if one is not None:
                 self._under_way -= 1
+            if one is not None and one.wanted:
                 self.facts.retried += 1
                 self._todo.appendleft(one)
         worker.tickets.clear()

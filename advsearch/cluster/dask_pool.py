@@ -44,6 +44,8 @@ CONFIG = {
     "distributed.worker.multiprocessing-method": "spawn",  # a fork would share what Mitsuba and torch hold
     "distributed.scheduler.allowed-failures": 1_000_000,  # who died of what is counted by the coordinator
     "distributed.admin.large-graph-warning-threshold": "2GiB",  # files of a scene are sent once a worker
+    "distributed.comm.timeouts.connect": "120s",  # a worker that starts on a busy machine takes its time,
+    "distributed.comm.timeouts.tcp": "120s",  # and one that gives up is not started again
     "distributed.worker.profile.enabled": False,
     "distributed.admin.system-monitor.gil.enabled": False,
 }

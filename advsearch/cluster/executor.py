@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from advsearch.files import JsonObject
 
-Call = Callable[[range], Any]
-"""What carries out one range; a pure function of it."""
+Call = Callable[[Any], Any]
+"""What carries out one range, or what its numbers stand for where that is given along; a pure function of it."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,12 @@ class Workforce:
     machines: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     link: str = ""
 
+    @property
+    def told(self) -> dict[str, float | str]:
+        """What is shown beside a bar."""
+        counts = {"lost": self.lost, "retried": self.retried}
+        return {"workers": self.workers, **{name: count for name, count in counts.items() if count}}
+
 
 class Executor(Protocol):
     """Carries out ranges."""
@@ -90,10 +96,15 @@ class Executor(Protocol):
     def facts(self) -> Workforce | None:
         """How the workers do; None where there are none."""
 
-    def results(self, ranges: Iterable[range]) -> Iterator[Done]:
+    def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
         """Carry out ranges, and yield what comes of them, in any order, each once.
 
-        Only a few are taken from `ranges` before their results are asked for.
+        Only a few are taken from `ranges` before their results are asked for. Where nobody goes on asking, what is
+        under way comes to nothing, and other ranges may follow.
+
+        Args:
+            ranges: of numbers.
+            given: what each number stands for, where the work's settings do not say it.
 
         Raises:
             AdvsearchError: what a range raises, or there is nobody who can carry it out.
@@ -112,6 +123,7 @@ class InProcess:
     def __init__(self, call: Call) -> None:
         self._call = call
 
-    def results(self, ranges: Iterable[range]) -> Iterator[Done]:
+    def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
         """See `Executor.results`; they come in order."""
-        return (Done(numbers, self._call(numbers)) for numbers in ranges)
+        for numbers in ranges:
+            yield Done(numbers, self._call(numbers if given is None else given[numbers.start : numbers.stop]))

@@ -13,7 +13,7 @@ import threading
 import time
 import traceback
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -109,14 +109,15 @@ def prepare(key: str, work: Work, files: Files, asked: str) -> Ready | Failure:
     return Ready(machine, time.perf_counter() - begun)
 
 
-def carry_out(key: str, first: int, last: int) -> Carried | Failure:
-    """Carry out the range from `first` to before `last` of a work that this worker is ready for."""
+def carry_out(key: str, first: int, last: int, given: Sequence[Any] | None = None) -> Carried | Failure:
+    """Carry out the range from `first` to before `last` of a work that this worker is ready for, or what is given for
+    its numbers."""
     begun = time.perf_counter()
     try:
         with _one_at_a_time:
             if key not in _known:
                 return Failure("it is not ready", forgotten=True)
-            value = _load(key, _known[key])(range(first, last))
+            value = _load(key, _known[key])(range(first, last) if given is None else given)
     except Exception as error:
         return _failure(error, unfit=isinstance(error, (OSError, StorageError)))
     return Carried(value, time.perf_counter() - begun)

@@ -53,14 +53,6 @@ class AttackConfig(DerivativeConfig):
             lambda one: not one.is_matrix,
             "is of several models; name them in `model`, separated by commas, or leave `ensemble` out",
         ),
-        *(
-            Clash(
-                name,
-                lambda one: one.command == "attack" and len(one.objects) < 2 and (not one.is_matrix or one.ensemble),
-                "one attack is not shared; name several in `object`, or in `model` without `ensemble`, or leave it out",
-            )
-            for name in ("workers", "cluster")
-        ),
         Clash(
             "smallest",
             lambda one: one.seconds is not None,
@@ -214,7 +206,7 @@ class AttackConfig(DerivativeConfig):
     workers: int | None = setting(
         None,
         "run",
-        "processes that share the attacks of several objects or models",
+        "processes that share the attacks of several objects or models, or what does not wait in one attack",
         otherwise="this one alone",
         unit="processes",
         ge=1,

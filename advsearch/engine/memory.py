@@ -80,6 +80,10 @@ class Memory:
         """Whether the row of this step is in the store already."""
         return step < self.counts.get(kind, 0)
 
+    def logged(self, kind: str, number: int) -> bool:
+        """Whether the evaluation of this number is read back."""
+        return self._run is not None and (kind, number) in self._run.replay
+
     def evaluator(
         self,
         kind: str,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -96,3 +96,17 @@ def different(names: Sequence[str], setting: str) -> Sequence[str]:
             f"{setting}: expected different names, got {','.join(names)!r}; leave {', '.join(twice[:1])} out"
         )
     return names
+
+
+def check_not_spread(settings: Mapping[str, object]) -> None:
+    """Refuse to share work on what is loaded already.
+
+    Raises:
+        InputError: `workers` or `cluster` is among the settings.
+    """
+    for name in ("workers", "cluster"):
+        if settings.get(name) is not None:
+            raise InputError(
+                f"{name}: expected names of objects, models and an objective beside it, which other processes can "
+                "load, got ones that are loaded; give their names or files"
+            )

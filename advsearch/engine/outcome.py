@@ -20,7 +20,7 @@ from advsearch.engine.pictures import write_artifacts, write_object, write_pictu
 from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
-from advsearch.engine.rows import verified_rate
+from advsearch.engine.rows import lost_remarks, verified_rate
 from advsearch.errors import InputError
 from advsearch.report.drawing import new_axes
 from advsearch.report.notebook import attack_html, side_by_side
@@ -46,6 +46,7 @@ from advsearch.runs.results.attack import (
     Printability,
     SearchClaim,
     SearchGradients,
+    SharedWork,
     SmallestEpsilon,
     UsualAnswer,
     VerificationSamples,
@@ -177,7 +178,7 @@ def summarise(
     space = problem.searched_space
     artifacts = space.artifacts(u)
     run = recorder.run
-    warnings = [*warnings, *_remarks(findings, problem)]
+    warnings = [*warnings, *_remarks(findings, problem, recorder)]
     if run is not None:
         write_pictures(run, problem, findings, linear, {"clean": clean, "adversarial": adversarial}, u)
         write_failures(run, problem, findings)
@@ -188,7 +189,10 @@ def summarise(
         write_answer(run.path, u.numpy())
     summary = _summary(asked, problem, findings, clean, adversarial, u)
     where = {"run": None if run is None else str(run.path), "warnings": warnings}
-    summary = summary.model_copy(update={**where, "seconds": {**stages.seconds, "total": stages.total}})
+    shared = SharedWork.of_facts(recorder.ahead.facts, recorder.machines.known)
+    summary = summary.model_copy(
+        update={**where, "shared": shared, "seconds": {**stages.seconds, "total": stages.total}}
+    )
     if run is not None:
         run.write_summary(summary)
         write_report(run.path)
@@ -430,7 +434,7 @@ def _verified(verification: Verification | None) -> VerifiedRate | None:
     return verified_rate(verification.adversarial, verification.adversarial_trials)
 
 
-def _remarks(findings: Findings, problem: Problem) -> list[str]:
+def _remarks(findings: Findings, problem: Problem, recorder: Recorder) -> list[str]:
     """What a reader has to know beside the numbers."""
     remarks = []
     count = findings.sample_count
@@ -439,8 +443,6 @@ def _remarks(findings: Findings, problem: Problem) -> list[str]:
             f"The margin still moved with the sample count at {count.spp} samples a pixel, the most that was tried: "
             "noise may take part in the verdict."
         )
-    if problem.renderer.non_finite:
-        remarks.append(
-            f"{problem.renderer.non_finite} values of pictures or gradients were not finite and were set to 0."
-        )
-    return remarks
+    if not_finite := problem.renderer.non_finite + recorder.ahead.non_finite:
+        remarks.append(f"{not_finite} values of pictures or gradients were not finite and were set to 0.")
+    return [*remarks, *lost_remarks(recorder.ahead.lost), *recorder.machines.remarks]

@@ -11,6 +11,8 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.attacks import Evaluation, SampleCount, SearchResult, StepRecord, Verification
 from advsearch.attacks.smallest import Bracket
+from advsearch.engine.ahead import Ahead
+from advsearch.engine.machines import Machines
 from advsearch.engine.memory import Memory
 from advsearch.engine.problem import Problem
 from advsearch.engine.rows import judged, trial_row
@@ -125,10 +127,13 @@ class Recorder:
         run: the open run directory, or None.
         problem: names labels and describes configurations.
         memory: what the store has already, which is not written again.
+        ahead: knows on which machine a picture was made.
     """
 
-    def __init__(self, run: RunDirectory | None, problem: Problem, memory: Memory) -> None:
+    def __init__(self, run: RunDirectory | None, problem: Problem, memory: Memory, ahead: Ahead | None = None) -> None:
         self.run = run
+        self.ahead = ahead or Ahead()
+        self.machines = Machines(run)
         self._problem = problem
         self._memory = memory
         self._renders: dict[str, int] = {}
@@ -150,6 +155,7 @@ class Recorder:
             values=problem.describe(u),
             seconds=record.seconds,
             renders=renders * problem.draws,
+            machine=self._machine(),
         )
         self.run.record(row if evaluation.judgement is None else judged(row, evaluation.judgement))
 
@@ -181,4 +187,11 @@ class Recorder:
             return
         told = self._problem.describe(u, seed) if described else {}
         told = {**told, **(self._problem.conditions_of(u, seed) if drawn else {})}
-        self.run.record(trial_row(kind, number, seed, spp, trial, told, sought=kind not in MEASURED))
+        made = self._machine()
+        self.run.record(trial_row(kind, number, seed, spp, trial, told, sought=kind not in MEASURED, machine=made))
+
+    def _machine(self) -> str | None:
+        """The machine on which the picture of this row was made, if that is not like this one."""
+        name = self.ahead.machine_of_row()
+        self.machines.meet(name, self.ahead.facts)
+        return name

@@ -10,9 +10,26 @@ from typing import Any
 
 from advsearch.attacks import Trials
 from advsearch.described import Value
+from advsearch.report.wording import count
 from advsearch.runs.results.attack import VerifiedRate
 from advsearch.runs.store import Row
 from advsearch.tasks import Answer, Judgement
+
+LOST = "(no answer)"
+"""The answer to a picture that nobody could make; what the row keeps beside it says why."""
+
+
+def no_answer(why: str) -> Judgement:
+    """Return what stands for the answer to a picture that nobody could make: neither right nor a success, and why."""
+    return Judgement(math.nan, math.nan, right=False, answer=Answer(LOST, None, None), payload={"lost": why})
+
+
+def lost_remarks(lost: int) -> list[str]:
+    """Return what a reader has to know of so many pictures that nobody could make."""
+    if not lost:
+        return []
+    has, it = ("has", "it") if lost == 1 else ("have", "them")
+    return [f"{count(lost, 'picture')} {has} no answer, which counts as not right: every worker that took {it} died."]
 
 
 def trial_row(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -21,6 +22,7 @@ from advsearch.attacks import (
     planned_renders,
     search,
 )
+from advsearch.engine.ahead import EvaluationAhead
 from advsearch.engine.bank import Bank
 from advsearch.engine.budget import RenderBudget
 from advsearch.engine.memory import TRANSPORT, Frames, Memory
@@ -106,13 +108,19 @@ class Searches:
             KeyboardInterrupt: the search was interrupted; the result of an interrupted main search is kept before.
         """
 
-        before = 0
+        before = done = 0
 
         def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
-            nonlocal before
+            nonlocal before, done
+            done += 1
             self.recorder.step(kind, record, u, evaluation)
-            self.stages.progress.advance(record.renders - before, best=record.best)
+            self.stages.progress.advance(record.renders - before, best=record.best, **self.recorder.ahead.told)
             before = record.renders
+
+        def announce(coming: Sequence[tuple[Tensor, int]]) -> None:
+            new = [one for number, one in enumerate(coming, done) if not self.memory.logged(kind, number)]
+            now = (kind, self.problem.spp, self.problem.search_depth)
+            self.recorder.ahead.begin([EvaluationAhead(u, index, *now, kept=_kept(frames, index)) for u, index in new])
 
         domain = self.problem.domain if domain is None else domain
         found = search(
@@ -125,6 +133,8 @@ class Searches:
             close=self.budget.close_looks,
             late=self.memory.clock(kind, steps, seconds),
             on_step=on_step,
+            announce=None if self.findings.transport is not None else announce,
+            together=self.recorder.ahead.most(domain.dim),
         )
         if found.ending is Ending.INTERRUPTED:
             self.findings.search = self.findings.search or found
@@ -143,6 +153,7 @@ class Searches:
 
         def make(tell: OnImage | None) -> Evaluate:
             made = (self.problem if transport is None else transport).evaluator(kind, tell)
+            made = made if transport is not None else self.recorder.ahead.evaluator(self.problem, made, kind, tell)
             return less_print_terms(made, self.problem.searched_space) if self.problem.printable else made
 
         if transport is None:
@@ -156,6 +167,11 @@ class Searches:
         if self.findings.transport is not None:
             hint = f"{steps} pictures predicted and {renders - steps} traced; {shorter}"
         self.stages.begin(name, title, renders, hint=hint, at_most=True)
+
+
+def _kept(frames: Frames | None, index: int) -> bool:
+    """Whether somebody wants the picture of an evaluation."""
+    return frames is not None and frames.wants(index)
 
 
 def _spent(found: SearchResult) -> int:

@@ -18,6 +18,7 @@ from advsearch.attacks import (
     verify,
 )
 from advsearch.attacks.sample_count import most_samples
+from advsearch.engine.ahead import TrialAhead
 from advsearch.engine.budget import RenderBudget
 from advsearch.engine.memory import Memory
 from advsearch.engine.problem import Problem
@@ -96,6 +97,7 @@ class Verifier:
             return
         kind = "first control" if self.findings.search is None else "control"
         self._clean_spp = self.findings.spp
+        self._announce(kind, self.problem.domain.start, self.budget.trials)
         self.findings.clean = run_trials(
             self._numbered(kind),
             self.problem.domain.start,
@@ -117,6 +119,7 @@ class Verifier:
         """Verify one search's answer against the control group, by as many trials if no other number is given;
         `curtailed` where only the verdict matters."""
         trials = self.budget.trials if trials is None else trials
+        self._announce(kind, self.problem.domain.project(found.best_u), trials)
         return verify(
             self._numbered(kind),
             self.problem.domain,
@@ -141,16 +144,21 @@ class Verifier:
             stored = self.memory.trial(kind, number)
             if stored is not None:
                 return stored
-            if number >= KEPT:
-                return self.problem.trial(u, seed, spp)
-            return self.problem.trial(u, seed, spp, keep=partial(self.findings.pictures.__setitem__, (kind, number)))
+            keep = partial(self.findings.pictures.__setitem__, (kind, number)) if number < KEPT else None
+            return self.recorder.ahead.trial(self.problem, u, seed, spp, keep)
 
         return trial
 
+    def _announce(self, kind: str, u: Tensor, trials: int) -> None:
+        """Have the trials of a configuration made beforehand that are not stored."""
+        seeded = ((number, seeds.stream(self.problem.seed, "verification", number)) for number in range(trials))
+        new = ((number, seed) for number, seed in seeded if self.memory.trial(kind, number) is None)
+        self.recorder.ahead.begin([TrialAhead(u, seed, self.findings.spp, number < KEPT) for number, seed in new])
+
     def trial(self, kind: str, number: int, u: Tensor) -> Judgement:
         """One trial of a configuration of its own, with a seed of its own; read back if it is stored."""
-        seed, spp = seeds.stream(self.problem.seed, kind, number), self.findings.spp
-        trial = self.memory.trial(kind, number) or self.problem.trial(u, seed, spp)
+        seed, spp = self._seed(kind, number), self.findings.spp
+        trial = self.memory.trial(kind, number) or self.recorder.ahead.trial(self.problem, u, seed, spp)
         self.recorder.trial(kind, number, spp, trial, seed, u, described=self.problem.domain.dim <= MANY)
         self.findings.verification_renders += 1
         return trial
@@ -160,13 +168,25 @@ class Verifier:
         if self.findings.sample_count is None:
             self.choose_spp({"clean": self.problem.domain.start})
         self.begin("trying random configurations", self.budget.average, name="average", flags="`average`")
-        found: list[Judgement] = []
-        for number in range(self.budget.average):
-            generator = torch.Generator().manual_seed(seeds.stream(self.problem.seed, "draw", number))
-            u = self.problem.domain.sample(generator)[0]
-            found.append(self.trial("average", number, u))
-            self.stages.progress.advance(1)
+        found, kind, numbers = list[Judgement](), "average", range(self.budget.average)
+        together = self.recorder.ahead.most(self.problem.domain.dim)
+        for begin in numbers[::together]:
+            drawn = {number: self._drawn(number) for number in numbers[begin : begin + together]}
+            new = {number: u for number, u in drawn.items() if self.memory.trial(kind, number) is None}
+            self.recorder.ahead.begin([TrialAhead(u, self._seed(kind, n), self.findings.spp) for n, u in new.items()])
+            for number, u in drawn.items():
+                found.append(self.trial(kind, number, u))
+                self.stages.progress.advance(1, **self.recorder.ahead.told)
         self.findings.average = tuple(found)
+
+    def _drawn(self, number: int) -> Tensor:
+        """The configuration of the average case with this number."""
+        generator = torch.Generator().manual_seed(seeds.stream(self.problem.seed, "draw", number))
+        return self.problem.domain.sample(generator)[0]
+
+    def _seed(self, kind: str, number: int) -> int:
+        """That of a trial of a configuration of its own."""
+        return seeds.stream(self.problem.seed, kind, number)
 
     def begin(
         self,
@@ -187,6 +207,6 @@ class Verifier:
             seed = seeds.stream(self.problem.seed, "verification", number)
             self.recorder.trial(kind, number, self.findings.spp, trial, seed, u)
             self.findings.verification_renders += 1
-            self.stages.progress.advance(1)
+            self.stages.progress.advance(1, **self.recorder.ahead.told)
 
         return on_trial

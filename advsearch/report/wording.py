@@ -11,13 +11,14 @@ from advsearch.report.phrases import (
     calling,
     calls,
     margin_text,
+    percent,
     percent_number,
     wanted,
     with_article,
 )
 
 if TYPE_CHECKING:
-    from advsearch.runs.results.attack import AttackSummary, VerifiedRate
+    from advsearch.runs.results.attack import AttackSummary, SharedWork, VerifiedRate
     from advsearch.runs.results.base import Formation, Interval
 
 NO_INTERVAL = "no interval"
@@ -141,6 +142,18 @@ def seconds_text(seconds: Any) -> str:
 def count(number: Any, thing: str) -> str:
     """Return ``1 step``, ``40 steps``."""
     return f"{number or 0} {thing}{'' if number == 1 else 's'}"
+
+
+def workers_text(shared: SharedWork | None) -> str:
+    """How many shared the work, and where their time went; empty where nothing was shared."""
+    if shared is None:
+        return ""
+    told = [f"{shared.most} at most"]
+    if shared.utilisation is not None:
+        told.append(f"busy {percent(shared.utilisation)} of {seconds_text(shared.alive)}")
+    told.append(f"loading took {seconds_text(shared.loading)}")
+    counts = {"lost": shared.lost, "refused": shared.refused, "given out again": shared.retried}
+    return ", ".join([*told, *(f"{number} {what}" for what, number in counts.items() if number)])
 
 
 def changed_text(summary: AttackSummary) -> str:

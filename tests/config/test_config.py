@@ -294,8 +294,6 @@ CLASHES: tuple[tuple[type[Config], dict[str, Any], str], ...] = (
     (AttackConfig, {"smallest": True, "printable": True}, "smallest: cannot be combined with `printable`"),
     (AttackConfig, {"smallest": True, "seconds": 5}, "smallest: takes several searches"),
     (AttackConfig, {"smallest": True, "over": "camera"}, "smallest: cannot be combined with `over` yet"),
-    (AttackConfig, {"workers": 2, "epsilon": "0.1,0.2"}, "workers: one attack is not shared; name several"),
-    (AttackConfig, {"cluster": "local", "model": "a,b", "ensemble": "worst"}, "cluster: one attack is not shared"),
     (AttackConfig, {"minimise": True, "object": "mug,bowl"}, "minimise: has no robust accuracy"),
     (AttackConfig, {"minimise": True, "target": "bowl"}, "minimise: makes the right answer easier to give"),
     (AttackConfig, {"minimise": True, "smallest": True}, "minimise: has no smallest change"),

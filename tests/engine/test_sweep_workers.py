@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,13 +19,14 @@ from advsearch.cli.main import main
 from advsearch.cli.sweep import answer
 from advsearch.cluster.executor import Done, Workforce
 from advsearch.config import SweepConfig
+from advsearch.engine.rows import LOST
 from advsearch.engine.sweeps import loop, swept_scene
-from advsearch.engine.sweeps.batch import LOST, Batches
+from advsearch.engine.sweeps.batch import Batches
 from advsearch.engine.sweeps.loop import Sweep
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress
 from advsearch.runs.directory import RunDirectory
-from advsearch.runs.results.sweep import SharedWork
+from advsearch.runs.results.attack import SharedWork
 from advsearch.runs.store import NAME, Store
 
 SMALL = {"object": "mug", "grid": {"pose.yaw": "0:360:3", "camera.elevation": [5, 35]}, "environment": "studio,noon"}
@@ -50,7 +51,7 @@ class Disorder:
     stop: int | None = None
     facts: Workforce | None = field(default_factory=lambda: Workforce(most=2, lost=1, busy=9.0, alive=10.0, retried=3))
 
-    def results(self, ranges: Iterable[range]) -> Iterator[Done]:
+    def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
         pieces = list(ranges)
         random.Random(self.seed).shuffle(pieces)
         for count, numbers in enumerate(pieces):
@@ -114,14 +115,14 @@ def test_a_configuration_that_kills_every_worker_is_a_row_that_says_so(tmp_path:
     assert (lost.correct, lost.margin, lost.probability, lost.renders) == (False, None, None, 0)
     assert lost.values["pose.yaw"]["value"] in (0.0, 120.0, 240.0) and lost.values["environment"]["value"] == "noon"
     assert result.summary.configurations == 12 and result.summary.renders["sweep"] == 11
-    assert any("every worker that took the picture died" in text for text in result.summary.warnings)
+    assert any("every worker that took it died" in text for text in result.summary.warnings)
     again = shared(tmp_path / "run", resumed=True)
-    assert any("every worker that took the picture died" in text for text in again.summary.warnings)
+    assert any("every worker that took it died" in text for text in again.summary.warnings)
 
 
 def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: Path) -> None:
     class Two(Disorder):
-        def results(self, ranges: Iterable[range]) -> Iterator[Done]:
+        def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
             for done in super().results(ranges):
                 yield Done(done.numbers, done.value, done.worker, "ab12" if done.numbers.start < 4 else None)
 
@@ -146,7 +147,7 @@ def test_what_is_shown_says_where_the_time_went() -> None:
 
 
 def test_what_is_loaded_already_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="workers: expected names of objects and models"):
+    with pytest.raises(InputError, match="workers: expected names of objects, models"):
         advsearch.sweep("mug", advsearch.load_model("reference"), {"pose.yaw": [0, 90]}, workers=2)
 
 

@@ -5,7 +5,6 @@ A batch is its numbers: what comes of it depends on them and on the job alone, s
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -14,19 +13,17 @@ from torch import Tensor
 
 from advsearch.attacks.draws import Seeds
 from advsearch.described import Value
+from advsearch.engine.rows import no_answer
 from advsearch.engine.sweeps.job import Job
 from advsearch.engine.sweeps.points import Picks
 from advsearch.engine.sweeps.swept_scene import Seen, SweptScene
 from advsearch.runs.results.attack import LinearTransport
 from advsearch.scene.description import OBJECT
-from advsearch.tasks import Answer, Judgement
+from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 
 KIND = "sweep"
 """Rows of the sweep, and the stream of their seeds."""
-
-LOST = "(no answer)"
-"""The answer to a picture that nobody could make; what the row keeps beside it says why."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +55,8 @@ class Batch:
     @classmethod
     def lost(cls, models: int, values: list[dict[str, Value]], why: str) -> Batch:
         """Return what stands for a picture that nobody could make: an answer that is not right, and why."""
-        nothing = Judgement(math.nan, math.nan, right=False, answer=Answer(LOST, None, None), payload={"lost": why})
         return cls(
-            judgements=[[nothing]] * models,
+            judgements=[[no_answer(why)]] * models,
             values=[values] * models,
             shown=[[(False, 0)]] * models,
             seconds=0.0,

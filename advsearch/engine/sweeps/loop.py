@@ -8,7 +8,6 @@ number, so that a sweep that was stopped, or whose batches come in another order
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -18,11 +17,12 @@ from advsearch.attacks.draws import Seeds
 from advsearch.attacks.product import batches
 from advsearch.cluster.executor import Done, Executor, InProcess
 from advsearch.described import Value
+from advsearch.engine.machines import Machines
 from advsearch.engine.pictures import save_marked
 from advsearch.engine.record import Stages
-from advsearch.engine.rows import judgement_of, trial_row
+from advsearch.engine.rows import LOST, judgement_of, lost_remarks, trial_row
 from advsearch.engine.sweeps.answer import SweepResult
-from advsearch.engine.sweeps.batch import KIND, LOST, Batch, Batches
+from advsearch.engine.sweeps.batch import KIND, Batch, Batches
 from advsearch.engine.sweeps.job import Job, check_all
 from advsearch.engine.sweeps.light import together
 from advsearch.engine.sweeps.points import Picks, Points
@@ -37,10 +37,9 @@ from advsearch.runs import store
 from advsearch.runs.directory import AOV_FOLDER, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.images import write_layers
-from advsearch.runs.results.attack import DescribedValue, LinearTransport
+from advsearch.runs.results.attack import DescribedValue, LinearTransport, SharedWork
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.sweep import (
-    SharedWork,
     SurfaceMap,
     SweepSummary,
     WorstClaim,
@@ -51,9 +50,6 @@ from advsearch.scene.transport.renderer import SPP as BASIS_SPP
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
 from advsearch.viewer.sweep_page import write_page
-
-MACHINES = "machines"
-"""The note under which the store keeps what the machines are that rows name."""
 
 NOT_FINITE = "pictures not finite"
 """The note under which the store keeps that there were some."""
@@ -96,7 +92,7 @@ class Sweep:
         self._executor = InProcess(self._batches) if executor is None else executor
         self._rendered = self._traced = self._predicted = self._lost = 0
         self._transport: dict[tuple[str, int], list[LinearTransport | None]] = {}
-        self._machines: dict[str, dict[str, str]] = (run.store.noted(MACHINES) if run is not None else None) or {}
+        self._machines = Machines(run)
         self._not_finite = run is not None and run.store.note(NOT_FINITE) is not None
         self._told, self._untold, self._begun = 0.0, 0, 0.0
         self._surface: SurfaceMap | None = None
@@ -197,16 +193,8 @@ class Sweep:
             self._not_finite = True
             if self.run is not None:
                 self.run.store.set_note(NOT_FINITE, "yes")
-        if done.machine is not None and done.machine not in self._machines:
-            self._meet(done.machine)
+        self._machines.meet(done.machine, self._executor.facts)
         return Done(numbers, batch.judgements, done.worker)
-
-    def _meet(self, name: str) -> None:
-        """Keep what another machine is."""
-        facts = self._executor.facts
-        self._machines[name] = dict(facts.machines.get(name, {})) if facts is not None else {}
-        if self.run is not None:
-            self.run.store.set_note(MACHINES, json.dumps(self._machines))
 
     def _missed(self, done: Done) -> Batch:
         """What stands for a picture that nobody could make."""
@@ -250,11 +238,12 @@ class Sweep:
         self._untold += count
         now = time.monotonic()
         if now - self._told >= TELL_SECONDS:
-            facts, info = self._executor.facts, {"accuracy": tally.correct / tally.seen} if tally.seen else {}
+            facts, told = self._executor.facts, dict[str, float | str]()
+            if tally.seen:
+                told["accuracy"] = tally.correct / tally.seen
             if facts is not None:
-                info |= {"workers": facts.workers, "a second": self._rendered / max(1e-9, now - self._begun)}
-                info |= {name: count for name in ("lost", "retried") if (count := getattr(facts, name))}
-            self.stages.progress.advance(self._untold, **info)
+                told |= {**facts.told, "a second": self._rendered / max(1e-9, now - self._begun)}
+            self.stages.progress.advance(self._untold, **told)
             self._told, self._untold = now, 0
 
     # ---- counting ---------------------------------------------------------------------------------------------------
@@ -375,7 +364,7 @@ class Sweep:
             },
             transport=together([one for light in self._transport.values() for one in light]),
             surface=self._surface,
-            shared=SharedWork.of_facts(self._executor.facts, self._machines),
+            shared=SharedWork.of_facts(self._executor.facts, self._machines.known),
             renders_per_second=self._rendered / swept if self._rendered and swept else None,
             seconds={**seconds, "total": self.stages.total},
             seed=job.pictures.seed,
@@ -391,18 +380,8 @@ class Sweep:
 
     def _remarks(self, tally: Tally, checked: WorstVerified | None) -> list[str]:
         """What a reader has to know beside the numbers."""
-        remarks = []
-        if self._lost:
-            which = [count(self._lost, "answer"), "there is none" if self._lost == 1 else "there are none"]
-            remarks.append(
-                f"{which[0]} of the model {which[1]}: every worker that took the picture died; counted as not right."
-            )
-        if self._machines:
-            told = "; ".join(", ".join(f"{key} {text}" for key, text in one.items()) for one in self._machines.values())
-            remarks.append(
-                "Rows come from machines that are not alike, so that their last bits may differ; beside the one that "
-                f"kept the run: {told}."
-            )
+        remarks = lost_remarks(self._lost)
+        remarks += self._machines.remarks
         if tally.not_finite:
             remarks.append(f"{tally.not_finite} answers of the model were not finite; they count as not right.")
         if self._not_finite:

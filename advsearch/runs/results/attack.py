@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 from pydantic import Field
 
@@ -215,6 +216,29 @@ class Printability(Fields):
     answer: PrintTerms | None = Field(description="of the answer; null if nothing was searched")
 
 
+class SharedWork(Fields):
+    """How the workers did that shared the work, in this sitting."""
+
+    most: int = Field(description="workers that were ready at once, at most")
+    lost: int = Field(description="that went away")
+    refused: int = Field(description="that could not do it")
+    retried: int = Field(description="batches that were given out again")
+    batches: int = Field(description="batches that came back")
+    busy: Number = Field(description="seconds that workers were at batches")
+    loading: Number = Field(description="seconds that they loaded scenes and models")
+    alive: Number = Field(description="seconds that they were there and ready")
+    utilisation: Number | None = Field(description="`busy` over `alive`")
+    machines: dict[str, dict[str, str]] = Field(description="what rows call by a name, where machines are not alike")
+
+    @classmethod
+    def of_facts(cls, facts: Any, machines: Mapping[str, Mapping[str, str]]) -> SharedWork | None:
+        """Return the fields from what an executor says; None where it says nothing."""
+        if facts is None:
+            return None
+        share = min(1.0, facts.busy / facts.alive) if facts.alive else None
+        return cls.model_validate({**vars(facts), "utilisation": share, "machines": machines})
+
+
 class AttackSummary(SceneResult):
     """The worst configuration of a scene that was found, how sure that is, and what it cost."""
 
@@ -249,6 +273,7 @@ class AttackSummary(SceneResult):
     claimed: SearchClaim | None = Field(default=None, description="what the search itself believes")
     gradients: SearchGradients | None = Field(default=None, description="of the search")
     configuration: dict[str, FoundValue] | None = Field(default=None, description="the answer in a few values")
+    shared: SharedWork | None = Field(default=None, description="only with `workers` or `cluster`")
     renders: dict[str, int] = Field(
         description="of the search, its gradients, the baseline and the verification; `products`: predicted instead"
     )

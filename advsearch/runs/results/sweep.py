@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from advsearch.runs.results.attack import DescribedValue, LinearTransport, VerifiedRate
+from advsearch.runs.results.attack import DescribedValue, LinearTransport, SharedWork, VerifiedRate
 from advsearch.runs.results.base import Fields, Formation, Interval, Number, Payload, RunResult, having
 
 AxisValue = int | float | str | tuple[float, float]
@@ -114,29 +113,6 @@ class SurfaceMap(Fields):
     cells: int = Field(description="along each side of the map")
     least: int = Field(description="pictures with and without a part that a comparison takes")
     tables: list[SurfaceTable] = Field(description="for every object, model and kind of part")
-
-
-class SharedWork(Fields):
-    """How the workers did that shared the work, in this sitting."""
-
-    most: int = Field(description="workers that were ready at once, at most")
-    lost: int = Field(description="that went away")
-    refused: int = Field(description="that could not do it")
-    retried: int = Field(description="batches that were given out again")
-    batches: int = Field(description="batches that came back")
-    busy: Number = Field(description="seconds that workers were at batches")
-    loading: Number = Field(description="seconds that they loaded scenes and models")
-    alive: Number = Field(description="seconds that they were there and ready")
-    utilisation: Number | None = Field(description="`busy` over `alive`")
-    machines: dict[str, dict[str, str]] = Field(description="what rows call by a name, where machines are not alike")
-
-    @classmethod
-    def of_facts(cls, facts: Any, machines: Mapping[str, Mapping[str, str]]) -> SharedWork | None:
-        """Return the fields from what an executor says; None where it says nothing."""
-        if facts is None:
-            return None
-        share = min(1.0, facts.busy / facts.alive) if facts.alive else None
-        return cls.model_validate({**vars(facts), "utilisation": share, "machines": machines})
 
 
 class SweepSummary(CountedAnswers, RunResult):
