@@ -87,6 +87,8 @@ class ObjectAsset:
         warnings: what the importer had to repair or leave out, one sentence each.
         up: the axis of the file that was taken for up; None for what comes from no file.
         surface: in place of the principled one, Mitsuba's own dictionary of it; see `advsearch.scene.parts.MeshPart`.
+        opacity: (H, W) float32 in [0, 1], the share of the light that does not pass through, row 0 on top; None where
+            it is 1.
     """
 
     name: str
@@ -98,6 +100,7 @@ class ObjectAsset:
     warnings: tuple[str, ...] = ()
     up: UpAxis | None = None
     surface: Mapping[str, object] | None = None
+    opacity: Floats | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -121,13 +121,21 @@ class SceneDescription:
         from advsearch.scene.geometry import moved_part, object_to_world
 
         own = self.object
-        under_test = MeshPart(OBJECT, own.mesh, object_to_world(self), own.base_color, self.material, own.surface)
+        under_test = MeshPart(
+            OBJECT, own.mesh, object_to_world(self), own.base_color, self.material, own.surface, own.opacity
+        )
         return {OBJECT: under_test, **{name: moved_part(one, self.values) for name, one in self.around.items()}}
 
     @property
     def around(self) -> Mapping[str, MeshPart]:
         """The meshes around the object by name, as they came."""
         return {one.name: one for one in self.parts if isinstance(one, MeshPart)}
+
+    @property
+    def cut_out(self) -> bool:
+        """Whether a mesh has cut-outs."""
+        around = any(one.opacity is not None for one in self.around.values())
+        return around or self.object.opacity is not None
 
     @property
     def lamps(self) -> Mapping[str, PointLamp | BallLamp]:

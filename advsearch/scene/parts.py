@@ -52,6 +52,7 @@ class MeshPart(ScenePart):
         material: the rest of the surface.
         surface: in place of the principled surface, Mitsuba's dictionary of one, with `BASE_COLOR` where the texture
             goes. What it lacks of the inputs, the part has not.
+        opacity: (h, w) float32 in [0, 1] of the principled surface, which cuts it out; None where it is 1.
     """
 
     mesh: Mesh
@@ -59,6 +60,7 @@ class MeshPart(ScenePart):
     base_color: Floats
     material: Material = field(default_factory=Material)
     surface: Mapping[str, object] | None = None
+    opacity: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,10 +24,11 @@ from fuzz.pictures import picture, sample
 def box_glb() -> bytes:
     """Return a textured box in a tree of two nodes."""
     box = trimesh.creation.box()
-    pixels = np.arange(192, dtype=np.uint8).reshape(8, 8, 3)
+    pixels = np.arange(256, dtype=np.uint8).reshape(8, 8, 4)
     material = PBRMaterial(
-        baseColorTexture=Image.fromarray(pixels), baseColorFactor=[0.5, 0.6, 0.7, 1.0], roughnessFactor=0.4
-    )
+        baseColorTexture=Image.fromarray(pixels), baseColorFactor=[0.5, 0.6, 0.7, 0.9], roughnessFactor=0.4,
+        alphaMode="MASK", alphaCutoff=0.3,
+    )  # fmt: skip
     box.visual = TextureVisuals(uv=box.vertices[:, :2] + 0.5, material=material)
     scene = trimesh.Scene(box)
     scene.add_geometry(trimesh.creation.icosphere(subdivisions=1), transform=trimesh.transformations.scale_matrix(0.5))

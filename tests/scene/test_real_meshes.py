@@ -91,8 +91,8 @@ CASES: dict[str, tuple[str, Callable[[], bytes], str]] = {
     "without normals": (".obj", lambda: moved(1.0, 0.0), ""),
     "16 bits": (".glb", lambda: painted(deep()), ""),
     "palette": (".glb", lambda: painted(palette()), ""),
-    "cut-outs": (".glb", lambda: painted(holes(), "MASK"), "the transparency of 1"),
-    "blended": (".glb", lambda: painted(holes(), "BLEND"), "the transparency of 1"),
+    "cut-outs": (".glb", lambda: painted(holes(), "MASK"), ""),
+    "blended": (".glb", lambda: painted(holes(), "BLEND"), ""),
 }
 """Ending, content, and words of the warning about what is not kept."""
 

@@ -36,6 +36,8 @@ PLAIN = 0.5
 """Specular of a surface whose index of refraction is 1.5."""
 WEB_SIDE, WEB_QUALITY = 1024, 90
 """Longest side in pixels of a texture in a file for the web, and the quality of its JPEG, from 1 to 95."""
+PNG = b"\x89PNG"
+"""The first bytes of such a file."""
 CAMERA = {"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.01}}
 """The camera of such a file: its place counts."""
 
@@ -49,12 +51,14 @@ class PosedMesh:
         mesh: in world space, z up.
         base_color: (h, w, 3) display-referred sRGB, row 0 at v = 1.
         material: the rest of the surface.
+        opacity: (h', w') in [0, 1], or None where there are no cut-outs.
     """
 
     name: str
     mesh: Mesh
     base_color: Floats
     material: Material
+    opacity: Floats | None = None
 
 
 def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> PosedMesh:
@@ -72,7 +76,7 @@ def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> PosedMesh:
     if "base_color" in given:
         color = linear_to_srgb(given["base_color"].clamp(0.0, 1.0)).numpy()
     numbers = {key: float(given[key]) for key in vars(part.material) if key in given}
-    return PosedMesh(part.name, mesh, color, replace(part.material, **numbers))
+    return PosedMesh(part.name, mesh, color, replace(part.material, **numbers), part.opacity)
 
 
 def _of(key: str) -> str:
@@ -128,7 +132,6 @@ def _described(made: _Buffer, meshes: Sequence[PosedMesh], picture: Callable[[Fl
         "samplers": [{"magFilter": 9729, "minFilter": 9729, "wrapS": 10497, "wrapT": 10497}],
         "images": [],
     }
-    kind = "image/png" if picture is _png else "image/jpeg"
     for number, one in enumerate(meshes):
         mesh = one.mesh
         corners = {
@@ -142,7 +145,9 @@ def _described(made: _Buffer, meshes: Sequence[PosedMesh], picture: Callable[[Fl
             {"name": one.name, "primitives": [{"attributes": corners, "indices": indices, "material": number}]}
         )
         header["materials"].append(_material(one, number))
-        header["images"].append({"mimeType": kind, "bufferView": made.view(picture(one.base_color))})
+        encoded = picture(one.base_color) if one.opacity is None else _cut_out_png(one.base_color, one.opacity)
+        kind = "image/png" if encoded.startswith(PNG) else "image/jpeg"
+        header["images"].append({"mimeType": kind, "bufferView": made.view(encoded)})
     return header
 
 
@@ -200,9 +205,13 @@ def _material(one: PosedMesh, texture: int) -> dict[str, Any]:
             "clearcoatFactor": surface.clearcoat,
             "clearcoatRoughnessFactor": COAT_ROUGHNESS,
         }
+    cut_out = {}
+    if one.opacity is not None:
+        cut_out = {"alphaMode": "MASK" if set(np.unique(one.opacity)) <= {0.0, 1.0} else "BLEND"}
     return {
         "name": one.name,
         "doubleSided": True,
+        **cut_out,
         "pbrMetallicRoughness": {
             "baseColorTexture": {"index": texture},
             "roughnessFactor": surface.roughness,
@@ -226,6 +235,14 @@ def _unit(normals: Floats) -> Floats:
 def _png(color: Floats) -> bytes:
     file = io.BytesIO()
     _rounded(color).save(file, "PNG")
+    return file.getvalue()
+
+
+def _cut_out_png(color: Floats, opacity: Floats) -> bytes:
+    """A picture whose alpha is the opacity, at the size of the colour."""
+    file, picture = io.BytesIO(), _rounded(color)
+    picture.putalpha(_rounded(opacity).resize(picture.size, Image.Resampling.BILINEAR))
+    picture.save(file, "PNG")
     return file.getvalue()
 
 

@@ -16,7 +16,7 @@ from advsearch import files
 from advsearch.scene.importing.files import damaged, looks_like, shown, text_of
 from advsearch.scene.importing.gltf_checks import check_header
 from advsearch.scene.importing.gltf_entries import Asset, Header, MaterialEntry, Primitive
-from advsearch.scene.importing.references import GLOW, NORMAL_MAPS, TRANSPARENCY
+from advsearch.scene.importing.references import GLOW, NORMAL_MAPS
 
 MOST_VALUES = 1_000_000
 """Lists, objects and values in a header; each takes hundreds of bytes of memory, and may take two of the file."""
@@ -112,7 +112,6 @@ def unread(header: Header) -> dict[str, int]:
     return {
         NORMAL_MAPS: sum(one.normalTexture is not None for one in header.materials),
         GLOW: sum(bool(one.emissiveTexture or any(one.emissiveFactor)) for one in header.materials),
-        TRANSPARENCY: sum(one.alphaMode != "OPAQUE" for one in header.materials),
     }
 
 

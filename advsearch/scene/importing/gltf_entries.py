@@ -153,6 +153,12 @@ class _MaterialExtensions(_Entry):
     glossiness: SpecularGlossiness | None = Field(default=None, alias="KHR_materials_pbrSpecularGlossiness")
 
 
+CUT_OUTS = ("MASK", "BLEND")
+"""Modes in which the alpha of the base colour counts."""
+CUTOFF = 0.5
+"""The alpha under which there is nothing, where the file does not say which."""
+
+
 class MaterialEntry(_Entry):
     pbrMetallicRoughness: MetallicRoughness | None = None
     name: str | None = None
@@ -160,6 +166,7 @@ class MaterialEntry(_Entry):
     emissiveTexture: TextureUse | None = None
     emissiveFactor: list[float] = []
     alphaMode: str = "OPAQUE"
+    alphaCutoff: float = CUTOFF
     extensions: _MaterialExtensions | None = None
 
     @property
@@ -170,16 +177,18 @@ class MaterialEntry(_Entry):
 
     def plain(self) -> MaterialEntry:
         """Return the material without extensions: the diffuse colour of an old one is its base colour."""
+        mode = self.alphaMode if self.alphaMode in CUT_OUTS else "OPAQUE"
+        plain = MaterialEntry(name=self.name, alphaMode=mode, alphaCutoff=self.alphaCutoff)
         old = self.extensions.glossiness if self.extensions else None
         if old is None:
-            return MaterialEntry(pbrMetallicRoughness=self.pbrMetallicRoughness, name=self.name)
+            return plain.model_copy(update={"pbrMetallicRoughness": self.pbrMetallicRoughness})
         surface = MetallicRoughness(
             baseColorFactor=old.diffuseFactor,
             baseColorTexture=old.diffuseTexture,
             metallicFactor=0.0,
             roughnessFactor=1.0 - old.glossinessFactor,
         )
-        return MaterialEntry(pbrMetallicRoughness=surface, name=self.name)
+        return plain.model_copy(update={"pbrMetallicRoughness": surface})
 
 
 class _WebpSource(_Entry):

@@ -73,16 +73,19 @@ def read_picture(path: Path, limit: int | None = TEXTURE_LIMIT) -> Floats:
         raise FileFormatError(f"{path}: expected a picture file such as PNG, got {reason}; check the path") from error
 
 
-def display_image(image: Image.Image, limit: int | None = TEXTURE_LIMIT, path: Path | str = "picture") -> Floats:
-    """Decode a picture; alpha is dropped.
+def display_image(
+    image: Image.Image, limit: int | None = TEXTURE_LIMIT, path: Path | str = "picture", *, alpha: bool = False
+) -> Floats:
+    """Decode a picture.
 
     Args:
         image: an opened picture of any mode.
         limit: longest side of the result; larger pictures are averaged down in linear light. None: no limit.
         path: where it is from, for messages.
+        alpha: keep it as a fourth channel, 1 where the picture has none; otherwise it is dropped.
 
     Returns:
-        (H, W, 3) float32 display-referred values in [0, 1], row 0 on top.
+        (H, W, 3 or 4) float32 display-referred values in [0, 1], row 0 on top.
 
     Raises:
         FileFormatError: too many pixels, or a format that is not one of `FORMATS`.
@@ -100,14 +103,16 @@ def display_image(image: Image.Image, limit: int | None = TEXTURE_LIMIT, path: P
         scale = 1.0 if limit is None else limit / max(height, width)
         display: Floats = np.arange(256, dtype=np.float32) / np.float32(255.0)
         if scale >= 1.0:
-            return np.asarray(display[_steps(image)])
+            return np.asarray(display[_steps(image, alpha=alpha)])
         target = max(1, round(height * scale)), max(1, round(width * scale))
         linear = srgb_to_linear(display)
-        return linear_to_srgb(
-            banded_average(
-                lambda top, end: np.take(linear, _steps(image.crop((0, top, width, end)))), (height, width), target
-            )
-        )
+
+        def band(top: int, end: int) -> Floats:
+            steps = _steps(image.crop((0, top, width, end)), alpha=alpha)
+            return np.concatenate([linear[steps[:, :, :3]], display[steps[:, :, 3:]]], axis=2)
+
+        averaged = banded_average(band, (height, width), target)
+        return np.concatenate([linear_to_srgb(averaged[:, :, :3]), averaged[:, :, 3:]], axis=2)
 
 
 def _scans(image: Image.Image) -> int:
@@ -122,14 +127,17 @@ def _scans(image: Image.Image) -> int:
     return count
 
 
-def _steps(image: Image.Image) -> npt.NDArray[np.uint8]:
-    """Return the (H, W, 3) colours of a decoded picture in 8 bits."""
+def _steps(image: Image.Image, *, alpha: bool) -> npt.NDArray[np.uint8]:
+    """Return the (H, W, 3) colours of a decoded picture in 8 bits; with alpha, (H, W, 4)."""
     if image.mode == "F" or image.mode.startswith("I"):  # grey in floats or 16 bits
         grey = np.nan_to_num(np.asarray(image, np.float32)) / np.float32(1.0 if image.mode == "F" else 65535.0)
         steps: npt.NDArray[np.uint8] = np.round(np.clip(grey, 0.0, 1.0) * 255.0).astype(np.uint8)
-        return steps[:, :, None].repeat(3, axis=2)
-    steps = np.asarray(image.convert("RGBA" if "transparency" in image.info else "RGB"))
-    return steps[:, :, :3]
+        steps = steps[:, :, None].repeat(3, axis=2)
+    else:
+        steps = np.asarray(image.convert("RGBA" if alpha or "transparency" in image.info else "RGB"))
+    if alpha and steps.shape[2] == 3:
+        steps = np.concatenate([steps, np.full_like(steps[:, :, :1], 255)], axis=2)
+    return steps if alpha else steps[:, :, :3]
 
 
 def banded_average(band: Callable[[int, int], Floats], size: tuple[int, int], target: tuple[int, int]) -> Floats:

@@ -37,7 +37,8 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
       where faces meet at more than 40 degrees.
     - UVs are the file's, moved into [0, 1] where that takes little. Where it has none, where they repeat a texture or
       are squashed, and where there are several materials, xatlas makes new ones and the colours are baked into a map.
-    - Base colour: the material's texture (averaged down to at most 1024 texels on its long side; alpha is dropped),
+    - Base colour: the material's texture (averaged down to at most 1024 texels on its long side; alpha
+      is opacity where a glTF material says so),
       otherwise the material's colour, otherwise vertex or face colours, otherwise grey of display-referred 0.5. A glTF
       texture is multiplied by its linear factor. The ``Kd`` of an .mtl is taken as display-referred, and ignored beside
       a ``map_Kd``. Where a texture is missing, the colour takes its place, or grey if that is plain white, with a
@@ -77,16 +78,20 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     soup, axis = _upright(parts, file, up)
     soup, repairs = repaired(soup, str(file))
     surfaces = [part.surface for part in parts]
-    soup, base_color, bakes = textured(soup, surfaces)
+    soup, map, bakes = textured(soup, surfaces)
+    opacity = np.ascontiguousarray(map[:, :, 3]) if map.shape[2] == 4 else None
+    if opacity is not None and not opacity.any():
+        opacity, bakes = None, [*bakes, "it is transparent all over; it is shown opaque"]
     material, blends = _material(soup, surfaces)
     return ObjectAsset(
         name=name,
         mesh=normalised(assemble(soup)),
-        base_color=base_color,
+        base_color=np.ascontiguousarray(map[:, :, :3]),
         material=material,
         source=str(file),
         warnings=_first([*notes, *(f"{file.name}: {note}" for note in repairs + bakes + blends)], file.name),
         up=axis,
+        opacity=opacity,
     )
 
 

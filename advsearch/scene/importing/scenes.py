@@ -108,7 +108,7 @@ def import_scene(path: Path, node: str) -> ImportedScene:
         matrix = np.eye(4)
         matrix[:3, :3] *= place.size / frame.size
         matrix[:3, 3] = frame.inside(place.origin)
-        surroundings.append(MeshPart(name, made.mesh, matrix, made.base_color, made.material))
+        surroundings.append(MeshPart(name, made.mesh, matrix, made.base_color, made.material, opacity=made.opacity))
     for index in lamps:
         light = header.lights[header.nodes[index].lamp or 0]
         surroundings.append(_lamp(names.free(light.name or header.label(index)), light, poses[index], frame))

@@ -14,6 +14,7 @@ from advsearch import files
 from advsearch.errors import FileFormatError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import shown
+from advsearch.scene.importing.gltf_entries import CUT_OUTS, CUTOFF
 from advsearch.scene.importing.images import LARGEST_PIXELS, TEXTURE_LIMIT, check_pixels, display_image
 from advsearch.scene.importing.references import Named, plain_name
 
@@ -40,8 +41,9 @@ class ImportedSurface:
     """What a part looks like; every colour is display-referred sRGB in [0, 1].
 
     Attributes:
-        color: (3,) float32 base colour where there is no texture; None when the file gives none.
-        texture: (H, W, 3) float32 base colour, row 0 on top; or None.
+        color: (3,) float32 base colour where there is no texture; None when the file gives none. Where light passes
+            through the part, (4,) with its opacity in [0, 1].
+        texture: (H, W, 3) float32 base colour, row 0 on top, or (H, W, 4) with the opacity; or None.
         roughness: in [0, 1], or None when the file gives none.
         metallic: in [0, 1], or None when the file gives none.
     """
@@ -75,7 +77,7 @@ class SurfaceReader:
     materials: int
     notes: list[str] = field(default_factory=list)
     _known: dict[int, ImportedSurface] = field(default_factory=dict)
-    _pictures: dict[int, Floats | str] = field(default_factory=dict)
+    _pictures: dict[tuple[int, bool], Floats | str] = field(default_factory=dict)
     _pixels: int = 0
 
     def surface(self, visual: Any) -> ImportedSurface:
@@ -98,15 +100,16 @@ class SurfaceReader:
         return ImportedSurface()
 
     def _gltf(self, material: PBRMaterial) -> ImportedSurface:
-        """Follow glTF 2.0, section 3.9.2: linear factors multiply the textures. Unlike there, no metal by default."""
+        """Follow glTF 2.0, sections 3.9.2 and 3.9.4: linear factors multiply the textures, and alpha is opacity. Unlike
+        there, no metal by default."""
         given = material.baseColorFactor
-        factor = (
-            np.ones(3, np.float32) if given is None else np.asarray(given[:3], dtype=np.float32) / np.float32(255.0)
-        )
+        scaled = np.ones(4, np.float32) if given is None else np.asarray(given, dtype=np.float32) / np.float32(255.0)
+        factor, alpha = scaled[:3], material.alphaMode in CUT_OUTS
         color = linear_to_srgb(factor)
-        texture = self._texture(material, material.baseColorTexture, color)
+        texture = self._texture(material, material.baseColorTexture, color, alpha=alpha)
         if texture is not None and (factor != 1.0).any():
-            texture = linear_to_srgb(srgb_to_linear(texture) * factor)
+            tinted = linear_to_srgb(srgb_to_linear(texture[:, :, :3]) * factor)
+            texture = np.concatenate([tinted, texture[:, :, 3:]], axis=2)
         roughness, metallic = material.roughnessFactor, material.metallicFactor
         packed = self._decoded(material.metallicRoughnessTexture)
         if isinstance(packed, np.ndarray):
@@ -114,11 +117,18 @@ class SurfaceReader:
             green, blue = packed[:, :, 1].mean(), packed[:, :, 2].mean()
             roughness = float(green) * (1.0 if roughness is None else roughness)
             metallic = float(blue) * (1.0 if metallic is None else metallic)
-        return ImportedSurface(_unless_white(color, material, self.named), texture, _unit(roughness), _unit(metallic))
+        kept = _unless_white(color, material, self.named)
+        if alpha:
+            under = material.alphaCutoff
+            cutoff = None if material.alphaMode == "BLEND" else CUTOFF if under is None else under
+            kept, texture = _with_opacity(color, scaled[3:], cutoff), _with_opacity(texture, scaled[3:], cutoff)
+        return ImportedSurface(kept, texture, _unit(roughness), _unit(metallic))
 
-    def _texture(self, material: Any, image: Image.Image | None, color: Floats | None) -> Floats | None:
+    def _texture(
+        self, material: Any, image: Image.Image | None, color: Floats | None, *, alpha: bool = False
+    ) -> Floats | None:
         """Return the base colour texture; where the material names one that cannot be had, warn."""
-        texture = self._decoded(image)
+        texture = self._decoded(image, alpha=alpha)
         if isinstance(texture, np.ndarray):
             return texture
         if material.name in self.named:
@@ -130,21 +140,22 @@ class SurfaceReader:
             self._note(f"{where}{file} names the texture {shown(name)}, which {why}; {instead} is used instead")
         return None
 
-    def _decoded(self, image: Image.Image | None) -> Floats | str | None:
+    def _decoded(self, image: Image.Image | None, *, alpha: bool = False) -> Floats | str | None:
         """Return a picture's values, why there are none, or None; a picture without format is trimesh's invention."""
         if image is None or image.format is None:
             return None
-        if id(image) not in self._pictures:
-            self._pictures[id(image)] = self._pixels_of(image)
-        return self._pictures[id(image)]
+        key = id(image), alpha
+        if key not in self._pictures:
+            self._pictures[key] = self._pixels_of(image, alpha)
+        return self._pictures[key]
 
-    def _pixels_of(self, image: Image.Image) -> Floats | str:
+    def _pixels_of(self, image: Image.Image, alpha: bool) -> Floats | str:
         """Decode a picture, or say why not."""
         width, height = image.size
         try:
             check_pixels("", width, height)
             self._check_sum(self._pixels + width * height)
-            texture = display_image(image, _side(self.materials), "")
+            texture = display_image(image, _side(self.materials), "", alpha=alpha)
         except FileFormatError as error:
             return f"is not read ({str(error).removeprefix(': ')})"
         except (OSError, ValueError, SyntaxError, EOFError):
@@ -178,6 +189,22 @@ def _color(given: Any) -> Floats | None:
     if values.shape not in ((1,), (3,)) or not np.isfinite(values).all():
         return None
     return np.clip(np.broadcast_to(values, (3,)), 0.0, 1.0).astype(np.float32)
+
+
+def _with_opacity(color: Floats | None, factor: Floats, cutoff: float | None) -> Floats | None:
+    """Return a base colour (..., 3 or 4) with its opacity, or as (..., 3) where it is opaque.
+
+    Args:
+        color: with or without alpha; None stays None.
+        factor: (1,) of alpha.
+        cutoff: the alpha from which it is opaque, and under which there is nothing; None for shares in between.
+    """
+    if color is None:
+        return None
+    opacity = (color[..., 3:] if color.shape[-1] == 4 else np.ones_like(color[..., :1])) * factor
+    if cutoff is not None:
+        opacity = (opacity >= cutoff).astype(np.float32)
+    return color[..., :3] if opacity.min() >= 1.0 else np.concatenate([color[..., :3], opacity], axis=-1)
 
 
 def _unless_white(color: Floats | None, material: Any, named: Named) -> Floats | None:

@@ -45,7 +45,8 @@ def textured(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[Soup, Flo
         surfaces: the surface of each part.
 
     Returns:
-        The soup, a (H, W, 3) float32 display-referred map in [0, 1] with row 0 on top, and sentences.
+        The soup, a (H, W, 3) float32 display-referred map in [0, 1] with row 0 on top, (H, W, 4) with the opacity where
+        light passes through a part, and sentences.
     """
     used = [surfaces[number] for number in np.unique(soup.part)]
     uniform = all(surface.same_color(used[0]) for surface in used)
@@ -55,7 +56,7 @@ def textured(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[Soup, Flo
         color = _plain(used[0]) if soup.colors.min() == 1.0 else _tinted(_plain(used[0]), soup.colors[0, 0])
         kept = _usable(soup, soup.uvs)
         soup = replace(soup, uvs=np.clip(soup.uvs, 0.0, 1.0)) if kept else unwrapped(soup)
-        return soup, np.full((PLAIN_SIZE, PLAIN_SIZE, 3), color, dtype=np.float32), []
+        return soup, np.full((PLAIN_SIZE, PLAIN_SIZE, len(color)), color, dtype=np.float32), []
     if colored and texture is not None and soup.colors.min() == 1.0 and np.isfinite(soup.uvs).all():
         uvs, texture = _windowed(_into_unit_square(soup), texture)
         if _usable(soup, uvs):
@@ -81,14 +82,15 @@ def _one_factor(soup: Soup) -> bool:
 
 
 def _plain(surface: ImportedSurface) -> Floats:
-    """Return the base colour of a surface without texture, (3,) display-referred."""
+    """Return the base colour of a surface without texture, (3 or 4,) display-referred."""
     return np.full(3, NEUTRAL, dtype=np.float32) if surface.color is None else surface.color
 
 
 def _tinted(color: npt.NDArray[np.floating], factor: npt.NDArray[np.floating]) -> Floats:
-    """Multiply display-referred colours (..., 3) in linear light."""
-    product = srgb_to_linear(np.asarray(color, np.float32)) * srgb_to_linear(np.asarray(factor, np.float32))
-    return linear_to_srgb(product.astype(np.float32))
+    """Multiply display-referred colours (..., 3 or 4) by factors (..., 3) in linear light; opacity stays."""
+    color = np.asarray(color, np.float32)
+    product = srgb_to_linear(color[..., :3]) * srgb_to_linear(np.asarray(factor, np.float32))
+    return np.concatenate([linear_to_srgb(product.astype(np.float32)), color[..., 3:]], axis=-1)
 
 
 # --- the file's UVs ----------------------------------------
@@ -134,7 +136,7 @@ def _windowed(uvs: Array, texture: Floats) -> tuple[Array, Floats]:
     columns = low[0] + (np.arange(width) + 0.5) / width * size[0]
     rows = high[1] - (np.arange(height) + 0.5) / height * size[1]
     grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    return (uvs - low) / size, sampled(texture, grid).reshape(height, width, 3)
+    return (uvs - low) / size, sampled(texture, grid).reshape(height, width, -1)
 
 
 # --- baking ----------------------------------------
@@ -149,13 +151,14 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Floats
         surfaces: the surface of each part.
 
     Returns:
-        (N, N, 3) float32 display-referred map. Texels outside every chart repeat the nearest one inside, so that
+        (N, N, 3 or 4) float32 display-referred map. Texels outside every chart repeat the nearest one inside, so that
         filtering finds no seam.
     """
     size = _baked_size(soup, surfaces)
     corners = np.stack([uvs[:, :, 0] * size - 0.5, (1.0 - uvs[:, :, 1]) * size - 0.5], axis=2)
     face, rows, columns, weights = pixels_in(corners, (size, size), tolerance=1e-9)
-    image, inside = np.zeros((size, size, 3), np.float32), np.zeros((size, size), np.bool_)
+    through = any(_channels(one) == 4 for one in surfaces)
+    image, inside = np.ones((size, size, 3 + through), np.float32), np.zeros((size, size), np.bool_)
     factor = np.einsum("tk,tkc->tc", weights, soup.colors[face])
     part = soup.part[face]
     order = np.argsort(part, kind="stable")
@@ -165,15 +168,19 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Floats
         number = int(part[here[0]])
         surface, at = surfaces[number], np.einsum("tk,tkc->tc", weights[here], soup.uvs[face[here]])
         if surface.texture is None or not np.isfinite(at).all():
-            color: Floats = (
-                np.broadcast_to(_plain(surface), (len(at), 3)) if surface.texture is None else _mean(surface.texture)
-            )
+            color: Floats = _plain(surface)[None] if surface.texture is None else _mean(surface.texture)
+            color = np.broadcast_to(color, (len(at), color.shape[1]))
         else:
             color = sampled(surface.texture, at)
-        image[rows[here], columns[here]] = _tinted(color, factor[here])
+        image[rows[here], columns[here], : color.shape[1]] = _tinted(color, factor[here])
     inside[rows, columns] = True
     nearest = distance_transform_edt(~inside, return_distances=False, return_indices=True)
     return np.ascontiguousarray(image[nearest[0], nearest[1]])
+
+
+def _channels(surface: ImportedSurface) -> int:
+    """Return how many channels its base colour has: 3, or 4 with opacity."""
+    return int((_plain(surface) if surface.texture is None else surface.texture).shape[-1])
 
 
 def _baked_size(soup: Soup, surfaces: Sequence[ImportedSurface]) -> int:
@@ -190,20 +197,20 @@ def _baked_size(soup: Soup, surfaces: Sequence[ImportedSurface]) -> int:
 
 
 def _mean(texture: Floats) -> Floats:
-    """Return the mean colour (1, 3) of a texture, taken in linear light."""
-    mean: Floats = srgb_to_linear(texture).mean(axis=(0, 1), dtype=np.float64).astype(np.float32)
-    return linear_to_srgb(mean)[None]
+    """Return the mean colour (1, 3 or 4) of a texture, taken in linear light."""
+    mean: Floats = srgb_to_linear(texture[:, :, :3]).mean(axis=(0, 1), dtype=np.float64).astype(np.float32)
+    return np.concatenate([linear_to_srgb(mean), texture[:, :, 3:].mean(axis=(0, 1))])[None]
 
 
 def sampled(texture: Floats, uvs: Array) -> Floats:
     """Look a repeating texture up with bilinear interpolation of its display-referred values.
 
     Args:
-        texture: (H, W, 3) float32, row 0 on top.
+        texture: (H, W, C) float32, row 0 on top.
         uvs: (T, 2), any finite values; v = 0 is the bottom.
 
     Returns:
-        (T, 3) float32.
+        (T, C) float32.
     """
     height, width = texture.shape[:2]
     u, v = (uvs % 1.0).T  # first, since a huge number times a width is infinite

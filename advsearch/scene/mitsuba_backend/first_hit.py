@@ -13,8 +13,8 @@ from advsearch.scene.surfaces import Surfaces
 def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces:
     """Return the surface in each pixel.
 
-    A thin lens is looked through at its middle. What lets light pass and does not shine towards the camera, as a lamp
-    that is off, is not seen; haze is no shape.
+    A thin lens is looked through at its middle. What lets more than half of the light pass and does not shine towards
+    the camera, as a lamp that is off or a hole in a leaf, is not seen; haze is no shape.
 
     Args:
         scene: Mitsuba's.
@@ -39,7 +39,10 @@ def first_hits(scene: Any, sensor: Any, resolution: tuple[int, int]) -> Surfaces
         hit = scene.ray_intersect(ray, active)
         active &= hit.is_valid()
         shining = dr.max(hit.emitter(scene, active).eval(hit, active)) > 0.0
-        passes = active & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.Null) & ~shining
+        flags = hit.bsdf().flags()
+        clear = dr.max(hit.bsdf().eval_null_transmission(hit, active)) > 0.5
+        passes = active & mi.has_flag(flags, mi.BSDFFlags.Null) & (clear | ~mi.has_flag(flags, mi.BSDFFlags.Smooth))
+        passes &= ~shining
         seen = active & ~passes
         for place_of, shape in enumerate(shapes, 1):
             number[seen & (hit.shape == mi.ShapePtr(shape))] = mi.UInt32(place_of)

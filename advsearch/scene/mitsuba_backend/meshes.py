@@ -21,13 +21,16 @@ POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "ve
 """Names of a mesh's parameters: flat arrays of 3, 3 and 2 numbers a vertex, and 3 indices a face."""
 
 
-def principled(base_color: Floats, material: Material, extra: Plugin | None = None) -> Plugin:
+def principled(
+    base_color: Floats, material: Material, extra: Plugin | None = None, opacity: Floats | None = None
+) -> Plugin:
     """A two-sided principled BSDF with the base colour as a bilinear texture of linear reflectance.
 
     Args:
         base_color: (h, w, 3) display-referred sRGB in [0, 1], row 0 at v = 1.
         material: the numbers of the surface. A clearcoat of 0 leaves the lobe out.
         extra: further entries of the plugin's dictionary.
+        opacity: (h, w) in [0, 1], row 0 at v = 1: light passes through the rest; None where there are no cut-outs.
     """
     surface: Plugin = {
         "type": "principled",
@@ -39,7 +42,12 @@ def principled(base_color: Floats, material: Material, extra: Plugin | None = No
     }
     if material.clearcoat > 0.0:
         surface["clearcoat"] = material.clearcoat
-    return {"type": "twosided", "bsdf": surface}
+    both_sides: Plugin = {"type": "twosided", "bsdf": surface}
+    return (
+        both_sides
+        if opacity is None
+        else {"type": "mask", "opacity": _texture(opacity[:, :, None]), "bsdf": both_sides}
+    )
 
 
 def matt(reflectance: Floats) -> Plugin:

@@ -88,6 +88,11 @@ class MitsubaScene:
         self._freeze = "tracing" in leave_out and not description.thin_lens  # Dr.Jit cannot record Mitsuba's thin lens
         self._thin_lens = description.thin_lens
         self._backdrop = description.backdrop
+        self._guides: Plugin = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
+        if description.cut_out:
+            import advsearch.scene.mitsuba_backend.guides  # noqa: F401  (registers the integrator)
+
+            self._guides = {"type": "advsearch_guides"}
         self.volumetric = any(part.volumetric for part in description.parts)
         plugins = scene_dict(description, resolution, filter, sampler)
         translated = [mesh_translation(description.meshes[OBJECT], None if "lobes" in leave_out else IDLE_LOBES)]
@@ -348,7 +353,7 @@ class MitsubaScene:
             recipes: dict[str, Plugin] = {
                 "path": path,
                 "hidden": {**path, "hide_emitters": True},
-                "guides": {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"},
+                "guides": self._guides,
                 "boundary": {
                     "type": "prb_projective",
                     "max_depth": self._depth,
