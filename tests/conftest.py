@@ -6,6 +6,7 @@ names of those that are not quick in tests/medium.txt.
 
 from __future__ import annotations
 
+import gc
 import resource
 from collections import defaultdict
 from collections.abc import Generator
@@ -98,3 +99,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.nodeid in known:
             item.add_marker("medium")
+
+
+def pytest_collection_finish() -> None:
+    """Let the garbage collector, which every change of Mitsuba's scenes calls, pass over all that was imported."""
+    gc.collect()
+    gc.freeze()

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-SMALL = ["--resolution", "128", "--steps", "10", "--verify-spp", "16"]
+SMALL = ["--resolution", "96", "--steps", "8", "--verify-spp", "8"]
 CASES = {
     "small mug": ("mug.obj", "comfy_cafe_1k.hdr", "coffee mug,cup", 0.06, SMALL),
     "mug": ("mug.obj", "comfy_cafe_1k.hdr", "coffee mug,cup", 0.03, []),

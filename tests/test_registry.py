@@ -101,12 +101,19 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
-def advsearch(installed: Path, *words: str) -> Any:
-    """Run a command beside the installed package and return its JSON answer."""
-    command = [sys.executable, "-m", "advsearch", *words, "--json"]
-    done = subprocess.run(command, stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": str(installed)})
+def advsearch(installed: Path, *commands: list[str]) -> list[Any]:
+    """Carry commands out, one after the other in one process beside the installed package; return their answers."""
+    code = "import json, sys\nfrom advsearch.cli.main import main\nsys.exit(max(map(main, json.loads(sys.argv[1]))))"
+    words = json.dumps([[*command, "--json"] for command in commands])
+    outside = {**os.environ, "PYTHONPATH": str(installed)}
+    done = subprocess.run([sys.executable, "-c", code, words], stdout=subprocess.PIPE, env=outside, text=True)
     assert done.returncode == 0
-    return json.loads(done.stdout)
+    answers, decoder, text = list[Any](), json.JSONDecoder(), done.stdout.lstrip()
+    while text:
+        answer, end = decoder.raw_decode(text)
+        answers.append(answer)
+        text = text[end:].lstrip()
+    return answers
 
 
 def examples() -> list[list[str]]:
@@ -116,37 +123,33 @@ def examples() -> list[list[str]]:
 
 
 def test_its_names_are_listed_and_its_parts_work_together(installed: Path, tmp_path: Path) -> None:
-    listed = advsearch(installed, "list")
-    names = {"controls": "fade", "policies": "shrinking", "objectives": "brightness", "tasks": "fading"}
-    assert {kind: listed[kind][-1] for kind in names} == names
     small = ["--run", str(tmp_path / "run"), "--no-baseline", "--steps", "4", "--spp", "1", "--verify-spp", "1"]
     words = [*examples()[0], *small, "--denoise", "none", "--label", "bowl", "--quiet"]
-    summary = advsearch(installed, *words)
+    listed, summary = advsearch(installed, ["list"], words)
+    names = {"controls": "fade", "policies": "shrinking", "objectives": "brightness", "tasks": "fading"}
+    assert {kind: listed[kind][-1] for kind in names} == names
     assert (summary["controls"], summary["policy"], summary["objective"]) == (["fade"], "shrinking", "brightness")
     assert summary["model"] == "tiny" and summary["steps"] == 4
 
 
 def test_its_task_is_searched_swept_and_rendered(installed: Path, tmp_path: Path) -> None:
-    small = ["--denoise", "none", "--spp", "16", "--quiet"]
-    run = tmp_path / "run"
+    small, run = ["--denoise", "none", "--spp", "16", "--quiet"], tmp_path / "run"
     attack = [*examples()[1], "--run", str(run), "--no-baseline", "--steps", "12", "--verify-spp", "16", *small]
-    found = advsearch(installed, *attack)
+    given = ["--object", "mug", "--task", "fading", "--model", "zoo:gauge", *small]
+    sweep = ["sweep", *given, "--grid", "fade.amount=0,0.4,1", "--trials", "0", "--run", str(tmp_path / "sweep")]
+    wide = [*(word.replace("fading", "fading={tolerance: 2}") for word in sweep), "--overwrite"]
+    picture = ["render", *given, "--control", "fade={amount: 0.4}", "--out", str(tmp_path / "mug.png")]
+    found, swept, widely, rendered = advsearch(installed, attack, sweep, wide, picture)
+
     assert (found["task"], found["objective"], found["model"]) == ("fading", "score", "gauge")
     assert found["label_set"] == ["0.0"] and found["clean"]["correct"] and found["clean"]["index"] is None
     assert found["ending"] == "found" and found["configuration"]["fade.amount"]["value"] > 0.7
     assert found["adversarial"]["label"].endswith(" faded") and found["verified"]["margin"] > 0.0
     assert "task: fading" in (run / "run.yaml").read_text("utf-8")
 
-    given = ["--object", "mug", "--task", "fading", "--model", "zoo:gauge", *small]
-    sweep = ["sweep", *given, "--grid", "fade.amount=0,0.4,1", "--trials", "0", "--run", str(tmp_path / "sweep")]
-    swept = advsearch(installed, *sweep)
     assert (swept["task"], swept["correct"], swept["configurations"]) == ("fading", 2, 3)
     assert swept["worst"]["values"]["fade.amount"]["value"] == 1.0 and swept["worst"]["label_set"] == ["1.0"]
+    assert (widely["task"], widely["correct"]) == ("fading", 3) and "'fading={tolerance: 2}'" in widely["command_line"]
 
-    wide = [word.replace("fading", "fading={tolerance: 2}") for word in sweep]
-    swept = advsearch(installed, *wide, "--overwrite")
-    assert (swept["task"], swept["correct"]) == ("fading", 3) and "'fading={tolerance: 2}'" in swept["command_line"]
-
-    picture = ["render", *given, "--control", "fade={amount: 0.4}", "--out", str(tmp_path / "mug.png")]
-    (view,) = advsearch(installed, *picture)["views"]
+    (view,) = rendered["views"]
     assert view["answers"][0]["probability"] is None and 0.3 < float(view["answers"][0]["label"].split()[0]) < 0.5
