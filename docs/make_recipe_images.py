@@ -21,6 +21,7 @@ import yaml
 import advsearch
 from advsearch.api.recipe import recipe_from_config
 from advsearch.config import RecipeConfig
+from advsearch.report.recipes import told_once
 from advsearch.runs.directory import CONFIG
 from advsearch.runs.results.recipe import RecipeResult
 from advsearch.runs.summary import NAME, read_result
@@ -130,12 +131,13 @@ def gone_on(run: Path) -> RecipeResult | None:
 def told(name: str, result: RecipeResult, suffix: str) -> dict[str, Any]:
     """Copy the figures that are shown, and return what there is to tell."""
     figures = []
+    texts = told_once(result.figures)
     for number in SHOWN[name]:
         image = IMAGES / "-".join(filter(None, [name, suffix, f"{number}.png"]))
         image.parent.mkdir(parents=True, exist_ok=True)
         image.write_bytes((Path(str(result.run)) / "images" / f"figure-{number}.png").read_bytes())
         made = result.figures[number - 1]
-        figures.append({"title": made.title, "text": made.text, "image": image.name})
+        figures.append({"title": made.title, "text": texts[number - 1], "image": image.name})
     return {
         "title": result.title,
         "objects": [Path(one).name for one in result.objects],

@@ -53,9 +53,11 @@ def _listed(as_json: bool) -> int:
 def answer(result: RecipeResult) -> str:
     """Return what each figure says, and the cost."""
     from advsearch.report import wording
+    from advsearch.report.recipes import told_once
     from advsearch.runs.directory import REPORT
 
-    said = [f"{one.title}\n" + "\n".join(f"  {text}" for text in one.text) for one in result.figures]
+    told = zip(result.figures, told_once(result.figures), strict=True)
+    said = [f"{one.title}\n" + "\n".join(f"  {text}" for text in texts) for one, texts in told]
     facts = [
         ["runs", str(len(result.parts))],
         ["renders", str(sum(one.renders for one in result.parts))],

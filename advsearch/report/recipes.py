@@ -17,6 +17,7 @@ from advsearch.runs.results.recipe import (
     HeatMapFigure,
     NamedCount,
     PointsFigure,
+    RecipeFigure,
     ScalingFigure,
     SurfaceFigure,
     TernaryFigure,
@@ -26,6 +27,15 @@ Numbers = tuple[list[str], list[list[str]]]
 """Heads and rows of a table."""
 
 COUNT_HEADS = ["right", "accuracy", "95 % interval"]
+
+
+def told_once(figures: Sequence[RecipeFigure]) -> list[list[str]]:
+    """Return what each figure says; of one that says the same as the figure before it, that."""
+    before: list[list[str]] = [[], *(one.text for one in figures[:-1])]
+    return [
+        one.text if one.text != other else ["It says the same as the figure before it."]
+        for one, other in zip(figures, before, strict=False)
+    ]
 
 
 def figure_table(made: AnyFigure) -> Numbers:

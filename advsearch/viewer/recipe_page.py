@@ -6,7 +6,7 @@ from pathlib import Path
 
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
-from advsearch.report.recipes import figure_table
+from advsearch.report.recipes import figure_table, told_once
 from advsearch.runs.directory import IMAGES, PARTS
 from advsearch.runs.results.recipe import AnyFigure, RecipePart, RecipeResult
 from advsearch.viewer.document import data_url, document, scrolled
@@ -30,7 +30,10 @@ def recipe_page(run: Path, result: RecipeResult) -> str:
     main = element(
         "main",
         element("p", result.about) if result.about else None,
-        *(_section(one, run / IMAGES / f"figure-{number}.png") for number, one in enumerate(result.figures, start=1)),
+        *(
+            _section(one, texts, run / IMAGES / f"figure-{number}.png")
+            for number, (one, texts) in enumerate(zip(result.figures, told_once(result.figures), strict=True), start=1)
+        ),
         join(element("h2", "Cost and conditions"), facts_table(facts)),
         _runs(run, result.parts),
         again(result.command_line),
@@ -48,7 +51,7 @@ def _cautions(result: RecipeResult) -> list[str]:
     return [*said, "Interrupted before its end; there are no figures yet."] if result.goes_on else said
 
 
-def _section(made: AnyFigure, picture: Path) -> Html:
+def _section(made: AnyFigure, texts: list[str], picture: Path) -> Html:
     heads, rows = figure_table(made)
     image = None
     if picture.is_file():
@@ -56,7 +59,7 @@ def _section(made: AnyFigure, picture: Path) -> Html:
         image = element("img", src=data_url(picture.read_bytes(), "image/png"), alt=alt)
     return join(
         element("h2", made.title),
-        *(element("p", text) for text in made.text),
+        *(element("p", text) for text in texts),
         element("figure", scrolled(image, "wide")) if image else None,
         element("details", element("summary", "The numbers"), table(heads, rows)) if rows else None,
     )

@@ -22,7 +22,7 @@ from advsearch.recipes.description import Recipe, names, read_recipe, titles
 from advsearch.recipes.figures import FIGURES, compute, draw, read_options
 from advsearch.recipes.parts import planned
 from advsearch.recipes.table import Answered, Table
-from advsearch.report.recipes import figure_table
+from advsearch.report.recipes import figure_table, told_once
 from advsearch.runs.images import write_png
 from advsearch.runs.results.attack import AnswerDistribution, FoundValue
 from advsearch.runs.results.recipe import BarsFigure, HeatMapFigure, RecipeResult
@@ -359,6 +359,12 @@ def test_where_a_mixture_has_one_answer_it_is_shown_how_far_that_leads() -> None
     assert unknown.text[0] == (
         "mug, 100 % of all answers, is given as often whatever most of the mixture is: no difference is shown."
     )
+
+
+def test_two_figures_that_say_the_same_say_it_once() -> None:
+    one, two = (figure({"figure": "bars", "by": "environment"}, rows({"noon": (at, 20)})) for at in (8, 9))
+    same = ["It says the same as the figure before it."]
+    assert told_once([one, one, two, one]) == [one.text, same, two.text, one.text] and told_once([]) == []
 
 
 def test_photographs_agree_with_the_renderings_whose_configurations_they_show() -> None:
