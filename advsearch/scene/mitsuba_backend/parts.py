@@ -9,6 +9,7 @@ from functools import singledispatch
 from advsearch.scene.mitsuba_backend.inputs import SceneInput, color, flat, number, plain_number, point, transform
 from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, mitsuba_mesh, own_surface, principled
 from advsearch.scene.mitsuba_backend.plugins import loadable
+from advsearch.scene.mitsuba_backend.population import population
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
 from advsearch.scene.parts import BallLamp, HazePart, MeshPart, PluginNumbers, PluginPart, PointLamp, ScenePart
 
@@ -118,6 +119,7 @@ def _haze(part: HazePart) -> Translation:
 
     name, albedo = part.name, _rgb((1.0, 1.0, 1.0))
     medium = mitsuba().load_dict({"type": "homogeneous", "albedo": albedo, "sigma_t": 0.0})
+    population.keep(medium)
     inputs = (
         SceneInput(f"{name}.density", f"{name}.sigma_t.value.value", number, True, (1,)),
         SceneInput(f"{name}.albedo", f"{name}.albedo.value.value", color, True, (3,)),

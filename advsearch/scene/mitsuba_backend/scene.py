@@ -23,7 +23,7 @@ from advsearch.scene.mitsuba_backend.first_hit import first_hits
 from advsearch.scene.mitsuba_backend.inputs import SceneInput, as_is, as_torch, contiguous, key_of, plain_number
 from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS
 from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, leave_dark_lamps_out, mesh_translation, translation
-from advsearch.scene.mitsuba_backend.population import population
+from advsearch.scene.mitsuba_backend.population import media_in, population
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER, next_count
 from advsearch.scene.mitsuba_backend.transport import Paths, collect
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
@@ -121,7 +121,8 @@ class MitsubaScene:
         self._recorded: dict[tuple[str, int, int], Callable[..., Any]] = {}
         self._recorded_at = (0, 0)
         population.bury()
-        population.add(self, self._scene, self._integrators, self.parameters)
+        media = media_in(self._scene) if self.volumetric else ()
+        population.add(self, self._scene, self._integrators, self.parameters, media=media)
         self._every: dict[str, Tensor] = {}
         if "uploads" not in leave_out:
             self._every = {name: self.base(name) for name in sorted(self.names)}
@@ -400,7 +401,8 @@ class MitsubaScene:
             return function
         key = what, spp, self._depth
         if key not in self._recorded:
-            self._recorded[key] = dr.freeze(function)
+            beside = population.media() if self.volumetric else []
+            self._recorded[key] = dr.freeze(function, state_fn=lambda *_, **__: beside)
         return self._recorded[key]
 
 
