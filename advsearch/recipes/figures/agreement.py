@@ -22,7 +22,7 @@ from advsearch.runs.results.recipe import AgreementCount, AgreementFigure, Agree
 
 NO_PHOTOGRAPHS = (
     "There are no photographs yet: nothing is said about reality here. Take some with advsearch dashboard and the "
-    "folders in parts/, or name a folder of them (photographs=FOLDER), and let advsearch resume go on with this run."
+    "runs in parts/, or name a folder of them (photographs=FOLDER), and let advsearch resume go on with this run."
 )
 ALL = "all objects"
 
