@@ -8,7 +8,6 @@ ranges.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,8 +15,9 @@ import torch
 
 from advsearch.bundled.objects import OBJECTS
 from advsearch.controls import Space
+from advsearch.engine.hardening.variation import varied
 from advsearch.scene import library
-from advsearch.scene.assets import EnvironmentAsset, Floats, ObjectAsset
+from advsearch.scene.assets import Floats, ObjectAsset
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.formation import ImageFormation
 from advsearch.scene.framing import filling_distance
@@ -65,7 +65,7 @@ def random_scene(name: str, environments: str, rng: np.random.Generator) -> Scen
     """Draw a scene with an object of a class, lit by an environment of one half of the library."""
     asset = _recoloured(OBJECTS[name].generate(rng), rng)
     names = library.list_environments(environments)
-    environment = _varied(library.load_environment(names[int(rng.integers(len(names)))]), rng)
+    environment = varied(library.load_environment(names[int(rng.integers(len(names)))]), rng)
     ground = rng.uniform(0.1, 0.9) + rng.normal(0.0, 0.08, 3)
     given = {
         "camera.azimuth": rng.uniform(0.0, 360.0),
@@ -102,26 +102,3 @@ def _blotches(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
     coarse = torch.from_numpy(rng.uniform(-1.0, 1.0, (1, 3, cells, cells)).astype(np.float32))
     fine = torch.nn.functional.interpolate(coarse, size=tuple(shape), mode="bilinear", align_corners=False)
     return np.ascontiguousarray(fine[0].permute(1, 2, 0).numpy())
-
-
-def _varied(environment: EnvironmentAsset, rng: np.random.Generator) -> EnvironmentAsset:
-    """Mirror, tint, change the contrast of, and add one soft light to an environment."""
-    radiance = environment.radiance[:, ::-1] if rng.random() < 0.5 else environment.radiance
-    radiance = radiance * np.exp(rng.normal(0.0, 0.1, 3)).astype(np.float32)
-    mean = float(radiance.mean()) + 1e-6
-    radiance = mean * (radiance / mean) ** np.float32(rng.uniform(0.8, 1.15))
-    if rng.random() < 0.5:
-        radiance = radiance + mean * _soft_light(radiance.shape[:2], rng)
-    return replace(environment, radiance=np.ascontiguousarray(radiance, dtype=np.float32))
-
-
-def _soft_light(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
-    """A broad lobe from a random direction above the horizon, in units of the map's mean; (H, W, 1)."""
-    height, width = shape
-    theta = (np.arange(height) + 0.5)[:, None] * math.pi / height
-    phi = (np.arange(width) + 0.5)[None, :] * 2.0 * math.pi / width
-    tilt, turn = rng.uniform(0.1, 1.3), rng.uniform(0.0, 2.0 * math.pi)
-    cosine = np.cos(theta) * math.cos(tilt) + np.sin(theta) * math.sin(tilt) * np.cos(phi - turn)
-    sharpness = rng.uniform(20.0, 150.0)
-    lobe = rng.uniform(2.0, 12.0) * np.exp(sharpness * (cosine - 1.0))
-    return np.asarray(lobe[..., None], dtype=np.float32)

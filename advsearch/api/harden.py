@@ -21,7 +21,7 @@ from advsearch.config.hardening import ALL
 from advsearch.engine.hardening.lessons import Lesson, lessons, plain_lessons
 from advsearch.engine.hardening.pictures import FOLDER
 from advsearch.engine.hardening.rounds import VALIDATION_VIEWS, WEIGHTS, TrainingRounds
-from advsearch.engine.hardening.split import HELD_OUT, TRAINING, VALIDATION, Split, check_disjoint
+from advsearch.engine.hardening.split import HELD_OUT, PLAIN, TRAINING, VALIDATION, Split, check_disjoint
 from advsearch.engine.hardening.training import Course, Examples, MakeOptimiser, right_share
 from advsearch.engine.loading import Scene
 from advsearch.engine.naming import AnyModel, load_models, model_name, scene_settings
@@ -61,7 +61,10 @@ TRIES = 6
 """Random configurations of a view that is rendered, of which the worst is trained on."""
 CLEAN_VIEWS = 2
 PLAIN_VIEWS = 3
-"""Further views of each scene as it is: clean accuracy is lost where there are too few."""
+"""Further views of each scene as it is."""
+PLAIN_SCENES, VIEWS_OF_PLAIN = 3, 2
+"""Further scenes for each one that is searched, of which there are so many views as they are: clean accuracy is lost
+where there are too few."""
 CLEAN_SCENES = 4
 """Held-out scenes whose plain pictures are looked at, for each one that is attacked."""
 CLEAN_SPP = 16
@@ -127,7 +130,7 @@ def _carry_out(
     (loaded, *_), warnings = load_models([model], task, labels=config.labels, used_threads=config.used_threads)
     student = trainable(loaded, config.layers)
     splits = splits_of(config, loaded)
-    course = Course(student, config.rate, config.epochs, seeds.stream(config.seed, "order"), optimiser, beside)
+    course = Course(student, loaded, config.rate, config.epochs, seeds.stream(config.seed, "order"), optimiser, beside)
     with RunDirectory.of(config, resumed) as run:
         _same_means(run, {"optimiser": optimiser is not None, "beside": beside is not None}, resumed)
         work = Hardening(config, run, loaded, course, splits, progress)
@@ -182,10 +185,11 @@ def splits_of(config: HardenConfig, model: Model) -> dict[str, Split]:
     training = split_names(config.environment) if config.environment else list_environments("train")
     asked = config.held_out_environment
     measured = split_names(asked) if asked else list_environments("heldout")
-    return {
-        name: Split(name, taken, lit, seeds.stream(config.seed, name))
-        for name, taken, lit in ((TRAINING, known, training), (VALIDATION, known, training), (HELD_OUT, held, measured))
-    }
+    taught = [
+        Split(name, known, training, seeds.stream(config.seed, name), True) for name in (TRAINING, PLAIN, VALIDATION)
+    ]
+    measured_on = Split(HELD_OUT, held, measured, seeds.stream(config.seed, HELD_OUT))
+    return {one.name: one for one in (*taught, measured_on)}
 
 
 def _has_class(model: Model, label: str) -> bool:
@@ -233,7 +237,7 @@ class Hardening:
     def carry_out(self) -> None:
         """Measure, train, and measure again."""
         sides = self.splits
-        check_disjoint(sides[HELD_OUT], [sides[TRAINING], sides[VALIDATION]], self._counts)
+        check_disjoint(sides[HELD_OUT], [sides[name] for name in (TRAINING, PLAIN, VALIDATION)], self._counts)
         self._measure("before", "attacking the model as it is", self.model, 1)
         self.rounds.carry_out(self.config.rounds)
         self._measure("after", "attacking the hardened model", self.student.model, 1)
@@ -244,8 +248,9 @@ class Hardening:
     def _counts(self) -> dict[str, int]:
         """Scenes of each split, by its name; of those that are held out a part is attacked."""
         config = self.config
-        held = CLEAN_SCENES * config.measured
-        return {TRAINING: config.scenes * config.rounds, VALIDATION: self.rounds.judged, HELD_OUT: held}
+        held, searched = CLEAN_SCENES * config.measured, config.scenes * config.rounds
+        counts = {TRAINING: searched, PLAIN: PLAIN_SCENES * searched}
+        return {**counts, VALIDATION: self.rounds.judged, HELD_OUT: held}
 
     def _alone(self, control: str, name: str, **changes: object) -> AttackConfig:
         """What one control is searched with, on an object of a name."""
@@ -257,7 +262,8 @@ class Hardening:
         return AttackConfig.of(config, **found)
 
     def _drawn(self, split: str, places: Sequence[int], views: int) -> list[Lesson]:
-        """Lessons of scenes for each control; in every fourth scene of the training all views share a texture."""
+        """Lessons of scenes for each control; in every fourth scene of the training all views share a texture, and
+        plain ones come on top."""
         side, found = self.splits[split], list[Lesson]()
         for control in self.config.controls:
             for number in places:
@@ -268,6 +274,15 @@ class Hardening:
                 found += lessons(problem, views, TRIES, seed, shared=shared)
                 found += plain_lessons(problem, PLAIN_VIEWS, seed)
                 self.progress.advance(1)
+        return [*found, *self._plain(places)] if split == TRAINING else found
+
+    def _plain(self, places: Sequence[int]) -> list[Lesson]:
+        """Plain lessons of the scenes that come with those of the training."""
+        side, found, control = self.splits[PLAIN], list[Lesson](), next(iter(self.config.controls))
+        for number in (place * PLAIN_SCENES + more for place in places for more in range(PLAIN_SCENES)):
+            name, scene = side.scene(number, self._set)
+            problem = problem_of(self._alone(control, name, over=_without(control)), scene, self.model)
+            found += plain_lessons(problem, VIEWS_OF_PLAIN, seeds.stream(side.seed, "views", number))
         return found
 
     # ---- measurement ------------------------------------------------------------------------------------------------
@@ -333,7 +348,7 @@ class Hardening:
             one.model_copy(update={"kept": done and n == self.rounds.best}) for n, one in enumerate(self.rounds.done)
         ]
         weights = self.run.path / ARTIFACTS / WEIGHTS
-        views = {TRAINING: config.views, VALIDATION: VALIDATION_VIEWS, HELD_OUT: CLEAN_VIEWS}
+        views = {TRAINING: config.views, PLAIN: VIEWS_OF_PLAIN, VALIDATION: VALIDATION_VIEWS, HELD_OUT: CLEAN_VIEWS}
         names = list(config.controls)
         return HardenResult(
             run=str(self.run.path),

@@ -71,7 +71,7 @@ def test_a_run_trains_measures_and_goes_on(attacks: list[tuple[str, int]], monke
     assert attacks[2:] == [("ball", 40), ("book", 40), ("ball", 120)]  # what was found is not sought any harder
     assert result.rounds[:2] == [one.model_copy(update={"kept": result.rounds[k].kept}) for k, one in
                                  enumerate(first.rounds)]  # fmt: skip
-    assert [one.lessons for one in result.rounds] == [0, 4, 8] and sum(one.kept for one in result.rounds) == 1
+    assert [one.lessons for one in result.rounds] == [0, 10, 20] and sum(one.kept for one in result.rounds) == 1
     assert result.before is not None and (result.before.right, result.before.count) == (1, 2)
     assert result.clean_after is not None and result.clean_after.count == 4
     assert read_result(Path("runs/run")) == result
@@ -115,7 +115,7 @@ def test_a_round_ends_with_the_part_of_the_way_that_is_best(
 
     monkeypatch.setattr("advsearch.engine.hardening.rounds.score", judged)
     with RunDirectory.create_for(config) as run:
-        work = hardening.Hardening(config, run, load(), Course(student, 0.1, 1, 0), {}, NullProgress())
+        work = hardening.Hardening(config, run, load(), Course(student, load(), 0.1, 1, 0), {}, NullProgress())
         work.rounds._keep(0, [], Score(1.0, 0.5), 0, 0.0)
         for loss, expected in ((0.05, 0.4), (0.2, 1.0), (0.001, 0.25)):
             net.load_state_dict({name: one + 1.0 for name, one in given.items()})

@@ -131,7 +131,7 @@ def test_a_round_teaches_plain_and_worst_pictures() -> None:
     made, lessons = student(), pupils()
     before = score(made.model, lessons)
     ticks: list[int] = []
-    course = Course(made, 0.04, 12, seed=3)
+    course = Course(made, student().model, 0.04, 12, seed=3)
     course.round(1, lessons, lambda: ticks.append(1))
     after = score(made.model, lessons)
     assert len(ticks) == course.steps(len(lessons)) == 12
@@ -148,7 +148,7 @@ def test_a_round_takes_the_users_optimiser_and_their_batches() -> None:
         return torch.optim.SGD(parameters, 0.5)  # type: ignore[arg-type]
 
     further = [(torch.stack([coloured(2, 0.4, n) for n in range(8)]), torch.full((8,), 9))]
-    Course(made, 1.0, 10, 3, optimiser, further).round(1, pupils())
+    Course(made, student().model, 1.0, 10, 3, optimiser, further).round(1, pupils())
     assert asked == [1]
     assert (made.model(further[0][0]).argmax(dim=1) == 9).float().mean() > 0.5  # only the batches beside say 9
 

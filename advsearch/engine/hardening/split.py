@@ -15,13 +15,15 @@ import numpy as np
 
 from advsearch import seeds
 from advsearch.bundled.objects import OBJECTS
+from advsearch.engine.hardening.variation import varied
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.errors import InputError
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.settings import Given
 
-TRAINING, VALIDATION, HELD_OUT = "training", "validation", "held out"
-"""The splits: what the weights are fitted to, what chooses among them, and what is measured in the end."""
+TRAINING, PLAIN, VALIDATION, HELD_OUT = "training", "plain training", "validation", "held out"
+"""The splits: what the weights are fitted to, of which the second is seen as it is alone, what chooses among them, and
+what is measured in the end."""
 
 ELEVATION = (8.0, 55.0)
 FIELD = (25.0, 45.0)
@@ -34,16 +36,18 @@ class Split:
     """One side of the split.
 
     Attributes:
-        name: `TRAINING`, `VALIDATION` or `HELD_OUT`.
+        name: one of the above.
         objects: names of bundled objects, or files.
         environments: names or files.
         seed: root of its draws.
+        varied: whether each scene has an environment of its own, made from one of these (`variation`).
     """
 
     name: str
     objects: tuple[str, ...]
     environments: tuple[str, ...]
     seed: int
+    varied: bool = False
 
     def scene(self, number: int, given: Given | None = None) -> tuple[str, Scene]:
         """Return the scene with this number, and the name of its object; the objects take turns.
@@ -54,8 +58,7 @@ class Split:
             number: from 0; equal numbers are equal scenes.
             given: parameters that are fixed in every scene.
         """
-        name = self.objects[number % len(self.objects)]
-        rng = np.random.default_rng([seeds.stream(self.seed, f"{self.name} scene", number)])
+        name, rng = self.objects[number % len(self.objects)], self._draws(number)
         made = OBJECTS[name].generate(rng) if name in OBJECTS else Path(name)
         environment = self.environments[int(rng.integers(len(self.environments)))]
         ground = np.clip(rng.uniform(*GROUND) + rng.normal(0.0, 0.05, 3), 0.02, 0.98)
@@ -69,20 +72,28 @@ class Split:
         settings = {**{key: float(value) for key, value in drawn.items()}, **(given or {})}
         scene = load_scene(made, environment, settings=settings)
         own = scene.description
+        if self.varied:
+            own = replace(own, environment=varied(own.environment, rng))
+            scene = Scene(own)
         if own.object.label is None:
             label = Path(name).stem.replace("-", " ").replace("_", " ")
             scene = Scene(replace(own, object=replace(own.object, label=label)))
         return name, scene
+
+    def _draws(self, number: int) -> np.random.Generator:
+        """What a scene is drawn from, its object first."""
+        return np.random.default_rng([seeds.stream(self.seed, f"{self.name} scene", number)])
 
     def assets(self, count: int) -> Iterator[ObjectAsset]:
         """Yield the objects of the first `count` scenes; what a file holds comes once."""
         files = set[str]()
         for number in range(count):
             name = self.objects[number % len(self.objects)]
-            if name not in files:
-                yield self.scene(number)[1].description.object
-            if name not in OBJECTS:
+            if name in OBJECTS:
+                yield OBJECTS[name].generate(self._draws(number))
+            elif name not in files:
                 files.add(name)
+                yield self.scene(number)[1].description.object
 
 
 def fingerprint(asset: ObjectAsset) -> str:

@@ -1,5 +1,8 @@
 """Training on lessons: in each step plain pictures and the worst ones, which are made worse as it goes, count alike.
 
+A network that answers plain pictures as it did before has lost nothing (learning without forgetting: Li and Hoiem 2016,
+arXiv 1606.09282): where the given model is right, its answers count beside the right ones.
+
 Weights are averaged over the steps; the average is what is judged and kept.
 """
 
@@ -11,6 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from advsearch.engine.hardening.augmentation import Augmentation
@@ -24,6 +28,8 @@ AUGMENTATION = Augmentation(cutout=0.0)
 WEIGHT_DECAY = 0.02
 LARGEST_GRADIENT_NORM = 2.0
 WARM_UP = 0.1
+KEEP = 2.0
+"""Weight of the given model's answers to plain pictures, beside that of the right ones."""
 AVERAGE = 0.98
 """Weight of the past in the average of the weights, per step."""
 HELD_BACK_STEPS = 8
@@ -53,6 +59,7 @@ class Course:
 
     Attributes:
         student: what is trained.
+        given: the model as it was given; its answers to plain pictures are kept.
         rate: the highest learning rate; of an optimiser of the user's, its own counts.
         epochs: how often a round looks at each lesson.
         seed: of the order.
@@ -61,6 +68,7 @@ class Course:
     """
 
     student: Trainable
+    given: Model
     rate: float
     epochs: int
     seed: int
@@ -115,11 +123,13 @@ class Course:
 
         harder(batch, self.student.model, change=change)
         searched = [one for one in batch if isinstance(one, (TextureLesson, RenderedLesson))]
-        images = [change(torch.stack([one.plain for one in batch]))]
+        plain = change(torch.stack([one.plain for one in batch]))
+        images = [plain]
         if searched:
             images.append(change(torch.stack([one.worst for one in searched])))
-        found = surprise(self.student.logits(torch.cat(images)), [one.right for one in [*batch, *searched]])
-        loss = found[: len(batch)].mean()
+        logits = self.student.logits(torch.cat(images))
+        found = surprise(logits, [one.right for one in [*batch, *searched]])
+        loss = found[: len(batch)].mean() + KEEP * self._forgotten(plain, logits[: len(batch)], batch)
         if searched:
             loss = loss + found[len(batch) :].mean()
         if self.beside is not None:
@@ -130,6 +140,15 @@ class Course:
         loss.backward()
         nn.utils.clip_grad_norm_(self.student.parameters(), LARGEST_GRADIENT_NORM)
         optimiser.step()
+
+    def _forgotten(self, plain: Tensor, logits: Tensor, batch: Sequence[Lesson]) -> Tensor:
+        """The Kullback-Leibler divergence of what the given model says of plain pictures (N, H, W, 3), where it is
+        right, to what logits (N, C) say; a mean over all."""
+        with torch.no_grad():
+            wanted = self.given(plain)
+        right = [said in one.right for said, one in zip(wanted.argmax(dim=1).tolist(), batch, strict=True)]
+        target = F.log_softmax(wanted[right], dim=1)
+        return F.kl_div(F.log_softmax(logits[right], dim=1), target, reduction="sum", log_target=True) / len(batch)
 
     def _next(self) -> tuple[Tensor, Tensor]:
         assert self.beside is not None

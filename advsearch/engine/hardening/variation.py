@@ -1,0 +1,36 @@
+"""Environments as a network has to know them: mirrored, tinted, with another contrast, with a soft light more.
+
+A handful of maps is soon known by heart; what is learned under few lights is lost under others.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from advsearch.scene.assets import EnvironmentAsset, Floats
+
+
+def varied(environment: EnvironmentAsset, rng: np.random.Generator) -> EnvironmentAsset:
+    """Mirror, tint, change the contrast of, and add one soft light to an environment, each by chance."""
+    radiance = environment.radiance[:, ::-1] if rng.random() < 0.5 else environment.radiance
+    radiance = radiance * np.exp(rng.normal(0.0, 0.1, 3)).astype(np.float32)
+    mean = float(radiance.mean()) + 1e-6
+    radiance = mean * (radiance / mean) ** np.float32(rng.uniform(0.8, 1.15))
+    if rng.random() < 0.5:
+        radiance = radiance + mean * _soft_light(radiance.shape[:2], rng)
+    return replace(environment, radiance=np.ascontiguousarray(radiance, dtype=np.float32))
+
+
+def _soft_light(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:
+    """A broad lobe from a random direction above the horizon, in units of the map's mean; (H, W, 1)."""
+    height, width = shape
+    theta = (np.arange(height) + 0.5)[:, None] * math.pi / height
+    phi = (np.arange(width) + 0.5)[None, :] * 2.0 * math.pi / width
+    tilt, turn = rng.uniform(0.1, 1.3), rng.uniform(0.0, 2.0 * math.pi)
+    cosine = np.cos(theta) * math.cos(tilt) + np.sin(theta) * math.sin(tilt) * np.cos(phi - turn)
+    sharpness = rng.uniform(20.0, 150.0)
+    lobe = rng.uniform(2.0, 12.0) * np.exp(sharpness * (cosine - 1.0))
+    return np.asarray(lobe[..., None], dtype=np.float32)
