@@ -72,7 +72,7 @@ class Split:
         settings = {**{key: float(value) for key, value in drawn.items()}, **(given or {})}
         scene = load_scene(made, environment, settings=settings)
         own = scene.description
-        if self.varied:
+        if self.varied and own.environment is not None:
             own = replace(own, environment=varied(own.environment, rng))
             scene = Scene(own)
         if own.object.label is None:
