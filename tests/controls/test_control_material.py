@@ -167,7 +167,7 @@ def test_the_adjoint_agrees_with_differences(name: str, value: float) -> None:
     u = torch.tensor([value], requires_grad=True)
     samples = [torch.autograd.grad((render(u, s, 64) * weight).sum(), u)[0] for s in range(6)]
     with torch.no_grad():
-        ends = [sum(float((render(u + h, s, 1024) * weight).sum()) for s in range(4)) / 4.0 for h in (0.06, -0.06)]
+        ends = [sum(float((render(u + h, s, 1024) * weight).sum()) for s in range(2)) / 2.0 for h in (0.06, -0.06)]
     expected = (ends[0] - ends[1]) / 0.12
     assert float(torch.stack(samples).mean()) == pytest.approx(expected, rel=AGREEMENT)
 

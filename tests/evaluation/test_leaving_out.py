@@ -83,7 +83,7 @@ def test_what_changes_the_picture_is_not_called_safe(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("advsearch.evaluation.leaving_out.ITEMS", {"tracing": ""})
     monkeypatch.setattr("advsearch.evaluation.leaving_out.NOTHING", EVERYTHING)
     renderer = made("camera.exposure")
-    rows = measured_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=512, repeats=2, depth=2)
+    rows = measured_gains(renderer, smooth_loss((SIZE, SIZE)), renderer.start, seed=1, spp=128, repeats=2, depth=2)
     tracing, bounces, _ = rows  # no row of predicted pictures: an exposure needs no render
     assert tracing.picture_difference < 1e-5 and tracing.safe  # a recorded kernel rounds otherwise
     assert tracing.gain > 0.0
