@@ -29,7 +29,7 @@ MOST, MOST_NUMBERS = 1024, 2**24
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class AheadAnswer:
     """What came of one configuration.
 
     Attributes:
@@ -59,15 +59,15 @@ class TrialAhead:
     spp: int
     kept: bool = False
 
-    def seen(self, problem: Problem) -> Seen:
+    def seen(self, problem: Problem) -> AheadAnswer:
         """Carry it out."""
         pictures: list[Tensor] = []
         judgement = problem.trial(self.u, self.seed, self.spp, keep=pictures.append)
-        return Seen(judgement, pictures[0] if self.kept else None)
+        return AheadAnswer(judgement, pictures[0] if self.kept else None)
 
-    def lost(self, why: str) -> Seen:
+    def lost(self, why: str) -> AheadAnswer:
         """What stands for it where nobody could carry it out."""
-        return Seen(no_answer(why))
+        return AheadAnswer(no_answer(why))
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,31 +90,31 @@ class EvaluationAhead:
     search_depth: int | None
     kept: bool = False
 
-    def seen(self, problem: Problem) -> Seen:
+    def seen(self, problem: Problem) -> AheadAnswer:
         """Carry it out; the problem takes the samples and the light paths."""
         problem.spp, problem.search_depth = self.spp, self.search_depth
         pictures: list[Tensor] = []
         told = OnImage(lambda index: True, lambda index, image: pictures.append(image)) if self.kept else None
         evaluation = problem.evaluator(self.kind, told)(self.u, index=self.index, gradient=False)
-        return Seen(evaluation, pictures[0] if pictures else None)
+        return AheadAnswer(evaluation, pictures[0] if pictures else None)
 
-    def lost(self, why: str) -> Seen:
+    def lost(self, why: str) -> AheadAnswer:
         """What stands for it where nobody could carry it out."""
-        return Seen(Evaluation(math.nan, None, False, judgement=no_answer(why)))
+        return AheadAnswer(Evaluation(math.nan, None, False, judgement=no_answer(why)))
 
 
 Announced = TrialAhead | EvaluationAhead
 
 
-def seen_by(problem: Problem) -> Callable[[Sequence[Announced]], list[Seen]]:
+def seen_by(problem: Problem) -> Callable[[Sequence[Announced]], list[AheadAnswer]]:
     """Return what carries out what is announced of a problem: what a worker does."""
 
-    def call(announced: Sequence[Announced]) -> list[Seen]:
+    def call(announced: Sequence[Announced]) -> list[AheadAnswer]:
         found = []
         for one in announced:
             before = problem.renderer.non_finite
             seen = one.seen(problem)
-            found.append(Seen(seen.value, seen.picture, problem.renderer.non_finite - before))
+            found.append(AheadAnswer(seen.value, seen.picture, problem.renderer.non_finite - before))
         return found
 
     return call
@@ -136,7 +136,7 @@ class Ahead:
     lost: int = 0
     machine: str | None = None
     _waiting: deque[Announced] = field(default_factory=deque)
-    _coming: Generator[Seen, None, None] | None = None
+    _coming: Generator[AheadAnswer, None, None] | None = None
 
     def most(self, dim: int) -> int:
         """Return how many configurations of so many numbers are announced at once, at most; 1 without workers."""
@@ -162,14 +162,14 @@ class Ahead:
             self._waiting.extend(announced)
             self._coming = self._answers(executor, list(announced))
 
-    def take(self, wanted: Announced) -> Seen | None:
+    def take(self, wanted: Announced) -> AheadAnswer | None:
         """Return what came of the next configuration; None where it is another one, or none was announced."""
         if self._coming is None or not self._waiting or not _same(self._waiting[0], wanted):
             return None
         self._waiting.popleft()
         return next(self._coming)
 
-    def _answers(self, executor: Executor, announced: Sequence[Announced]) -> Generator[Seen, None, None]:
+    def _answers(self, executor: Executor, announced: Sequence[Announced]) -> Generator[AheadAnswer, None, None]:
         ones, early, turn = (range(n, n + 1) for n in range(len(announced))), dict[int, Done](), 0
         results: Any = executor.results(ones, announced)
         with closing(results):

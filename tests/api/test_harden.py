@@ -46,6 +46,7 @@ def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, 
 
     monkeypatch.setattr(hardening, "_attacked", attacked)
     monkeypatch.setattr(hardening, "CLEAN_SCENES", 1)
+    monkeypatch.setattr(hardening, "PLAIN_SCENES", 1)
     return done
 
 
@@ -71,7 +72,7 @@ def test_a_run_trains_measures_and_goes_on(attacks: list[tuple[str, int]], monke
     assert attacks[2:] == [("ball", 40), ("book", 40), ("ball", 120)]  # what was found is not sought any harder
     assert result.rounds[:2] == [one.model_copy(update={"kept": result.rounds[k].kept}) for k, one in
                                  enumerate(first.rounds)]  # fmt: skip
-    assert [one.lessons for one in result.rounds] == [0, 10, 20] and sum(one.kept for one in result.rounds) == 1
+    assert [one.lessons for one in result.rounds] == [0, 6, 12] and sum(one.kept for one in result.rounds) == 1
     assert result.before is not None and (result.before.right, result.before.count) == (1, 2)
     assert result.clean_after is not None and result.clean_after.count == 4
     assert read_result(Path("runs/run")) == result
@@ -79,7 +80,7 @@ def test_a_run_trains_measures_and_goes_on(attacks: list[tuple[str, int]], monke
     assert not set(held.environments) & set(result.split["training"].environments)
     assert result.hardened == f"small_models:Colours@{result.weights}"
     assert advsearch.load_model(result.hardened, input_size=32).classes == 14
-    assert len(list(Path(str(result.pictures)).glob("*/*.png"))) == 2 * (2 + 3)
+    assert len(list(Path(str(result.pictures)).glob("*/*.png"))) == 2 * (2 + 3 + 2)
     assert "robust to texture" in answer(result)
     page = Path("runs/run/report.html").read_text("utf-8")
     assert "Of 2 held-out scenes the searches leave 1 right, before 1;" in page and "data:image/png" in page
