@@ -395,7 +395,7 @@ def _question(job: _Job) -> Question:
     """What the summary repeats of the settings."""
     config, objective = job.config, job.objective
     named = objective if isinstance(objective, str) else config.objective
-    return Question(config.object, config.lit_by, config.policy_name, named, config.command_line())
+    return Question(config.object, config.policy_name, named, config.command_line())
 
 
 # ---- carrying it out ------------------------------------------------------------------------------------------------

@@ -164,7 +164,7 @@ class _Measurements:
         return PlanResult(
             run=run,
             object=config.object,
-            environment=problem.space.environment or config.lit_by,
+            environment=problem.environment,
             controls=list(config.controls),
             model=problem.model.name,
             ending=ending,

@@ -388,7 +388,7 @@ def _subject(
         run=run,
         object=config.object,
         model=problem.model.name,
-        environment=problem.space.environment or config.lit_by,
+        environment=problem.environment,
         controls=list(config.controls),
         ending=ending,
         image_formation=Formation.of(problem.renderer.formation),

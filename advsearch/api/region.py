@@ -109,7 +109,7 @@ def region_from_config(
         result = RegionResult(
             run=str(run.path),
             object=config.object,
-            environment=problem.space.environment or config.lit_by,
+            environment=problem.environment,
             model=problem.model.name,
             task=problem.task.name,
             controls=[bound.name for bound in problem.space.controls],

@@ -72,14 +72,12 @@ class Question:
 
     Attributes:
         object: its name or file.
-        environment: likewise; a control may have put another in its place.
         policy: its name.
         objective: its name; None for the task's own.
         command_line: the command that asks the same again.
     """
 
     object: str
-    environment: str
     policy: str
     objective: str | None
     command_line: str
@@ -219,7 +217,7 @@ def _summary(
         object=asked.object,
         model=problem.model.name,
         task=task.name,
-        environment=problem.space.environment or asked.environment,
+        environment=problem.environment,
         controls=list(budgets),
         policy=asked.policy,
         objective=asked.objective or task.objective,

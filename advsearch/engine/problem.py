@@ -19,6 +19,7 @@ from advsearch.engine.answers import Described, Looked
 from advsearch.engine.domains import domain_of
 from advsearch.models import Model
 from advsearch.runs.results.plan import GroupDerivative, PlannedGradient
+from advsearch.scene.description import NO_MAP
 from advsearch.scene.formation import to_8_bit
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import GradientPlan
@@ -110,6 +111,12 @@ class Problem:
     def searched_space(self) -> Space:
         """The controls that are searched, as a space of their own: it describes and keeps what was found."""
         return replace(self.space, controls=self.space.controls[: self.searched])
+
+    @property
+    def environment(self) -> str:
+        """What lights the clean scene, by name."""
+        scene = self.space.scene
+        return self.space.environment or (NO_MAP if scene is None else scene.environment_name)
 
     @property
     def rule(self) -> Rule:

@@ -179,7 +179,7 @@ def test_an_attack_on_a_node_is_verified_and_goes_on_from_its_file(file: Path, t
     assert main(["attack", "--object", f"{file}#crate", "--control", "pose,pose:the-wall,texture:floor", *small, *fixed,
                  "--run", str(run)]) == 0  # fmt: skip
     summary = json.loads((run / "summary.json").read_text())
-    assert summary["object"] == f"{file}#crate"
+    assert summary["object"] == f"{file}#crate" and summary["environment"] == "none"  # lit by its own lamp
     assert {"pose.yaw", "pose:the-wall.yaw", "texture:floor.linf"} <= set(summary["configuration"])
     assert (run / "artifacts" / "texture@floor.png").is_file()
     assert "artifacts/texture@floor.png" in (run / "report.html").read_text()
