@@ -126,3 +126,24 @@ def test_stock_mitsuba_renders_the_cut_outs_that_are_written(framed: Path, tmp_p
     theirs = torch.from_numpy(np.array(mi.render(mi.load_file(str(tmp_path / "out" / "scene.xml")), spp=256)))[..., :3]
     ours = renderer.scene.radiance({}, 0, 256)
     assert (theirs - ours).abs().mean() < 0.03 * ours.mean()
+
+
+@pytest.mark.parametrize(("mode", "share"), [("RGBA", 1.0), ("L", 0.5)])
+def test_a_material_file_says_opacity_by_a_number_and_a_picture(mode: str, share: float, tmp_path: Path) -> None:
+    """The picture's alpha, or its grey; another size than the colours' will do."""
+    texels = np.full((32, 32, 4), 255, np.uint8)
+    texels[..., 3] = np.uint8(window() * 255)
+    picture = Image.fromarray(texels) if mode == "RGBA" else Image.fromarray(texels[..., 3])
+    picture.save(tmp_path / "holes.png")
+    Image.new("RGB", (64, 64), (255, 0, 0)).save(tmp_path / "red.png")
+    corners = "v -1 0 0\nv 1 0 0\nv 1 2 0\nv -1 2 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+    (tmp_path / "card.obj").write_text(f"mtllib card.mtl\n{corners}usemtl a\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n")
+    (tmp_path / "card.mtl").write_text(f"newmtl a\nKd 1 1 1\nd {share}\nmap_Kd red.png\nmap_d holes.png\n")
+    made = import_object(tmp_path / "card.obj", up="y")
+    assert made.opacity is not None and made.opacity.shape == (64, 64) and made.base_color.shape == (64, 64, 3)
+    assert made.opacity[32, 32] == 0.0 and made.opacity[4, 4] == pytest.approx(share)
+    assert not [text for text in made.warnings if "opac" in text]
+    (tmp_path / "holes.png").write_bytes(b"none")
+    broken = import_object(tmp_path / "card.obj", up="y")
+    assert "the opacity 'holes.png' cannot be read as a picture; it is opaque instead" in " ".join(broken.warnings)
+    assert (broken.opacity is None) == (share == 1.0)

@@ -108,7 +108,7 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         notes.append(f"{path.name}: {len(found) - len(meshes)} parts without faces (points, lines) are left out")
     named = _named_textures(path, data, header, references)
     materials = len(references.materials) if header is None else len(header.materials)
-    reader = SurfaceReader(path.name, named, references.refused, materials)
+    reader = SurfaceReader(path.name, named, references.refused, materials, references.get)
     parts = []
     for mesh, matrix, node in meshes:
         part = _part(mesh, reader.surface(mesh.visual), linear=path.suffix.lower() in GLTF)

@@ -20,15 +20,14 @@ Named = dict[str | None, tuple[str, str]]
 
 MISSING = "is missing"
 OUTSIDE = "is outside its folder and is not read"
-NORMAL_MAPS, GLOW, TRANSPARENCY = "the normal maps", "the glow", "the transparency"
+NORMAL_MAPS, GLOW = "the normal maps", "the glow"
 """What a material may have that is not read."""
 
 _UNREAD = {
     **dict.fromkeys(("bump", "map_bump", "norm"), NORMAL_MAPS),
     **dict.fromkeys(("ke", "map_ke"), GLOW),
-    **dict.fromkeys(("d", "map_d"), TRANSPARENCY),
 }
-_SAID_BY_DEFAULT = {"ke": 0.0, "d": 1.0}
+_SAID_BY_DEFAULT = {"ke": 0.0}
 """By the key of a line of a material file: what it says; and the numbers with which it says nothing."""
 
 _NO_SUCH_NAME = (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EINVAL)
@@ -47,7 +46,7 @@ class References:
         refused: for each name, as `plain_name` gives it, why it was not read: `MISSING`, `OUTSIDE` or another clause.
         materials: names of the materials in the .mtl files read.
         named: the textures that these name.
-        unread: for `NORMAL_MAPS`, `GLOW` and `TRANSPARENCY`, the names of the materials that have them.
+        unread: for `NORMAL_MAPS` and `GLOW`, the names of the materials that have them.
     """
 
     def __init__(self, path: Path) -> None:
@@ -55,7 +54,7 @@ class References:
         self.refused: dict[str, str] = {}
         self.materials: set[str] = set()
         self.named: Named = {}
-        self.unread: dict[str, set[str]] = {NORMAL_MAPS: set(), GLOW: set(), TRANSPARENCY: set()}
+        self.unread: dict[str, set[str]] = {NORMAL_MAPS: set(), GLOW: set()}
         self._folder = os.path.realpath(path.parent)
         self._contents: dict[str, bytes] = {}
 

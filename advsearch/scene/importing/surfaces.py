@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import io
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,11 +17,11 @@ from advsearch.errors import FileFormatError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.files import shown
 from advsearch.scene.importing.gltf_entries import CUT_OUTS, CUTOFF
-from advsearch.scene.importing.images import LARGEST_PIXELS, TEXTURE_LIMIT, check_pixels, display_image
+from advsearch.scene.importing.images import FORMATS, LARGEST_PIXELS, TEXTURE_LIMIT, check_pixels, display_image
 from advsearch.scene.importing.references import Named, plain_name
 
 if TYPE_CHECKING:
-    from trimesh.visual.material import PBRMaterial
+    from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 Floats = npt.NDArray[np.float32]
 
@@ -68,6 +70,7 @@ class SurfaceReader:
         named: for each material that names a texture: the file that names it, and the texture's name.
         refused: for names of files, as `plain_name` gives them, why they were not read.
         materials: how many the file has.
+        read: returns the content of a file that it names; raises FileNotFoundError.
         notes: the warnings so far.
     """
 
@@ -75,9 +78,11 @@ class SurfaceReader:
     named: Named
     refused: Mapping[str, str]
     materials: int
+    read: Callable[[str], bytes]
     notes: list[str] = field(default_factory=list)
     _known: dict[int, ImportedSurface] = field(default_factory=dict)
     _pictures: dict[tuple[int, bool], Floats | str] = field(default_factory=dict)
+    _opened: list[Image.Image] = field(default_factory=list)
     _pixels: int = 0
 
     def surface(self, visual: Any) -> ImportedSurface:
@@ -96,8 +101,40 @@ class SurfaceReader:
             # The Kd of a textured material is an exporter's default more often than a tint: the texture stands alone.
             color = _color(material.kwargs.get("kd"))
             texture = self._texture(material, material.image, color)
-            return ImportedSurface(_unless_white(color, material, self.named), texture)
+            return self._see_through(material, ImportedSurface(_unless_white(color, material, self.named), texture))
         return ImportedSurface()
+
+    def _see_through(self, material: SimpleMaterial, surface: ImportedSurface) -> ImportedSurface:
+        """Give a surface the opacity that a material file says by ``d``, a number, and ``map_d``, a picture: its alpha,
+        or its grey where it has none."""
+        factor, map = _last_number(material.kwargs.get("d"), 1.0), self._opacity(material)
+        if map is None and factor == 1.0:
+            return surface
+        share, color, texture = np.array([factor], np.float32), surface.color, surface.texture
+        if map is not None:
+            plain = np.full(3, NEUTRAL, np.float32) if color is None else color
+            texture = np.broadcast_to(plain, (*map.shape, 3)) if texture is None else texture
+            size = (texture.shape[1], texture.shape[0])
+            fitted = np.asarray(Image.fromarray(map).resize(size, Image.Resampling.BILINEAR))
+            texture = np.concatenate([texture, fitted[:, :, None]], axis=2)
+        return replace(surface, color=_with_opacity(color, share, None), texture=_with_opacity(texture, share, None))
+
+    def _opacity(self, material: SimpleMaterial) -> Floats | None:
+        """The (H, W) opacity in [0, 1] that a material's ``map_d`` holds; warn where it cannot be had."""
+        name = " ".join(material.kwargs.get("map_d") or [])
+        if not name:
+            return None
+        try:
+            image = Image.open(io.BytesIO(self.read(name)), formats=FORMATS)
+            found = self._decoded(image, alpha=True)
+            self._opened.append(image)  # what is decoded is known by its identity
+        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+            found = None
+        if isinstance(found, np.ndarray):
+            return found[:, :, 3] if found[:, :, 3].min() < 1.0 else found[:, :, :3].mean(axis=2)
+        why = self.refused.get(plain_name(name)) or found or "cannot be read as a picture"
+        self._note(f"{self.source}: the opacity {shown(name)} {why}; it is opaque instead")
+        return None
 
     def _gltf(self, material: PBRMaterial) -> ImportedSurface:
         """Follow glTF 2.0, sections 3.9.2 and 3.9.4: linear factors multiply the textures, and alpha is opacity. Unlike
@@ -212,6 +249,15 @@ def _unless_white(color: Floats | None, material: Any, named: Named) -> Floats |
     if color is not None and material.name in named and (color > 0.999).all():
         return None
     return color
+
+
+def _last_number(words: list[str] | None, otherwise: float) -> float:
+    """Return the last word of a line as a number in [0, 1], or what holds otherwise."""
+    try:
+        number = float((words or [""])[-1])
+    except ValueError:
+        return otherwise
+    return min(max(number, 0.0), 1.0) if math.isfinite(number) else otherwise
 
 
 def _unit(value: float | None) -> float | None:
