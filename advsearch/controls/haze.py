@@ -8,6 +8,7 @@ absorbed, per channel: white haze takes nothing away, dark haze is smoke. Haze f
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -17,7 +18,7 @@ from torch import Tensor
 from advsearch.controls.base import Parameter
 from advsearch.controls.numbers import NumberControl, Values
 from advsearch.controls.values import Fixed, Number, Range
-from advsearch.scene.color import srgb_to_linear
+from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.description import SceneDescription
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.parts import HazePart
@@ -53,12 +54,15 @@ class HazeControl(NumberControl):
     )
 
     def default(self, scene: SceneDescription, parameter: Parameter) -> Number:
+        if (own := _haze_of(scene)) is not None and own.density:
+            return own.density if parameter.name == "density" else _display(own)[CHANNELS.index(parameter.name)]
         if parameter.name == "density" and self.asked and not self.searches_density:
             return THIN_HAZE
         return parameter.default
 
     def unchanged(self, scene: SceneDescription, parameter: Parameter) -> Number:
-        return parameter.default
+        own = _haze_of(scene)
+        return parameter.default if own is None or not own.density else self.default(scene, parameter)
 
     @property
     def searches_density(self) -> bool:
@@ -73,9 +77,22 @@ class HazeControl(NumberControl):
         return parameter.estimators if isinstance(spec, Range) and spec.low > 0.0 else ("differences",)
 
     def prepare(self, scene: SceneDescription) -> SceneDescription:
+        if (own := _haze_of(scene)) is not None and own.density:  # of a scene that comes with haze
+            named = replace(own, name=self.name)
+            return replace(scene, parts=tuple(named if one is own else one for one in scene.parts))
         away = float(np.linalg.norm(camera_to_world(scene)[:3, 3]))
         return scene.with_part(HazePart(self.name, max(LEAST_RADIUS, BEHIND_CAMERA * away)))
 
     def scene_inputs(self, scene: SceneDescription, values: Values, so_far: Mapping[str, Tensor]) -> dict[str, Tensor]:
         albedo = srgb_to_linear(torch.stack([values[channel] for channel in CHANNELS]))
         return {f"{self.name}.density": values["density"].reshape(1), f"{self.name}.albedo": albedo}
+
+
+def _haze_of(scene: SceneDescription) -> HazePart | None:
+    """The haze that a scene has, if it has one."""
+    return next((one for one in scene.parts if isinstance(one, HazePart)), None)
+
+
+def _display(haze: HazePart) -> list[float]:
+    """The colour of a haze, display-referred."""
+    return [float(value) for value in linear_to_srgb(np.asarray(haze.albedo, np.float32))]

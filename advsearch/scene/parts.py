@@ -140,9 +140,12 @@ class HazePart(ScenePart):
     Attributes:
         name: of the haze.
         radius: of the ball that it fills, object sizes.
+        density, albedo: what it has by itself; none by default, for a control to fill.
     """
 
     radius: float
+    density: float = 0.0
+    albedo: tuple[float, float, float] = (1.0, 1.0, 1.0)
     volumetric: ClassVar[bool] = True
 
 

@@ -17,12 +17,14 @@ import advsearch
 from advsearch.api.export_scene import answer_of
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig
+from advsearch.controls import make_control, make_space
 from advsearch.engine.pictures import write_object
 from advsearch.runs.directory import OBJECT_FILE, RunDirectory
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.parts import HazePart
 
 CONTROLS = {"texture": {"resolution": 64}, "pose": {}, "light": {}, "camera": {}, "lens": {}}
 
@@ -92,6 +94,15 @@ def test_stock_mitsuba_renders_haze_and_a_plain_background(
     noise = max(np.abs(ours - again).mean(), np.abs(theirs - once_more)[..., :3].mean())
     if controls is HAZE:
         assert "Haze scatters light" in note
+        back = advsearch.load_scene(f"{tmp_path}/scene.xml#object")
+        (haze,) = (part for part in back.description.parts if isinstance(part, HazePart))
+        read = MitsubaScene(back.description, (16, 16)).radiance({}, 3, 128).numpy()
+        assert not back.description.notes and np.abs(ours - read).mean() < 1.2 * noise
+        assert read.mean() == pytest.approx(ours.mean(), rel=0.02)
+        space = make_space([make_control("haze", {})], back.description)  # goes on from the scene's own
+        assert (
+            space.describe(space.start)["haze.density"]["value"] == pytest.approx(haze.density) == pytest.approx(0.22)
+        )
     else:
         color = [float(one) for one in note.partition("(")[2].partition(")")[0].split(",")]
         theirs = theirs[..., :3] + (1.0 - theirs[..., 3:]) * color

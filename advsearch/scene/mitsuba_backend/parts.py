@@ -117,8 +117,8 @@ def _haze(part: HazePart) -> Translation:
     """Mitsuba's medium only holds density and albedo for the integrator: no shape refers to it."""
     import advsearch.scene.mitsuba_backend.haze_path  # noqa: F401  (registers the integrator)
 
-    name, albedo = part.name, _rgb((1.0, 1.0, 1.0))
-    medium = mitsuba().load_dict({"type": "homogeneous", "albedo": albedo, "sigma_t": 0.0})
+    name, albedo = part.name, _rgb(part.albedo)
+    medium = mitsuba().load_dict({"type": "homogeneous", "albedo": albedo, "sigma_t": part.density})
     population.keep(medium)
     inputs = (
         SceneInput(f"{name}.density", f"{name}.sigma_t.value.value", number, True, (1,)),

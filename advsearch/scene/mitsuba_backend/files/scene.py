@@ -18,6 +18,7 @@ from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.importing.files import safe_name
 from advsearch.scene.importing.objects import object_of
 from advsearch.scene.importing.scenes import TAKEN, ImportedScene, clean
+from advsearch.scene.mitsuba_backend.files.haze import haze_in
 from advsearch.scene.mitsuba_backend.files.shapes import MESHES, mesh_of, surface_of
 from advsearch.scene.mitsuba_backend.files.trusted import trusted
 from advsearch.scene.mitsuba_backend.files.xml import read_scene
@@ -49,6 +50,8 @@ INTEGRATORS = frozenset(
     path prb prb_basic prb_projective prbvolpath volpath volpathmis direct aov ptracer depth moment stokes
     """.split()
 )
+NOTHING = {"type": "null"}
+"""The surface of what only bounds a medium."""
 MEDIA = frozenset(("homogeneous", "heterogeneous"))
 Y_TO_Z = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 MOST_PARTS = 2000
@@ -101,14 +104,20 @@ def contents(path: Path) -> PluginContents:
     """
     named = dict(_plugins(read_tree(path)))
     kinds = {name: str(one["type"]) for name, one in named.items()}
-    objects = tuple(name for name, kind in kinds.items() if kind in MESHES)
+    objects = tuple(name for name, kind in kinds.items() if kind in MESHES and named[name].get("bsdf") != NOTHING)
     cameras = tuple(name for name, kind in kinds.items() if kind in CAMERAS)
     others = {
         name: kind
         for name, kind in kinds.items()
         if name not in (*objects, *cameras) and kind not in INTEGRATORS | SENSORS
     }
-    return PluginContents(objects, others, tuple(name for name, one in named.items() if _shines(one)), cameras)
+    lights = tuple(name for name, one in named.items() if _shines(one))
+    return PluginContents(objects, others, lights, tuple(map(_free, cameras)))
+
+
+def _free(name: str) -> str:
+    """A name, or another one where the house has taken it."""
+    return f"{name}-2" if name in TAKEN else name
 
 
 def _shines(plugin: Mapping[str, object]) -> bool:
@@ -140,10 +149,11 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     if len(named) > MOST_PARTS:
         raise InputError(f"{where}: expected at most {MOST_PARTS} plugins at the top, got {len(named)}; join meshes")
     shape = named[wanted]
-    notes = [f"{where}: {one}" for one in _left_out(tree, shape)]
     bsdf = _bsdf(shape, named)
     color, surface = surface_of(bsdf)
     frame = _Frame(shape, wanted, z_up=_is_z_up(named))
+    haze, used = haze_in(named, frame.matrix) or (None, frozenset[str]())
+    notes = [f"{where}: {one}" for one in _left_out(tree, shape, hazy=haze is not None)]
     part = replace(mesh_of(shape, wanted, painted=color.texture is not None), surface=color)
     turned = replace(
         part,
@@ -152,12 +162,12 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     )
     source = scene if isinstance(scene, Path) else Path("scene.xml")
     made = object_of([turned], notes, source, f"{safe_name(source)}-{clean(wanted)}", "z")
-    around: list[ScenePart] = []
+    around: list[ScenePart] = [] if haze is None else [haze]
     cameras: dict[str, PlacedCamera] = {}
     for name, one in named.items():
-        if name == wanted or one["type"] in INTEGRATORS:
+        if name == wanted or name in used or one["type"] in INTEGRATORS:
             continue
-        free = f"{name}-2" if name in TAKEN else name
+        free = _free(name)
         if one["type"] in SENSORS:
             if one["type"] in CAMERAS:
                 cameras[free] = _camera(one, frame)
@@ -206,8 +216,8 @@ def _bsdf(shape: Mapping[str, object], named: Mapping[str, Mapping[str, object]]
     return {"type": "diffuse"}
 
 
-def _left_out(tree: Mapping[str, object], shape: Mapping[str, object]) -> Iterator[str]:
-    """Sentences about what is not as it is in the file."""
+def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: bool) -> Iterator[str]:
+    """Sentences about what is not as it is in the file; `hazy` where the camera's medium is the scene's haze."""
     for name, one in _plugins(tree):
         kind = one["type"]
         if kind in SENSORS - CAMERAS:
@@ -216,7 +226,7 @@ def _left_out(tree: Mapping[str, object], shape: Mapping[str, object]) -> Iterat
             yield f"the sensor {name} is sharp at all distances: its lens is left out"
         elif kind in INTEGRATORS - {"path", "prb", "volpath", "prbvolpath", "volpathmis", "prb_projective"}:
             yield f"the integrator {name} is left out: a {kind}; light takes all paths of up to 6 segments"
-        if kind in SENSORS and "medium" in one:
+        if kind in SENSORS and "medium" in one and not hazy:
             yield f"the sensor {name} sees nothing of its medium up to the first surface"
         if kind in SENSORS and any("principal_point" in key for key in one):
             yield f"the sensor {name} looks along its middle: its principal point is left out"

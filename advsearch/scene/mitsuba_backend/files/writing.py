@@ -113,7 +113,8 @@ def described(base: Plugin, description: SceneDescription, inputs: Mapping[str, 
 
 def _put_haze(scene: Plugin, haze: HazePart, left: Plugin) -> None:
     """Fill a ball and the camera in it with haze, unless its density is 0; takes its inputs from what is left."""
-    density, albedo = (left.pop(f"{haze.name}.{name}", np.zeros(3)).tolist() for name in ("density", "albedo"))
+    density = left.pop(f"{haze.name}.density", np.array([haze.density])).tolist()
+    albedo = left.pop(f"{haze.name}.albedo", np.array(haze.albedo)).tolist()
     if not density[0] > 0.0:
         return
     medium = f"{haze.name}-medium"
