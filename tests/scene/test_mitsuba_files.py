@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import torch
 
 import advsearch
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
+from advsearch.scene.mitsuba_backend.files.haze import haze_in
 from advsearch.scene.mitsuba_backend.files.scene import contents, import_plugins
 from advsearch.scene.mitsuba_backend.files.xml import read_scene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
@@ -169,3 +171,37 @@ def test_what_mitsuba_refuses_is_told_in_its_words(box: Path) -> None:
     )
     with pytest.raises(AdvsearchError, match="oops"):
         advsearch.load_scene(f"{box}#largebox").renderer("pose", resolution=16)
+
+
+@pytest.mark.parametrize(
+    ("changed", "is_haze"),
+    [
+        ({}, True),
+        ({"ball": {"radius": "wide"}}, False),
+        ({"ball": {"radius": 0.0}}, False),
+        ({"ball": {"center": [3.0, 0.0, 0.0]}}, False),
+        ({"ball": {"bsdf": {"type": "diffuse"}}}, False),
+        ({"fog": {"sigma_t": {"type": "rgb", "value": [0.1, 0.2, 0.3]}}}, False),
+        ({"fog": {"sigma_t": float("nan")}}, False),
+        ({"fog": {"sigma_t": {"type": "gridvolume"}}}, False),
+        ({"fog": {"albedo": 0.0}}, False),
+        ({"fog": {"scale": 0.5}}, True),
+        ({"eye": {"medium": {"type": "ref", "id": "mist"}}}, False),
+        ({"mist": {"type": "homogeneous"}}, False),
+    ],
+)
+def test_haze_is_one_grey_medium_in_a_ball_around_the_camera(changed: dict[str, dict[str, Any]], is_haze: bool) -> None:
+    fog: dict[str, Any] = {"type": "ref", "id": "fog"}
+    named: dict[str, dict[str, Any]] = {
+        "eye": {"type": "perspective", "medium": fog},
+        "ball": {"type": "sphere", "radius": 8.0, "bsdf": {"type": "null"}, "interior": fog},
+        "fog": {"type": "homogeneous", "sigma_t": 0.1},
+    }
+    for name, values in changed.items():
+        named[name] = {**named.get(name, {}), **values}
+    found = haze_in(named, np.diag([0.5, 0.5, 0.5, 1.0]))
+    assert (found is not None) == is_haze
+    if found is not None:
+        haze, used = found
+        scale = changed.get("fog", {}).get("scale", 1.0)
+        assert (haze.radius, haze.density) == pytest.approx((4.0, 0.2 * scale)) and used == {"ball", "fog"}

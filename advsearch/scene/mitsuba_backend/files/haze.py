@@ -43,19 +43,22 @@ def haze_in(named: Plugins, matrix: npt.NDArray[np.float64]) -> tuple[HazePart, 
     plain = set(ball) <= _OF_BALL and set(medium) <= _OF_MEDIUM and medium["type"] == "homogeneous"
     if not plain or bsdf != {"type": "null"} or phase != {"type": "isotropic"} or inside != {media[0]}:
         return None
+    told = [_numbers(ball.get(key, otherwise)) for key, otherwise in (("radius", 1.0), ("center", np.zeros(3)))]
+    told += [
+        _numbers(medium.get(key, otherwise)) for key, otherwise in (("sigma_t", 1.0), ("albedo", 0.75), ("scale", 1.0))
+    ]
+    across, middle, density, albedo, scale = (np.full(1, np.nan) if one is None else one for one in told)
+    own = matrix @ np.asarray(ball.get("to_world", np.eye(4)), np.float64)
+    place = own @ np.append(np.broadcast_to(middle, (3,)), 1.0)
+    radius = float(across[0]) * float(np.cbrt(abs(np.linalg.det(own[:3, :3]))))
     size = float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
-    own = np.asarray(ball.get("to_world", np.eye(4)), np.float64)
-    place = matrix @ own @ np.append(np.asarray(ball.get("center", np.zeros(3)), np.float64), 1.0)
-    radius = float(np.asarray(ball.get("radius", 1.0))) * size * float(np.cbrt(abs(np.linalg.det(own[:3, :3]))))
-    density, albedo = _numbers(medium.get("sigma_t", 1.0)), _numbers(medium.get("albedo", 0.75))
-    if density is None or albedo is None or len(set(density.tolist())) > 1:
+    extinction, (red, green, blue) = density * scale / size, np.broadcast_to(albedo, (3,)).tolist()
+    grey = 0.0 < float(extinction.min()) == float(extinction.max()) <= MOST
+    if not (grey and DARKEST <= min(red, green, blue) and max(red, green, blue) <= 1.0):
         return None
-    density = density * float(np.asarray(medium.get("scale", 1.0))) / size
-    known = 0.0 < float(density[0]) <= MOST and float(albedo.min()) >= DARKEST and float(albedo.max()) <= 1.0
-    if not known or float(np.linalg.norm(place[:3])) > OFF * radius:
+    if not (radius > 0.0 and float(np.linalg.norm(place[:3])) <= OFF * radius):
         return None
-    colour = np.broadcast_to(albedo, (3,)).tolist()
-    return HazePart(balls[0], radius, float(density[0]), tuple(colour)), frozenset((balls[0], media[0]))
+    return HazePart(balls[0], radius, float(extinction[0]), (red, green, blue)), frozenset((balls[0], media[0]))
 
 
 def _reference(given: object) -> str | None:
