@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
@@ -70,9 +70,28 @@ Late = Callable[[int], bool]
 OnStep = Callable[[StepRecord, Tensor, Evaluation], None]
 """Called after every evaluation, ranking included, with its record, u, and the (usable) evaluation."""
 
-Announce = Callable[[Sequence[tuple[Tensor, int]]], None]
-"""Told configurations (d,) with their seed indices that are evaluated next, in this order, and do not wait for each
-other; all of them without derivative, with the search's own samples."""
+
+@dataclass(frozen=True, eq=False)
+class Coming:
+    """An evaluation that is to come.
+
+    Attributes:
+        proposal: what is evaluated.
+        index: of its seed.
+        step: its number, from 0; ranking goes on counting.
+    """
+
+    proposal: Proposal
+    index: int
+    step: int
+
+
+Line = Generator[Coming, Evaluation, None]
+"""Evaluations each of which waits for the one before: yields what comes next, and is sent what came of it."""
+
+Announce = Callable[[Callable[[], Sequence[Line]]], None]
+"""Told what gives the lines of evaluations that come next, one line after the other. No line waits for another; what is
+given holds as long as each line takes as many renders as it may."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,8 +194,9 @@ def search(
             is always one evaluation, and step 2 comes on top. Policies still plan for `steps`.
         late: says, after so many evaluations, whether the time is over; in place of `seconds`, for a run that goes on
             after it was stopped.
-        announce: told beforehand what is going to be evaluated, where that does not depend on the evaluations before.
-        together: how many configurations it is told of at once, at most.
+        announce: asked before each evaluation, and each ranking, whether it wants to be told what is coming: see
+            `Announce`.
+        together: how many lines there are at once, at most.
 
     Raises:
         InputError: steps, candidates, repeats, close or seconds out of range, or the policy cannot search this domain.
@@ -191,7 +211,7 @@ def search(
     if seconds is not None and not seconds > 0.0:
         raise InputError(f"seconds: expected a number over 0, got {seconds}")
     begun = time.perf_counter()
-    log = _Log(evaluate, domain, on_step, max(1, candidates), announce or (lambda coming: None), together)
+    log = _Log(evaluate, domain, on_step, max(1, candidates), announce or (lambda lines: None), together)
     try:
         with interruptible():
             in_time = math.inf if seconds is None else begun + seconds
@@ -279,13 +299,11 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
     generator = torch.Generator().manual_seed(stream(seed, "search"))
     name, policy = policy.name, with_choices(policy, log.domain)
     state = policy.start(log.domain, generator, steps)
-    in_a_row = told = 0
+    in_a_row = 0
     while log.renders < steps:
         step = len(log.records)
-        if step >= told and log.together > 1:
-            upcoming = _upcoming(policy, state, min(log.together, steps - log.renders))
-            log.announce([(u, step + place) for place, u in enumerate(upcoming)])
-            told = step + len(upcoming)
+        if log.together > 1:
+            log.announce(partial(_lines, policy, state, step, min(log.together, steps - log.renders)))
         proposals, state = policy.propose(state, 1)
         if not proposals:
             return Ending.STALLED
@@ -306,12 +324,34 @@ def _explore(log: _Log, policy: Policy[Any], steps: int, seed: int, late: Late) 
     return Ending.BUDGET_SPENT
 
 
-def _upcoming(policy: Policy[Any], state: Any, n: int) -> list[Tensor]:
-    """Return up to n configurations that the policy proposes next whatever comes of them, and wants no more of than a
-    picture."""
-    proposals, _ = policy.propose(state, n)
-    plain = itertools.takewhile(lambda one: not one.gradient and one.samples == 1, proposals)
-    return [one.u for one in plain]
+def _lines(policy: Policy[Any], state: Any, step: int, most: int) -> list[Line]:
+    """Return up to so many lines of what a policy proposes next: configurations whatever comes of them, of which it
+    wants no more than a picture, or else searches side by side."""
+    proposals, _ = policy.propose(state, most)
+    plain = list(itertools.takewhile(lambda one: not one.gradient and one.samples == 1, proposals))
+    if len(plain) > 1:
+        return [_line_of(Coming(one, number, number)) for number, one in enumerate(plain, step)]
+    lines = []
+    for turn, count in policy.turns(state)[:most]:
+        lines.append(_line(policy, turn, range(step, step + count)))
+        step += count
+    return lines
+
+
+def _line_of(coming: Coming) -> Line:
+    """One evaluation."""
+    yield coming
+
+
+def _line(policy: Policy[Any], state: Any, steps: range) -> Line:
+    """A search from a state on, over so many evaluations."""
+    for step in steps:
+        proposals, state = policy.propose(state, 1)
+        if not proposals:
+            return
+        (proposal,) = proposals
+        evaluation = yield Coming(proposal, step, step)
+        state = policy.update(state, [(proposal.u, usable(evaluation))])
 
 
 def _rank(log: _Log, first_index: int, repeats: int, close: int) -> None:
@@ -325,13 +365,19 @@ def _rank(log: _Log, first_index: int, repeats: int, close: int) -> None:
 
 
 def _look(log: _Log, indices: range) -> None:
-    log.announce([(candidate.u, index) for candidate in log.pool for index in indices])
+    log.announce(partial(_looks, log.pool, indices, len(log.records)))
     for candidate in log.pool:
         evaluations = [log.render(Proposal(candidate.u), index, "ranking") for index in indices]
         again = (*candidate.again, *(e.objective for e in evaluations))
         successes = candidate.successes + sum(e.success for e in evaluations)
         ranked = replace(candidate, again=again, successes=successes)
         log.pool = tuple(ranked if c is candidate else c for c in log.pool)
+
+
+def _looks(pool: Sequence[Candidate], indices: range, step: int) -> list[Line]:
+    """Return what `_look` renders, as lines."""
+    pairs = [(Proposal(candidate.u), index) for candidate in pool for index in indices]
+    return [_line_of(Coming(proposal, index, step + place)) for place, (proposal, index) in enumerate(pairs)]
 
 
 def _result(log: _Log, stopped: Ending, seconds: float) -> SearchResult:

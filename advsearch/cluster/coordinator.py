@@ -108,7 +108,7 @@ class Coordinator:
         self._load_deaths = self._seen = 0
         self._counted_at = self._alone_since = self._looked_at = clock()
 
-    def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
+    def results(self, ranges: Iterable[range | None], given: Sequence[Any] | None = None) -> Iterator[Done]:
         """See `Executor.results`.
 
         Raises:
@@ -140,15 +140,18 @@ class Coordinator:
 
     # ---- giving out -------------------------------------------------------------------------------------------------
 
-    def _give_out(self, source: Iterator[range]) -> None:
+    def _give_out(self, source: Iterator[range | None]) -> None:
         while self._free:
             worker = self._free[0]
             if not self._is_there(worker):
                 self._free.popleft()
                 continue
-            one = self._todo.popleft() if self._todo else next((_Range(numbers) for numbers in source), None)
-            if one is None:
-                return
+            if not self._todo:
+                numbers = next(source, None)
+                if numbers is None:
+                    return
+                self._todo.append(_Range(numbers))
+            one = self._todo.popleft()
             if one.alone:
                 idle = next((free for free in self._free if not free.tickets and self._is_there(free)), None)
                 if idle is None:  # soon
@@ -219,7 +222,7 @@ class Coordinator:
             self.facts.batches += 1
             self.facts.busy += value.seconds
             self._per_number.append(value.seconds / max(1, len(one.numbers)))
-            self._free.extend([worker] * (self._depth if one.alone else 1))
+            self._set_free(worker, self._depth if one.alone else 1)
             if one.wanted:
                 yield Done(one.numbers, value.value, worker.address, worker.machine)
         elif isinstance(value, Failure):
@@ -255,7 +258,13 @@ class Coordinator:
         worker.ready = True
         self.facts.workers += 1
         self.facts.most = max(self.facts.most, self.facts.workers)
-        self._free.extend([worker] * self._depth)
+        self._set_free(worker, self._depth)
+
+    def _set_free(self, worker: _Worker, places: int) -> None:
+        """Note places for ranges: the first one of a worker that has nothing to do in front of all others."""
+        idle = not worker.tickets
+        self._free.extendleft([worker] * idle)
+        self._free.extend([worker] * (places - idle))
 
     def _refuse(self, worker: _Worker, text: str) -> None:
         """Give a worker nothing more."""

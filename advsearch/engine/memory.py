@@ -80,9 +80,10 @@ class Memory:
         """Whether the row of this step is in the store already."""
         return step < self.counts.get(kind, 0)
 
-    def logged(self, kind: str, number: int) -> bool:
-        """Whether the evaluation of this number is read back."""
-        return self._run is not None and (kind, number) in self._run.replay
+    def evaluation(self, kind: str, number: int) -> Evaluation | None:
+        """Return an evaluation that is read back, or None."""
+        log = None if self._run is None else self._run.replay
+        return _evaluation(log.read(kind, number)) if log is not None and (kind, number) in log else None
 
     def evaluator(
         self,

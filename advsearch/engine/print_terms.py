@@ -66,15 +66,19 @@ def print_terms(space: Space, u: Tensor) -> PrintTerms:
 
 
 def less_print_terms(evaluate: Evaluate, space: Space) -> Evaluate:
-    """Return the evaluation whose objective is less by both weighted terms, and its derivative by theirs."""
+    """Return the evaluation that is `penalised`."""
 
     def evaluated(u: Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
-        found = evaluate(u, index=index, gradient=gradient, samples=samples)
-        at = u.detach().clone().requires_grad_()
-        with torch.enable_grad():
-            penalty = WEIGHT * torch.stack(_terms(space, at)).sum()
-            (slope,) = torch.autograd.grad(penalty, at)
-        derivative = None if found.gradient is None else found.gradient - slope
-        return replace(found, objective=found.objective - float(penalty.detach()), gradient=derivative)
+        return penalised(evaluate(u, index=index, gradient=gradient, samples=samples), space, u)
 
     return evaluated
+
+
+def penalised(found: Evaluation, space: Space, u: Tensor) -> Evaluation:
+    """Return an evaluation of u whose objective is less by both weighted terms, and its derivative by theirs."""
+    at = u.detach().clone().requires_grad_()
+    with torch.enable_grad():
+        penalty = WEIGHT * torch.stack(_terms(space, at)).sum()
+        (slope,) = torch.autograd.grad(penalty, at)
+    derivative = None if found.gradient is None else found.gradient - slope
+    return replace(found, objective=found.objective - float(penalty.detach()), gradient=derivative)

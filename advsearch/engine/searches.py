@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -22,11 +22,12 @@ from advsearch.attacks import (
     planned_renders,
     search,
 )
-from advsearch.engine.ahead import EvaluationAhead
+from advsearch.attacks.search import Line
+from advsearch.engine.ahead import AheadLine, evaluation_ahead
 from advsearch.engine.bank import Bank
 from advsearch.engine.budget import RenderBudget
 from advsearch.engine.memory import TRANSPORT, Frames, Memory
-from advsearch.engine.print_terms import less_print_terms
+from advsearch.engine.print_terms import less_print_terms, penalised
 from advsearch.engine.problem import OnImage, Problem
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.transport import CleanMatrix, Transport, reason_against
@@ -108,19 +109,17 @@ class Searches:
             KeyboardInterrupt: the search was interrupted; the result of an interrupted main search is kept before.
         """
 
-        before = done = 0
+        before = 0
 
         def on_step(record: StepRecord, u: Tensor, evaluation: Evaluation) -> None:
-            nonlocal before, done
-            done += 1
+            nonlocal before
             self.recorder.step(kind, record, u, evaluation)
             self.stages.progress.advance(record.renders - before, best=record.best, **self.recorder.ahead.told)
             before = record.renders
 
-        def announce(coming: Sequence[tuple[Tensor, int]]) -> None:
-            new = [one for number, one in enumerate(coming, done) if not self.memory.logged(kind, number)]
-            now = (kind, self.problem.spp, self.problem.search_depth)
-            self.recorder.ahead.begin([EvaluationAhead(u, index, *now, kept=_kept(frames, index)) for u, index in new])
+        def announce(lines: Callable[[], Sequence[Line]]) -> None:
+            if not self.recorder.ahead.begun:
+                self.recorder.ahead.begin([self._ahead(line, kind, frames) for line in lines()])
 
         domain = self.problem.domain if domain is None else domain
         found = search(
@@ -140,6 +139,20 @@ class Searches:
             self.findings.search = self.findings.search or found
             raise KeyboardInterrupt
         return found
+
+    def _ahead(self, line: Line, kind: str, frames: Frames | None) -> AheadLine:
+        """A line of evaluations, without those that are stored."""
+        problem, answer = self.problem, None
+        while True:
+            try:
+                coming = next(line) if answer is None else line.send(answer)
+            except StopIteration:
+                return
+            answer = self.memory.evaluation(kind, coming.step)
+            if answer is None:
+                one, kept = coming.proposal, _kept(frames, coming.index)
+                answer = yield evaluation_ahead(problem, kind, one.u, coming.index, one.gradient, one.samples, kept)
+                answer = penalised(answer, problem.searched_space, one.u) if problem.printable else answer
 
     def _as_evaluated(self, domain: Domain, policy: Policy[Any]) -> Domain:
         """The domain with what is known of the noise of its evaluations."""

@@ -18,7 +18,7 @@ from advsearch.attacks import (
     verify,
 )
 from advsearch.attacks.sample_count import most_samples
-from advsearch.engine.ahead import TrialAhead
+from advsearch.engine.ahead import TrialAhead, line_of
 from advsearch.engine.budget import RenderBudget
 from advsearch.engine.memory import Memory
 from advsearch.engine.problem import Problem
@@ -153,7 +153,9 @@ class Verifier:
         """Have the trials of a configuration made beforehand that are not stored."""
         seeded = ((number, seeds.stream(self.problem.seed, "verification", number)) for number in range(trials))
         new = ((number, seed) for number, seed in seeded if self.memory.trial(kind, number) is None)
-        self.recorder.ahead.begin([TrialAhead(u, seed, self.findings.spp, number < KEPT) for number, seed in new])
+        self.recorder.ahead.begin(
+            [line_of(TrialAhead(u, seed, self.findings.spp, number < KEPT)) for number, seed in new]
+        )
 
     def trial(self, kind: str, number: int, u: Tensor) -> Judgement:
         """One trial of a configuration of its own, with a seed of its own; read back if it is stored."""
@@ -173,7 +175,8 @@ class Verifier:
         for begin in numbers[::together]:
             drawn = {number: self._drawn(number) for number in numbers[begin : begin + together]}
             new = {number: u for number, u in drawn.items() if self.memory.trial(kind, number) is None}
-            self.recorder.ahead.begin([TrialAhead(u, self._seed(kind, n), self.findings.spp) for n, u in new.items()])
+            trials = (TrialAhead(u, self._seed(kind, n), self.findings.spp) for n, u in new.items())
+            self.recorder.ahead.begin([line_of(one) for one in trials])
             for number, u in drawn.items():
                 found.append(self.trial(kind, number, u))
                 self.stages.progress.advance(1, **self.recorder.ahead.told)

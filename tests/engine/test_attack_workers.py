@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +16,14 @@ import torch
 import advsearch
 from advsearch.api import attack as attacking
 from advsearch.api.attack import announced_of, attack_once
-from advsearch.attacks import Evaluation, make_policy, search
+from advsearch.attacks import Evaluation, Proposal, make_policy, search
 from advsearch.attacks.domain import Block, Domain
 from advsearch.attacks.evaluation import Wanted
+from advsearch.attacks.search import Line
 from advsearch.cli.attack import answer
 from advsearch.cluster.executor import Done, InProcess, Workforce
 from advsearch.config import AttackConfig
-from advsearch.engine.ahead import Ahead, TrialAhead
+from advsearch.engine.ahead import Ahead, TrialAhead, line_of
 from advsearch.engine.outcome import AttackResult
 from advsearch.errors import InputError
 from advsearch.runs.store import Row, Store
@@ -40,13 +43,16 @@ class Ready:
     given: list[int] = field(default_factory=list)
     facts: Workforce | None = field(default_factory=lambda: Workforce(workers=2, most=2, busy=1.0, alive=2.0))
 
-    def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
+    def results(self, ranges: Iterable[range | None], given: Sequence[Any] | None = None) -> Iterator[Done]:
+        """The latest of those that are ready comes first, but for what waits for results."""
         assert given is not None
-        first = len(self.given)
-        for place, done in enumerate(self.made.results(reversed(list(ranges)), given)):
-            self.given.append(done.numbers.start)
-            away = "it died" if first + place in self.lost else ""
-            yield Done(done.numbers, None if away else done.value, "tcp://1", "ab12" if place else None, away)
+        source, first = iter(ranges), len(self.given)
+        while ready := list(takewhile(lambda one: one is not None, source)):
+            for done in self.made.results(reversed(ready), given):
+                place = len(self.given) - first
+                self.given.append(done.numbers.start)
+                away = "it died" if first + place in self.lost else ""
+                yield Done(done.numbers, None if away else done.value, "tcp://1", "ab12" if place else None, away)
 
 
 def rows(run: Path) -> list[Row]:
@@ -118,26 +124,82 @@ def test_what_is_stored_is_not_asked_of_workers(
 
 def test_what_was_not_announced_is_done_here() -> None:
     ahead, u = Ahead(), torch.zeros(2)
-    ahead.begin([TrialAhead(u, 1, 1), TrialAhead(u, 2, 1)])
+    ahead.begin([line_of(TrialAhead(u, 1, 1)), line_of(TrialAhead(u, 2, 1))])
     assert ahead.take(TrialAhead(u, 1, 1)) is None and ahead.facts is None and ahead.told == {}
 
 
-@pytest.mark.parametrize("name", ["random", "cmaes", "sobol", "pgd"])
-def test_announcements_are_what_comes_next(name: str) -> None:
-    """Of a population as many as are left of it; of a policy that takes derivatives only the ranking."""
-    domain = Domain(torch.full((3,), 0.5), (Block(3),))
-    seen, told = list[tuple[tuple[float, ...], int]](), list[tuple[tuple[float, ...], int]]()
+RESTARTS = {"name": "restarts", "times": 3}
 
-    def announce(coming: Sequence[tuple[torch.Tensor, int]]) -> None:
-        told.extend((tuple(u.tolist()), index) for u, index in coming)
+
+def test_searches_side_by_side_have_the_rows_of_one_after_the_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Restarts along derivatives, by differences here, each evaluation after the one before in its restart."""
+    settings = {**SMALL, "policy": RESTARTS, "steps": 40, "average": 0, "baseline": False}
+    attack_once(AttackConfig(**settings, run=str(tmp_path / "run")))
+    ready, found = shared(monkeypatch, settings), rows(tmp_path / "run")
+    attack_once(AttackConfig(**settings, workers=2, run=str(tmp_path / "workers")))
+    assert rows(tmp_path / "workers") == found and max(row.renders or 0 for row in found) > 1
+    assert len(ready.given) == len(found), "none is rendered here"
+
+
+Noted = tuple[tuple[float, ...], int, Wanted, int]
+
+
+@pytest.mark.parametrize(
+    ("policy", "options", "cost", "missed"),
+    [
+        ({"name": "random"}, 0, 0, 0),
+        ({"name": "cmaes"}, 0, 0, 0),
+        ({"name": "sobol"}, 0, 0, 0),
+        ({"name": "pgd"}, 0, 0, 60),
+        (RESTARTS, 0, 0, 0),
+        (RESTARTS, 0, 2, 0),
+        ({"name": "restarts", "policy": "adam"}, 0, 5, 0),
+        ({"name": "halving", "policy": "pgd"}, 0, 1, 0),
+        ({"name": "portfolio"}, 0, 1, 0),
+        ({"name": "pgd"}, 3, 2, 0),
+    ],
+)
+def test_announcements_are_what_comes_next(policy: dict[str, Any], options: int, cost: int, missed: int) -> None:
+    """Of a population as many as are left of it; of restarts, of races and of choices all turns of a round; of one
+    search along derivatives only the ranking."""
+    dim = 3 + bool(options)
+    blocks = (Block(3), *([Block(1, options=options)] if options else []))
+    domain = Domain(torch.full((dim,), 0.5), blocks, gradient_cost=cost)
+    told, alone = deque[Noted](), list[Noted]()
+
+    def announce(coming: Callable[[], Sequence[Line]]) -> None:
+        if not told:
+            told.extend(one for line in coming() for one in carried(line))
+
+    def carried(line: Line) -> Iterator[Noted]:
+        coming = next(line, None)
+        while coming is not None:
+            one = coming.proposal
+            yield noted(one, coming.index)
+            try:
+                coming = line.send(evaluated(one.u, one.gradient, one.samples))
+            except StopIteration:
+                return
+
+    def noted(proposal: Proposal, index: int) -> Noted:
+        return tuple(proposal.u.tolist()), index, proposal.gradient, proposal.samples
+
+    def evaluated(u: torch.Tensor, gradient: Wanted, samples: int) -> Evaluation:
+        slope = torch.cos(7.0 * u) if gradient else None
+        taken = samples * (1 + (cost if gradient else 0))
+        return Evaluation(float(torch.sin(7.0 * u).sum()), slope, False, cost=taken)
 
     def evaluate(u: torch.Tensor, *, index: int, gradient: Wanted, samples: int = 1) -> Evaluation:
-        seen.append((tuple(u.tolist()), index))
-        return Evaluation(float(u[0]), torch.tensor([1.0, 0.0, 0.0]) if gradient else None, False)
+        now = noted(Proposal(u, gradient, samples=samples), index)
+        if not told or told.popleft() != now:
+            alone.append(now)
+            told.clear()
+        return evaluated(u, gradient, samples)
 
-    search(evaluate, domain, make_policy(name), steps=11, seed=0, announce=announce, together=4)
-    plain = [one for one in seen if name != "pgd" or one[1] >= 11]
-    assert told == plain and len(told) > 3
+    search(evaluate, domain, make_policy(**policy), steps=60, seed=0, announce=announce, together=64)
+    assert len(alone) == missed
 
 
 @pytest.mark.slow

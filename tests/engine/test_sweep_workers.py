@@ -51,8 +51,8 @@ class Disorder:
     stop: int | None = None
     facts: Workforce | None = field(default_factory=lambda: Workforce(most=2, lost=1, busy=9.0, alive=10.0, retried=3))
 
-    def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
-        pieces = list(ranges)
+    def results(self, ranges: Iterable[range | None], given: Sequence[Any] | None = None) -> Iterator[Done]:
+        pieces = [one for one in ranges if one is not None]
         random.Random(self.seed).shuffle(pieces)
         for count, numbers in enumerate(pieces):
             if count == self.stop:
@@ -122,7 +122,7 @@ def test_a_configuration_that_kills_every_worker_is_a_row_that_says_so(tmp_path:
 
 def test_rows_of_another_machine_name_it_and_the_run_says_what_it_is(tmp_path: Path) -> None:
     class Two(Disorder):
-        def results(self, ranges: Iterable[range], given: Sequence[Any] | None = None) -> Iterator[Done]:
+        def results(self, ranges: Iterable[range | None], given: Sequence[Any] | None = None) -> Iterator[Done]:
             for done in super().results(ranges):
                 yield Done(done.numbers, done.value, done.worker, "ab12" if done.numbers.start < 4 else None)
 

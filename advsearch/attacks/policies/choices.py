@@ -94,6 +94,9 @@ class Choices(Policy[ChoicesState]):
         inner = [(u[state.numbers], _part(evaluation, state.numbers)) for u, evaluation in evaluated]
         return replace(state, race=racing.update(state.race, inner))
 
+    def turns(self, state: ChoicesState) -> list[tuple[ChoicesState, int]]:
+        return [(replace(state, race=race), count) for race, count in racing.turns(state.race)]
+
     def counts(self, state: ChoicesState) -> Counts:
         return racing.counts(state.race)
 

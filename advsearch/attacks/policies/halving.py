@@ -84,6 +84,9 @@ class Halving(Raced):
     def propose(self, state: Race, n: int) -> tuple[tuple[Proposal, ...], Race]:
         return racing.propose(state, n, self._samples)
 
+    def turns(self, state: Race) -> list[tuple[Race, int]]:
+        return racing.turns(state, self._samples)
+
     def _samples(self, race: Race) -> int:
         """Return all that is left of the turn, or what keeps the evaluations of a round as many as before."""
         return min(MOST_SAMPLES, max(1, race.left) if self.policy is None else self.eta**race.round)

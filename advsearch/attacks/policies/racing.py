@@ -161,6 +161,22 @@ def update(race: Race, evaluated: Evaluated) -> Race:
     return replace(race, spent=race.spent + sum(evaluation.cost for _, evaluation in evaluated), asked=())
 
 
+def turns(race: Race, samples: Callable[[Race], int] = once) -> list[tuple[Race, int]]:
+    """Return the turns that are left in this round, or those of the next, see `Policy.turns`; `samples` as for
+    `propose`."""
+    found = []
+    while race.running.over or race.left <= 0:
+        if all(runner.over for runner in race.runners):
+            return []
+        race = _next_turn(race)
+    while True:
+        if not race.running.over and race.left > 0:
+            found.append((race, _evaluations(race, samples)))
+        if race.turn + 1 == len(race.field):
+            return found
+        race = _begin_turn(replace(race, spent=max(race.spent, race.turn_ends)), race.turn + 1)
+
+
 def leader(race: Race) -> int:
     """Return the number of the search that has met the largest objective so far, the first of equals."""
     return max(range(len(race.runners)), key=lambda k: race.runners[k].best)
@@ -192,6 +208,9 @@ class Raced(Policy[Race]):
 
     def update(self, state: Race, evaluated: Evaluated) -> Race:
         return update(state, evaluated)
+
+    def turns(self, state: Race) -> list[tuple[Race, int]]:
+        return turns(state)
 
     def answer(self, state: Race) -> Distribution | None:
         return answer(state)
@@ -230,6 +249,17 @@ def _ask(race: Race, n: int, samples: Callable[[Race], int]) -> tuple[Race, tupl
             runner = replace(runner, state=state, over=not own)
             return _with(ahead, race.field[race.turn], runner), tuple(own)
         n = len(own)  # the turn does not pay for more
+
+
+def _evaluations(race: Race, samples: Callable[[Race], int]) -> int:
+    """Return how many evaluations the renders left in this turn suffice for, if each wants a gradient where the policy
+    uses them."""
+    runner, later, count = race.running, race.round + 1 < race.rounds, 0
+    while race.left > 0:
+        proposal = Proposal(runner.domain.start, gradient=runner.policy.uses_gradient, samples=samples(race))
+        cost = affordable(proposal, runner.domain, race.left + later).cost(runner.domain)
+        race, count = replace(race, spent=race.spent + cost), count + 1
+    return count
 
 
 def _planned(race: Race) -> int:
