@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 
-from advsearch.api.attack import budget_of, preparation_of
+from advsearch.api import attack as attacking
+from advsearch.api.attack import announced_of, budget_of, preparation_of
 from advsearch.attacks import Block, Domain, Evaluation, Policy, make_policy
 from advsearch.attacks.verification import WORST_CASE, Rule
+from advsearch.cluster.executor import Done, InProcess, Workforce
 from advsearch.config import AttackConfig
 from advsearch.engine.memory import Memory
 from advsearch.engine.record import Findings, Recorder, Stages
@@ -158,3 +163,31 @@ class Impatient(NullProgress):
         self._left -= self._searching
         if self._searching and self._left == 0:
             raise KeyboardInterrupt
+
+
+@dataclass
+class StandInWorkers:
+    """Carries everything out in another problem that it has made from the settings, as a worker does."""
+
+    made: InProcess
+    lost: tuple[int, ...] = ()
+    given: list[int] = field(default_factory=list)
+    facts: Workforce | None = field(default_factory=lambda: Workforce(workers=2, most=2, busy=1.0, alive=2.0))
+
+    def results(self, ranges: Iterable[range | None], given: Sequence[Any] | None = None) -> Iterator[Done]:
+        """The latest of those that are ready comes first, but for what waits for results."""
+        assert given is not None
+        source, first = iter(ranges), len(self.given)
+        while ready := list(takewhile(lambda one: one is not None, source)):
+            for done in self.made.results(reversed(ready), given):
+                place = len(self.given) - first
+                self.given.append(done.numbers.start)
+                away = "it died" if first + place in self.lost else ""
+                yield Done(done.numbers, None if away else done.value, "tcp://1", "ab12" if place else None, away)
+
+
+def shared(monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], **more: Any) -> StandInWorkers:
+    """Let attacks of these settings share with stand-ins."""
+    ready = StandInWorkers(InProcess(announced_of(settings)), **more)
+    monkeypatch.setattr(attacking, "executor_of", lambda work, **_: nullcontext(ready))
+    return ready

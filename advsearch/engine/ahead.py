@@ -24,7 +24,9 @@ from advsearch.attacks.evaluation import Wanted
 from advsearch.cluster.executor import Done, Executor, Workforce
 from advsearch.engine.problem import OnImage, Problem
 from advsearch.engine.rows import no_answer
+from advsearch.errors import ClusterError
 from advsearch.scene.gradients.plan import GradientPlan
+from advsearch.scene.transport.renderer import Linearised, LinearRenderer
 from advsearch.tasks import Judgement
 
 MOST, MOST_NUMBERS = 1024, 2**24
@@ -39,7 +41,7 @@ class AheadAnswer:
     """What came of one configuration.
 
     Attributes:
-        value: an evaluation, or the judgement of a trial.
+        value: an evaluation, the judgement of a trial, or what a matrix collected.
         picture: (H, W, 3) sRGB in [0, 1], where it was wanted.
         non_finite: values of pictures that were not finite and were set to 0.
     """
@@ -119,7 +121,51 @@ class EvaluationAhead:
         return AheadAnswer(Evaluation(math.nan, gradient, False, cost=self.samples, judgement=no_answer(why)))
 
 
-Announced = TrialAhead | EvaluationAhead
+@dataclass(frozen=True, eq=False)
+class MatrixAhead:
+    """A matrix of light transport: see `LinearRenderer`.
+
+    Attributes:
+        u: (d,) of the whole space, where it is made.
+        seed: of its noise.
+        spp: samples a pixel.
+        depth: longest light path in segments.
+        names: of the inputs that get one.
+    """
+
+    u: Tensor
+    seed: int
+    spp: int
+    depth: int
+    names: frozenset[str]
+
+    def made(self, problem: Problem, collected: Linearised | None = None) -> LinearRenderer:
+        """Make it, unless it is there."""
+        with problem.renderer.scene.shorter(self.depth):
+            return LinearRenderer(
+                problem.renderer,
+                self.u,
+                self.seed,
+                spp=self.spp,
+                quick=True,
+                names=self.names,
+                collected=collected,
+            )
+
+    def seen(self, problem: Problem) -> AheadAnswer:
+        """Carry it out."""
+        return AheadAnswer(self.made(problem).collected)
+
+    def lost(self, why: str) -> AheadAnswer:
+        """Nothing can stand for it.
+
+        Raises:
+            ClusterError: always.
+        """
+        raise ClusterError(f"the matrix of a condition: {why}; `advsearch resume RUN workers=null` makes it here")
+
+
+Announced = TrialAhead | EvaluationAhead | MatrixAhead
 AheadLine: TypeAlias = Generator[Announced, Any, None]
 """What is announced, one after the other; it is sent the value of each answer before it says what comes next."""
 

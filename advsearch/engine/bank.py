@@ -25,6 +25,7 @@ from advsearch.attacks import Evaluate, Evaluation
 from advsearch.attacks.domain import Domain, centre_of_option
 from advsearch.attacks.draws import Draws
 from advsearch.attacks.evaluation import Wanted
+from advsearch.engine.ahead import Ahead, MatrixAhead, line_of
 from advsearch.engine.problem import OnImage, Problem
 from advsearch.engine.transport import Conditions, Deviation, Predictor, Tick, deviation_of
 from advsearch.files import scaled
@@ -86,6 +87,7 @@ class Bank(Predictor):
             search that goes on.
         keep: told of `grown` whenever there is another one.
         gaps: by how much the objective was larger in the bank than under unseen conditions, by comparison.
+        ahead: workers make the matrices, as far as the next comparison, before their turn.
     """
 
     problem: Problem
@@ -94,6 +96,7 @@ class Bank(Predictor):
     keep: Callable[[list[int]], None] = lambda grown: None
     deviations: list[Deviation] = field(default_factory=list)
     gaps: list[float] = field(default_factory=list)
+    ahead: Ahead = field(default_factory=Ahead)
     seconds: float = 0.0
     _held: list[Condition] = field(default_factory=list)
     _places: dict[int, Tensor] = field(default_factory=dict)
@@ -186,7 +189,8 @@ class Bank(Predictor):
         """The picture of u under the conditions that the scene comes with."""
         if self._still is None:
             seed = seeds.stream(self.problem.seed, "bank still")
-            self._still = self._collected(self.problem.domain.start, None, seed)
+            self._still = self._matrix(self.problem.whole(self.problem.domain.start), seed).made(self.problem)
+            self._made += 1
         with torch.no_grad():
             return self._still(self.problem.whole(u))
 
@@ -207,6 +211,9 @@ class Bank(Predictor):
         """Make the matrices that there should be by an evaluation, newest last, as far as memory lasts."""
         wanted, begun = self._wanted(index), time.perf_counter()
         first = self._held[-1].number + 1 if self._held else 0
+        if first < wanted and not self.ahead.begun:
+            coming = range(first, self._wanted((index // EVERY + 1) * EVERY - 1))
+            self.ahead.begin([line_of(self._announced(number)) for number in coming])
         for number in range(first, wanted):
             self._held.append(self._condition(number))
             self._bytes += self._held[-1].renderer.bytes
@@ -217,11 +224,21 @@ class Bank(Predictor):
         if first < wanted:
             self.seconds += time.perf_counter() - begun
 
+    def _numbers(self, number: int) -> Tensor:
+        """The condition with this number."""
+        assert self.problem.conditions is not None
+        return stratified(self.problem.conditions, number, seeds.stream(self.problem.seed, "bank"))
+
+    def _announced(self, number: int) -> MatrixAhead:
+        """The matrix of the condition with this number."""
+        seed = seeds.stream(self.problem.seed, "bank matrix", number)
+        return self._matrix(torch.cat([self._place(number), self._numbers(number)]), seed)
+
     def _condition(self, number: int) -> Condition:
-        problem, u = self.problem, self._place(number)
-        assert problem.conditions is not None
-        numbers = stratified(problem.conditions, number, seeds.stream(problem.seed, "bank"))
-        made = self._collected(u, numbers, seeds.stream(problem.seed, "bank matrix", number))
+        problem, u, numbers, wanted = self.problem, self._place(number), self._numbers(number), self._announced(number)
+        seen = self.ahead.take(wanted)
+        made = wanted.made(problem, None if seen is None else seen.value)
+        self._made += 1
         with torch.no_grad():
             own = problem.searched_space.inputs(u)
         alone = all(name in own and torch.equal(own[name], there) for name, there in made.there.items())
@@ -231,13 +248,11 @@ class Bank(Predictor):
         self._there = dict(made.there)
         return Condition(number, numbers, made, alone)
 
-    def _collected(self, u: Tensor, numbers: Tensor | None, seed: int) -> LinearRenderer:
+    def _matrix(self, whole: Tensor, seed: int) -> MatrixAhead:
+        """What a matrix of the whole space is made of."""
         problem = self.problem
-        whole = problem.whole(u) if numbers is None else torch.cat([u, numbers])
         names = {name for group in problem.plan.groups for name in self._reached(group.name, group.control)}
-        self._made += 1
-        with problem.renderer.scene.shorter(min(DEPTH, problem.search_depth or DEPTH)):
-            return LinearRenderer(problem.renderer, whole, seed, spp=SPP, quick=True, names=names)
+        return MatrixAhead(whole, seed, SPP, min(DEPTH, problem.search_depth or DEPTH), frozenset(names))
 
     def _reached(self, group: str, control: str) -> frozenset[str]:
         """The base colours that a group of searched coordinates changes."""

@@ -71,7 +71,7 @@ class Searches:
         if problem.conditions is None:
             findings.transport = Transport(problem, steps, renewals=stored or {}, keep=keep, clean=self.clean)
         else:
-            findings.transport = Bank(problem, steps, grown=stored or [], keep=keep)
+            findings.transport = Bank(problem, steps, grown=stored or [], keep=keep, ahead=self.recorder.ahead)
         hint = "from here on the search renders nothing (counted in samples a pixel); `specialise=false` leaves it out"
         self.stages.begin("transport", "collecting light transport", findings.transport.samples, hint=hint)
         try:

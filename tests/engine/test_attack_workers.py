@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
-from itertools import takewhile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from stand_ins import shared
 
 import advsearch
-from advsearch.api import attack as attacking
-from advsearch.api.attack import announced_of, attack_once
+from advsearch.api.attack import attack_once
 from advsearch.attacks import Evaluation, Proposal, make_policy, search
 from advsearch.attacks.domain import Block, Domain
 from advsearch.attacks.evaluation import Wanted
 from advsearch.attacks.search import Line
 from advsearch.cli.attack import answer
-from advsearch.cluster.executor import Done, InProcess, Workforce
 from advsearch.config import AttackConfig
 from advsearch.engine.ahead import Ahead, TrialAhead, line_of
 from advsearch.engine.outcome import AttackResult
@@ -34,38 +31,11 @@ SMALL: dict[str, Any] = {
 }  # fmt: skip
 
 
-@dataclass
-class Ready:
-    """Carries everything out in another problem that it has made from the settings, as a worker does."""
-
-    made: InProcess
-    lost: tuple[int, ...] = ()
-    given: list[int] = field(default_factory=list)
-    facts: Workforce | None = field(default_factory=lambda: Workforce(workers=2, most=2, busy=1.0, alive=2.0))
-
-    def results(self, ranges: Iterable[range | None], given: Sequence[Any] | None = None) -> Iterator[Done]:
-        """The latest of those that are ready comes first, but for what waits for results."""
-        assert given is not None
-        source, first = iter(ranges), len(self.given)
-        while ready := list(takewhile(lambda one: one is not None, source)):
-            for done in self.made.results(reversed(ready), given):
-                place = len(self.given) - first
-                self.given.append(done.numbers.start)
-                away = "it died" if first + place in self.lost else ""
-                yield Done(done.numbers, None if away else done.value, "tcp://1", "ab12" if place else None, away)
-
-
 def rows(run: Path) -> list[Row]:
     """What a run has stored, but for times and machines."""
     with Store(run / "results.sqlite", read_only=True) as store:
         found = [row for kind in store.counts() for row in store.rows(kind)]
     return [replace(row, seconds=None, time=None, machine=None, id=None) for row in found]
-
-
-def shared(monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], **more: Any) -> Ready:
-    ready = Ready(InProcess(announced_of(settings)), **more)
-    monkeypatch.setattr(attacking, "executor_of", lambda work, **_: nullcontext(ready))
-    return ready
 
 
 @pytest.fixture(scope="module")

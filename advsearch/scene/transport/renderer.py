@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import torch
@@ -64,6 +64,23 @@ class PredictingRenderer(Renderer, ABC):
         return ()
 
 
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """What a `LinearRenderer` has collected; it can be sent to another process.
+
+    Attributes:
+        transports: by input, finished.
+        there: the inputs where it was linearised.
+        applied: the inputs that belong to the picture, not to the scene.
+        base: the picture there, linear radiance.
+    """
+
+    transports: Mapping[str, TextureTransport]
+    there: dict[str, Tensor]
+    applied: Mapping[str, Tensor]
+    base: Halves
+
+
 class LinearRenderer(PredictingRenderer):
     """A renderer whose pictures come from a matrix.
 
@@ -78,6 +95,7 @@ class LinearRenderer(PredictingRenderer):
         names: the inputs that get a matrix; None for all base colours that the space sets. Without any there is the
             base picture alone.
         light: inputs in the place of those of u.
+        collected: what was collected elsewhere with the same arguments; nothing is traced then.
 
     Attributes:
         transports: by input.
@@ -86,6 +104,10 @@ class LinearRenderer(PredictingRenderer):
     Raises:
         TransportTooLargeError: a matrix would take more than `MOST_BYTES`.
     """
+
+    transports: Mapping[str, TextureTransport]
+    there: dict[str, Tensor]
+    _applied: Mapping[str, Tensor]
 
     def __init__(
         self,
@@ -98,9 +120,14 @@ class LinearRenderer(PredictingRenderer):
         quick: bool = False,
         names: Collection[str] | None = None,
         light: Mapping[str, Tensor] = MappingProxyType({}),
+        collected: Linearised | None = None,
     ) -> None:
         vars(self).update(vars(copy.copy(renderer)))
         self.products = 0
+        if collected is not None:
+            self.transports, self.there = collected.transports, collected.there
+            self._applied, self._base = collected.applied, collected.base
+            return
         with torch.no_grad():
             inputs = self._assembled(u)
             self._applied = {name: value for name, value in inputs.items() if name in ON_PICTURE}
@@ -117,6 +144,11 @@ class LinearRenderer(PredictingRenderer):
                 base = self.primal(traced, seed, spp, self._hide)
                 tick(spp)
             self._base = Halves(base)
+
+    @property
+    def collected(self) -> Linearised:
+        """What was collected."""
+        return Linearised(self.transports, self.there, self._applied, self._base)
 
     @property
     def entries(self) -> int:
