@@ -238,6 +238,8 @@ class PrecisionKeywords(DerivativeKeywords, NamedKeywords, total=False):
     policies: Names
     steps: int
     repeats: int
+    workers: int | None
+    cluster: str | None
     out: str | Path | None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,6 +18,8 @@ from advsearch import seeds
 from advsearch.api.attack import LOADING, problem_from_config
 from advsearch.api.keywords import PrecisionKeywords, asks, configured
 from advsearch.attacks import Policy, make_policy
+from advsearch.cluster.executor import Call, Executor, Work
+from advsearch.cluster.opening import executor_of
 from advsearch.config import PrecisionConfig
 from advsearch.engine.gradients import Loss, inside, smooth_loss
 from advsearch.engine.measuring import Results, kept_rows
@@ -29,19 +32,21 @@ from advsearch.evaluation.precision.gradient import GradientBench, GradientPart,
 from advsearch.evaluation.precision.image import REFERENCE_SAMPLER, PictureBench, variants
 from advsearch.evaluation.precision.machine import machine
 from advsearch.evaluation.precision.objective import ObjectiveBench, curve_of
-from advsearch.evaluation.precision.points import MeasuredSetting, Point, Sample, point_of
+from advsearch.evaluation.precision.points import Array, MeasuredSetting, Point, Sample, point_of
 from advsearch.evaluation.precision.report import MeasuredLine, Section, report_of
 from advsearch.evaluation.precision.rounds import Rounds, TimeBudget, in_rounds
+from advsearch.evaluation.precision.sharing import ReferencePart, shared_parts
 from advsearch.files import JsonObject
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.diagrams import precision_figures
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.files import write_bytes, write_text
+from advsearch.runs.results.attack import SharedWork
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.precision import PrecisionResult, PrecisionSubject
 from advsearch.runs.summary import to_json
 from advsearch.scene.renderer import Renderer
-from advsearch.settings import split_names
+from advsearch.settings import FILES, split_names
 from advsearch.viewer.pages import write_page
 
 if TYPE_CHECKING:
@@ -58,6 +63,8 @@ count, and at most."""
 VERIFY_SPP, VERIFY_RENDERS = 64, 4
 """Samples a pixel, and fresh renders, that verify what a search held."""
 NUMBERS, FIGURE = "precision.json", "precision"
+IMAGE = "image"
+"""The name of the picture's sitting."""
 
 
 @asks(PrecisionConfig, PrecisionKeywords)
@@ -123,32 +130,60 @@ def _measured(config: PrecisionConfig, run: RunDirectory | None, progress: Progr
     problem, warnings = problem_from_config(config)
     for text in warnings:
         progress.message(text)
-    setup = time.perf_counter() - begun
     wanted = split_names(config.quantities)
     if "gradient" in wanted and not any(group.valid for group in problem.renderer.plan.groups):
         raise InputError(
             f"`controls` {','.join(config.controls)}: has no derivative; leave gradient out of `quantities`"
         )
-    job, results = _Measurement(config, problem, progress, policies), Results(Memory(run))
-    parts = [one for one in job.parts() if one.quantity in wanted]
+    with _executor(config, progress) as executor:
+        setup = time.perf_counter() - begun
+        job, results = _Measurement(config, problem, progress, policies, executor), Results(Memory(run))
+        parts = [one for one in job.parts() if one.quantity in wanted]
 
-    def sections() -> Iterator[Section]:
-        left = config.seconds
-        for number, part in enumerate(parts):
-            share = part.share / math.fsum(one.share for one in parts[number:])
-            stored = results.get(part.name, partial(part.timed, TimeBudget(share * left)))
-            left = max(0.0, left - stored["seconds"])
-            yield Section.of(stored["section"])
+        def sections() -> Iterator[Section]:
+            left = config.seconds
+            for number, part in enumerate(parts):
+                share = part.share / math.fsum(one.share for one in parts[number:])
+                stored = results.get(part.name, partial(part.timed, TimeBudget(share * left)))
+                left = max(0.0, left - stored["seconds"])
+                yield Section.of(stored["section"])
 
-    def result(sections: Sequence[Section], ending: str) -> PrecisionResult:
-        whole = Section(config.pixel_sampler)
-        for one in sections:
-            whole.extend(one)
-        seconds = {"budget": config.seconds, "setup": setup, "total": time.perf_counter() - begun}
-        path = None if run is None else str(run.path)
-        return report_of(_subject(config, problem, path, ending, seconds), whole, config.error)
+        def result(sections: Sequence[Section], ending: str) -> PrecisionResult:
+            whole = Section(config.pixel_sampler)
+            for one in sections:
+                whole.extend(one)
+            seconds = {"budget": config.seconds, "setup": setup, "total": time.perf_counter() - begun}
+            path = None if run is None else str(run.path)
+            facts = None if executor is None else executor.facts
+            shared = SharedWork.of_facts(facts, facts.machines if facts else {})
+            report = report_of(_subject(config, problem, path, ending, seconds), whole, config.error)
+            return report.model_copy(update={"shared": shared})
 
-    return kept_rows(run, results, sections(), result)
+        return kept_rows(run, results, sections(), result)
+
+
+@contextmanager
+def _executor(config: PrecisionConfig, progress: Progress) -> Iterator[Executor | None]:
+    """Open what carries out parts of references, its first worker ready; None for this process."""
+    settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
+    work = Work("advsearch.api.precision:references_of", settings, FILES, config.used_threads or 1, ahead=False)
+    with executor_of(work, workers=config.workers, cluster=config.cluster, tell=progress.message) as executor:
+        if executor is not None:
+            progress.stage("workers load the scene and the model")
+            for _ in executor.results([range(1)], [None]):
+                pass
+        yield executor
+
+
+def references_of(settings: JsonObject) -> Call:
+    """Return what carries out parts of the references of a configuration: what a worker does."""
+    config = PrecisionConfig(**settings)
+    job = _Measurement(config, problem_from_config(config)[0], NullProgress(), {})
+
+    def call(asked: Sequence[ReferencePart | None]) -> list[Array]:
+        return [job.reference_part(one) for one in asked if one is not None]
+
+    return call
 
 
 @dataclass(frozen=True)
@@ -182,21 +217,22 @@ class _Measurement:
     problem: Problem
     progress: Progress
     policies: Mapping[str, Policy[Any]]
+    executor: Executor | None = None
     section: Section = field(init=False)
 
     def parts(self) -> list[_Part]:
         """Everything, in its order."""
-        renderer, _ = self._differentiated
-        linear = self.config.loss == "linear"
-        divided = parts_of(renderer.plan.groups, linear=linear, by_matrix=matrix_groups(renderer))
-        gradients = [
-            _Part(
-                "gradient", f"gradient of {one.name}", SHARES["gradient"] / len(divided), partial(self._gradient, one)
-            )
-            for one in divided
-        ]
-        first = _Part("image", "image", SHARES["image"], self._image)
+        share = SHARES["gradient"] / max(1, len(self._divided))
+        gradients = [_Part("gradient", _named(one), share, partial(self._gradient, one)) for one in self._divided]
+        first = _Part("image", IMAGE, SHARES["image"], self._image)
         return [first, *gradients, _Part("objective", "objective", SHARES["objective"], self._objective)]
+
+    def reference_part(self, asked: ReferencePart) -> Array:
+        """Return a part of a reference."""
+        if asked.name == IMAGE:
+            return self._pictures.part(asked.by, asked.spp, asked.seed)
+        part = next(one for one in self._divided if _named(one) == asked.name)
+        return self._bench(part).part_of(asked.by, asked.spp, asked.seed)
 
     @property
     def seed(self) -> int:
@@ -206,17 +242,9 @@ class _Measurement:
     def _image(self, budget: TimeBudget) -> Section:
         """The picture and the model's margin."""
         self.section = Section(self.config.pixel_sampler)
-        renderer, problem = self.problem.renderer, self.problem
-        depths = [int(part) for part in split_names(self.config.depths)]
-        chosen = variants(
-            split_names(self.config.samplers), depths, renderer.scene.max_depth, volumetric=renderer.scene.volumetric
-        )
-
-        def margin(picture: Tensor) -> float:
-            return -problem.judge(picture, problem.whole(problem.domain.start)).score
-
         self.progress.stage("the picture: preparing every sampler and path length")
-        bench = PictureBench(renderer, problem.whole(problem.domain.start), margin, chosen)
+        bench = self._pictures
+        chosen = list(bench.variants.values())
         share = budget.share(REFERENCE_SHARE)
         bench.refer(share, self.seed, self._timed("the picture: rendering references", share))
         for family, one in bench.pictures.items():
@@ -227,6 +255,34 @@ class _Measurement:
         for measure in ("error", "margin_error"):
             self._take(measured, measure, bench.floor, lambda series: theories[series], families)
         return self.section
+
+    @cached_property
+    def _pictures(self) -> PictureBench:
+        """The picture in every variant."""
+        renderer, problem = self.problem.renderer, self.problem
+        depths = [int(part) for part in split_names(self.config.depths)]
+        chosen = variants(
+            split_names(self.config.samplers), depths, renderer.scene.max_depth, volumetric=renderer.scene.volumetric
+        )
+        whole = problem.whole(problem.domain.start)
+
+        def margin(picture: Tensor) -> float:
+            return -problem.judge(picture, whole).score
+
+        return PictureBench(renderer, whole, margin, chosen, partial(shared_parts, self.executor, IMAGE))
+
+    @cached_property
+    def _divided(self) -> list[GradientPart]:
+        """The parts of the space whose gradients are measured."""
+        renderer, _ = self._differentiated
+        linear = self.config.loss == "linear"
+        return parts_of(renderer.plan.groups, linear=linear, by_matrix=matrix_groups(renderer))
+
+    def _bench(self, part: GradientPart) -> GradientBench:
+        """What takes the gradient of a part."""
+        renderer, loss = self._differentiated
+        elsewhere = partial(shared_parts, self.executor, _named(part))
+        return GradientBench(renderer, loss, inside(renderer), part, self._exact, elsewhere)
 
     @cached_property
     def _differentiated(self) -> tuple[Renderer, Loss]:
@@ -247,8 +303,7 @@ class _Measurement:
     def _gradient(self, part: GradientPart, budget: TimeBudget) -> Section:
         """The gradient of a part of the space."""
         self.section = Section(self.config.pixel_sampler)
-        renderer, loss = self._differentiated
-        bench = GradientBench(renderer, loss, inside(renderer), part, self._exact)
+        bench = self._bench(part)
         share = budget.share(REFERENCE_SHARE)
         bench.refer(share, self.seed, self._timed(f"gradient of {part.name}: references", share))
         if bench.reference is None:
@@ -378,6 +433,11 @@ class _Measurement:
             done = passed
 
         return tick
+
+
+def _named(part: GradientPart) -> str:
+    """The name of a gradient's sitting."""
+    return f"gradient of {part.name}"
 
 
 def _subject(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from advsearch.cli import output
 from advsearch.cli.question import QuestionCommand
+from advsearch.report.wording import workers_text
 
 if TYPE_CHECKING:
     from advsearch.runs.results.precision import (
@@ -51,6 +52,7 @@ def answer(report: PrecisionResult) -> str:
     if report.slopes:
         lines += ["", "slopes (logarithm of the error against that of samples or seconds):", _slopes(report.slopes)]
     lines += ["", "references, with their own errors:", _references(report.references)] if report.references else []
+    lines += ["", f"workers: {workers_text(report.shared)}"] if report.shared else []
     lines += ["", "recommended:", *(f"  {sentence(one, report.goal)}" for one in report.recommendations)]
     lines += ["", "warnings:", *(f"  {one}" for one in report.warnings)] if report.warnings else []
     lines += ["", "It was stopped: only a part was measured."] if report.goes_on else []

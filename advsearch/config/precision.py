@@ -7,6 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import field_validator
 
+from advsearch.config.attack import AttackConfig
 from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import Clash, check_once, setting, setting_as_in, split_names
@@ -24,6 +25,7 @@ class PrecisionConfig(DerivativeConfig):
     """Everything that decides what `precision` does: error against run time, for a scene, its controls and a model."""
 
     command: ClassVar[str] = "precision"
+    free: ClassVar[tuple[str, ...]] = (*DerivativeConfig.free, "workers", "cluster")
     clashes: ClassVar[tuple[Clash, ...]] = (
         *DerivativeConfig.clashes,
         *(
@@ -85,6 +87,10 @@ class PrecisionConfig(DerivativeConfig):
     )
     steps: int = setting(32, "search", "renders of each search of a policy", ge=2, le=100_000)
     repeats: int = setting(5, "search", "searches of each policy, with other seeds", ge=1, le=1000)
+    workers: int | None = setting_as_in(
+        AttackConfig, "workers", description="processes that share the references; what is timed stays in this one"
+    )
+    cluster: str | None = setting_as_in(AttackConfig, "cluster")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/OBJECT-precision-NNN")
     out: str | None = setting(
         None,

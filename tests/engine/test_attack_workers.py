@@ -173,9 +173,12 @@ def test_announcements_are_what_comes_next(policy: dict[str, Any], options: int,
 
 
 @pytest.mark.slow
-def test_two_processes_have_the_rows_of_none(alone: AttackResult, tmp_path: Path) -> None:
-    attack_once(AttackConfig(**SMALL, workers=2, run=str(tmp_path / "run")))
-    assert alone.run is not None and rows(tmp_path / "run") == rows(alone.run)
+@pytest.mark.parametrize("policy", ["cmaes", RESTARTS])
+def test_two_processes_have_the_rows_of_none(policy: Any, tmp_path: Path) -> None:
+    settings = {**SMALL, "policy": policy, "steps": 24}
+    attack_once(AttackConfig(**settings, run=str(tmp_path / "alone")))
+    attack_once(AttackConfig(**settings, workers=2, run=str(tmp_path / "run")))
+    assert rows(tmp_path / "run") == rows(tmp_path / "alone")
 
 
 def test_what_is_loaded_already_is_not_shared() -> None:

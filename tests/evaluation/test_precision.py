@@ -5,7 +5,10 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import nullcontext
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +16,14 @@ import numpy as np
 import pytest
 
 from advsearch.api import precision as measuring
-from advsearch.api.precision import precision_from_config
+from advsearch.api.precision import precision_from_config, references_of
 from advsearch.cli.main import main
 from advsearch.cli.precision import answer as precision_text
+from advsearch.cluster.executor import Done, InProcess, Workforce
 from advsearch.config import AttackConfig, PrecisionConfig
 from advsearch.engine.gradients import smooth_loss
 from advsearch.engine.loading import load_scene
-from advsearch.errors import InputError
+from advsearch.errors import ClusterError, InputError
 from advsearch.evaluation.precision.fits import (
     FURTHEST,
     INDEPENDENT,
@@ -49,7 +53,8 @@ from advsearch.evaluation.precision.points import (
     typical_seconds,
 )
 from advsearch.evaluation.precision.report import MeasuredLine, Section, rounding
-from advsearch.evaluation.precision.rounds import LEAST, TimeBudget, gather, in_rounds, part_samples
+from advsearch.evaluation.precision.rounds import LEAST, TimeBudget, gather, in_rounds, one_by_one, part_samples
+from advsearch.evaluation.precision.sharing import ReferencePart
 from advsearch.progress import NullProgress
 from advsearch.report.diagrams import precision_figures
 from advsearch.runs.listing import finished
@@ -392,10 +397,24 @@ def test_a_reference_has_two_parts_whatever_they_take_and_stops_in_time() -> Non
         clock.now += 1.0
         return np.array([float(seed)])
 
-    assert len(gather(part, TimeBudget(0.1, clock), seed=0)) == 2
-    found = gather(part, TimeBudget(5.5, clock), seed=0)
+    parts = one_by_one(part)
+    assert len(gather(parts, TimeBudget(0.1, clock), seed=0)) == 2
+    found = gather(parts, TimeBudget(5.5, clock), seed=0)
     assert len(found) == 5 and len({float(one[0]) for one in found}) == 5
-    assert len(gather(part, TimeBudget(1e9, clock), seed=0, most=7)) == 7
+    assert len(gather(parts, TimeBudget(1e9, clock), seed=0, most=7)) == 7
+
+
+def test_parts_that_come_two_at_a_time_stop_in_time_too() -> None:
+    """As two workers have them, the later one first: after five and a half seconds there are twice five."""
+    clock = Clock()
+
+    def parts(wanted: Iterator[int]) -> Iterator[tuple[int, np.ndarray]]:
+        while both := list(islice(wanted, 2)):
+            clock.now += 1.0
+            yield from ((seed, np.array([float(seed)])) for seed in reversed(both))
+
+    assert len(gather(parts, TimeBudget(5.5, clock), seed=0)) == 10
+    assert len(gather(parts, TimeBudget(0.1, clock), seed=0)) == 2
 
 
 def test_samples_of_a_part_fit_into_the_time() -> None:
@@ -602,6 +621,44 @@ def test_a_part_that_is_measured_is_kept_and_not_measured_again(
     pictures = [one.to_dict() for one in report.points if one.quantity == "image"]
     assert pictures == [one.to_dict() for one in stopped.points]
     assert {one.quantity for one in report.points} == {"image", "gradient"}
+
+
+def test_workers_make_the_references_and_what_is_timed_stays_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By differences and by an adjoint; each part is the one that this process would have made."""
+    settings: dict[str, Any] = {
+        "object": "mug", "controls": {"pose.yaw": {}, "texture": {}}, "quantities": "image,gradient", "depths": "2",
+        "samplers": "independent", "resolution": (8, 8), "seconds": 2.0, "rounds": 3, "threads": 1,
+    }  # fmt: skip
+    made = InProcess(references_of(PrecisionConfig(**settings).plain()))
+    asked: dict[ReferencePart, np.ndarray] = {}
+    died: list[str] = []
+
+    class Watched:
+        facts = Workforce(workers=2, most=2, busy=1.0, alive=2.0)
+
+        def results(self, ranges: Iterable[range | None], given: Sequence[Any] | None = None) -> Iterator[Done]:
+            assert given is not None
+            for done in made.results(ranges, given):
+                (one,) = given[done.numbers.start : done.numbers.stop]
+                asked.update({} if one is None else {one: done.value[0]})
+                yield replace(done, lost="it died") if one is not None and died else done
+
+    monkeypatch.setattr(measuring, "executor_of", lambda work, **_: nullcontext(Watched()))
+    report = precision_from_config(PrecisionConfig(**settings, workers=2, run=str(tmp_path / "run")))
+    assert sum(one.parts for one in report.references) == len(asked) >= 8
+    assert {(one.name, one.by) for one in asked} == {
+        ("image", "raw"), ("image", "oidn"), ("image", "depth"), ("gradient of pose", "differences"),
+        ("gradient of texture", "adjoint"),
+    }  # fmt: skip
+    assert report.shared is not None and "workers: 2 at most" in precision_text(report)
+    again = references_of(PrecisionConfig(**settings).plain())
+    for one in {each.name: each for each in asked}.values():
+        assert np.array_equal(again([one])[0], asked[one]) and asked[one].dtype == np.float64
+    died.append("now")
+    with pytest.raises(ClusterError, match="image, a part of its reference: it died; leave `workers` out"):
+        precision_from_config(PrecisionConfig(**settings, workers=2, run=str(tmp_path / "lost")))
 
 
 def test_what_was_measured_is_the_same_after_json() -> None:

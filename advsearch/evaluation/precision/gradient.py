@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from advsearch import seeds
 from advsearch.engine.gradients import EXPENSIVE, Loss, Probe, estimated, reference
 from advsearch.evaluation.precision.fits import INDEPENDENT, STRATIFIED, UNKNOWN, Theory
 from advsearch.evaluation.precision.points import Array, MeasuredSetting, ReferenceValue, reference_of
-from advsearch.evaluation.precision.rounds import TimeBudget, gather, part_samples
+from advsearch.evaluation.precision.rounds import Parts, TimeBudget, gather, one_by_one, part_samples
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.plan import BY_ADJOINT, DIRECTIONS
 from advsearch.scene.renderer import Renderer
@@ -118,13 +119,20 @@ class GradientBench:
         u: (d,) where.
         part: of what.
         exact: renders the same with a better sampler, for references; None takes the renderer itself.
+        elsewhere: from a way to take it and samples to what carries out parts of the reference, if not this process.
     """
 
     def __init__(
-        self, renderer: Renderer, loss: Loss, u: Tensor, part: GradientPart, exact: Renderer | None = None
+        self,
+        renderer: Renderer,
+        loss: Loss,
+        u: Tensor,
+        part: GradientPart,
+        exact: Renderer | None = None,
+        elsewhere: Callable[[str, int], Parts | None] = lambda by, spp: None,
     ) -> None:
         self._renderer, self._loss, self._u, self.part = renderer, loss, u, part
-        self._exact = exact or renderer
+        self._exact, self.elsewhere = exact or renderer, elsewhere
         self.reference: ReferenceValue | None = None
         self.part_spp = 0
         self.by = ""
@@ -200,20 +208,31 @@ class GradientBench:
         gradient = estimated(renderer, self._loss, self._u, estimator, self.part.names, seed, spp)
         return self.part.of(gradient)
 
+    def part_of(self, by: str, spp: int, seed: int) -> Array:
+        """Return a part of the reference: (n,) of an estimator, or (2, n) by differences: the derivatives along each
+        coordinate, and how far their two steps are apart."""
+        if by != "differences":
+            return self._estimated(self._exact, by, seed, spp)
+        both = [self._difference(probe, seed, spp) for probe in self._coordinates]
+        found: Array = np.array(both, dtype=np.float64).T
+        return found
+
+    @property
+    def _coordinates(self) -> list[Probe]:
+        return [_coordinate(self._u, group, number) for group in self.part.groups for number in range(group.size)]
+
+    def _gathered(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> list[Array]:
+        by, spp = self.by, self.part_spp
+        parts = self.elsewhere(by, spp) or one_by_one(partial(self.part_of, by, spp))
+        return gather(parts, budget, seed=seed, name=f"precision {self.part.name}", on_done=on_done)
+
     def _by_differences(self, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> None:
-        along = [_coordinate(self._u, group, number) for group in self.part.groups for number in range(group.size)]
+        along = self._coordinates
         rate = self._rate(lambda spp: self._difference(along[0], seed, spp)) * len(along)
         self.part_spp = part_samples(rate, budget.left, parts=3, counts=(16, 64, 256))
-        steps: list[Array] = []
-
-        def part(seed: int) -> Array:
-            both = np.array([self._difference(probe, seed, self.part_spp) for probe in along])
-            steps.append(both[:, 1])
-            return np.asarray(both[:, 0], dtype=np.float64)
-
-        found = gather(part, budget, seed=seed, name=f"precision {self.part.name}", on_done=on_done)
-        left = float(np.linalg.norm(np.mean(steps, axis=0))) / 4.0
-        self.reference = reference_of(found, bias=left)
+        found = self._gathered(budget, seed, on_done)
+        left = float(np.linalg.norm(np.mean([apart for _, apart in found], axis=0))) / 4.0
+        self.reference = reference_of([value for value, _ in found], bias=left)
 
     def _difference(self, probe: Probe, seed: int, spp: int) -> tuple[float, float]:
         """The derivative along a probe, extrapolated to a step of zero, and how far its two steps are apart."""
@@ -226,12 +245,7 @@ class GradientBench:
         rate = self._rate(lambda spp: self._estimated(self._exact, by, seed, spp))
         self.part_spp = part_samples(rate, budget.left)
 
-        def part(seed: int) -> Array:
-            return self._estimated(self._exact, by, seed, self.part_spp)
-
-        self.reference = reference_of(
-            gather(part, budget, seed=seed, name=f"precision {self.part.name}", on_done=on_done)
-        )
+        self.reference = reference_of(self._gathered(budget, seed, on_done))
 
     def _rate(self, call: Callable[[int], object], pilot: int = 16) -> float:
         """Seconds a sample, from the second of two calls."""

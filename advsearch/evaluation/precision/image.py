@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from advsearch.evaluation.precision.fits import INDEPENDENT, STRATIFIED, UNKNOWN, Theory
 from advsearch.evaluation.precision.points import Array, MeasuredSetting, ReferenceValue, reference_through
-from advsearch.evaluation.precision.rounds import TimeBudget, gather, part_samples
+from advsearch.evaluation.precision.rounds import Parts, TimeBudget, gather, one_by_one, part_samples
 from advsearch.scene.renderer import Renderer
 
 Margin = Callable[[Tensor], float]
@@ -94,10 +95,18 @@ class PictureBench:
         u: (d,) the configuration.
         margin: the model's.
         chosen: the variants.
+        elsewhere: from a family and samples to what carries out parts of its reference, if not this process.
     """
 
-    def __init__(self, renderer: Renderer, u: Tensor, margin: Margin, chosen: Sequence[Variant]) -> None:
-        self._u, self._margin = u, margin
+    def __init__(
+        self,
+        renderer: Renderer,
+        u: Tensor,
+        margin: Margin,
+        chosen: Sequence[Variant],
+        elsewhere: Callable[[str, int], Parts | None] = lambda family, spp: None,
+    ) -> None:
+        self._u, self._margin, self.elsewhere = u, margin, elsewhere
         self.variants = {one.series: one for one in chosen}
         self._renderer = renderer
         self._scenes: dict[tuple[str, int, str], Any] = {}
@@ -121,7 +130,7 @@ class PictureBench:
         families = [one for one in ("raw", "depth", "oidn") if any(v.family == one for v in self.variants.values())]
         for number, family in enumerate(families):
             share = budget.share(1.0 / (len(families) - number))
-            self._refer(family, self._truth(family), share, seed, on_done)
+            self._refer(family, share, seed, on_done)
 
     def measure(self, setting: MeasuredSetting, seed: int) -> tuple[dict[str, float], float]:
         """Render one setting and return its errors, and the seconds that rendering and denoising took."""
@@ -151,20 +160,25 @@ class PictureBench:
         denoiser = "oidn" if family == "oidn" else "none"
         return self._as(Variant(family, family, REFERENCE_SAMPLER, denoiser, max(depths)))
 
-    def _refer(
-        self, family: str, renderer: Renderer, budget: TimeBudget, seed: int, on_done: Callable[[], None]
-    ) -> None:
-        pilot = 16
+    def part(self, family: str, spp: int, seed: int) -> Array:
+        """Return a part of a family's reference: its radiance, flat."""
+        return _flat(self._radiance(self._truth(family), seed, spp))
+
+    def _refer(self, family: str, budget: TimeBudget, seed: int, on_done: Callable[[], None]) -> None:
+        renderer, pilot = self._truth(family), 16
         for number in range(3):
             begun = time.perf_counter()
             self._radiance(renderer, number, pilot)
             rate = (time.perf_counter() - begun) / pilot
         spp = part_samples(rate, budget.left)
 
-        def part(seed: int) -> Array:
-            return _flat(self._radiance(renderer, seed, spp))
-
-        parts = gather(part, budget, seed=seed, name=f"precision reference {family}", on_done=on_done)
+        parts = gather(
+            self.elsewhere(family, spp) or one_by_one(partial(self.part, family, spp)),
+            budget,
+            seed=seed,
+            name=f"precision reference {family}",
+            on_done=on_done,
+        )
         self.part_spp[family] = spp
         self.pictures[family] = reference_through(lambda mean: _flat(self._shown(mean)), parts)
         self.margins[family] = reference_through(lambda mean: _one(self._margin(self._shown(mean))), parts)

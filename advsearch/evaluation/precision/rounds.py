@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -164,8 +164,17 @@ class Forecast(Generic[Result]):
         return statistics.median((taken[self._cold :] or taken[-1:])[-3:])
 
 
+Parts = Callable[[Iterator[int]], Iterator[tuple[int, Array]]]
+"""From seeds to each seed with what came of it, in any order; asks for another seed only when it begins with it."""
+
+
+def one_by_one(part: Callable[[int], Array]) -> Parts:
+    """Return what carries out parts in this process, one after the other."""
+    return lambda wanted: ((seed, part(seed)) for seed in wanted)
+
+
 def gather(
-    part: Callable[[int], Array],
+    parts: Parts,
     budget: TimeBudget,
     *,
     seed: int,
@@ -177,7 +186,7 @@ def gather(
     """Return independent parts of a reference, each from a seed of its own, as many as fit into a budget.
 
     Args:
-        part: from a seed to (n,) float64.
+        parts: from seeds to arrays of one shape, float64.
         budget: when to stop.
         seed: root of the seeds.
         name: of the stream of seeds.
@@ -186,11 +195,20 @@ def gather(
         on_done: told about every part.
     """
     found: list[Array] = []
-    slowest, before = 0.0, budget.left
-    while len(found) < most and (len(found) < least or slowest <= budget.left):
-        found.append(part(seeds.stream(seed, name, len(found))))
-        now = budget.left
-        slowest, before = max(before - now, 0.5 * slowest), now
+    begun: dict[int, float] = {}
+    slowest = 0.0
+
+    def wanted() -> Iterator[int]:
+        for number in range(most):
+            if number >= least and slowest > budget.left:
+                return
+            one = seeds.stream(seed, name, number)
+            begun[one] = budget.left
+            yield one
+
+    for one, array in parts(wanted()):
+        found.append(array)
+        slowest = max(begun[one] - budget.left, 0.5 * slowest)
         if on_done is not None:
             on_done()
     return found

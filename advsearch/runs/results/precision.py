@@ -7,6 +7,7 @@ from typing import ClassVar, NamedTuple
 
 from pydantic import Field
 
+from advsearch.runs.results.attack import SharedWork
 from advsearch.runs.results.base import Fields, Formation, Interval, Number, RunResult
 
 
@@ -148,3 +149,6 @@ class PrecisionResult(PrecisionSubject):
     warnings: list[str] = Field(description="sentences that a reader has to know")
     left_out: list[NotMeasured]
     figures: list[str]
+    shared: SharedWork | None = Field(
+        default=None, description="how [workers](cluster.md) did that made parts of references; absent without"
+    )
