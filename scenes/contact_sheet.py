@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
 from advsearch.scene.color import linear_to_srgb
+from advsearch.scene.parts import mesh_part
 
 from .environments import ENVIRONMENTS
 from .objects import OBJECTS
@@ -46,6 +47,7 @@ def picture(
     radius = 0.5 * float(np.linalg.norm(high - low)) / zoom
     a, e = np.radians(azimuth), np.radians(elevation)
     away = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+    whole = mesh_part(asset.name, asset, np.eye(4), asset.material)
     fov = 35.0
     eye = middle + away * radius * 1.02 / np.sin(np.radians(fov / 2))
     scene = mi.load_dict(
@@ -72,7 +74,7 @@ def picture(
                 "to_world": transform().scale([1.5, 1.5, 1]),
                 "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.13, 0.08]}},
             },
-            "object": mitsuba_mesh(asset.name, asset.mesh, np.eye(4), principled(asset.base_color, asset.material)),
+            "object": mitsuba_mesh(asset.name, asset.mesh, np.eye(4), principled(whole)),
         }
     )
     layers = torch.from_numpy(np.array(mi.render(scene, spp=spp, seed=1), dtype=np.float32))

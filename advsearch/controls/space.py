@@ -50,12 +50,16 @@ class Space:
     def groups(self) -> tuple[Group, ...]:
         """Every group of coordinates in the order of u, without an estimator yet.
 
-        Adjoints with boundary terms know neither a medium nor a backdrop nor a thin lens nor the edges of cut-outs, so
-        that they are not valid beside these.
+        Adjoints with boundary terms know neither a medium nor a backdrop nor a thin lens nor the edges of cut-outs, nor
+        where a normal of a normal map turns away from the camera, so that they are not valid beside these.
         """
         scene = self.scene
         unknown = scene is not None and (
-            scene.backdrop or scene.thin_lens or scene.cut_out or any(part.volumetric for part in scene.parts)
+            scene.backdrop
+            or scene.thin_lens
+            or scene.cut_out
+            or scene.normal_mapped
+            or any(part.volumetric for part in scene.parts)
         )
         found, begin = [], 0
         for control in self.controls:

@@ -89,6 +89,8 @@ class ObjectAsset:
         surface: in place of the principled one, Mitsuba's own dictionary of it; see `advsearch.scene.parts.MeshPart`.
         opacity: (H, W) float32 in [0, 1], the share of the light that does not pass through, row 0 on top; None where
             it is 1.
+        normal_map: (H, W, 3) float32, `(n + 1) / 2` of unit normals in the frame of tangent (along u), normal x tangent
+            and normal, row 0 on top; None where there is none.
     """
 
     name: str
@@ -101,6 +103,7 @@ class ObjectAsset:
     up: UpAxis | None = None
     surface: Mapping[str, object] | None = None
     opacity: Floats | None = None
+    normal_map: Floats | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:

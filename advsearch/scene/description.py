@@ -20,7 +20,7 @@ from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
-from advsearch.scene.parts import BallLamp, MeshPart, PlacedCamera, PluginPart, PointLamp, ScenePart
+from advsearch.scene.parts import BallLamp, MeshPart, PlacedCamera, PluginPart, PointLamp, ScenePart, mesh_part
 from advsearch.scene.photograph import Photograph, photograph_of
 
 Doubles = npt.NDArray[np.float64]
@@ -120,10 +120,7 @@ class SceneDescription:
         """Every mesh by name, as the settings have it; the one under test is `OBJECT`."""
         from advsearch.scene.geometry import moved_part, object_to_world
 
-        own = self.object
-        under_test = MeshPart(
-            OBJECT, own.mesh, object_to_world(self), own.base_color, self.material, own.surface, own.opacity
-        )
+        under_test = mesh_part(OBJECT, self.object, object_to_world(self), self.material)
         return {OBJECT: under_test, **{name: moved_part(one, self.values) for name, one in self.around.items()}}
 
     @property
@@ -134,8 +131,12 @@ class SceneDescription:
     @property
     def cut_out(self) -> bool:
         """Whether a mesh has cut-outs."""
-        around = any(one.opacity is not None for one in self.around.values())
-        return around or self.object.opacity is not None
+        return any(one.opacity is not None for one in self.meshes.values())
+
+    @property
+    def normal_mapped(self) -> bool:
+        """Whether a mesh has a normal map."""
+        return any(one.normal_map is not None for one in self.meshes.values())
 
     @property
     def lamps(self) -> Mapping[str, PointLamp | BallLamp]:

@@ -15,7 +15,7 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.scene.assets import Floats, Material, Mesh
+from advsearch.scene.assets import Floats, Material, Mesh, ObjectAsset
 
 Doubles = npt.NDArray[np.float64]
 Triple = tuple[float, float, float]
@@ -53,6 +53,7 @@ class MeshPart(ScenePart):
         surface: in place of the principled surface, Mitsuba's dictionary of one, with `BASE_COLOR` where the texture
             goes. What it lacks of the inputs, the part has not.
         opacity: (h, w) float32 in [0, 1] of the principled surface, which cuts it out; None where it is 1.
+        normal_map: (h, w, 3) float32 of the principled surface, as `ObjectAsset.normal_map`.
     """
 
     mesh: Mesh
@@ -61,6 +62,14 @@ class MeshPart(ScenePart):
     material: Material = field(default_factory=Material)
     surface: Mapping[str, object] | None = None
     opacity: Floats | None = None
+    normal_map: Floats | None = None
+
+
+def mesh_part(name: str, asset: ObjectAsset, to_world: Doubles, material: Material) -> MeshPart:
+    """Return an object with another material under a pose (4, 4)."""
+    return MeshPart(
+        name, asset.mesh, to_world, asset.base_color, material, asset.surface, asset.opacity, asset.normal_map
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -997,7 +997,7 @@ def test_pictures_that_run_programs_or_take_gigabytes_are_not_decoded(
 
 def test_textures_have_a_limit_in_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     picture(tmp_path)
-    monkeypatch.setattr("advsearch.scene.importing.surfaces.LARGEST_SUM", 512)  # two of the three
+    monkeypatch.setattr("advsearch.scene.importing.pictures.LARGEST_SUM", 512)  # two of the three
     materials = "".join(f"newmtl m{k}\nKd 0.2 0.3 0.7\nmap_Kd wood.png\n" for k in range(3))
     written(tmp_path, "thing.mtl", materials)
     faces = "".join(f"usemtl m{k}\nf 1/1 2/2 3/3\nf 1/1 3/3 4/4\n" for k in range(3))

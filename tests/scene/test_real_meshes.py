@@ -179,7 +179,7 @@ def test_a_texture_is_looked_up_by_the_coordinates_that_its_material_names(tmp_p
 @pytest.mark.parametrize(
     ("line", "left_out"),
     [
-        ("map_Bump -bm 1 leaf.png", "the normal maps of 1 material are left out"),
+        ("map_Bump -bm 1 leaf.png", "the normal map 'leaf.png' is missing; it is left out"),
         ("Ke 0.2 0 0", "the glow of 1 material is left out"),
         ("d 1.0", ""),
         ("d 0.25", ""),

@@ -52,6 +52,7 @@ class PosedMesh:
         base_color: (h, w, 3) display-referred sRGB, row 0 at v = 1.
         material: the rest of the surface.
         opacity: (h', w') in [0, 1], or None where there are no cut-outs.
+        normal_map: as `ObjectAsset.normal_map`.
     """
 
     name: str
@@ -59,6 +60,7 @@ class PosedMesh:
     base_color: Floats
     material: Material
     opacity: Floats | None = None
+    normal_map: Floats | None = None
 
 
 def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> PosedMesh:
@@ -76,7 +78,7 @@ def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> PosedMesh:
     if "base_color" in given:
         color = linear_to_srgb(given["base_color"].clamp(0.0, 1.0)).numpy()
     numbers = {key: float(given[key]) for key in vars(part.material) if key in given}
-    return PosedMesh(part.name, mesh, color, replace(part.material, **numbers), part.opacity)
+    return PosedMesh(part.name, mesh, color, replace(part.material, **numbers), part.opacity, part.normal_map)
 
 
 def _of(key: str) -> str:
@@ -128,7 +130,7 @@ def _described(made: _Buffer, meshes: Sequence[PosedMesh], picture: Callable[[Fl
         "nodes": [{"name": one.name, "mesh": number} for number, one in enumerate(meshes)],
         "meshes": [],
         "materials": [],
-        "textures": [{"source": number, "sampler": 0} for number in range(len(meshes))],
+        "textures": [],
         "samplers": [{"magFilter": 9729, "minFilter": 9729, "wrapS": 10497, "wrapT": 10497}],
         "images": [],
     }
@@ -144,11 +146,21 @@ def _described(made: _Buffer, meshes: Sequence[PosedMesh], picture: Callable[[Fl
         header["meshes"].append(
             {"name": one.name, "primitives": [{"attributes": corners, "indices": indices, "material": number}]}
         )
-        header["materials"].append(_material(one, number))
         encoded = picture(one.base_color) if one.opacity is None else _cut_out_png(one.base_color, one.opacity)
-        kind = "image/png" if encoded.startswith(PNG) else "image/jpeg"
-        header["images"].append({"mimeType": kind, "bufferView": made.view(encoded)})
+        material = _material(one, _texture(header, made.view(encoded), encoded))
+        if one.normal_map is not None:
+            encoded = picture(one.normal_map)
+            material["normalTexture"] = {"index": _texture(header, made.view(encoded), encoded)}
+        header["materials"].append(material)
     return header
+
+
+def _texture(header: dict[str, Any], view: int, picture: bytes) -> int:
+    """Add a picture in a view of the buffer to the header, and return the number of its texture."""
+    kind = "image/png" if picture.startswith(PNG) else "image/jpeg"
+    header["images"].append({"mimeType": kind, "bufferView": view})
+    header["textures"].append({"source": len(header["textures"]), "sampler": 0})
+    return len(header["textures"]) - 1
 
 
 class _Buffer:

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from advsearch import files
 from advsearch.scene.importing.files import damaged, looks_like, shown, text_of
 from advsearch.scene.importing.gltf_checks import check_header
-from advsearch.scene.importing.gltf_entries import Asset, Header, MaterialEntry, Primitive
+from advsearch.scene.importing.gltf_entries import Asset, Header, MaterialEntry, Primitive, TextureUse
 from advsearch.scene.importing.references import GLOW, NORMAL_MAPS
 
 MOST_VALUES = 1_000_000
@@ -23,6 +23,9 @@ MOST_VALUES = 1_000_000
 
 MAP = "TEXCOORD_0"
 """The texture coordinates that are read of the header that is written."""
+
+MATERIAL = "material "
+"""Before the number of a material in its name, in the header that is written."""
 
 NODE = "node "
 """Before the number of a node in its name, in the header that is written."""
@@ -66,7 +69,10 @@ def rewritten(path: Path, data: bytes, header: Header) -> bytes:
                 mesh.model_copy(update={"primitives": [_one_map(header, one) for one in mesh.primitives]})
                 for mesh in header.meshes
             ],
-            "materials": [material.plain() for material in header.materials],
+            "materials": [
+                material.plain().model_copy(update={"name": f"{MATERIAL}{index}"})
+                for index, material in enumerate(header.materials)
+            ],
             "textures": [texture.plain() for texture in header.textures],
             "nodes": [
                 node.model_copy(update={"name": f"{NODE}{index}", "camera": None, "extensions": None})
@@ -87,19 +93,24 @@ def rewritten(path: Path, data: bytes, header: Header) -> bytes:
 
 
 def _one_map(header: Header, primitive: Primitive) -> Primitive:
-    """Return a primitive whose one set of texture coordinates is that by which its base colour is looked up."""
-    used = None if primitive.material is None else header.materials[primitive.material].base_color
-    if used is None or not used.texCoord:
+    """Return a primitive whose one set of texture coordinates is that by which its textures are looked up."""
+    used = MAP if primitive.material is None else header.materials[primitive.material].coordinates
+    if used == MAP:
         return primitive
     attributes = {name: index for name, index in primitive.attributes.items() if name != MAP}
-    if used.coordinates in attributes:
-        attributes[MAP] = attributes[used.coordinates]
+    if used in attributes:
+        attributes[MAP] = attributes[used]
     return primitive.model_copy(update={"attributes": attributes})
 
 
-def base_color_image(header: Header, material: MaterialEntry) -> str | None:
-    """Return a name for the base colour image of a material, or None when it has none."""
-    used = material.base_color
+def entry_of(header: Header, name: str | None) -> MaterialEntry | None:
+    """Return the material of a name in the header that is written; None where there is none."""
+    number = (name or "").removeprefix(MATERIAL)
+    return header.materials[int(number)] if number.isdecimal() and int(number) < len(header.materials) else None
+
+
+def image_name(header: Header, used: TextureUse | None) -> str | None:
+    """Return a name for the image of a texture, or None where there is no texture."""
     if used is None:
         return None
     source = header.textures[used.index].plain().source
@@ -110,7 +121,7 @@ def base_color_image(header: Header, material: MaterialEntry) -> str | None:
 def unread(header: Header) -> dict[str, int]:
     """Return what materials have that is not read, each with how many of them."""
     return {
-        NORMAL_MAPS: sum(one.normalTexture is not None for one in header.materials),
+        NORMAL_MAPS: sum(one.normalTexture is not None and not one.plain().normalTexture for one in header.materials),
         GLOW: sum(bool(one.emissiveTexture or any(one.emissiveFactor)) for one in header.materials),
     }
 

@@ -44,7 +44,8 @@ def check_header(path: Path, header: Header) -> None:
         _check_index(path, "bufferViews", image.bufferView, header.bufferViews)
     for material in header.materials:
         surface = material.plain().pbrMetallicRoughness
-        for use in (surface.baseColorTexture, surface.metallicRoughnessTexture) if surface else ():
+        uses = (surface.baseColorTexture, surface.metallicRoughnessTexture) if surface else ()
+        for use in (*uses, material.normalTexture):
             _check_index(path, "textures", None if use is None else use.index, header.textures)
     sizes = (sum(view.byteLength for view in header.bufferViews), sum(a.size() for a in header.accessors))
     if max(sizes) > files.scaled(LARGEST_VALUES):
@@ -66,8 +67,8 @@ def _check_primitive(path: Path, header: Header, primitive: Primitive) -> None:
     for index in (*primitive.attributes.values(), primitive.indices):
         _check_index(path, "accessors", index, header.accessors)
     _check_index(path, "materials", primitive.material, header.materials)
-    used = None if primitive.material is None else header.materials[primitive.material].base_color
-    for name in ("POSITION", "NORMAL", "TEXCOORD_0" if used is None else used.coordinates):
+    coordinates = "TEXCOORD_0" if primitive.material is None else header.materials[primitive.material].coordinates
+    for name in ("POSITION", "NORMAL", coordinates):
         if name not in primitive.attributes:
             continue
         accessor = header.accessors[primitive.attributes[name]]

@@ -132,6 +132,10 @@ class TextureUse(_Entry):
         return f"TEXCOORD_{self.texCoord}"
 
 
+class NormalUse(TextureUse):
+    scale: float = 1.0
+
+
 Factor = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 
@@ -162,7 +166,7 @@ CUTOFF = 0.5
 class MaterialEntry(_Entry):
     pbrMetallicRoughness: MetallicRoughness | None = None
     name: str | None = None
-    normalTexture: TextureUse | None = None
+    normalTexture: NormalUse | None = None
     emissiveTexture: TextureUse | None = None
     emissiveFactor: list[float] = []
     alphaMode: str = "OPAQUE"
@@ -172,23 +176,41 @@ class MaterialEntry(_Entry):
     @property
     def base_color(self) -> TextureUse | None:
         """Where its base colour texture is, and by which coordinates it is looked up; None without one."""
-        surface = self.plain().pbrMetallicRoughness
+        surface = self._metallic_roughness()
         return None if surface is None else surface.baseColorTexture
 
+    @property
+    def coordinates(self) -> str:
+        """Name of the attribute by which its textures are looked up: that of the base colour, if it has one."""
+        used = self.base_color or self.normalTexture
+        return "TEXCOORD_0" if used is None else used.coordinates
+
     def plain(self) -> MaterialEntry:
-        """Return the material without extensions: the diffuse colour of an old one is its base colour."""
-        mode = self.alphaMode if self.alphaMode in CUT_OUTS else "OPAQUE"
-        plain = MaterialEntry(name=self.name, alphaMode=mode, alphaCutoff=self.alphaCutoff)
+        """Return the material without extensions: the diffuse colour of an old one is its base colour. Textures that
+        are looked up by other coordinates than that are left out."""
+        surface = self._metallic_roughness()
+        used = surface.baseColorTexture if surface else None
+        normals = self.normalTexture
+        if normals is not None and used is not None and normals.coordinates != used.coordinates:
+            normals = None
+        return MaterialEntry(
+            pbrMetallicRoughness=surface,
+            name=self.name,
+            normalTexture=normals,
+            alphaMode=self.alphaMode if self.alphaMode in CUT_OUTS else "OPAQUE",
+            alphaCutoff=self.alphaCutoff,
+        )
+
+    def _metallic_roughness(self) -> MetallicRoughness | None:
         old = self.extensions.glossiness if self.extensions else None
         if old is None:
-            return plain.model_copy(update={"pbrMetallicRoughness": self.pbrMetallicRoughness})
-        surface = MetallicRoughness(
+            return self.pbrMetallicRoughness
+        return MetallicRoughness(
             baseColorFactor=old.diffuseFactor,
             baseColorTexture=old.diffuseTexture,
             metallicFactor=0.0,
             roughnessFactor=1.0 - old.glossinessFactor,
         )
-        return plain.model_copy(update={"pbrMetallicRoughness": surface})
 
 
 class _WebpSource(_Entry):

@@ -74,7 +74,12 @@ def read_picture(path: Path, limit: int | None = TEXTURE_LIMIT) -> Floats:
 
 
 def display_image(
-    image: Image.Image, limit: int | None = TEXTURE_LIMIT, path: Path | str = "picture", *, alpha: bool = False
+    image: Image.Image,
+    limit: int | None = TEXTURE_LIMIT,
+    path: Path | str = "picture",
+    *,
+    alpha: bool = False,
+    raw: bool = False,
 ) -> Floats:
     """Decode a picture.
 
@@ -83,6 +88,7 @@ def display_image(
         limit: longest side of the result; larger pictures are averaged down in linear light. None: no limit.
         path: where it is from, for messages.
         alpha: keep it as a fourth channel, 1 where the picture has none; otherwise it is dropped.
+        raw: it holds numbers, as a normal map does, and no colours; larger ones are averaged down as they are.
 
     Returns:
         (H, W, 3 or 4) float32 display-referred values in [0, 1], row 0 on top.
@@ -105,13 +111,15 @@ def display_image(
         if scale >= 1.0:
             return np.asarray(display[_steps(image, alpha=alpha)])
         target = max(1, round(height * scale)), max(1, round(width * scale))
-        linear = srgb_to_linear(display)
+        linear = display if raw else srgb_to_linear(display)
 
         def band(top: int, end: int) -> Floats:
             steps = _steps(image.crop((0, top, width, end)), alpha=alpha)
             return np.concatenate([linear[steps[:, :, :3]], display[steps[:, :, 3:]]], axis=2)
 
         averaged = banded_average(band, (height, width), target)
+        if raw:
+            return averaged
         return np.concatenate([linear_to_srgb(averaged[:, :, :3]), averaged[:, :, 3:]], axis=2)
 
 

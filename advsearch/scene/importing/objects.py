@@ -43,6 +43,8 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
       texture is multiplied by its linear factor. The ``Kd`` of an .mtl is taken as display-referred, and ignored beside
       a ``map_Kd``. Where a texture is missing, the colour takes its place, or grey if that is plain white, with a
       warning.
+    - The normal map of glTF, and of an .mtl ``norm``, ``map_Bump`` or ``bump`` that holds normals; where textures are
+      baked, it is turned to the new texture coordinates.
     - Roughness and metallic are those of glTF where given, their mean over several materials, and else `Material`'s.
 
     The same file gives the same bytes every time.
@@ -78,20 +80,21 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     soup, axis = _upright(parts, file, up)
     soup, repairs = repaired(soup, str(file))
     surfaces = [part.surface for part in parts]
-    soup, map, bakes = textured(soup, surfaces)
-    opacity = np.ascontiguousarray(map[:, :, 3]) if map.shape[2] == 4 else None
+    soup, maps, bakes = textured(soup, surfaces)
+    opacity = np.ascontiguousarray(maps.color[:, :, 3]) if maps.color.shape[2] == 4 else None
     if opacity is not None and not opacity.any():
         opacity, bakes = None, [*bakes, "it is transparent all over; it is shown opaque"]
     material, blends = _material(soup, surfaces)
     return ObjectAsset(
         name=name,
         mesh=normalised(assemble(soup)),
-        base_color=np.ascontiguousarray(map[:, :, :3]),
+        base_color=np.ascontiguousarray(maps.color[:, :, :3]),
         material=material,
         source=str(file),
         warnings=_first([*notes, *(f"{file.name}: {note}" for note in repairs + bakes + blends)], file.name),
         up=axis,
         opacity=opacity,
+        normal_map=maps.normals,
     )
 
 

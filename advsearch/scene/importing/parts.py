@@ -26,7 +26,8 @@ from advsearch.scene.importing.checks import check_faces, checked
 from advsearch.scene.importing.files import damaged, shown, text_of
 from advsearch.scene.importing.gltf_entries import Header
 from advsearch.scene.importing.images import without_pillows_limit
-from advsearch.scene.importing.references import Named, References
+from advsearch.scene.importing.pictures import Pictures
+from advsearch.scene.importing.references import GLOW, Named, References
 from advsearch.scene.importing.surfaces import UNNAMED, ImportedSurface, SurfaceReader
 
 Array = npt.NDArray[np.float64]
@@ -108,7 +109,8 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         notes.append(f"{path.name}: {len(found) - len(meshes)} parts without faces (points, lines) are left out")
     named = _named_textures(path, data, header, references)
     materials = len(references.materials) if header is None else len(header.materials)
-    reader = SurfaceReader(path.name, named, references.refused, materials, references.get)
+    pictures = Pictures(materials, references.get, references.refused)
+    reader = SurfaceReader(path.name, named, pictures, header)
     parts = []
     for mesh, matrix, node in meshes:
         part = _part(mesh, reader.surface(mesh.visual), linear=path.suffix.lower() in GLTF)
@@ -172,7 +174,7 @@ def _file_notes(path: Path, data: bytes, header: Header | None, references: Refe
     unread = gltf.unread(header) if header else {what: len(names) for what, names in references.unread.items()}
     for what, count in unread.items():
         if count:
-            verb = "are" if what.endswith("maps") else "is"
+            verb = "is" if what == GLOW else "are"
             notes.append(f"{path.name}: {what} of {count} material{'s' if count > 1 else ''} {verb} left out")
     return notes
 
@@ -184,10 +186,10 @@ def _named_textures(path: Path, data: bytes, header: Header | None, references: 
         return {UNNAMED: (path.name, found[1])} if found else {}
     if header is None:
         return references.named
-    images: dict[str | None, str | None] = {}
-    for material in header.materials:
-        texture = gltf.base_color_image(header, material)
-        images[material.name] = texture if material.name not in images or images[material.name] else None
+    images = {
+        f"{gltf.MATERIAL}{index}": gltf.image_name(header, material.base_color)
+        for index, material in enumerate(header.materials)
+    }
     return {name: (path.name, image) for name, image in images.items() if image}
 
 

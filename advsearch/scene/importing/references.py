@@ -20,13 +20,10 @@ Named = dict[str | None, tuple[str, str]]
 
 MISSING = "is missing"
 OUTSIDE = "is outside its folder and is not read"
-NORMAL_MAPS, GLOW = "the normal maps", "the glow"
+NORMAL_MAPS, GLOW = "the normal maps with texture coordinates of their own", "the glow"
 """What a material may have that is not read."""
 
-_UNREAD = {
-    **dict.fromkeys(("bump", "map_bump", "norm"), NORMAL_MAPS),
-    **dict.fromkeys(("ke", "map_ke"), GLOW),
-}
+_UNREAD = dict.fromkeys(("ke", "map_ke"), GLOW)
 _SAID_BY_DEFAULT = {"ke": 0.0}
 """By the key of a line of a material file: what it says; and the numbers with which it says nothing."""
 
@@ -46,7 +43,7 @@ class References:
         refused: for each name, as `plain_name` gives it, why it was not read: `MISSING`, `OUTSIDE` or another clause.
         materials: names of the materials in the .mtl files read.
         named: the textures that these name.
-        unread: for `NORMAL_MAPS` and `GLOW`, the names of the materials that have them.
+        unread: for `GLOW`, the names of the materials that have it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -54,7 +51,7 @@ class References:
         self.refused: dict[str, str] = {}
         self.materials: set[str] = set()
         self.named: Named = {}
-        self.unread: dict[str, set[str]] = {NORMAL_MAPS: set(), GLOW: set()}
+        self.unread: dict[str, set[str]] = {GLOW: set()}
         self._folder = os.path.realpath(path.parent)
         self._contents: dict[str, bytes] = {}
 

@@ -25,7 +25,7 @@ from advsearch.scene.importing.geometry import FLAT
 from advsearch.scene.importing.gltf_entries import CameraEntry, Header, Light, Node
 from advsearch.scene.importing.objects import SUFFIXES, object_of
 from advsearch.scene.importing.parts import GLTF, ImportedPart, read_parts
-from advsearch.scene.parts import MeshPart, PlacedCamera, PointLamp, ScenePart
+from advsearch.scene.parts import PlacedCamera, PointLamp, ScenePart, mesh_part
 
 Doubles = npt.NDArray[np.float64]
 
@@ -108,7 +108,7 @@ def import_scene(path: Path, node: str) -> ImportedScene:
         matrix = np.eye(4)
         matrix[:3, :3] *= place.size / frame.size
         matrix[:3, 3] = frame.inside(place.origin)
-        surroundings.append(MeshPart(name, made.mesh, matrix, made.base_color, made.material, opacity=made.opacity))
+        surroundings.append(mesh_part(name, made, matrix, made.material))
     for index in lamps:
         light = header.lights[header.nodes[index].lamp or 0]
         surroundings.append(_lamp(names.free(light.name or header.label(index)), light, poses[index], frame))

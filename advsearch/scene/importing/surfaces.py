@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,24 +10,18 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from advsearch import files
-from advsearch.errors import FileFormatError
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
+from advsearch.scene.importing import gltf
 from advsearch.scene.importing.files import shown
-from advsearch.scene.importing.gltf_entries import CUT_OUTS, CUTOFF
-from advsearch.scene.importing.images import FORMATS, LARGEST_PIXELS, TEXTURE_LIMIT, check_pixels, display_image
-from advsearch.scene.importing.references import Named, plain_name
+from advsearch.scene.importing.gltf_entries import CUT_OUTS, CUTOFF, Header
+from advsearch.scene.importing.normal_maps import holds_normals, normal_map
+from advsearch.scene.importing.pictures import Pictures
+from advsearch.scene.importing.references import Named
 
 if TYPE_CHECKING:
     from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 Floats = npt.NDArray[np.float32]
-
-LARGEST_SUM = 2 * LARGEST_PIXELS
-"""Pixels that the textures of a file may have in all, before `advsearch.files.scaled`."""
-
-MOST_TEXTURES = 16
-"""Materials whose textures are kept at `TEXTURE_LIMIT`; more are baked into one map, for which less will do."""
 
 NEUTRAL = 0.5
 """Display-referred grey of an object without material."""
@@ -48,16 +40,23 @@ class ImportedSurface:
         texture: (H, W, 3) float32 base colour, row 0 on top, or (H, W, 4) with the opacity; or None.
         roughness: in [0, 1], or None when the file gives none.
         metallic: in [0, 1], or None when the file gives none.
+        normal_map: (H, W, 3) float32 of `advsearch.scene.importing.normal_maps`, row 0 on top; or None.
     """
 
     color: Floats | None = None
     texture: Floats | None = None
     roughness: float | None = None
     metallic: float | None = None
+    normal_map: Floats | None = None
 
-    def same_color(self, other: ImportedSurface) -> bool:
-        """Tell whether two surfaces have the same base colour everywhere."""
-        pairs = ((self.color, other.color), (self.texture, other.texture))
+    @property
+    def pictures(self) -> tuple[Floats, ...]:
+        """What is looked up by texture coordinates."""
+        return tuple(one for one in (self.texture, self.normal_map) if one is not None)
+
+    def same_maps(self, other: ImportedSurface) -> bool:
+        """Tell whether two surfaces have the same base colour, and the same normal map, everywhere."""
+        pairs = ((self.color, other.color), (self.texture, other.texture), (self.normal_map, other.normal_map))
         return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
 
 
@@ -68,22 +67,17 @@ class SurfaceReader:
     Attributes:
         source: the file's name, for warnings.
         named: for each material that names a texture: the file that names it, and the texture's name.
-        refused: for names of files, as `plain_name` gives them, why they were not read.
-        materials: how many the file has.
-        read: returns the content of a file that it names; raises FileNotFoundError.
+        pictures: decodes those that it names.
+        header: of a glTF file; None of others.
         notes: the warnings so far.
     """
 
     source: str
     named: Named
-    refused: Mapping[str, str]
-    materials: int
-    read: Callable[[str], bytes]
+    pictures: Pictures
+    header: Header | None = None
     notes: list[str] = field(default_factory=list)
     _known: dict[int, ImportedSurface] = field(default_factory=dict)
-    _pictures: dict[tuple[int, bool], Floats | str] = field(default_factory=dict)
-    _opened: list[Image.Image] = field(default_factory=list)
-    _pixels: int = 0
 
     def surface(self, visual: Any) -> ImportedSurface:
         """Return the surface of a parsed mesh's visual; an empty one where the file gives no material."""
@@ -101,7 +95,8 @@ class SurfaceReader:
             # The Kd of a textured material is an exporter's default more often than a tint: the texture stands alone.
             color = _color(material.kwargs.get("kd"))
             texture = self._texture(material, material.image, color)
-            return self._see_through(material, ImportedSurface(_unless_white(color, material, self.named), texture))
+            found = ImportedSurface(_unless_white(color, material, self.named), texture)
+            return replace(self._see_through(material, found), normal_map=self._bumps(material))
         return ImportedSurface()
 
     def _see_through(self, material: SimpleMaterial, surface: ImportedSurface) -> ImportedSurface:
@@ -124,17 +119,28 @@ class SurfaceReader:
         name = " ".join(material.kwargs.get("map_d") or [])
         if not name:
             return None
-        try:
-            image = Image.open(io.BytesIO(self.read(name)), formats=FORMATS)
-            found = self._decoded(image, alpha=True)
-            self._opened.append(image)  # what is decoded is known by its identity
-        except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-            found = None
+        found = self.pictures.of_file(name, "colours and alpha")
         if isinstance(found, np.ndarray):
             return found[:, :, 3] if found[:, :, 3].min() < 1.0 else found[:, :, :3].mean(axis=2)
-        why = self.refused.get(plain_name(name)) or found or "cannot be read as a picture"
-        self._note(f"{self.source}: the opacity {shown(name)} {why}; it is opaque instead")
+        self._note(f"{self.source}: the opacity {shown(name)} {found}; it is opaque instead")
         return None
+
+    def _bumps(self, material: SimpleMaterial) -> Floats | None:
+        """The normal map of a material file: ``norm``, or ``map_Bump`` or ``bump`` where these hold normals."""
+        for key in ("norm", "map_bump", "bump"):
+            scale, name = _scale_and_name(material.kwargs.get(key) or [])
+            if not name:
+                continue
+            picture = self.pictures.of_file(name, "numbers")
+            if isinstance(picture, np.ndarray):
+                if key == "norm" or holds_normals(picture):
+                    return normal_map(picture, scale)
+                picture = "holds heights, and no normals"
+            self._without_normals(name, picture)
+        return None
+
+    def _without_normals(self, name: str, why: str) -> None:
+        self._note(f"{self.source}: the normal map {shown(name)} {why}; it is left out")
 
     def _gltf(self, material: PBRMaterial) -> ImportedSurface:
         """Follow glTF 2.0, sections 3.9.2 and 3.9.4: linear factors multiply the textures, and alpha is opacity. Unlike
@@ -148,7 +154,7 @@ class SurfaceReader:
             tinted = linear_to_srgb(srgb_to_linear(texture[:, :, :3]) * factor)
             texture = np.concatenate([tinted, texture[:, :, 3:]], axis=2)
         roughness, metallic = material.roughnessFactor, material.metallicFactor
-        packed = self._decoded(material.metallicRoughnessTexture)
+        packed = self.pictures.decoded(material.metallicRoughnessTexture)
         if isinstance(packed, np.ndarray):
             self._note(f"{self.source}: textures of roughness and metallic are replaced by their means")
             green, blue = packed[:, :, 1].mean(), packed[:, :, 2].mean()
@@ -159,65 +165,40 @@ class SurfaceReader:
             under = material.alphaCutoff
             cutoff = None if material.alphaMode == "BLEND" else CUTOFF if under is None else under
             kept, texture = _with_opacity(color, scaled[3:], cutoff), _with_opacity(texture, scaled[3:], cutoff)
-        return ImportedSurface(kept, texture, _unit(roughness), _unit(metallic))
+        return ImportedSurface(kept, texture, _unit(roughness), _unit(metallic), self._normals(material))
+
+    def _normals(self, material: PBRMaterial) -> Floats | None:
+        """The normal map of a glTF material; warn where it cannot be had."""
+        entry = None if self.header is None else gltf.entry_of(self.header, material.name)
+        use = None if entry is None else entry.plain().normalTexture
+        if self.header is None or use is None:
+            return None
+        found = self.pictures.decoded(material.normalTexture, "numbers")
+        if isinstance(found, np.ndarray):
+            return normal_map(found, use.scale)
+        name = gltf.image_name(self.header, use) or ""
+        self._without_normals(name, self.pictures.why(name, found))
+        return None
 
     def _texture(
         self, material: Any, image: Image.Image | None, color: Floats | None, *, alpha: bool = False
     ) -> Floats | None:
         """Return the base colour texture; where the material names one that cannot be had, warn."""
-        texture = self._decoded(image, alpha=alpha)
+        texture = self.pictures.decoded(image, "colours and alpha" if alpha else "colours")
         if isinstance(texture, np.ndarray):
             return texture
         if material.name in self.named:
             file, name = self.named[material.name]
-            why = self.refused.get(plain_name(name)) or texture or "cannot be read as a picture"
+            why = self.pictures.why(name, texture)
             kept = _unless_white(color, material, self.named)
             instead = "neutral grey" if kept is None else f"its base colour ({', '.join(f'{c:.2f}' for c in kept)})"
             where = "" if file == self.source else f"{self.source}: "
             self._note(f"{where}{file} names the texture {shown(name)}, which {why}; {instead} is used instead")
         return None
 
-    def _decoded(self, image: Image.Image | None, *, alpha: bool = False) -> Floats | str | None:
-        """Return a picture's values, why there are none, or None; a picture without format is trimesh's invention."""
-        if image is None or image.format is None:
-            return None
-        key = id(image), alpha
-        if key not in self._pictures:
-            self._pictures[key] = self._pixels_of(image, alpha)
-        return self._pictures[key]
-
-    def _pixels_of(self, image: Image.Image, alpha: bool) -> Floats | str:
-        """Decode a picture, or say why not."""
-        width, height = image.size
-        try:
-            check_pixels("", width, height)
-            self._check_sum(self._pixels + width * height)
-            texture = display_image(image, _side(self.materials), "", alpha=alpha)
-        except FileFormatError as error:
-            return f"is not read ({str(error).removeprefix(': ')})"
-        except (OSError, ValueError, SyntaxError, EOFError):
-            return "cannot be read as a picture"
-        self._pixels += width * height
-        return texture
-
-    @staticmethod
-    def _check_sum(pixels: int) -> None:
-        """Refuse a picture that is too much with those before it."""
-        most = files.scaled(LARGEST_SUM)
-        if pixels > most:
-            raise files.too_large("", f"pictures of at most {most:,} pixels", f"{pixels:,} in all")
-
     def _note(self, message: str) -> None:
         if message not in self.notes:
             self.notes.append(message)
-
-
-def _side(materials: int) -> int:
-    """Return the longest side of the textures of so many materials; all together they take a bounded memory."""
-    side = TEXTURE_LIMIT
-    while side > 64 and materials * side * side > MOST_TEXTURES * TEXTURE_LIMIT * TEXTURE_LIMIT:
-        side //= 2
-    return side
 
 
 def _color(given: Any) -> Floats | None:
@@ -249,6 +230,18 @@ def _unless_white(color: Floats | None, material: Any, named: Named) -> Floats |
     if color is not None and material.name in named and (color > 0.999).all():
         return None
     return color
+
+
+def _scale_and_name(words: list[str]) -> tuple[float, str]:
+    """Return the factor (``-bm``) of a line of a material file that names a bump map, 1 by default, and the name."""
+    if "-bm" not in words[:-2]:
+        return 1.0, " ".join(words)
+    at = words.index("-bm")
+    try:
+        scale = float(words[at + 1])
+    except ValueError:
+        scale = 1.0
+    return scale if math.isfinite(scale) else 1.0, " ".join(words[:at] + words[at + 2 :])
 
 
 def _last_number(words: list[str] | None, otherwise: float) -> float:

@@ -1,13 +1,13 @@
-"""The base colour map of an imported object, and texture coordinates that fit it.
+"""The maps of an imported object, of its base colour and its normals, and texture coordinates that fit them.
 
-The file's own UVs and texture are kept where they can be used as they are. Otherwise the mesh is unwrapped with xatlas
-and whatever colours the file has (repeating textures, several materials, vertex colours) are baked into one texture.
+The file's own UVs and textures are kept where they can be used as they are. Otherwise the mesh is unwrapped with xatlas
+and whatever the file has (repeating textures, several materials, vertex colours) is baked into one texture of a kind.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,9 @@ from scipy.sparse import coo_array, csgraph
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing.geometry import Array, Soup
 from advsearch.scene.importing.images import TEXTURE_LIMIT
+from advsearch.scene.importing.normal_maps import FLAT
 from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface
+from advsearch.scene.importing.tangents import mirrored, turned, unmirrored
 from advsearch.scene.importing.unwrap import unwrapped
 from advsearch.scene.raster import doubled_areas, pixels_in
 from advsearch.scene.surface_map import looked_up
@@ -37,32 +39,54 @@ _WINDOW = 1.5  # how many textures wide and high UVs may be and still keep their
 _FILLED = 0.5  # share of an atlas that its charts fill, about
 
 
-def textured(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[Soup, Floats, list[str]]:
-    """Return the soup with UVs in [0, 1] on every corner, the base colour map that fits them, and the warnings.
+@dataclass(frozen=True, eq=False)
+class SurfaceMaps:
+    """What an object looks like by its texture coordinates; row 0 is on top, at v = 1.
+
+    Attributes:
+        color: (H, W, 3) float32 display-referred base colour in [0, 1]; (H, W, 4) with the opacity where light passes
+            through a part.
+        normals: (H', W', 3) float32 of `advsearch.scene.importing.normal_maps`; None where there is no normal map.
+    """
+
+    color: Floats
+    normals: Floats | None = None
+
+
+def textured(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[Soup, SurfaceMaps, list[str]]:
+    """Return the soup with UVs in [0, 1] on every corner, the maps that fit them, and the warnings.
 
     Args:
         soup: repaired geometry.
         surfaces: the surface of each part.
-
-    Returns:
-        The soup, a (H, W, 3) float32 display-referred map in [0, 1] with row 0 on top, (H, W, 4) with the opacity where
-        light passes through a part, and sentences.
     """
     used = [surfaces[number] for number in np.unique(soup.part)]
-    uniform = all(surface.same_color(used[0]) for surface in used)
+    first, uniform = used[0], all(surface.same_maps(used[0]) for surface in used)
     colored = uniform and _one_factor(soup)
-    texture = used[0].texture
-    if colored and texture is None:
-        color = _plain(used[0]) if soup.colors.min() == 1.0 else _tinted(_plain(used[0]), soup.colors[0, 0])
+    if colored and not first.pictures:
         kept = _usable(soup, soup.uvs)
         soup = replace(soup, uvs=np.clip(soup.uvs, 0.0, 1.0)) if kept else unwrapped(soup)
-        return soup, np.full((PLAIN_SIZE, PLAIN_SIZE, len(color)), color, dtype=np.float32), []
-    if colored and texture is not None and soup.colors.min() == 1.0 and np.isfinite(soup.uvs).all():
-        uvs, texture = _windowed(_into_unit_square(soup), texture)
+        return soup, SurfaceMaps(_of_one_color(soup, first)), []
+    if colored and (first.texture is None or soup.colors.min() == 1.0) and np.isfinite(soup.uvs).all():
+        uvs, pictures = _windowed(_into_unit_square(soup), first.pictures)
         if _usable(soup, uvs):
-            return replace(soup, uvs=np.clip(uvs, 0.0, 1.0)), texture, []
+            return *_kept(soup, np.clip(uvs, 0.0, 1.0), first, pictures), []
     fresh = unwrapped(soup)
     return fresh, baked(fresh.uvs, soup, surfaces), [_why(soup, used, uniform)]
+
+
+def _of_one_color(soup: Soup, surface: ImportedSurface) -> Floats:
+    color = _plain(surface) if soup.colors.min() == 1.0 else _tinted(_plain(surface), soup.colors[0, 0])
+    return np.full((PLAIN_SIZE, PLAIN_SIZE, len(color)), color, dtype=np.float32)
+
+
+def _kept(soup: Soup, uvs: Array, surface: ImportedSurface, pictures: Sequence[Floats]) -> tuple[Soup, SurfaceMaps]:
+    """Return the soup with the file's own UVs, and its pictures, as `ImportedSurface.pictures` has them, as maps."""
+    color = _of_one_color(soup, surface) if surface.texture is None else pictures[0]
+    if surface.normal_map is None:
+        return replace(soup, uvs=uvs), SurfaceMaps(color)
+    uvs, color, normals = unmirrored(uvs, mirrored(soup, uvs), color, pictures[-1])
+    return replace(soup, uvs=uvs), SurfaceMaps(color, normals)
 
 
 def _why(soup: Soup, used: Sequence[ImportedSurface], uniform: bool) -> str:
@@ -72,7 +96,8 @@ def _why(soup: Soup, used: Sequence[ImportedSurface], uniform: bool) -> str:
     if not _one_factor(soup) or soup.colors.min() < 1.0:
         return "its vertex or face colours were baked into a texture"
     if not np.isfinite(soup.uvs).all():
-        return "it has a texture but lacks texture coordinates; where it does, the texture's mean colour is used"
+        mean = "the texture's mean colour is used" if used[0].texture is not None else "its normal map is left out"
+        return f"it has a texture but lacks texture coordinates; where it does, {mean}"
     return "its texture coordinates repeat or hardly use the texture; it was unwrapped anew and its texture resampled"
 
 
@@ -118,32 +143,38 @@ def _into_unit_square(soup: Soup) -> Array:
     return moved
 
 
-def _windowed(uvs: Array, texture: Floats) -> tuple[Array, Floats]:
-    """Cut the texture to the window that UVs span where they overstep the unit square a little or use a corner of it.
+def _windowed(uvs: Array, pictures: Sequence[Floats]) -> tuple[Array, Sequence[Floats]]:
+    """Cut pictures to the window that UVs span where they overstep the unit square a little or use a corner of it.
 
-    The layout of the charts stays. Windows larger than `_WINDOW` textures are left alone: there the texture repeats.
+    The layout of the charts stays. Windows larger than `_WINDOW` textures are left alone: there the textures repeat.
 
     Returns:
-        The UVs and the texture, unchanged or both made to fit the window.
+        The UVs and the pictures, unchanged or all made to fit the window.
     """
-    texel = 1.0 / np.array(texture.shape[1::-1])
+    texel = np.max([1.0 / np.array(one.shape[1::-1]) for one in pictures], axis=0)
     low, high = uvs.min(axis=(0, 1)) - texel, uvs.max(axis=(0, 1)) + texel
     size = high - low
     inside = low.min() >= -_SLACK - texel.max() and high.max() <= 1.0 + _SLACK + texel.max()
     if size.max() > _WINDOW or (inside and np.abs(doubled_areas(uvs)).sum() / 2.0 >= _CRAMPED):
-        return uvs, texture
-    width, height = np.clip(np.ceil(size / texel), 1, TEXTURE_LIMIT).astype(int)
+        return uvs, pictures
+    return (uvs - low) / size, [_cut(one, low, high) for one in pictures]
+
+
+def _cut(picture: Floats, low: Array, high: Array) -> Floats:
+    """Return the window of a repeating picture (H, W, C) between two corners (u, v), with texels of the same size."""
+    size = high - low
+    width, height = np.clip(np.ceil(size * np.array(picture.shape[1::-1])), 1, TEXTURE_LIMIT).astype(int)
     columns = low[0] + (np.arange(width) + 0.5) / width * size[0]
     rows = high[1] - (np.arange(height) + 0.5) / height * size[1]
     grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    return (uvs - low) / size, sampled(texture, grid).reshape(height, width, -1)
+    return sampled(picture, grid).reshape(height, width, -1)
 
 
 # --- baking ----------------------------------------
 
 
-def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Floats:
-    """Paint the colours of a soup into a texture for new UVs.
+def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> SurfaceMaps:
+    """Paint the colours and the normals of a soup into maps for new UVs.
 
     Args:
         uvs: (F, 3, 2) new UVs in [0, 1], without overlaps.
@@ -151,31 +182,39 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Floats
         surfaces: the surface of each part.
 
     Returns:
-        (N, N, 3 or 4) float32 display-referred map. Texels outside every chart repeat the nearest one inside, so that
-        filtering finds no seam.
+        Maps (N, N, ...). Texels outside every chart repeat the nearest one inside, so that filtering finds no seam.
     """
     size = _baked_size(soup, surfaces)
     corners = np.stack([uvs[:, :, 0] * size - 0.5, (1.0 - uvs[:, :, 1]) * size - 0.5], axis=2)
     face, rows, columns, weights = pixels_in(corners, (size, size), tolerance=1e-9)
     through = any(_channels(one) == 4 for one in surfaces)
     image, inside = np.ones((size, size, 3 + through), np.float32), np.zeros((size, size), np.bool_)
+    bumpy = any(one.normal_map is not None for one in surfaces)
+    normals = np.full((size, size, 3), FLAT) if bumpy else None
     factor = np.einsum("tk,tkc->tc", weights, soup.colors[face])
     part = soup.part[face]
     order = np.argsort(part, kind="stable")
     for here in np.split(order, np.flatnonzero(np.diff(part[order])) + 1):
         if not len(here):  # no texel at all
             continue
-        number = int(part[here[0]])
-        surface, at = surfaces[number], np.einsum("tk,tkc->tc", weights[here], soup.uvs[face[here]])
-        if surface.texture is None or not np.isfinite(at).all():
-            color: Floats = _plain(surface)[None] if surface.texture is None else _mean(surface.texture)
-            color = np.broadcast_to(color, (len(at), color.shape[1]))
-        else:
-            color = sampled(surface.texture, at)
+        surface, at = surfaces[int(part[here[0]])], np.einsum("tk,tkc->tc", weights[here], soup.uvs[face[here]])
+        color = _looked_up(surface, at)
         image[rows[here], columns[here], : color.shape[1]] = _tinted(color, factor[here])
+        if normals is not None and surface.normal_map is not None and np.isfinite(at).all():
+            texels = sampled(surface.normal_map, at)
+            normals[rows[here], columns[here]] = turned(texels, soup, uvs, face[here], weights[here])
     inside[rows, columns] = True
     nearest = distance_transform_edt(~inside, return_distances=False, return_indices=True)
-    return np.ascontiguousarray(image[nearest[0], nearest[1]])
+    whole = nearest[0], nearest[1]
+    return SurfaceMaps(image[whole], None if normals is None else normals[whole])
+
+
+def _looked_up(surface: ImportedSurface, at: Array) -> Floats:
+    """Return the base colour (T, 3 or 4) of a surface at UVs (T, 2)."""
+    if surface.texture is not None and np.isfinite(at).all():
+        return sampled(surface.texture, at)
+    color = _plain(surface)[None] if surface.texture is None else _mean(surface.texture)
+    return np.broadcast_to(color, (len(at), color.shape[1]))
 
 
 def _channels(surface: ImportedSurface) -> int:
@@ -187,9 +226,7 @@ def _baked_size(soup: Soup, surfaces: Sequence[ImportedSurface]) -> int:
     """Return a power of two, `BAKED_SIZE` to `TEXTURE_LIMIT`, that has room for the texels that the object shows."""
     texels, areas = 0.0, np.nan_to_num(np.abs(doubled_areas(soup.uvs)) / 2.0)
     for number, area in enumerate(np.bincount(soup.part, areas)):
-        texture = surfaces[number].texture
-        if texture is not None:
-            texels += float(area) * texture.shape[0] * texture.shape[1]
+        texels += float(area) * max((one.shape[0] * one.shape[1] for one in surfaces[number].pictures), default=0)
     size = BAKED_SIZE
     while size < TEXTURE_LIMIT and size * size * _FILLED < texels:
         size *= 2

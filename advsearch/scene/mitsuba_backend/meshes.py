@@ -11,30 +11,27 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.scene.assets import Floats, Material, Mesh
+from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.mitsuba_backend.plugins import loadable
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
-from advsearch.scene.parts import BASE_COLOR
+from advsearch.scene.parts import BASE_COLOR, MeshPart
 
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
 """Names of a mesh's parameters: flat arrays of 3, 3 and 2 numbers a vertex, and 3 indices a face."""
 
 
-def principled(
-    base_color: Floats, material: Material, extra: Plugin | None = None, opacity: Floats | None = None
-) -> Plugin:
+def principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
     """A two-sided principled BSDF with the base colour as a bilinear texture of linear reflectance.
 
     Args:
-        base_color: (h, w, 3) display-referred sRGB in [0, 1], row 0 at v = 1.
-        material: the numbers of the surface. A clearcoat of 0 leaves the lobe out.
+        part: the mesh whose surface it is, with cut-outs and normal map. A clearcoat of 0 leaves the lobe out.
         extra: further entries of the plugin's dictionary.
-        opacity: (h, w) in [0, 1], row 0 at v = 1: light passes through the rest; None where there are no cut-outs.
     """
+    material = part.material
     surface: Plugin = {
         "type": "principled",
-        "base_color": _texture(srgb_to_linear(base_color)),
+        "base_color": _texture(srgb_to_linear(part.base_color)),
         "roughness": material.roughness,
         "metallic": material.metallic,
         "specular": material.specular,
@@ -42,12 +39,12 @@ def principled(
     }
     if material.clearcoat > 0.0:
         surface["clearcoat"] = material.clearcoat
-    both_sides: Plugin = {"type": "twosided", "bsdf": surface}
-    return (
-        both_sides
-        if opacity is None
-        else {"type": "mask", "opacity": _texture(opacity[:, :, None]), "bsdf": both_sides}
-    )
+    found: Plugin = {"type": "twosided", "bsdf": surface}
+    if part.normal_map is not None:
+        found = {"type": "normalmap", "normalmap": _texture(part.normal_map), "bsdf": found}
+    if part.opacity is not None:
+        found = {"type": "mask", "opacity": _texture(part.opacity[:, :, None]), "bsdf": found}
+    return found
 
 
 def matt(reflectance: Floats) -> Plugin:

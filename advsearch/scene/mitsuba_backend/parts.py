@@ -49,7 +49,7 @@ def mesh_translation(part: MeshPart, lobes: Plugin | None = None) -> Translation
         lobes: further entries of the principled plugin's dictionary, such as `IDLE_LOBES`.
     """
     name, count = part.name, len(part.mesh.vertices)
-    surface, color_key = principled(part.base_color, part.material, lobes, part.opacity), "base_color"
+    surface, color_key = principled(part, lobes), "base_color"
     if part.surface is not None:
         surface, color_key = own_surface(part.surface, part.base_color)
     inputs = (

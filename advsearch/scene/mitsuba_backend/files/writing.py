@@ -150,7 +150,7 @@ def _part(part: ScenePart, left: Plugin) -> Plugin:
         part = replace(part, material=replace(part.material, **numbers))
         if color is not None:
             part = replace(part, base_color=_display(color))
-        surface = principled(part.base_color, part.material, opacity=part.opacity)
+        surface = principled(part)
         if part.surface is not None:
             surface = own_surface(part.surface, part.base_color)[0]
         found: Plugin = {"type": "ply", "bsdf": surface}
