@@ -45,7 +45,8 @@ CONFIG = {
     "distributed.scheduler.allowed-failures": 1_000_000,  # who died of what is counted by the coordinator
     "distributed.admin.large-graph-warning-threshold": "2GiB",  # files of a scene are sent once a worker
     "distributed.comm.timeouts.connect": "120s",  # a worker that starts on a busy machine takes its time,
-    "distributed.comm.timeouts.tcp": "120s",  # and one that gives up is not started again
+    "distributed.comm.timeouts.tcp": "120s",  # and one that gives up is not started again,
+    "distributed.deploy.lost-worker-timeout": "1h",  # nor is one that is not back after this
     "distributed.worker.profile.enabled": False,
     "distributed.admin.system-monitor.gil.enabled": False,
 }

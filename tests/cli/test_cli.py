@@ -137,7 +137,7 @@ def test_no_command_prints_help_and_version_is_told(capsys: pytest.CaptureFixtur
         (["--jsn"], "unknown flag '--jsn'."),
         (["attack", "--epsilom", "1"], "unknown flag '--epsilom'. Did you mean '--epsilon'"),
         (["attack", "--eps", "1"], "unknown flag '--eps'."),
-        (["precision", "--workers", "2"], "advsearch precision has no --workers, a flag of advsearch attack, sweep"),
+        (["region", "--workers", "2"], "advsearch region has no --workers, a flag of advsearch attack, sweep"),
         (["attack", "mug"], "expected flags, got 'mug'; see advsearch attack --help"),
         (["attack", "--steps"], "argument --steps: expected one argument; see advsearch attack --help"),
         (["attack"], "--object: expected the name of an object or a .obj, .ply, .glb, .gltf or .stl file, got nothing"),

@@ -22,6 +22,7 @@ from advsearch.cluster.opening import CLASSES, executor_of, place_of
 from advsearch.errors import ClusterError, FileFormatError, InputError
 
 psutil: Any = import_module("psutil")  # which Dask brings along
+dask: Any = import_module("dask")
 SCRIPTS = Path(sys.executable).parent
 
 
@@ -60,6 +61,27 @@ def test_processes_of_this_machine_are_killed_and_nothing_is_lost() -> None:
         assert len(seen) == 400 and list(lost) == [301]
         facts = executor.facts
         assert facts is not None and facts.lost >= 4 and facts.most == 2
+
+
+@pytest.mark.slow
+def test_a_worker_that_takes_long_to_start_again_is_waited_for(tmp_path: Path) -> None:
+    """The only one dies, and needs more than the 15 seconds after which Dask gives up by itself."""
+    begun, late = tmp_path / "begun", tmp_path / "late.py"
+    late.write_text(
+        f"import pathlib, time\nbegun = pathlib.Path({str(begun)!r})\n"
+        "time.sleep(17.0) if begun.exists() else begun.touch()\n"
+    )
+    work = Work("cluster_work:squares", {"seconds": 0.01})
+    with dask.config.set({"distributed.worker.preload": [str(late)]}):
+        with executor_of(work, workers=1, cluster=None, tell=lambda text: None) as executor:
+            assert executor is not None
+            seen: set[int] = set()
+            for done in executor.results(pieces(100)):
+                if not seen:
+                    mine = psutil.Process().children(recursive=True)
+                    next(one for one in mine if "spawn_main" in " ".join(one.cmdline())).kill()
+                seen |= set(done.numbers)
+            assert seen == set(range(100)) and executor.facts is not None and executor.facts.lost == 1
 
 
 @contextmanager
