@@ -18,7 +18,7 @@ from advsearch.api import attack as attacking
 from advsearch.api.attack import announced_of, budget_of, preparation_of
 from advsearch.attacks import Block, Domain, Evaluation, Policy, make_policy
 from advsearch.attacks.verification import WORST_CASE, Rule
-from advsearch.cluster.executor import Done, InProcess, Workforce
+from advsearch.cluster.executor import Done, InProcess, Work, Workforce
 from advsearch.config import AttackConfig
 from advsearch.engine.memory import Memory
 from advsearch.engine.record import Findings, Recorder, Stages
@@ -186,8 +186,14 @@ class StandInWorkers:
                 yield Done(done.numbers, None if away else done.value, "tcp://1", "ab12" if place else None, away)
 
 
-def shared(monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], **more: Any) -> StandInWorkers:
-    """Let attacks of these settings share with stand-ins."""
-    ready = StandInWorkers(InProcess(announced_of(settings)), **more)
-    monkeypatch.setattr(attacking, "executor_of", lambda work, **_: nullcontext(ready))
+def shared(
+    monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], call: Callable[[Any], Any] = announced_of, **more: Any
+) -> StandInWorkers:
+    """Let stand-ins carry out a call wherever it is asked for of these settings; all else is done in this process."""
+    ready = StandInWorkers(InProcess(call(settings)), **more)
+
+    def executor_of(work: Work, **_: Any) -> nullcontext[StandInWorkers | None]:
+        return nullcontext(ready if work.function.endswith(f":{call.__name__}") else None)
+
+    monkeypatch.setattr(attacking, "executor_of", executor_of)
     return ready

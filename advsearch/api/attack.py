@@ -17,7 +17,7 @@ from advsearch.attacks import Policy, make_policy
 from advsearch.attacks.objectives import check_objective
 from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
-from advsearch.config import AttackConfig, SceneConfig
+from advsearch.config import AttackConfig, PrecisionConfig, SceneConfig
 from advsearch.config.scene import one_only
 from advsearch.controls import make_space
 from advsearch.controls.base import Control
@@ -413,7 +413,7 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
     policy = _policy(job, problem)
     with _directory(job, run) as kept:
         memory = Memory(kept)
-        with _executor(job.config, progress) as executor:
+        with executor_for(job.config, "advsearch.api.attack:announced_of", progress) as executor:
             recorder = Recorder(kept, problem, memory, Ahead(executor))
             spent = (budget_of(job.config), policy, recorder, memory, stages, preparation_of(job.config))
             findings = Attack(problem, *spent, clean=job.clean).carry_out()
@@ -425,10 +425,19 @@ def announced_of(settings: JsonObject) -> Call:
     return seen_by(_problem(_job(AttackConfig(**settings))))
 
 
-def _executor(config: AttackConfig, progress: Progress) -> AbstractContextManager[Executor | None]:
-    """What carries out beforehand what does not wait; None for this process."""
+def executor_for(
+    config: AttackConfig | PrecisionConfig, function: str, progress: Progress, *, ahead: bool = True
+) -> AbstractContextManager[Executor | None]:
+    """Return what carries out a function of a configuration, as its workers and cluster say; None for this process.
+
+    Args:
+        config: its settings are the function's.
+        function: see `Work`, as `ahead`.
+        progress: told what a person should read.
+        ahead: see there.
+    """
     settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
-    work = Work("advsearch.api.attack:announced_of", settings, FILES, config.used_threads or 1)
+    work = Work(function, settings, FILES, config.used_threads or 1, ahead=ahead)
     return executor_of(work, workers=config.workers, cluster=config.cluster, tell=progress.message)
 
 

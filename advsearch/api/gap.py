@@ -11,16 +11,20 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.api.attack import LOADING, attack_once, check_from_config, problem_from_config
+from advsearch.api.attack import LOADING, attack_once, check_from_config, executor_for, problem_from_config
 from advsearch.api.keywords import GapKeywords, asks, configured
 from advsearch.api.parts import SETTLED, StudyAttack, chains_of, share
 from advsearch.attacks import clopper_pearson
 from advsearch.attacks.verification import WORST_CASE
+from advsearch.cluster.executor import Call
 from advsearch.config import AttackConfig, GapConfig
+from advsearch.engine.ahead import Ahead, AheadAnswer, PictureAhead, seen_by
 from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.naming import different, load_models
+from advsearch.engine.problem import Problem
 from advsearch.engine.transfer import Transfer
 from advsearch.engine.transport import CleanMatrix
+from advsearch.files import JsonObject
 from advsearch.interrupts import interruptible
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.drawing import Figures
@@ -380,10 +384,12 @@ def _matrix(config: AttackConfig, names: Sequence[str], parts: _Parts) -> tuple[
                 parts.progress.stage("loading the models to try the answers on")
                 problems = {name: problem_from_config(_alone(config, name))[0] for name in names}
                 seed, trials = seeds.stream(config.seed, "matrix"), config.trial_count
-                tried = Transfer(problems, parts.run, parts.progress, trials=trials, spp=spp, seed=seed)
-                models = tried.clean()
-                for name, u in answers.items():
-                    cells[name] = tried.on_each(name, u)
+                with executor_for(config, "advsearch.api.gap:pictures_of", parts.progress) as executor:
+                    kept = (problems, parts.run, parts.progress, Ahead(executor))
+                    tried = Transfer(*kept, trials=trials, spp=spp, seed=seed)
+                    models = tried.clean()
+                    for name, u in answers.items():
+                        cells[name] = tried.on_each(name, u)
         except KeyboardInterrupt:
             parts.interrupted = True
     rows = [
@@ -391,6 +397,21 @@ def _matrix(config: AttackConfig, names: Sequence[str], parts: _Parts) -> tuple[
         for name, one in attacked
     ]
     return models, rows
+
+
+def pictures_of(settings: JsonObject) -> Call:
+    """Return what makes pictures for the models of a configuration: what a worker does."""
+    config, problems = AttackConfig(**settings), dict[str, Problem]()
+
+    def call(asked: Sequence[PictureAhead]) -> list[AheadAnswer]:
+        found = []
+        for one in asked:
+            if one.of not in problems:
+                problems[one.of] = problem_from_config(_alone(config, one.of))[0]
+            found += seen_by(problems[one.of])([one])
+        return found
+
+    return call
 
 
 def _alone(config: AttackConfig, name: str) -> AttackConfig:

@@ -15,11 +15,10 @@ import torch
 from torch import Tensor
 
 from advsearch import seeds
-from advsearch.api.attack import LOADING, problem_from_config
+from advsearch.api.attack import LOADING, executor_for, problem_from_config
 from advsearch.api.keywords import PrecisionKeywords, asks, configured
 from advsearch.attacks import Policy, make_policy
-from advsearch.cluster.executor import Call, Executor, Work
-from advsearch.cluster.opening import executor_of
+from advsearch.cluster.executor import Call, Executor
 from advsearch.config import PrecisionConfig
 from advsearch.engine.gradients import Loss, inside, smooth_loss
 from advsearch.engine.measuring import Results, kept_rows
@@ -46,7 +45,7 @@ from advsearch.runs.results.base import Formation
 from advsearch.runs.results.precision import PrecisionResult, PrecisionSubject
 from advsearch.runs.summary import to_json
 from advsearch.scene.renderer import Renderer
-from advsearch.settings import FILES, split_names
+from advsearch.settings import split_names
 from advsearch.viewer.pages import write_page
 
 if TYPE_CHECKING:
@@ -165,9 +164,7 @@ def _measured(config: PrecisionConfig, run: RunDirectory | None, progress: Progr
 @contextmanager
 def _executor(config: PrecisionConfig, progress: Progress) -> Iterator[Executor | None]:
     """Open what carries out parts of references, its first worker ready; None for this process."""
-    settings = config.to_repeat().model_copy(update={"workers": None, "cluster": None}).plain()
-    work = Work("advsearch.api.precision:references_of", settings, FILES, config.used_threads or 1, ahead=False)
-    with executor_of(work, workers=config.workers, cluster=config.cluster, tell=progress.message) as executor:
+    with executor_for(config, "advsearch.api.precision:references_of", progress, ahead=False) as executor:
         if executor is not None:
             progress.stage("workers load the scene and the model")
             for _ in executor.results([range(1)], [None]):

@@ -41,7 +41,7 @@ class AheadAnswer:
     """What came of one configuration.
 
     Attributes:
-        value: an evaluation, the judgement of a trial, or what a matrix collected.
+        value: an evaluation, the judgement of a trial, what a matrix collected, or a picture.
         picture: (H, W, 3) sRGB in [0, 1], where it was wanted.
         non_finite: values of pictures that were not finite and were set to 0.
     """
@@ -165,7 +165,36 @@ class MatrixAhead:
         raise ClusterError(f"the matrix of a condition: {why}; `advsearch resume RUN workers=null` makes it here")
 
 
-Announced = TrialAhead | EvaluationAhead | MatrixAhead
+@dataclass(frozen=True, eq=False)
+class PictureAhead:
+    """A picture: see `Problem.picture`.
+
+    Attributes:
+        u: (d,) of the searched controls.
+        seed: of its render.
+        spp: samples a pixel.
+        of: the name of the problem, where there are several.
+    """
+
+    u: Tensor
+    seed: int
+    spp: int
+    of: str
+
+    def seen(self, problem: Problem) -> AheadAnswer:
+        """Carry it out."""
+        return AheadAnswer(problem.picture(self.u, self.seed, self.spp))
+
+    def lost(self, why: str) -> AheadAnswer:
+        """Nothing can stand for it.
+
+        Raises:
+            ClusterError: always.
+        """
+        raise ClusterError(f"a picture for {self.of}: {why}; `advsearch resume RUN workers=null` makes it here")
+
+
+Announced = TrialAhead | EvaluationAhead | MatrixAhead | PictureAhead
 AheadLine: TypeAlias = Generator[Announced, Any, None]
 """What is announced, one after the other; it is sent the value of each answer before it says what comes next."""
 

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from advsearch.attacks import Ending, Verification, run_trials, verify
+from advsearch.engine.ahead import Ahead, PictureAhead, line_of
 from advsearch.engine.memory import Memory
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder
 from advsearch.progress import Progress
 from advsearch.runs.directory import RunDirectory
 from advsearch.scene.formation import to_8_bit
+from advsearch.seeds import stream
 from advsearch.tasks import Judgement
 
 
@@ -52,10 +54,18 @@ class Retrials:
         progress: told of every trial.
         trials: of each answer under each condition.
         seed: root of these trials, which nothing else uses.
+        ahead: workers make the pictures before their turn.
     """
 
     def __init__(
-        self, conditions: Sequence[RetrialCondition], run: RunDirectory, progress: Progress, *, trials: int, seed: int
+        self,
+        conditions: Sequence[RetrialCondition],
+        run: RunDirectory,
+        progress: Progress,
+        *,
+        trials: int,
+        seed: int,
+        ahead: Ahead | None = None,
     ) -> None:
         self._conditions, self._progress, self._count, self._seed = conditions, progress, trials, seed
         memory = Memory(run)
@@ -64,6 +74,7 @@ class Retrials:
         self._clean: dict[str, tuple[Judgement, ...]] = {}
         self._pictures: dict[tuple[Hashable, int, int], Tensor] = {}
         self._pictured = ""
+        self._ahead = ahead or Ahead()
 
     def clean(self, condition: RetrialCondition) -> tuple[Judgement, ...]:
         """Try the clean scene under one condition, once."""
@@ -106,6 +117,8 @@ class Retrials:
             number, count = count, count + 1
             judged = self._stored(rows, number)
             if judged is None:
+                if not self._ahead.begun:
+                    self._announce(kind, condition, u, range(number, self._count))
                 picture = condition.change(self._picture(kind, condition, u, seed), seed)
                 judged = problem.judge(to_8_bit(picture), problem.whole(u, seed))
             self._recorders[condition.name].trial(rows, number, spp, judged, seed, u)
@@ -114,12 +127,25 @@ class Retrials:
 
         return trial
 
+    def _announce(self, kind: str, condition: RetrialCondition, u: Tensor, numbers: range) -> None:
+        """Have the pictures of these trials made beforehand that are not there."""
+        rows = f"{kind} under {condition.name}"
+        new = [stream(self._seed, "verification", one) for one in numbers if self._stored(rows, one) is None]
+        wanted = [one for one in new if kind != self._pictured or self._key(condition, one) not in self._pictures]
+        pictures = (PictureAhead(u, one, condition.spp, condition.name) for one in wanted)
+        self._ahead.begin([line_of(one) for one in pictures])
+
+    @staticmethod
+    def _key(condition: RetrialCondition, seed: int) -> tuple[Hashable, int, int]:
+        return condition.source, seed, condition.spp
+
     def _picture(self, kind: str, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
         """The picture of a trial; those of the configuration that is tried now are kept for other conditions."""
         if kind != self._pictured:
             self._pictures.clear()
             self._pictured = kind
-        key = condition.source, seed, condition.spp
+        key = self._key(condition, seed)
         if key not in self._pictures:
-            self._pictures[key] = condition.problem.picture(u, seed, condition.spp)
+            seen = self._ahead.take(PictureAhead(u, seed, condition.spp, condition.name))
+            self._pictures[key] = condition.problem.picture(u, seed, condition.spp) if seen is None else seen.value
         return self._pictures[key]

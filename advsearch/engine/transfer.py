@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from torch import Tensor
 
 from advsearch.attacks import Verification, count_right
+from advsearch.engine.ahead import Ahead
 from advsearch.engine.problem import Problem
 from advsearch.engine.retrial import RetrialCondition, Retrials
 from advsearch.engine.rows import verified_rate
@@ -23,6 +24,7 @@ class Transfer:
         problems: of each model, by its name; they have one space.
         run: keeps the rows.
         progress: told how far it is.
+        ahead: workers make the pictures before their turn.
         trials: of each answer on each model.
         spp: samples a pixel.
         seed: root of the trials.
@@ -33,13 +35,14 @@ class Transfer:
         problems: Mapping[str, Problem],
         run: RunDirectory,
         progress: Progress,
+        ahead: Ahead,
         *,
         trials: int,
         spp: int,
         seed: int,
     ) -> None:
         self._conditions = [RetrialCondition(name, one, spp, _size(one)) for name, one in problems.items()]
-        self._retrials = Retrials(self._conditions, run, progress, trials=trials, seed=seed)
+        self._retrials = Retrials(self._conditions, run, progress, trials=trials, seed=seed, ahead=ahead)
         self._progress, self._each = progress, trials * len(problems)
 
     def clean(self) -> list[MatrixModel]:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from small_models import easy, hard
+from stand_ins import rows, shared
 from torch import Tensor
 
 import advsearch
+from advsearch.api import parts
 from advsearch.api.attack import attack_from_config
+from advsearch.api.gap import pictures_of
 from advsearch.attacks import get_objective
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig, GapConfig
@@ -89,6 +93,19 @@ def test_a_matrix_goes_on_with_the_trial_at_which_it_was_stopped(
     assert isinstance(again, MatrixResult) and again.ending == "done"
     assert [row.tested for row in again.table] == [row.tested for row in whole.table]
     assert done < 2 * 6 * 3 + 2, "what was tried is not tried again"
+
+
+def test_workers_make_the_pictures_of_the_trials(
+    whole: MatrixResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of three configurations six for each model, whose input sizes differ; the rows stay."""
+    run = tmp_path / "run"
+    config = AttackConfig(**{**SHORT, "model": BOTH, "run": str(run)})
+    ready = shared(monkeypatch, config.plain(), pictures_of)
+    monkeypatch.setattr(parts, "executor_of", lambda work, **_: nullcontext(None))
+    result = carried_out(run, workers=2)
+    assert isinstance(result, MatrixResult) and len(ready.given) == 3 * 2 * 6
+    assert rows(run) == rows(Path(str(whole.run)))
 
 
 def test_one_answer_for_all_models(tmp_path: Path) -> None:

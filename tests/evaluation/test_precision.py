@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from advsearch.api import attack as attacking
 from advsearch.api import precision as measuring
 from advsearch.api.precision import precision_from_config, references_of
 from advsearch.cli.main import main
@@ -645,7 +646,7 @@ def test_workers_make_the_references_and_what_is_timed_stays_here(
                 asked.update({} if one is None else {one: done.value[0]})
                 yield replace(done, lost="it died") if one is not None and died else done
 
-    monkeypatch.setattr(measuring, "executor_of", lambda work, **_: nullcontext(Watched()))
+    monkeypatch.setattr(attacking, "executor_of", lambda work, **_: nullcontext(Watched()))
     report = precision_from_config(PrecisionConfig(**settings, workers=2, run=str(tmp_path / "run")))
     assert sum(one.parts for one in report.references) == len(asked) >= 8
     assert {(one.name, one.by) for one in asked} == {
