@@ -51,7 +51,8 @@ class Space:
         """Every group of coordinates in the order of u, without an estimator yet.
 
         Adjoints with boundary terms know neither a medium nor a backdrop nor a thin lens nor the edges of cut-outs, nor
-        where a normal of a normal map turns away from the camera, so that they are not valid beside these.
+        where a normal of a normal map turns away from the camera, nor meshes that emit light, so that they are not
+        valid beside these.
         """
         scene = self.scene
         unknown = scene is not None and (
@@ -59,6 +60,7 @@ class Space:
             or scene.thin_lens
             or scene.cut_out
             or scene.normal_mapped
+            or scene.emits
             or any(part.volumetric for part in scene.parts)
         )
         found, begin = [], 0

@@ -91,6 +91,8 @@ class ObjectAsset:
             it is 1.
         normal_map: (H, W, 3) float32, `(n + 1) / 2` of unit normals in the frame of tangent (along u), normal x tangent
             and normal, row 0 on top; None where there is none.
+        emission: (H, W, 3) float32 linear radiance of the front of its faces, row 0 on top; (1, 1, 3) where it is the
+            same everywhere, None where there is none.
     """
 
     name: str
@@ -104,6 +106,7 @@ class ObjectAsset:
     surface: Mapping[str, object] | None = None
     opacity: Floats | None = None
     normal_map: Floats | None = None
+    emission: Floats | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -139,6 +139,11 @@ class SceneDescription:
         return any(one.normal_map is not None for one in self.meshes.values())
 
     @property
+    def emits(self) -> bool:
+        """Whether a mesh emits light."""
+        return any(one.emission is not None for one in self.meshes.values())
+
+    @property
     def lamps(self) -> Mapping[str, PointLamp | BallLamp]:
         """Every light beside the environment, by name."""
         return {one.name: one for one in self.parts if isinstance(one, (PointLamp, BallLamp))}
@@ -147,7 +152,7 @@ class SceneDescription:
     def lit(self) -> bool:
         """Whether there is anything that shines."""
         shining = any(part.shines for part in self.parts if isinstance(part, PluginPart))
-        return self.environment is not None or bool(self.lamps) or shining
+        return self.environment is not None or bool(self.lamps) or shining or self.emits
 
     @property
     def object_name(self) -> str:

@@ -2,8 +2,8 @@
 
 A grey card is laid against every piece of the object's surface that the camera sees, and the light that arrives there
 is averaged over the picture: from the environment as far as the surface faces it, and from the ground plane, which is
-lit by the environment itself. What the object is made of takes no part, so that a black object stays black; nor do
-shadows, which would need a render.
+lit by the environment itself, from lamps, and from surroundings that emit light. What the object is made of takes no
+part, so that a black object stays black; nor do shadows, which would need a render.
 
 The meter is held with camera, pose and rotation of the environment as they are by default, and then left alone. So a
 configuration has the same exposure whether its camera is a setting, a control's fixed value or a point of a grid.
@@ -20,13 +20,15 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.scene.assets import EnvironmentAsset
+from advsearch.scene.assets import EnvironmentAsset, Floats
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.description import ORBIT_CAMERA, SceneDescription
+from advsearch.scene.description import OBJECT, ORBIT_CAMERA, SceneDescription
 from advsearch.scene.geometry import camera_to_world, object_to_world
+from advsearch.scene.parts import MeshPart
 from advsearch.scene.raster import pixels_in
 from advsearch.scene.settings import resolve
 from advsearch.scene.silhouettes import NEAREST, Frame
+from advsearch.scene.surface_map import looked_up
 
 Doubles = npt.NDArray[np.float64]
 
@@ -41,6 +43,10 @@ WHITE = 0.8
 METERED_WHITE = 0.5
 """Linear display value that it gets, on average over what the camera sees of the object."""
 
+
+_NINTHS = [(a, b) for a in range(4) for b in range(4 - a)]
+WITHIN = np.array([(3 * a + 1, 3 * b + 1, 10 - 3 * a - 3 * b) for a, b in _NINTHS]) / 12.0
+"""Barycentric weights (10, 3) of the places of a face at which its radiance is looked up."""
 
 MOVED = ("camera.", "pose.", "environment.")
 """Settings whose defaults are metered, by the beginning of their names: those that controls move."""
@@ -89,7 +95,29 @@ def irradiance(scene: SceneDescription, normals: Doubles) -> Doubles:
         if faced.any():  # the lamps of controls are dark as they come
             length = max(float(np.linalg.norm(way)), 1e-12)
             found = found + np.maximum(normals @ (way / length), 0.0)[:, None] * faced
+    for name, part in scene.meshes.items():
+        if part.emission is not None and name != OBJECT:  # what the object emits belongs to what it is made of
+            ways, faced = _emitted(part, part.emission, middle)
+            facing = np.maximum(np.einsum("nk,fk->nf", normals, ways), 0.0)
+            found = found + np.einsum("nf,fc->nc", facing, faced)
     return found
+
+
+def _emitted(part: MeshPart, emission: Floats, place: Doubles) -> tuple[Doubles, Doubles]:
+    """Return unit ways (F, 3) from a place (3,) to the faces of a mesh, and the irradiance (F, 3) where each is faced.
+
+    A face is taken for a disk of its mean radiance.
+    """
+    corners = (part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T + part.to_world[:3, 3])[part.mesh.faces]
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0
+    way = corners.mean(axis=1) - place
+    far = (way * way).sum(axis=1)
+    way = way / np.maximum(np.sqrt(far), 1e-12)[:, None]
+    uv = np.einsum("pk,fkc->fpc", WITHIN, part.mesh.uvs[part.mesh.faces])
+    height, width = emission.shape[:2]
+    mean = looked_up(emission, uv[..., 0] * width - 0.5, (1.0 - uv[..., 1]) * height - 0.5).mean(axis=1)
+    front = np.maximum(-(area * way).sum(axis=1), 0.0)
+    return way, mean * (front / (far + np.linalg.norm(area, axis=1) / math.pi))[:, None]
 
 
 def visible_normals(scene: SceneDescription) -> Doubles:

@@ -41,8 +41,9 @@ class MeshPart(ScenePart):
     """A mesh with a principled surface and a base-colour texture.
 
     Takes `NAME.vertices` and `NAME.normals` (V, 3) in world space, `NAME.base_color` (h, w, 3) linear reflectance with
-    row 0 at v = 1, and `NAME.roughness`, `.metallic`, `.specular`, `.clearcoat` (1,) in [0, 1]. `NAME.to_world` (4, 4)
-    and `NAME.offsets` (V, 3) are turned into vertices and normals by `advsearch.scene.assembly`.
+    row 0 at v = 1, and `NAME.roughness`, `.metallic`, `.specular`, `.clearcoat` (1,) in [0, 1]; where it emits light,
+    `NAME.radiance`, linear, (3,) or (h, w, 3). `NAME.to_world` (4, 4) and `NAME.offsets` (V, 3) are turned into
+    vertices and normals by `advsearch.scene.assembly`.
 
     Attributes:
         name: "object" for the object itself.
@@ -54,6 +55,7 @@ class MeshPart(ScenePart):
             goes. What it lacks of the inputs, the part has not.
         opacity: (h, w) float32 in [0, 1] of the principled surface, which cuts it out; None where it is 1.
         normal_map: (h, w, 3) float32 of the principled surface, as `ObjectAsset.normal_map`.
+        emission: (h, w, 3) or (1, 1, 3) float32, as `ObjectAsset.emission`.
     """
 
     mesh: Mesh
@@ -63,12 +65,21 @@ class MeshPart(ScenePart):
     surface: Mapping[str, object] | None = None
     opacity: Floats | None = None
     normal_map: Floats | None = None
+    emission: Floats | None = None
 
 
 def mesh_part(name: str, asset: ObjectAsset, to_world: Doubles, material: Material) -> MeshPart:
     """Return an object with another material under a pose (4, 4)."""
     return MeshPart(
-        name, asset.mesh, to_world, asset.base_color, material, asset.surface, asset.opacity, asset.normal_map
+        name,
+        asset.mesh,
+        to_world,
+        asset.base_color,
+        material,
+        asset.surface,
+        asset.opacity,
+        asset.normal_map,
+        asset.emission,
     )
 
 

@@ -27,7 +27,8 @@ def box_glb() -> bytes:
     pixels = np.arange(256, dtype=np.uint8).reshape(8, 8, 4)
     material = PBRMaterial(
         baseColorTexture=Image.fromarray(pixels), baseColorFactor=[0.5, 0.6, 0.7, 0.9], roughnessFactor=0.4,
-        alphaMode="MASK", alphaCutoff=0.3,
+        alphaMode="MASK", alphaCutoff=0.3, emissiveFactor=[1.0, 0.5, 0.1],
+        normalTexture=Image.fromarray(pixels[::-1, :, :3]), emissiveTexture=Image.fromarray(pixels[:, ::-1, :3]),
     )  # fmt: skip
     box.visual = TextureVisuals(uv=box.vertices[:, :2] + 0.5, material=material)
     scene = trimesh.Scene(box)

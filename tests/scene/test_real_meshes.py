@@ -180,7 +180,8 @@ def test_a_texture_is_looked_up_by_the_coordinates_that_its_material_names(tmp_p
     ("line", "left_out"),
     [
         ("map_Bump -bm 1 leaf.png", "the normal map 'leaf.png' is missing; it is left out"),
-        ("Ke 0.2 0 0", "the glow of 1 material is left out"),
+        ("map_Ke leaf.png", "the texture 'leaf.png' of the emission is missing; it is left out"),
+        ("Ke 0.2 0 0", ""),
         ("d 1.0", ""),
         ("d 0.25", ""),
         ("Ke 0 0 0", ""),

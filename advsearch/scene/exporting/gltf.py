@@ -52,7 +52,7 @@ class PosedMesh:
         base_color: (h, w, 3) display-referred sRGB, row 0 at v = 1.
         material: the rest of the surface.
         opacity: (h', w') in [0, 1], or None where there are no cut-outs.
-        normal_map: as `ObjectAsset.normal_map`.
+        normal_map, emission: as those of `ObjectAsset`.
     """
 
     name: str
@@ -61,6 +61,7 @@ class PosedMesh:
     material: Material
     opacity: Floats | None = None
     normal_map: Floats | None = None
+    emission: Floats | None = None
 
 
 def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> PosedMesh:
@@ -78,7 +79,8 @@ def posed(part: MeshPart, inputs: Mapping[str, Tensor]) -> PosedMesh:
     if "base_color" in given:
         color = linear_to_srgb(given["base_color"].clamp(0.0, 1.0)).numpy()
     numbers = {key: float(given[key]) for key in vars(part.material) if key in given}
-    return PosedMesh(part.name, mesh, color, replace(part.material, **numbers), part.opacity, part.normal_map)
+    material = replace(part.material, **numbers)
+    return PosedMesh(part.name, mesh, color, material, part.opacity, part.normal_map, part.emission)
 
 
 def _of(key: str) -> str:
@@ -124,7 +126,7 @@ def _described(made: _Buffer, meshes: Sequence[PosedMesh], picture: Callable[[Fl
     """Return the header of a file with some meshes in one scene, and put their bytes into the buffer."""
     header: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "advsearch"},
-        "extensionsUsed": ["KHR_materials_clearcoat", "KHR_materials_specular"],
+        "extensionsUsed": ["KHR_materials_clearcoat", "KHR_materials_emissive_strength", "KHR_materials_specular"],
         "scene": 0,
         "scenes": [{"nodes": list(range(len(meshes)))}],
         "nodes": [{"name": one.name, "mesh": number} for number, one in enumerate(meshes)],
@@ -151,6 +153,13 @@ def _described(made: _Buffer, meshes: Sequence[PosedMesh], picture: Callable[[Fl
         if one.normal_map is not None:
             encoded = picture(one.normal_map)
             material["normalTexture"] = {"index": _texture(header, made.view(encoded), encoded)}
+        if one.emission is not None:
+            most = float(one.emission.max())
+            share = linear_to_srgb(one.emission / np.float32(most))
+            material["emissiveFactor"] = [1.0, 1.0, 1.0]
+            encoded = picture(share)
+            material["emissiveTexture"] = {"index": _texture(header, made.view(encoded), encoded)}
+            material.setdefault("extensions", {})["KHR_materials_emissive_strength"] = {"emissiveStrength": most}
         header["materials"].append(material)
     return header
 

@@ -122,8 +122,13 @@ def unread(header: Header) -> dict[str, int]:
     """Return what materials have that is not read, each with how many of them."""
     return {
         NORMAL_MAPS: sum(one.normalTexture is not None and not one.plain().normalTexture for one in header.materials),
-        GLOW: sum(bool(one.emissiveTexture or any(one.emissiveFactor)) for one in header.materials),
+        GLOW: sum(any(one.emission) and not _lit_alike(one) for one in header.materials),
     }
+
+
+def _lit_alike(material: MaterialEntry) -> bool:
+    """Whether the texture of its emission, if it has one, is looked up as its other textures are."""
+    return material.emissiveTexture is None or material.plain().emissiveTexture is not None
 
 
 def _json_chunk(path: Path, data: bytes) -> bytes:

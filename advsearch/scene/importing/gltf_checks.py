@@ -45,7 +45,7 @@ def check_header(path: Path, header: Header) -> None:
     for material in header.materials:
         surface = material.plain().pbrMetallicRoughness
         uses = (surface.baseColorTexture, surface.metallicRoughnessTexture) if surface else ()
-        for use in (*uses, material.normalTexture):
+        for use in (*uses, material.normalTexture, material.emissiveTexture):
             _check_index(path, "textures", None if use is None else use.index, header.textures)
     sizes = (sum(view.byteLength for view in header.bufferViews), sum(a.size() for a in header.accessors))
     if max(sizes) > files.scaled(LARGEST_VALUES):

@@ -153,7 +153,12 @@ class SpecularGlossiness(_Entry):
     glossinessFactor: float = 1.0
 
 
+class EmissiveStrength(_Entry):
+    emissiveStrength: Annotated[float, Field(ge=0.0)] = 1.0
+
+
 class _MaterialExtensions(_Entry):
+    strength: EmissiveStrength | None = Field(default=None, alias="KHR_materials_emissive_strength")
     glossiness: SpecularGlossiness | None = Field(default=None, alias="KHR_materials_pbrSpecularGlossiness")
 
 
@@ -168,7 +173,7 @@ class MaterialEntry(_Entry):
     name: str | None = None
     normalTexture: NormalUse | None = None
     emissiveTexture: TextureUse | None = None
-    emissiveFactor: list[float] = []
+    emissiveFactor: Annotated[list[Annotated[float, Field(ge=0.0)]], Field(min_length=3, max_length=3)] = [0.0] * 3
     alphaMode: str = "OPAQUE"
     alphaCutoff: float = CUTOFF
     extensions: _MaterialExtensions | None = None
@@ -182,21 +187,24 @@ class MaterialEntry(_Entry):
     @property
     def coordinates(self) -> str:
         """Name of the attribute by which its textures are looked up: that of the base colour, if it has one."""
-        used = self.base_color or self.normalTexture
+        used = self.base_color or self.normalTexture or self.emissiveTexture
         return "TEXCOORD_0" if used is None else used.coordinates
+
+    @property
+    def emission(self) -> list[float]:
+        """(3,) linear radiance, where there is a texture that times its colour."""
+        given = self.extensions.strength if self.extensions else None
+        return [one * (1.0 if given is None else given.emissiveStrength) for one in self.emissiveFactor]
 
     def plain(self) -> MaterialEntry:
         """Return the material without extensions: the diffuse colour of an old one is its base colour. Textures that
         are looked up by other coordinates than that are left out."""
-        surface = self._metallic_roughness()
-        used = surface.baseColorTexture if surface else None
-        normals = self.normalTexture
-        if normals is not None and used is not None and normals.coordinates != used.coordinates:
-            normals = None
+        normals, glow = self.normalTexture, self.emissiveTexture
         return MaterialEntry(
-            pbrMetallicRoughness=surface,
+            pbrMetallicRoughness=self._metallic_roughness(),
             name=self.name,
-            normalTexture=normals,
+            normalTexture=normals if normals is None or normals.coordinates == self.coordinates else None,
+            emissiveTexture=glow if glow is None or glow.coordinates == self.coordinates else None,
             alphaMode=self.alphaMode if self.alphaMode in CUT_OUTS else "OPAQUE",
             alphaCutoff=self.alphaCutoff,
         )

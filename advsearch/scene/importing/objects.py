@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
+from PIL import Image
 
 from advsearch.errors import InputError
 from advsearch.scene.assets import Material, ObjectAsset, UpAxis, normalised
@@ -17,6 +19,8 @@ from advsearch.scene.importing.parts import GLTF, ImportedPart, read_parts
 from advsearch.scene.importing.surfaces import ImportedSurface
 from advsearch.scene.importing.texture import textured
 from advsearch.scene.importing.upright import guess_up
+
+Floats = npt.NDArray[np.float32]
 
 SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".blend")
 """The mesh files that can be imported."""
@@ -43,6 +47,7 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
       texture is multiplied by its linear factor. The ``Kd`` of an .mtl is taken as display-referred, and ignored beside
       a ``map_Kd``. Where a texture is missing, the colour takes its place, or grey if that is plain white, with a
       warning.
+    - Emission is that of glTF, and of an .mtl ``Ke`` and ``map_Ke``: linear radiance on the front of the faces.
     - The normal map of glTF, and of an .mtl ``norm``, ``map_Bump`` or ``bump`` that holds normals; where textures are
       baked, it is turned to the new texture coordinates.
     - Roughness and metallic are those of glTF where given, their mean over several materials, and else `Material`'s.
@@ -95,7 +100,19 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
         up=axis,
         opacity=opacity,
         normal_map=maps.normals,
+        emission=_let_out(maps.emission, opacity),
     )
+
+
+def _let_out(emission: Floats | None, opacity: Floats | None) -> Floats | None:
+    """Return the radiance (H, W, 3) of what is not cut out; None where it is dark."""
+    if emission is None or opacity is None:
+        return emission
+    sizes = [(one.shape[1], one.shape[0]) for one in (emission, opacity)]
+    width, height = max(sizes)
+    share = np.asarray(Image.fromarray(opacity).resize((width, height), Image.Resampling.BILINEAR))[:, :, None]
+    columns, rows = ((np.arange(n) * m) // n for n, m in ((width, sizes[0][0]), (height, sizes[0][1])))
+    return np.asarray(emission[rows][:, columns] * share, np.float32)
 
 
 def _first(warnings: list[str], name: str) -> tuple[str, ...]:

@@ -171,8 +171,7 @@ def _file_notes(path: Path, data: bytes, header: Header | None, references: Refe
             )
     if header is not None and "KHR_texture_transform" in header.extensionsUsed:
         notes.append(f"{path.name} moves its textures with KHR_texture_transform, which is not applied")
-    unread = gltf.unread(header) if header else {what: len(names) for what, names in references.unread.items()}
-    for what, count in unread.items():
+    for what, count in gltf.unread(header).items() if header else ():
         if count:
             verb = "is" if what == GLOW else "are"
             notes.append(f"{path.name}: {what} of {count} material{'s' if count > 1 else ''} {verb} left out")

@@ -20,12 +20,9 @@ Named = dict[str | None, tuple[str, str]]
 
 MISSING = "is missing"
 OUTSIDE = "is outside its folder and is not read"
-NORMAL_MAPS, GLOW = "the normal maps with texture coordinates of their own", "the glow"
+NORMAL_MAPS = "the normal maps with texture coordinates of their own"
+GLOW = "the emission with texture coordinates of its own"
 """What a material may have that is not read."""
-
-_UNREAD = dict.fromkeys(("ke", "map_ke"), GLOW)
-_SAID_BY_DEFAULT = {"ke": 0.0}
-"""By the key of a line of a material file: what it says; and the numbers with which it says nothing."""
 
 _NO_SUCH_NAME = (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EINVAL)
 
@@ -43,7 +40,6 @@ class References:
         refused: for each name, as `plain_name` gives it, why it was not read: `MISSING`, `OUTSIDE` or another clause.
         materials: names of the materials in the .mtl files read.
         named: the textures that these name.
-        unread: for `GLOW`, the names of the materials that have it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -51,7 +47,6 @@ class References:
         self.refused: dict[str, str] = {}
         self.materials: set[str] = set()
         self.named: Named = {}
-        self.unread: dict[str, set[str]] = {GLOW: set()}
         self._folder = os.path.realpath(path.parent)
         self._contents: dict[str, bytes] = {}
 
@@ -112,17 +107,7 @@ class References:
                 self.materials.add(current)
             elif key.lower() == "map_kd" and current is not None and rest.strip():
                 self.named[current] = (Path(name).name, rest.strip())
-            elif key.lower() in _UNREAD and current is not None and _says_something(key.lower(), rest):
-                self.unread[_UNREAD[key.lower()]].add(current)
         return text_of(data).encode()
-
-
-def _says_something(key: str, rest: str) -> bool:
-    """Tell whether a line of a material file is more than what holds without it."""
-    try:
-        return any(float(word) != _SAID_BY_DEFAULT[key] for word in rest.split())
-    except (KeyError, ValueError):
-        return bool(rest.strip())
 
 
 def _candidates(name: str, plain: str) -> list[str]:

@@ -13,7 +13,7 @@ from PIL import Image
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing import gltf
 from advsearch.scene.importing.files import shown
-from advsearch.scene.importing.gltf_entries import CUT_OUTS, CUTOFF, Header
+from advsearch.scene.importing.gltf_entries import CUT_OUTS, CUTOFF, Header, MaterialEntry, NormalUse
 from advsearch.scene.importing.normal_maps import holds_normals, normal_map
 from advsearch.scene.importing.pictures import Pictures
 from advsearch.scene.importing.references import Named
@@ -30,6 +30,10 @@ UNNAMED = "material_0"
 """The name that trimesh gives to a material that the file does not name."""
 
 
+BRIGHTEST = 1e5
+"""Largest radiance that a surface may emit; white in the light of a bundled environment is about 1."""
+
+
 @dataclass(frozen=True, eq=False)
 class ImportedSurface:
     """What a part looks like; every colour is display-referred sRGB in [0, 1].
@@ -41,6 +45,8 @@ class ImportedSurface:
         roughness: in [0, 1], or None when the file gives none.
         metallic: in [0, 1], or None when the file gives none.
         normal_map: (H, W, 3) float32 of `advsearch.scene.importing.normal_maps`, row 0 on top; or None.
+        emission: (H, W, 3) float32 linear radiance, row 0 on top; (1, 1, 3) where it is the same everywhere, None where
+            there is none.
     """
 
     color: Floats | None = None
@@ -48,15 +54,18 @@ class ImportedSurface:
     roughness: float | None = None
     metallic: float | None = None
     normal_map: Floats | None = None
+    emission: Floats | None = None
 
     @property
     def pictures(self) -> tuple[Floats, ...]:
         """What is looked up by texture coordinates."""
-        return tuple(one for one in (self.texture, self.normal_map) if one is not None)
+        glow = None if self.emission is None or self.emission.shape == (1, 1, 3) else self.emission
+        return tuple(one for one in (self.texture, self.normal_map, glow) if one is not None)
 
     def same_maps(self, other: ImportedSurface) -> bool:
-        """Tell whether two surfaces have the same base colour, and the same normal map, everywhere."""
-        pairs = ((self.color, other.color), (self.texture, other.texture), (self.normal_map, other.normal_map))
+        """Tell whether two surfaces have the same base colour, normal map and emission everywhere."""
+        ours = (self.color, self.texture, self.normal_map, self.emission)
+        pairs = zip(ours, (other.color, other.texture, other.normal_map, other.emission), strict=True)
         return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
 
 
@@ -96,7 +105,8 @@ class SurfaceReader:
             color = _color(material.kwargs.get("kd"))
             texture = self._texture(material, material.image, color)
             found = ImportedSurface(_unless_white(color, material, self.named), texture)
-            return replace(self._see_through(material, found), normal_map=self._bumps(material))
+            found = replace(self._see_through(material, found), normal_map=self._bumps(material))
+            return replace(found, emission=self._glow(material))
         return ImportedSurface()
 
     def _see_through(self, material: SimpleMaterial, surface: ImportedSurface) -> ImportedSurface:
@@ -165,20 +175,65 @@ class SurfaceReader:
             under = material.alphaCutoff
             cutoff = None if material.alphaMode == "BLEND" else CUTOFF if under is None else under
             kept, texture = _with_opacity(color, scaled[3:], cutoff), _with_opacity(texture, scaled[3:], cutoff)
-        return ImportedSurface(kept, texture, _unit(roughness), _unit(metallic), self._normals(material))
-
-    def _normals(self, material: PBRMaterial) -> Floats | None:
-        """The normal map of a glTF material; warn where it cannot be had."""
+        found = ImportedSurface(kept, texture, _unit(roughness), _unit(metallic))
         entry = None if self.header is None else gltf.entry_of(self.header, material.name)
-        use = None if entry is None else entry.plain().normalTexture
-        if self.header is None or use is None:
+        if self.header is None or entry is None:
+            return found
+        normals = self._normals(self.header, entry.plain().normalTexture, material.normalTexture)
+        return replace(found, normal_map=normals, emission=self._emission(self.header, entry, material))
+
+    def _normals(self, header: Header, use: NormalUse | None, image: Image.Image | None) -> Floats | None:
+        """The normal map of a glTF material; warn where it cannot be had."""
+        if use is None:
             return None
-        found = self.pictures.decoded(material.normalTexture, "numbers")
+        found = self.pictures.decoded(image, "numbers")
         if isinstance(found, np.ndarray):
             return normal_map(found, use.scale)
-        name = gltf.image_name(self.header, use) or ""
+        name = gltf.image_name(header, use) or ""
         self._without_normals(name, self.pictures.why(name, found))
         return None
+
+    def _emission(self, header: Header, entry: MaterialEntry, material: PBRMaterial) -> Floats | None:
+        """The radiance of a glTF material (section 3.9.3, and KHR_materials_emissive_strength), in the unit of
+        environments, as Blender has it."""
+        factor = np.array(entry.emission)
+        if not factor.any() or (entry.emissiveTexture is not None and entry.plain().emissiveTexture is None):
+            return None
+        if entry.emissiveTexture is None:
+            return self._radiance(factor)
+        found = self.pictures.decoded(material.emissiveTexture)
+        if isinstance(found, np.ndarray):
+            return self._radiance(factor, found)
+        name = gltf.image_name(header, entry.emissiveTexture) or ""
+        self._without_emission(name, self.pictures.why(name, found))
+        return None
+
+    def _glow(self, material: SimpleMaterial) -> Floats | None:
+        """The radiance that a material file says by ``Ke`` and ``map_Ke``; where it has both, their product."""
+        words, name = material.kwargs.get("ke") or [], " ".join(material.kwargs.get("map_ke") or [])
+        factor = _radiances(words)
+        if factor is None:
+            self._note(f"{self.source}: the emission {shown(' '.join(words))} is no colour; it is left out")
+            return None
+        if not name:
+            return self._radiance(factor)
+        found = self.pictures.of_file(name, "colours")
+        if isinstance(found, np.ndarray):
+            return self._radiance(factor if factor.any() else np.ones(3), found)
+        self._without_emission(name, found)
+        return None
+
+    def _radiance(self, factor: npt.NDArray[np.float64], picture: Floats | None = None) -> Floats | None:
+        """Return a factor (3,) times the linear values of a picture (H, W, 3); None where it is dark."""
+        if factor.max() > BRIGHTEST:
+            self._note(f"{self.source}: emission brighter than {BRIGHTEST:g} is cut to that")
+            factor = np.minimum(factor, BRIGHTEST)
+        linear = np.ones((1, 1, 3), np.float32) if picture is None else srgb_to_linear(picture)
+        found = (linear * factor).astype(np.float32)
+        return found if found.any() else None
+
+    def _without_emission(self, name: str, why: str) -> None:
+        self._note(f"{self.source}: the texture {shown(name)} of the emission {why}; it is left out")
 
     def _texture(
         self, material: Any, image: Image.Image | None, color: Floats | None, *, alpha: bool = False
@@ -207,6 +262,16 @@ def _color(given: Any) -> Floats | None:
     if values.shape not in ((1,), (3,)) or not np.isfinite(values).all():
         return None
     return np.clip(np.broadcast_to(values, (3,)), 0.0, 1.0).astype(np.float32)
+
+
+def _radiances(words: list[str]) -> npt.NDArray[np.float64] | None:
+    """Return one or three numbers of at least 0 as a colour (3,), black where there are none; None for other words."""
+    try:
+        values = np.array([float(word) for word in words or ["0"]])
+    except ValueError:
+        return None
+    good = values.shape in ((1,), (3,)) and np.isfinite(values).all() and values.min() >= 0.0
+    return np.broadcast_to(values, (3,)) if good else None
 
 
 def _with_opacity(color: Floats | None, factor: Floats, cutoff: float | None) -> Floats | None:

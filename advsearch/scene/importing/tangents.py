@@ -29,7 +29,9 @@ def mirrored(soup: Soup, uvs: Array) -> Bools:
     return np.full(len(turned), share > 0.5) if min(share, 1.0 - share) < FEW else turned
 
 
-def unmirrored(uvs: Array, over: Bools, color: Floats, normals: Floats) -> tuple[Array, Floats, Floats]:
+def unmirrored(
+    uvs: Array, over: Bools, color: Floats, normals: Floats, emission: Floats | None
+) -> tuple[Array, tuple[Floats, Floats, Floats | None]]:
     """Return texture coordinates that mirror no face, and the maps for them; no texel is resampled.
 
     The maps get a second half, which is the first one mirrored, and there the faces go.
@@ -39,16 +41,22 @@ def unmirrored(uvs: Array, over: Bools, color: Floats, normals: Floats) -> tuple
         over: (F,) the mirrored faces, as `mirrored` gives them.
         color: (H, W, C).
         normals: (H', W', 3), a normal map.
+        emission: (H", W", 3); None where there is none.
     """
     if not over.any():
-        return uvs, color, normals
+        return uvs, (color, normals, emission)
     if over.all():
-        return uvs, color, normals * np.array([1, -1, 1], np.float32) + np.array([0, 1, 0], np.float32)
+        return uvs, (color, normals * np.array([1, -1, 1], np.float32) + np.array([0, 1, 0], np.float32), emission)
     placed = uvs.copy()
     placed[over, :, 0] = 2.0 - placed[over, :, 0]
     placed[:, :, 0] /= 2.0
     other = normals[:, ::-1] * np.array([-1, 1, 1], np.float32) + np.array([1, 0, 0], np.float32)
-    return placed, np.concatenate([color, color[:, ::-1]], axis=1), np.concatenate([normals, other], axis=1)
+    glow = emission if emission is None or emission.shape == (1, 1, 3) else _beside(emission, emission[:, ::-1])
+    return placed, (_beside(color, color[:, ::-1]), _beside(normals, other), glow)
+
+
+def _beside(left: Floats, right: Floats) -> Floats:
+    return np.concatenate([left, right], axis=1)
 
 
 def turned(texels: Floats, before: Soup, after: Array, face: Ints, weights: Array) -> Floats:

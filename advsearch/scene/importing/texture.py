@@ -36,6 +36,8 @@ _SLACK = 1e-4  # how far UVs may overstep [0, 1] and still be clipped
 _SQUASHED = 0.05  # share of the surface that may have no area in UV space
 _CRAMPED = 0.02  # share of the unit square that UVs must cover in all
 _WINDOW = 1.5  # how many textures wide and high UVs may be and still keep their layout
+_BORDER = 2.0  # texels outside a chart up to which it emits light: filtering needs them
+_SHARED = 0.005  # share of the texels that emit light which may lie on several faces
 _FILLED = 0.5  # share of an atlas that its charts fill, about
 
 
@@ -47,10 +49,13 @@ class SurfaceMaps:
         color: (H, W, 3) float32 display-referred base colour in [0, 1]; (H, W, 4) with the opacity where light passes
             through a part.
         normals: (H', W', 3) float32 of `advsearch.scene.importing.normal_maps`; None where there is no normal map.
+        emission: (H", W", 3) float32 linear radiance; (1, 1, 3) where it is the same everywhere, None where there is
+            none.
     """
 
     color: Floats
     normals: Floats | None = None
+    emission: Floats | None = None
 
 
 def textured(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[Soup, SurfaceMaps, list[str]]:
@@ -62,17 +67,19 @@ def textured(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[Soup, Sur
     """
     used = [surfaces[number] for number in np.unique(soup.part)]
     first, uniform = used[0], all(surface.same_maps(used[0]) for surface in used)
-    colored = uniform and _one_factor(soup)
+    colored, twice = uniform and _one_factor(soup), False
     if colored and not first.pictures:
         kept = _usable(soup, soup.uvs)
         soup = replace(soup, uvs=np.clip(soup.uvs, 0.0, 1.0)) if kept else unwrapped(soup)
-        return soup, SurfaceMaps(_of_one_color(soup, first)), []
+        return soup, SurfaceMaps(_of_one_color(soup, first), None, first.emission), []
     if colored and (first.texture is None or soup.colors.min() == 1.0) and np.isfinite(soup.uvs).all():
         uvs, pictures = _windowed(_into_unit_square(soup), first.pictures)
-        if _usable(soup, uvs):
+        twice = _usable(soup, uvs) and _lit_twice(uvs, first, pictures)
+        if _usable(soup, uvs) and not twice:
             return *_kept(soup, np.clip(uvs, 0.0, 1.0), first, pictures), []
     fresh = unwrapped(soup)
-    return fresh, baked(fresh.uvs, soup, surfaces), [_why(soup, used, uniform)]
+    shared = "several faces share a texture that emits light; it was unwrapped anew and its texture resampled"
+    return fresh, baked(fresh.uvs, soup, surfaces), [shared if twice else _why(soup, used, uniform)]
 
 
 def _of_one_color(soup: Soup, surface: ImportedSurface) -> Floats:
@@ -82,11 +89,25 @@ def _of_one_color(soup: Soup, surface: ImportedSurface) -> Floats:
 
 def _kept(soup: Soup, uvs: Array, surface: ImportedSurface, pictures: Sequence[Floats]) -> tuple[Soup, SurfaceMaps]:
     """Return the soup with the file's own UVs, and its pictures, as `ImportedSurface.pictures` has them, as maps."""
-    color = _of_one_color(soup, surface) if surface.texture is None else pictures[0]
-    if surface.normal_map is None:
-        return replace(soup, uvs=uvs), SurfaceMaps(color)
-    uvs, color, normals = unmirrored(uvs, mirrored(soup, uvs), color, pictures[-1])
-    return replace(soup, uvs=uvs), SurfaceMaps(color, normals)
+    left = list(pictures)
+    color = _of_one_color(soup, surface) if surface.texture is None else left.pop(0)
+    normals = None if surface.normal_map is None else left.pop(0)
+    emission = left.pop(0) if left else surface.emission
+    if normals is not None:
+        uvs, (color, normals, emission) = unmirrored(uvs, mirrored(soup, uvs), color, normals, emission)
+    return replace(soup, uvs=uvs), SurfaceMaps(color, normals, emission)
+
+
+def _lit_twice(uvs: Array, surface: ImportedSurface, pictures: Sequence[Floats]) -> bool:
+    """Whether a texel that emits light lies on several faces: Mitsuba would send light from one of them only."""
+    if surface.emission is None or surface.emission.shape == (1, 1, 3):
+        return False
+    lit = pictures[-1].any(axis=2)
+    height, width = lit.shape
+    corners = np.stack([uvs[:, :, 0] * width - 0.5, (1.0 - uvs[:, :, 1]) * height - 0.5], axis=2)
+    _, rows, columns, _ = pixels_in(corners, (height, width), tolerance=-1e-6)
+    count = np.bincount(rows * width + columns, minlength=height * width).reshape(height, width)[lit]
+    return bool((count > 1).sum() > _SHARED * max(1, len(count)))
 
 
 def _why(soup: Soup, used: Sequence[ImportedSurface], uniform: bool) -> str:
@@ -191,6 +212,7 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surfac
     image, inside = np.ones((size, size, 3 + through), np.float32), np.zeros((size, size), np.bool_)
     bumpy = any(one.normal_map is not None for one in surfaces)
     normals = np.full((size, size, 3), FLAT) if bumpy else None
+    emission = None if all(one.emission is None for one in surfaces) else np.zeros((size, size, 3), np.float32)
     factor = np.einsum("tk,tkc->tc", weights, soup.colors[face])
     part = soup.part[face]
     order = np.argsort(part, kind="stable")
@@ -203,10 +225,14 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surfac
         if normals is not None and surface.normal_map is not None and np.isfinite(at).all():
             texels = sampled(surface.normal_map, at)
             normals[rows[here], columns[here]] = turned(texels, soup, uvs, face[here], weights[here])
+        if emission is not None and surface.emission is not None and np.isfinite(at).all():
+            emission[rows[here], columns[here]] = sampled(surface.emission, at)
     inside[rows, columns] = True
-    nearest = distance_transform_edt(~inside, return_distances=False, return_indices=True)
+    away, nearest = distance_transform_edt(~inside, return_indices=True)
     whole = nearest[0], nearest[1]
-    return SurfaceMaps(image[whole], None if normals is None else normals[whole])
+    if emission is not None:
+        emission = emission[whole] * (away < _BORDER)[:, :, None]
+    return SurfaceMaps(image[whole], None if normals is None else normals[whole], emission)
 
 
 def _looked_up(surface: ImportedSurface, at: Array) -> Floats:

@@ -47,6 +47,20 @@ def principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
     return found
 
 
+def emitter(part: MeshPart) -> Plugin | None:
+    """The light that a mesh emits, from the front of its faces; None where it emits none."""
+    if part.emission is None:
+        return None
+    if textured_emission(part):
+        return {"type": "area", "radiance": _texture(part.emission)}
+    return {"type": "area", "radiance": {"type": "rgb", "value": part.emission[0, 0].tolist()}}
+
+
+def textured_emission(part: MeshPart) -> bool:
+    """Whether a mesh emits light that differs from place to place."""
+    return part.emission is not None and part.emission.shape != (1, 1, 3)
+
+
 def matt(reflectance: Floats) -> Plugin:
     """A two-sided diffuse BSDF with a bilinear texture (h, w, 3) of linear reflectance, row 0 at v = 1."""
     return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": _texture(reflectance)}}
@@ -75,7 +89,9 @@ def own_surface(surface: Mapping[str, object], base_color: Floats) -> tuple[Plug
     return loadable(filled(surface)), place
 
 
-def mitsuba_mesh(name: str, mesh: Mesh, to_world: npt.NDArray[np.float64], bsdf: Plugin) -> Any:
+def mitsuba_mesh(
+    name: str, mesh: Mesh, to_world: npt.NDArray[np.float64], bsdf: Plugin, light: Plugin | None = None
+) -> Any:
     """Return a Mitsuba mesh of the given geometry under a pose, with shading normals and texture coordinates.
 
     Mitsuba's bitmaps have row 0 at v = 0 while ours have it at v = 1, hence the flip.
@@ -87,6 +103,8 @@ def mitsuba_mesh(name: str, mesh: Mesh, to_world: npt.NDArray[np.float64], bsdf:
     uvs = np.stack([mesh.uvs[:, 0], 1.0 - mesh.uvs[:, 1]], axis=1)
     properties = mi.Properties()
     properties["bsdf"] = mi.load_dict(bsdf)
+    if light is not None:
+        properties["emitter"] = mi.load_dict(light)
     result = mi.Mesh(
         name,
         vertex_count=len(vertices),

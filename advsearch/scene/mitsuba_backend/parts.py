@@ -7,7 +7,15 @@ from dataclasses import dataclass, field
 from functools import singledispatch
 
 from advsearch.scene.mitsuba_backend.inputs import SceneInput, color, flat, number, plain_number, point, transform
-from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, mitsuba_mesh, own_surface, principled
+from advsearch.scene.mitsuba_backend.meshes import (
+    NORMALS,
+    POSITIONS,
+    emitter,
+    mitsuba_mesh,
+    own_surface,
+    principled,
+    textured_emission,
+)
 from advsearch.scene.mitsuba_backend.plugins import loadable
 from advsearch.scene.mitsuba_backend.population import population
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
@@ -52,7 +60,7 @@ def mesh_translation(part: MeshPart, lobes: Plugin | None = None) -> Translation
     surface, color_key = principled(part, lobes), "base_color"
     if part.surface is not None:
         surface, color_key = own_surface(part.surface, part.base_color)
-    inputs = (
+    inputs: tuple[SceneInput, ...] = (
         SceneInput(f"{name}.vertices", f"{name}.{POSITIONS}", flat, shape=(count, 3)),
         SceneInput(f"{name}.normals", f"{name}.{NORMALS}", flat, shape=(count, 3)),
         SceneInput(f"{name}.base_color", f"{name}.*.{color_key}.data", interior=True),
@@ -61,7 +69,16 @@ def mesh_translation(part: MeshPart, lobes: Plugin | None = None) -> Translation
         SceneInput(f"{name}.specular", f"{name}.*.specular", number, True, (1,)),
         SceneInput(f"{name}.clearcoat", f"{name}.*.clearcoat.value", number, True, (1,)),
     )
-    return Translation({name: mitsuba_mesh(name, part.mesh, part.to_world, surface)}, inputs)
+    if part.emission is not None:
+        inputs += (_radiance(part),)
+    return Translation({name: mitsuba_mesh(name, part.mesh, part.to_world, surface, emitter(part))}, inputs)
+
+
+def _radiance(part: MeshPart) -> SceneInput:
+    name, place = f"{part.name}.radiance", f"{part.name}.emitter.radiance"
+    if textured_emission(part):
+        return SceneInput(name, f"{place}.data", interior=True)
+    return SceneInput(name, f"{place}.value", color, interior=True, shape=(3,))
 
 
 @translation.register

@@ -21,7 +21,7 @@ from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.dictionary import GROUND_INPUT, camera_inputs, scene_dict
 from advsearch.scene.mitsuba_backend.first_hit import first_hits
 from advsearch.scene.mitsuba_backend.inputs import SceneInput, as_is, as_torch, contiguous, key_of, plain_number
-from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS
+from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, textured_emission
 from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, leave_dark_lamps_out, mesh_translation, translation
 from advsearch.scene.mitsuba_backend.population import media_in, population
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER, next_count
@@ -85,9 +85,15 @@ class MitsubaScene:
         self.max_depth = max_depth
         self._depth = max_depth
         self._leave_out = frozenset(leave_out)
-        self._freeze = "tracing" in leave_out and not description.thin_lens  # Dr.Jit cannot record Mitsuba's thin lens
+        unrecorded = description.thin_lens or any(map(textured_emission, description.meshes.values()))
+        self._freeze = "tracing" in leave_out and not unrecorded  # Dr.Jit can record neither of these
         self._thin_lens = description.thin_lens
         self._backdrop = description.backdrop
+        if description.backdrop and description.emits:
+            raise InputError(
+                "background: Mitsuba hides surfaces that emit light together with the environment; leave the plain "
+                "background out, or take an object and surroundings without emission"
+            )
         self._guides: Plugin = {"type": "aov", "aovs": "albedo:albedo,normal:sh_normal"}
         if description.cut_out:
             import advsearch.scene.mitsuba_backend.guides  # noqa: F401  (registers the integrator)

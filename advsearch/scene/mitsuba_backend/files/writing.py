@@ -22,7 +22,7 @@ from advsearch.errors import InputError
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.description import OBJECT, SceneDescription
 from advsearch.scene.mitsuba_backend.dictionary import GROUND, scene_dict
-from advsearch.scene.mitsuba_backend.meshes import matt, own_surface, principled
+from advsearch.scene.mitsuba_backend.meshes import emitter, matt, own_surface, principled
 from advsearch.scene.mitsuba_backend.parts import translation
 from advsearch.scene.mitsuba_backend.plugins import loadable
 from advsearch.scene.mitsuba_backend.scene import NO_ROULETTE, MitsubaScene
@@ -153,7 +153,11 @@ def _part(part: ScenePart, left: Plugin) -> Plugin:
         surface = principled(part)
         if part.surface is not None:
             surface = own_surface(part.surface, part.base_color)[0]
-        found: Plugin = {"type": "ply", "bsdf": surface}
+        radiance = given.pop("radiance", None)
+        if radiance is not None:
+            part = replace(part, emission=radiance.reshape(-1, *radiance.shape[-2:] if radiance.ndim > 1 else (1, 3)))
+        light = emitter(part)
+        found: Plugin = {"type": "ply", "bsdf": surface, **({"emitter": light} if light else {})}
     elif isinstance(part, PointLamp):
         found = translation(replace(part, **_triples(given))).plugins[part.name]
     elif isinstance(part, BallLamp):
