@@ -28,6 +28,7 @@ from advsearch.scene.gradients.plan import WITH_BOUNDARY
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.files.writing import write_scene
+from advsearch.scene.mitsuba_backend.meshes import sampling_weights
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 from advsearch.scene.parts import PointLamp
@@ -340,3 +341,25 @@ def test_the_adjoint_of_a_texture_is_right_beside_emission(picture: np.ndarray |
         up, down = (made.radiance({name: base + way * (base > 0.0)}, 3, 1024).sum() for way in (step, -step))
         gradient = made.adjoint({name: base}, ones, 7, 1024)[name][base > 0.0]
         assert float(gradient.sum()) == pytest.approx(float(up - down) / (2.0 * step), rel=0.03)
+
+
+def test_many_dim_surfaces_do_not_take_the_samples_of_the_environment(tmp_path: Path) -> None:
+    """Thirty of them: the picture hardly has more noise than without."""
+    scene = trimesh.Scene()
+    scene.add_geometry(card(picture=None, vertices=CORNERS * 0.01 + [0, 0, 2.0]), node_name="dot0")
+    wall = card(grey=0.8)
+    wall.visual.material.emissiveFactor = None
+    scene.add_geometry(wall, node_name="wall")
+    for number in range(1, 30):
+        dot = card(vertices=CORNERS * 0.01 + [0.1 * number, 0, 2.0])
+        dot.visual.material = scene.geometry["geometry_0"].visual.material
+        scene.add_geometry(dot, node_name=f"dot{number}")
+    described = describe(f"{written(tmp_path, scene, 0.1)}#wall", "studio", given=SEEN)
+    weights = sampling_weights(described.meshes.values())
+    assert len(weights) == 30 and sum(weights.values()) == pytest.approx(1.0)
+
+    def noise(one: SceneDescription) -> float:
+        made = MitsubaScene(one, (SIZE, SIZE), max_depth=2)
+        return float(torch.stack([made.radiance({}, seed, 16) for seed in range(8)]).std(dim=0).mean())
+
+    assert noise(described) < 1.6 * noise(replace(described, parts=()))

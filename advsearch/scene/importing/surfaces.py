@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,7 @@ from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing import gltf
 from advsearch.scene.importing.files import shown
 from advsearch.scene.importing.gltf_entries import CUT_OUTS, CUTOFF, Header, MaterialEntry, NormalUse
+from advsearch.scene.importing.material_lines import color_of, last_number, radiance_of, scale_and_name
 from advsearch.scene.importing.normal_maps import holds_normals, normal_map
 from advsearch.scene.importing.pictures import Pictures
 from advsearch.scene.importing.references import Named
@@ -102,7 +102,7 @@ class SurfaceReader:
             return self._gltf(material)
         if isinstance(material, SimpleMaterial):
             # The Kd of a textured material is an exporter's default more often than a tint: the texture stands alone.
-            color = _color(material.kwargs.get("kd"))
+            color = color_of(material.kwargs.get("kd"))
             texture = self._texture(material, material.image, color)
             found = ImportedSurface(_unless_white(color, material, self.named), texture)
             found = replace(self._see_through(material, found), normal_map=self._bumps(material))
@@ -112,7 +112,7 @@ class SurfaceReader:
     def _see_through(self, material: SimpleMaterial, surface: ImportedSurface) -> ImportedSurface:
         """Give a surface the opacity that a material file says by ``d``, a number, and ``map_d``, a picture: its alpha,
         or its grey where it has none."""
-        factor, map = _last_number(material.kwargs.get("d"), 1.0), self._opacity(material)
+        factor, map = last_number(material.kwargs.get("d"), 1.0), self._opacity(material)
         if map is None and factor == 1.0:
             return surface
         share, color, texture = np.array([factor], np.float32), surface.color, surface.texture
@@ -138,7 +138,7 @@ class SurfaceReader:
     def _bumps(self, material: SimpleMaterial) -> Floats | None:
         """The normal map of a material file: ``norm``, or ``map_Bump`` or ``bump`` where these hold normals."""
         for key in ("norm", "map_bump", "bump"):
-            scale, name = _scale_and_name(material.kwargs.get(key) or [])
+            scale, name = scale_and_name(material.kwargs.get(key) or [])
             if not name:
                 continue
             picture = self.pictures.of_file(name, "numbers")
@@ -211,7 +211,7 @@ class SurfaceReader:
     def _glow(self, material: SimpleMaterial) -> Floats | None:
         """The radiance that a material file says by ``Ke`` and ``map_Ke``; where it has both, their product."""
         words, name = material.kwargs.get("ke") or [], " ".join(material.kwargs.get("map_ke") or [])
-        factor = _radiances(words)
+        factor = radiance_of(words)
         if factor is None:
             self._note(f"{self.source}: the emission {shown(' '.join(words))} is no colour; it is left out")
             return None
@@ -256,24 +256,6 @@ class SurfaceReader:
             self.notes.append(message)
 
 
-def _color(given: Any) -> Floats | None:
-    """Return a material file's colour as (3,) float32, clipped to [0, 1]; None unless it is one or three numbers."""
-    values = np.atleast_1d(np.asarray(given if given is not None else [], dtype=np.float32))
-    if values.shape not in ((1,), (3,)) or not np.isfinite(values).all():
-        return None
-    return np.clip(np.broadcast_to(values, (3,)), 0.0, 1.0).astype(np.float32)
-
-
-def _radiances(words: list[str]) -> npt.NDArray[np.float64] | None:
-    """Return one or three numbers of at least 0 as a colour (3,), black where there are none; None for other words."""
-    try:
-        values = np.array([float(word) for word in words or ["0"]])
-    except ValueError:
-        return None
-    good = values.shape in ((1,), (3,)) and np.isfinite(values).all() and values.min() >= 0.0
-    return np.broadcast_to(values, (3,)) if good else None
-
-
 def _with_opacity(color: Floats | None, factor: Floats, cutoff: float | None) -> Floats | None:
     """Return a base colour (..., 3 or 4) with its opacity, or as (..., 3) where it is opaque.
 
@@ -295,27 +277,6 @@ def _unless_white(color: Floats | None, material: Any, named: Named) -> Floats |
     if color is not None and material.name in named and (color > 0.999).all():
         return None
     return color
-
-
-def _scale_and_name(words: list[str]) -> tuple[float, str]:
-    """Return the factor (``-bm``) of a line of a material file that names a bump map, 1 by default, and the name."""
-    if "-bm" not in words[:-2]:
-        return 1.0, " ".join(words)
-    at = words.index("-bm")
-    try:
-        scale = float(words[at + 1])
-    except ValueError:
-        scale = 1.0
-    return scale if math.isfinite(scale) else 1.0, " ".join(words[:at] + words[at + 2 :])
-
-
-def _last_number(words: list[str] | None, otherwise: float) -> float:
-    """Return the last word of a line as a number in [0, 1], or what holds otherwise."""
-    try:
-        number = float((words or [""])[-1])
-    except ValueError:
-        return otherwise
-    return min(max(number, 0.0), 1.0) if math.isfinite(number) else otherwise
 
 
 def _unit(value: float | None) -> float | None:

@@ -5,7 +5,7 @@ Mitsuba 3.10 renames these parameters: they stand here and nowhere else.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,10 @@ from advsearch.scene.parts import BASE_COLOR, MeshPart
 
 POSITIONS, NORMALS, TEXCOORDS, FACES = "vertex_positions", "vertex_normals", "vertex_texcoords", "faces"
 """Names of a mesh's parameters: flat arrays of 3, 3 and 2 numbers a vertex, and 3 indices a face."""
+
+
+LEAST = 0.2
+"""See `sampling_weights`."""
 
 
 def principled(part: MeshPart, extra: Plugin | None = None) -> Plugin:
@@ -54,6 +58,21 @@ def emitter(part: MeshPart) -> Plugin | None:
     if textured_emission(part):
         return {"type": "area", "radiance": _texture(part.emission)}
     return {"type": "area", "radiance": {"type": "rgb", "value": part.emission[0, 0].tolist()}}
+
+
+def sampling_weights(parts: Iterable[MeshPart]) -> dict[str, float]:
+    """How often light is sampled from each mesh that emits some, by its name, where the environment has 1.
+
+    All of them together have 1 too, by their power; however little that is, each has `LEAST` of an equal share.
+    """
+    powers: dict[str, float] = {}
+    for part in parts:
+        if part.emission is not None:
+            corners = (part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T)[part.mesh.faces]
+            doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            powers[part.name] = float(part.emission.mean() * np.linalg.norm(doubled, axis=1).sum())
+    total = sum(powers.values())
+    return {name: (1.0 - LEAST) * power / total + LEAST / len(powers) for name, power in powers.items()}
 
 
 def textured_emission(part: MeshPart) -> bool:

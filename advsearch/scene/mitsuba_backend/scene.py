@@ -21,7 +21,7 @@ from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.dictionary import GROUND_INPUT, camera_inputs, scene_dict
 from advsearch.scene.mitsuba_backend.first_hit import first_hits
 from advsearch.scene.mitsuba_backend.inputs import SceneInput, as_is, as_torch, contiguous, key_of, plain_number
-from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, textured_emission
+from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, sampling_weights, textured_emission
 from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, leave_dark_lamps_out, mesh_translation, translation
 from advsearch.scene.mitsuba_backend.population import media_in, population
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER, next_count
@@ -112,6 +112,9 @@ class MitsubaScene:
         self._scene = _loaded(plugins, description)
         self._sensor = self._scene.sensors()[0]
         self.parameters = mi.traverse(self._scene)
+        for name, weight in sampling_weights(description.meshes.values()).items():
+            self.parameters[f"{name}.emitter.sampling_weight"] = weight
+        self.parameters.update()
         self._integrators: dict[tuple[str, int], Any] = {}
         parts = [one for part in translated for one in part.inputs]
         declared = [*camera_inputs(resolution), ENVIRONMENT_INPUT, GROUND_INPUT, *parts]
