@@ -24,6 +24,7 @@ from advsearch import seeds
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.harmonics import real_harmonics
+from advsearch.scene.parts import PluginPart
 from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.renderer import LinearRenderer, PredictingRenderer
 
@@ -46,6 +47,11 @@ Inputs = Mapping[str, Tensor]
 def light_inputs(renderer: Renderer) -> frozenset[str]:
     """The inputs of a scene that are light."""
     return frozenset(name for name in renderer.scene.names if name == ENVIRONMENT or name.endswith(LAMPS))
+
+
+def fixed_lights(renderer: Renderer) -> bool:
+    """Whether a light of the scene is no input: one of a Mitsuba scene."""
+    return any(isinstance(part, PluginPart) and part.shines for part in renderer.scene.made[0].parts)
 
 
 # ---- what moves -----------------------------------------------------------------------------------------------------
@@ -82,7 +88,8 @@ class Lighting:
 def lighting(renderer: Renderer) -> Lighting:
     """Return which groups of coordinates change nothing but light, and the picture behind the renderer.
 
-    Found by looking at the inputs of configurations, so that it holds for whatever sets them.
+    Found by looking at the inputs of configurations, so that it holds for whatever sets them. A light that is no input
+    would be in every basis picture: beside one only those that change the picture behind the renderer are returned.
     """
     middle = 0.5 * renderer.start + 0.25
     groups, harmonic, bright = {}, set(), []
@@ -102,6 +109,8 @@ def lighting(renderer: Renderer) -> Lighting:
                 if changes.get(ENVIRONMENT) == "harmonics":
                     harmonic.add(group.name)
             else:
+                if not found <= ON_PICTURE and fixed_lights(renderer):
+                    continue
                 groups[group.name] = frozenset(found)
                 if ENVIRONMENT in found and group.name not in harmonic:
                     bright.append((group.coordinates, brightest[group.coordinates]))

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 from torch import Tensor
 
 from advsearch.scene.renderer import Renderer
-from advsearch.scene.transport.lights import BasisRenderer, Lights, lighting
+from advsearch.scene.transport.lights import BasisRenderer, Lights, fixed_lights, light_inputs, lighting
 from advsearch.scene.transport.renderer import SPP, LinearRenderer, PredictingRenderer, linear_inputs, passes
 
 
@@ -32,6 +32,8 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
             return f"the estimator of {group.name} is forced"
         if group.estimator == "image" or group.name in lit:
             continue
+        if renderer.routes.get(group.name, frozenset()) & light_inputs(renderer) and fixed_lights(renderer):
+            return f"{group.name} changes light, and the scene has other lights of its own"
         if group.estimator != "adjoint" or not renderer.routes.get(group.name, frozenset()) <= linear:
             return f"{group.name} changes more than base colours{'' if varying else ' and light'}"
     if not any(renderer.routes.get(group.name) or lit.get(group.name) for group in searched):
