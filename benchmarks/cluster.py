@@ -2,9 +2,14 @@
 
     python benchmarks/cluster.py [--turns 3] [--pictures 512] [--rows 100000] [--figure FILE.png] [--only KIND]
 
+Kinds: real, searches, simulated.
+
 Real: the rate of a sweep between its first and its last row, so that loading does not count, with no workers on one
 thread, with one and with two; ratios of rates of the same turn, their medians. Asked: two over one 1.9, one over none
 0.97, on a machine that does nothing else.
+
+Searches: the same rate of an attack whose four restarts have workers side by side, and of one whose steps wait for the
+matrices of a bank of conditions.
 
 Simulated: workers of 0.5 s a picture (exponential around it, with a fixed seed) and an answer that takes 5 ms to come,
 in simulated time, to which the time is added that the coordinator really takes: it gives out, takes back, makes rows
@@ -69,10 +74,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--pictures", type=int, default=512)
     parser.add_argument("--rows", type=int, default=100_000)
     parser.add_argument("--figure", type=Path)
-    parser.add_argument("--only", choices=("real", "simulated"))
+    parser.add_argument("--only", choices=("real", "searches", "simulated"))
     args = parser.parse_args(argv)
-    held = [] if args.only == "simulated" else real(args.turns, args.pictures)
-    if args.only != "real":
+    held = real(args.turns, args.pictures) if args.only in (None, "real") else []
+    if args.only in (None, "searches"):
+        searches(args.turns)
+    if args.only in (None, "simulated"):
         held += simulated(args.figure) + stored(args.rows)
     return 0 if all(held) else 3
 
@@ -96,15 +103,42 @@ def real(turns: int, pictures: int) -> list[bool]:
 def rate(workers: int, pictures: int) -> float:
     """Rows a second of a sweep, from its first batch to its last."""
     side = max(2, pictures // 8)
+    words = ["sweep", "--object", "mug", "--grid", f"pose.yaw=0:360:{side}", "--grid", "camera.elevation=5:60:8"]
+    return rows_a_second([*words, "--trials", "0"], KIND, workers)
+
+
+def rows_a_second(words: Sequence[str], kind: str, workers: int) -> float:
+    """The rate of a command's rows of a kind, those of the first time left out."""
     with tempfile.TemporaryDirectory() as folder:
-        words = ["sweep", "--object", "mug", "--grid", f"pose.yaw=0:360:{side}", "--grid", "camera.elevation=5:60:8"]
-        words += ["--trials", "0", "--quiet", "--threads", "1", "--run", f"{folder}/run"]
-        words += ["--workers", str(workers)] if workers else []
-        subprocess.run([sys.executable, "-m", "advsearch", *words], check=True, stdout=subprocess.DEVNULL)
+        more = [
+            "--quiet",
+            "--threads",
+            "1",
+            "--run",
+            f"{folder}/run",
+            *(["--workers", str(workers)] if workers else []),
+        ]
+        subprocess.run([sys.executable, "-m", "advsearch", *words, *more], check=True, stdout=subprocess.DEVNULL)
         with Store(Path(folder) / "run" / NAME, read_only=True) as store:
-            times = sorted(row.time or 0.0 for row in store.rows(KIND))
+            times = sorted(row.time or 0.0 for row in store.rows(kind))
     first = times.count(times[0])
     return (len(times) - first) / (times[-1] - times[0])
+
+
+SEARCHES = {
+    "restarts": "--control pose --policy restarts --steps 200 --no-specialise",
+    "bank": "--control texture --over pose --steps 40 --draws 4",
+}
+
+
+def searches(turns: int) -> None:
+    """Print what searches gain."""
+    for name, words in SEARCHES.items():
+        asked = ["attack", "--object", "mug", *words.split(), "--trials", "6", "--no-baseline", "--measure", "no"]
+        rates = [[rows_a_second(asked, "search", workers) for workers in (0, 1, 2)] for _ in range(turns)]
+        for title, over, under in (("one worker over none", 1, 0), ("two workers over one", 2, 1)):
+            ratios = [each[over] / each[under] for each in rates]
+            print(f"  {name:10s} {statistics.median(ratios):.3f} {title}, of {turns}: {_listed(ratios)}")
 
 
 def _listed(ratios: Sequence[float]) -> str:
