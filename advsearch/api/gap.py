@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -275,11 +276,13 @@ def _curve(parts: _Parts) -> list[ObjectRow]:
     rows = []
     for chain in parts.chains:
         row, clean = ObjectRow(object=chain[0].of, clean=None, flips_at=None), CleanMatrix()
+        renders: Counter[str] = Counter()
         for one in chain:
             summary = parts.attack(one, clean)
             if summary is None:
                 break
-            row = _seen(one.of, summary, one.epsilon)
+            renders.update(summary.renders)
+            row = _seen(one.of, summary, one.epsilon).model_copy(update={"renders": dict(renders)})
             if row.ending in SETTLED:
                 break
         rows.append(row)

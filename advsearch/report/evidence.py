@@ -137,6 +137,10 @@ def _gap(result: GapResult) -> Iterator[Claim]:
 
 
 def _curve(result: CurveResult) -> Iterator[Claim]:
+    each = [row.renders for row in result.table if row.renders]
+    total = {kind: sum(one.get(kind, 0) for one in each) for kind in {kind for one in each for kind in one}}
+    searched = _searches(total, result.policy, bool(total.get("baseline")))
+    spent = f"Searched were, of all objects and epsilons together, {searched}. "
     for point in result.curve:
         if point.accuracy is None:
             continue
@@ -146,7 +150,7 @@ def _curve(result: CurveResult) -> Iterator[Claim]:
         where = "the controls' own budget" if point.epsilon is None else f"epsilon {point.epsilon:g}"
         text = (
             f"Within {where} the policy {result.policy} found no failure of {_share(extent)} objects; "
-            f"{point.already_wrong} are wrong as they are. {NO_PROOF}"
+            f"{point.already_wrong} are wrong as they are. {spent if total else ''}{NO_PROOF}"
         )
         yield _claim("measured", text, extent)
 

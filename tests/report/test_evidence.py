@@ -114,6 +114,12 @@ def test_envelopes_regions_curves_and_hardening_are_claims_as_far_as_they_were_c
     for box in (None, {**samples.EXPLAIN["envelope"], "held": False}):
         assert nothing(claims_of(ExplainResult.of({**samples.EXPLAIN, "envelope": box}))[0])
     assert [NO_PROOF in one.statement for one in claims_of(samples.curve())] == [True]
+    table = [{**row, "renders": {"search": 40, "baseline": 30}} for row in samples.CURVE["table"]]
+    (counted,) = claims_of(samples.curve(table=table))
+    assert "no failure of" in counted.statement
+    assert (
+        f"together, {40 * len(table)} renders by the policy auto and {30 * len(table)} by random" in counted.statement
+    )
     assert [NO_PROOF in one.statement for one in claims_of(HardenResult.of(samples.HARDEN))] == [True, True]
     assert nothing(claims_of(RecipeResult.of(samples.RECIPE))[0]), "its parts are runs of their own"
 

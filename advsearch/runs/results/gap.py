@@ -35,6 +35,9 @@ class ObjectRow(Fields):
     margin: Number | None = Field(default=None, description="mean of the trials, in logits")
     run: str | None = None
     tried: float | None = Field(default=None, description="the largest epsilon that was tried")
+    renders: dict[str, int] | None = Field(
+        default=None, description="pictures by kind, of the attacks at all epsilons together; null in older runs"
+    )
 
 
 class CurvePoint(Fields):
