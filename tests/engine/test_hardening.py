@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import shutil
 import tarfile
+import weakref
 from importlib import resources
 from pathlib import Path
 
@@ -13,10 +15,13 @@ import torch
 from small_models import Colours
 from torch import Tensor, nn
 
-from advsearch.engine.hardening.lessons import Lesson, RenderedLesson, harder, surprise
+from advsearch.api.attack import problem_of
+from advsearch.config import AttackConfig
+from advsearch.engine.hardening.lessons import Lesson, RenderedLesson, TextureLesson, harder, lessons, surprise
 from advsearch.engine.hardening.pictures import save_pictures, write_archive
 from advsearch.engine.hardening.split import HELD_OUT, TRAINING, Split, check_disjoint, fingerprint
 from advsearch.engine.hardening.training import Course, Score, score
+from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model, reference
 from advsearch.models.trainable import Trainable, trainable
@@ -39,6 +44,21 @@ def pupils() -> list[Lesson]:
     """Three classes by their brightest channel, of which the worst pictures show little."""
     worst = [coloured(n % 3, 0.2, 99 + n) for n in range(24)]
     return [RenderedLesson((n % 3,), coloured(n % 3, 0.4, n), one, one[None]) for n, one in enumerate(worst)]
+
+
+def test_lessons_of_textures_let_go_of_their_scene() -> None:
+    """There are hundreds of them; what is left says the pictures, and takes no renderer."""
+    settings = {"resolution": (16, 16), "controls": {"texture": {"resolution": 4}}}
+    config = AttackConfig(object="mug", **settings, over={"camera": {}, "environment": {}}, measure="no")
+    model = load_model("reference")
+    problem = problem_of(config, load_scene("mug"), model)
+    (lesson,) = lessons(problem, 1, 1, 0)
+    scene = weakref.ref(problem.renderer.scene)
+    del problem
+    gc.collect()
+    assert scene() is None and isinstance(lesson, TextureLesson)
+    harder([lesson], model, 2)
+    assert lesson.worst.shape == (16, 16, 3) and not torch.equal(lesson.worst, lesson.plain)
 
 
 # ---- the split ------------------------------------------------------------------------------------------------------

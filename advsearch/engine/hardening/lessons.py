@@ -10,13 +10,15 @@ which the one that is worst for the model as it is counts.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from advsearch import seeds
+from advsearch.attacks import Domain
+from advsearch.controls import Space
 from advsearch.engine.problem import Problem
 from advsearch.models import Model
 from advsearch.scene.formation import to_8_bit
@@ -63,20 +65,22 @@ class TextureLesson(Lesson):
     """A lesson whose pictures a matrix says.
 
     Attributes:
-        problem: whose searched space the texture belongs to.
-        linear: says the pictures.
+        space: that the texture belongs to.
+        domain: where it may be.
+        linear: says the pictures; the scene is let go of, as there are many lessons.
         numbers: conditions that it was made for.
         texture: the adversarial one.
     """
 
-    problem: Problem
+    space: Space
+    domain: Domain
     linear: LinearRenderer
     numbers: Tensor
     texture: Disguise
 
     def picture(self, u: Tensor) -> Tensor:
         """Return the picture (H, W, 3) of a texture, with a graph."""
-        inputs = self.problem.searched_space.inputs(u)
+        inputs = self.space.inputs(u)
         return self.linear.shown({name: inputs[name] for name in self.linear.there}, torch.cat([u, self.numbers]))
 
 
@@ -112,7 +116,8 @@ def lessons(problem: Problem, views: int, tries: int, seed: int, *, shared: bool
     varying = [one.name for one in problem.space.controls[problem.searched :]]
     linear, found = why_not(problem.renderer, varying) is None, list[Lesson]()
     right = tuple(int(index) for index in problem.truth())
-    common = _begun(problem, seed)
+    common, whole_space = _begun(problem, seed), replace(problem.space, scene=None)
+    space = replace(problem.searched_space, scene=None)
     with torch.no_grad(), problem.renderer.scene.shorter(DEPTH):
         for number in range(views):
             own = seeds.stream(seed, "lesson", number)
@@ -122,7 +127,8 @@ def lessons(problem: Problem, views: int, tries: int, seed: int, *, shared: bool
                 made = LinearRenderer(problem.renderer, whole, own, spp=SPP, quick=True)
                 plain = made(whole)
                 texture = common if shared else _begun(problem, own)
-                found.append(TextureLesson(right, plain, plain, problem, made, numbers, texture))
+                made.let_go(whole_space)
+                found.append(TextureLesson(right, plain, plain, space, problem.domain, made, numbers, texture))
             else:
                 drawn = problem.domain.sample(torch.Generator().manual_seed(own), tries)
                 shown = [problem.renderer(torch.cat([u, numbers]), seed=own, spp=SPP) for u in drawn]
@@ -178,7 +184,7 @@ def _ascend(chosen: Sequence[TextureLesson], model: Model, steps: int, change: C
         pictures = torch.stack([one.picture(leaves[one.texture]) for one in chosen])
         loss = surprise(model(change(pictures)), [one.right for one in chosen]).sum()
         slopes = torch.autograd.grad(loss, list(leaves.values()))
-        domains = {one.texture: one.problem.domain for one in chosen}
+        domains = {one.texture: one.domain for one in chosen}
         for texture, slope in zip(textures, slopes, strict=True):
             domain = domains[texture]
             texture.u = domain.project(texture.u + STEP * domain.steepest(texture.u, slope))

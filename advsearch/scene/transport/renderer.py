@@ -16,7 +16,7 @@ from advsearch.files import scaled
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.mitsuba_backend.transport import Paths, mean_of
-from advsearch.scene.renderer import Renderer
+from advsearch.scene.renderer import InputSpace, Renderer
 from advsearch.scene.transport.matrix import Halves, TextureTransport
 
 SPP = 128
@@ -144,6 +144,11 @@ class LinearRenderer(PredictingRenderer):
                 base = self.primal(traced, seed, spp, self._hide)
                 tick(spp)
             self._base = Halves(base)
+
+    def let_go(self, space: InputSpace) -> None:
+        """Let go of the scene, which only tracing takes; the pictures stay, and `space` is the same without a scene."""
+        vars(self).pop("scene")
+        self.space = space
 
     @property
     def collected(self) -> Linearised:
