@@ -18,13 +18,14 @@ from advsearch.attacks.verification import WORST_CASE
 from advsearch.bundled.objects import OBJECTS
 from advsearch.config import AttackConfig, HardenConfig
 from advsearch.config.hardening import ALL
-from advsearch.engine.hardening.lessons import Lesson, lessons, plain_lessons
+from advsearch.engine.hardening.lessons import Lesson, RenderedLesson, lessons, plain_lessons
 from advsearch.engine.hardening.pictures import FOLDER
 from advsearch.engine.hardening.rounds import VALIDATION_VIEWS, WEIGHTS, TrainingRounds
-from advsearch.engine.hardening.split import HELD_OUT, PLAIN, TRAINING, VALIDATION, Split, check_disjoint
+from advsearch.engine.hardening.split import FURTHER, HELD_OUT, TRAINING, VALIDATION, Split, check_disjoint
 from advsearch.engine.hardening.training import Course, Examples, MakeOptimiser, right_share
 from advsearch.engine.loading import Scene
 from advsearch.engine.naming import AnyModel, load_models, model_name, scene_settings
+from advsearch.engine.problem import Problem
 from advsearch.engine.run_settings import RunSettings
 from advsearch.errors import InputError
 from advsearch.interrupts import interruptible
@@ -62,9 +63,9 @@ TRIES = 6
 CLEAN_VIEWS = 2
 PLAIN_VIEWS = 3
 """Further views of each scene as it is."""
-PLAIN_SCENES, VIEWS_OF_PLAIN = 3, 2
-"""Further scenes for each one that is searched, of which there are so many views as they are: clean accuracy is lost
-where there are too few."""
+FURTHER_SCENES, FURTHER_VIEWS = 3, 2
+"""Scenes that come with each one of the training, and views of each, as they are: clean accuracy is lost where there
+are too few. What is rendered is searched there too, as its lessons hold few worst pictures."""
 CLEAN_SCENES = 4
 """Held-out scenes whose plain pictures are looked at, for each one that is attacked."""
 CLEAN_SPP = 16
@@ -186,7 +187,7 @@ def splits_of(config: HardenConfig, model: Model) -> dict[str, Split]:
     asked = config.held_out_environment
     measured = split_names(asked) if asked else list_environments("heldout")
     taught = [
-        Split(name, known, training, seeds.stream(config.seed, name), True) for name in (TRAINING, PLAIN, VALIDATION)
+        Split(name, known, training, seeds.stream(config.seed, name), True) for name in (TRAINING, FURTHER, VALIDATION)
     ]
     measured_on = Split(HELD_OUT, held, measured, seeds.stream(config.seed, HELD_OUT))
     return {one.name: one for one in (*taught, measured_on)}
@@ -221,7 +222,7 @@ class Hardening:
 
     def __post_init__(self) -> None:
         config = self.config
-        amounts = (config.scenes, config.views, len(config.controls), config.clean_loss)
+        amounts = (config.scenes, config.views, config.clean_loss)
         self.rounds = TrainingRounds(self.run, self.course, self._drawn, *amounts, self.progress)
         self.measured: dict[str, str] = json.loads(self.run.store.note(MEASURED) or "{}")
         self.clean: dict[str, Share] = {}
@@ -237,7 +238,7 @@ class Hardening:
     def carry_out(self) -> None:
         """Measure, train, and measure again."""
         sides = self.splits
-        check_disjoint(sides[HELD_OUT], [sides[name] for name in (TRAINING, PLAIN, VALIDATION)], self._counts)
+        check_disjoint(sides[HELD_OUT], [sides[name] for name in (TRAINING, FURTHER, VALIDATION)], self._counts)
         self._measure("before", "attacking the model as it is", self.model, 1)
         self.rounds.carry_out(self.config.rounds)
         self._measure("after", "attacking the hardened model", self.student.model, 1)
@@ -249,7 +250,7 @@ class Hardening:
         """Scenes of each split, by its name; of those that are held out a part is attacked."""
         config = self.config
         held, searched = CLEAN_SCENES * config.measured, config.scenes * config.rounds
-        counts = {TRAINING: searched, PLAIN: PLAIN_SCENES * searched}
+        counts = {TRAINING: searched, FURTHER: FURTHER_SCENES * searched}
         return {**counts, VALIDATION: self.rounds.judged, HELD_OUT: held}
 
     def _alone(self, control: str, name: str, **changes: object) -> AttackConfig:
@@ -261,29 +262,40 @@ class Hardening:
         found |= {"controls": {control: given}, "measure": "no", "baseline": False}
         return AttackConfig.of(config, **found)
 
-    def _drawn(self, split: str, places: Sequence[int], views: int) -> list[Lesson]:
+    def _drawn(self, title: str, split: str, places: Sequence[int], views: int) -> list[Lesson]:
         """Lessons of scenes for each control; in every fourth scene of the training all views share a texture, and
-        plain ones come on top."""
-        side, found = self.splits[split], list[Lesson]()
+        further scenes come on top."""
+        side, found, rendered = self.splits[split], list[Lesson](), list[str]()
+        further = FURTHER_SCENES if split == TRAINING else 0
+        self.progress.stage(title, len(places) * (len(self.config.controls) + further))
         for control in self.config.controls:
             for number in places:
-                name, scene = side.scene(number, self._set)
-                problem = problem_of(self._alone(control, name, over=_without(control)), scene, self.student.model)
-                shared = split == TRAINING and number % 4 == 3
-                seed = seeds.stream(side.seed, "views", number)
-                found += lessons(problem, views, TRIES, seed, shared=shared)
-                found += plain_lessons(problem, PLAIN_VIEWS, seed)
+                problem, seed = self._problem(side, number, control)
+                drawn = lessons(problem, views, TRIES, seed, shared=split == TRAINING and number % 4 == 3)
+                found += drawn + plain_lessons(problem, PLAIN_VIEWS, seed)
                 self.progress.advance(1)
-        return [*found, *self._plain(places)] if split == TRAINING else found
+            if isinstance(drawn[0], RenderedLesson):
+                rendered.append(control)
+        return found + self._further([place * further + more for place in places for more in range(further)], rendered)
 
-    def _plain(self, places: Sequence[int]) -> list[Lesson]:
-        """Plain lessons of the scenes that come with those of the training."""
-        side, found, control = self.splits[PLAIN], list[Lesson](), next(iter(self.config.controls))
-        for number in (place * PLAIN_SCENES + more for place in places for more in range(PLAIN_SCENES)):
-            name, scene = side.scene(number, self._set)
-            problem = problem_of(self._alone(control, name, over=_without(control)), scene, self.model)
-            found += plain_lessons(problem, VIEWS_OF_PLAIN, seeds.stream(side.seed, "views", number))
+    def _further(self, places: Sequence[int], rendered: Sequence[str]) -> list[Lesson]:
+        """Lessons of scenes that come with those of the training: plain ones, and of controls that are rendered."""
+        side, found, first = self.splits[FURTHER], list[Lesson](), next(iter(self.config.controls))
+        for number in places:
+            for control in dict.fromkeys([first, *rendered]):
+                problem, seed = self._problem(side, number, control)
+                if control in rendered:
+                    found += lessons(problem, FURTHER_VIEWS, TRIES, seed)
+                if control == first:
+                    found += plain_lessons(problem, FURTHER_VIEWS, seed)
+            self.progress.advance(1)
         return found
+
+    def _problem(self, side: Split, number: int, control: str) -> tuple[Problem, int]:
+        """What a scene is searched as, and the root of the draws of its lessons."""
+        name, scene = side.scene(number, self._set)
+        problem = problem_of(self._alone(control, name, over=_without(control)), scene, self.model)
+        return problem, seeds.stream(side.seed, "views", number)
 
     # ---- measurement ------------------------------------------------------------------------------------------------
 
@@ -348,7 +360,7 @@ class Hardening:
             one.model_copy(update={"kept": done and n == self.rounds.best}) for n, one in enumerate(self.rounds.done)
         ]
         weights = self.run.path / ARTIFACTS / WEIGHTS
-        views = {TRAINING: config.views, PLAIN: VIEWS_OF_PLAIN, VALIDATION: VALIDATION_VIEWS, HELD_OUT: CLEAN_VIEWS}
+        views = {TRAINING: config.views, FURTHER: FURTHER_VIEWS, VALIDATION: VALIDATION_VIEWS, HELD_OUT: CLEAN_VIEWS}
         names = list(config.controls)
         return HardenResult(
             run=str(self.run.path),

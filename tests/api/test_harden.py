@@ -16,7 +16,9 @@ from advsearch.cli.harden import answer
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig, HardenConfig
 from advsearch.config.hardening import QUICK
+from advsearch.engine.hardening.lessons import Lesson, RenderedLesson, TextureLesson
 from advsearch.engine.hardening.rounds import ROUNDS
+from advsearch.engine.hardening.split import TRAINING, VALIDATION
 from advsearch.engine.hardening.training import Course, Score
 from advsearch.engine.loading import Scene
 from advsearch.errors import InputError
@@ -46,7 +48,7 @@ def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, 
 
     monkeypatch.setattr(hardening, "_attacked", attacked)
     monkeypatch.setattr(hardening, "CLEAN_SCENES", 1)
-    monkeypatch.setattr(hardening, "PLAIN_SCENES", 1)
+    monkeypatch.setattr(hardening, "FURTHER_SCENES", 1)
     return done
 
 
@@ -84,6 +86,19 @@ def test_a_run_trains_measures_and_goes_on(attacks: list[tuple[str, int]], monke
     assert "robust to texture" in answer(result)
     page = Path("runs/run/report.html").read_text("utf-8")
     assert "Of 2 held-out scenes the searches leave 1 right, before 1;" in page and "data:image/png" in page
+
+
+def test_what_is_rendered_is_searched_in_further_scenes_too(attacks: list[tuple[str, int]]) -> None:
+    config = HardenConfig(**{**SMALL, "controls": "texture,pose", "labels": "labels.json"})
+    with RunDirectory.create_for(config) as run:
+        course = Course(Trainable(torch.nn.Linear(2, 3), load()), load(), 0.1, 1, 0)
+        work = hardening.Hardening(config, run, load(), course, hardening.splits_of(config, load()), NullProgress())
+        found = [type(one) for one in work._drawn("scenes", TRAINING, range(1), 1)]
+        held_back = [type(one) for one in work._drawn("scenes", VALIDATION, range(1), 1)]
+    plain = [Lesson] * 3
+    assert held_back == [TextureLesson, *plain, RenderedLesson, *plain]
+    assert found == [*held_back, Lesson, Lesson, RenderedLesson, RenderedLesson]
+    shutil.rmtree(run.path)
 
 
 def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple[str, int]]) -> None:

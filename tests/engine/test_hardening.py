@@ -10,6 +10,7 @@ import weakref
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from small_models import Colours
@@ -21,10 +22,12 @@ from advsearch.engine.hardening.lessons import Lesson, RenderedLesson, TextureLe
 from advsearch.engine.hardening.pictures import save_pictures, write_archive
 from advsearch.engine.hardening.split import HELD_OUT, TRAINING, Split, check_disjoint, fingerprint
 from advsearch.engine.hardening.training import Course, Score, score
+from advsearch.engine.hardening.variation import white_light_changed
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model, reference
 from advsearch.models.trainable import Trainable, trainable
+from advsearch.scene.library import load_environment
 
 LABELS = [f"class {number}" for number in range(14)]
 
@@ -85,6 +88,20 @@ def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
         check_disjoint(files[0], files[1:], counts)
     with pytest.raises(InputError, match="held_out_environment: noon is an environment of the training too"):
         check_disjoint(Split(HELD_OUT, ("ball",), ("noon",), 2), [training], counts)
+
+
+def test_light_of_some_scenes_is_as_warm_as_a_lamp_or_as_cold_as_a_sky() -> None:
+    """Colours between those of 2,700 and 10,000 K, in half of the scenes; the rest of the map stays as it is."""
+    given, rng = load_environment("noon"), np.random.default_rng(0)
+    tints = list[float]()
+    for _ in range(200):
+        found = white_light_changed(given, rng).radiance
+        factors = (found / given.radiance)[10, 10]
+        assert np.allclose(found, given.radiance * factors, rtol=1e-4)
+        tints.append(float(np.log(factors[0] / factors[2])))
+    changed = [one for one in tints if abs(one) > 1e-6]
+    assert 75 < len(changed) < 125
+    assert -0.6 < min(changed) < -0.3 and 1.9 < max(changed) < 2.4
 
 
 # ---- what is trained ------------------------------------------------------------------------------------------------

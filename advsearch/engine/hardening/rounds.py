@@ -33,8 +33,8 @@ VALIDATION_VIEWS = 2
 PARTS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
 """Of the way from the weights that were given to the trained ones, which are judged."""
 
-Draw = Callable[[str, Sequence[int], int], list[Lesson]]
-"""From the name of a split, numbers of its scenes and the views of each to lessons."""
+Draw = Callable[[str, str, Sequence[int], int], list[Lesson]]
+"""From what to tell the progress, the name of a split, numbers of its scenes and the views of each to lessons."""
 
 
 @dataclass
@@ -44,10 +44,9 @@ class TrainingRounds:
     Attributes:
         run: keeps them.
         course: trains.
-        draw: draws lessons; advances `progress` by one for each scene and control.
+        draw: draws lessons.
         each: scenes that a round adds for each control.
         views: of each.
-        controls: how many there are.
         clean_loss: share of plain pictures that may be lost.
         progress: told how far it is.
         done: what each round came to; the first is the model as it was.
@@ -58,7 +57,6 @@ class TrainingRounds:
     draw: Draw
     each: int
     views: int
-    controls: int
     clean_loss: float
     progress: Progress
     done: list[TrainingRound] = field(init=False)
@@ -93,13 +91,12 @@ class TrainingRounds:
 
     def _train(self, count: int) -> None:
         student, pool = self.course.student, list[Lesson]()
-        self.progress.stage("drawing scenes to choose weights by", self.judged * self.controls)
-        held_back = self.draw(VALIDATION, range(self.judged), VALIDATION_VIEWS)
+        held_back = self.draw("drawing scenes to choose weights by", VALIDATION, range(self.judged), VALIDATION_VIEWS)
         if not self.done:
             self._keep(0, [], score(student.model, held_back), 0, 0.0)
         for number in range(1, count + 1):
-            self.progress.stage(f"round {number}: drawing scenes", self.each * self.controls)
-            new = self.draw(TRAINING, range((number - 1) * self.each, number * self.each), self.views)
+            places = range((number - 1) * self.each, number * self.each)
+            new = self.draw(f"round {number}: drawing scenes", TRAINING, places, self.views)
             pool += new
             if number < len(self.done):
                 continue  # done before this run was stopped

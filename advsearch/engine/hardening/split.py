@@ -15,15 +15,15 @@ import numpy as np
 
 from advsearch import seeds
 from advsearch.bundled.objects import OBJECTS
-from advsearch.engine.hardening.variation import varied
+from advsearch.engine.hardening.variation import varied, white_light_changed
 from advsearch.engine.loading import Scene, load_scene
 from advsearch.errors import InputError
 from advsearch.scene.assets import ObjectAsset
 from advsearch.scene.settings import Given
 
-TRAINING, PLAIN, VALIDATION, HELD_OUT = "training", "plain training", "validation", "held out"
-"""The splits: what the weights are fitted to, of which the second is seen as it is alone, what chooses among them, and
-what is measured in the end."""
+TRAINING, FURTHER, VALIDATION, HELD_OUT = "training", "further training", "validation", "held out"
+"""The splits: what the weights are fitted to (the second mostly as it is), what chooses among them, and what is
+measured in the end."""
 
 ELEVATION = (8.0, 55.0)
 FIELD = (25.0, 45.0)
@@ -73,7 +73,7 @@ class Split:
         scene = load_scene(made, environment, settings=settings)
         own = scene.description
         if self.varied and own.environment is not None:
-            own = replace(own, environment=varied(own.environment, rng))
+            own = replace(own, environment=white_light_changed(varied(own.environment, rng), rng))
             scene = Scene(own)
         if own.object.label is None:
             label = Path(name).stem.replace("-", " ").replace("_", " ")

@@ -1,6 +1,7 @@
 """Environments as a network has to know them: mirrored, tinted, with another contrast, with a soft light more.
 
-A handful of maps is soon known by heart; what is learned under few lights is lost under others.
+A handful of maps is soon known by heart; what is learned under few lights is lost under others. Lamps and skies of a
+day go through colours that no single map has (`white_light_changed`).
 """
 
 from __future__ import annotations
@@ -12,6 +13,13 @@ import numpy as np
 
 from advsearch.scene.assets import EnvironmentAsset, Floats
 
+WARM = (1.06, 0.18, -1.25)
+"""Logarithms of what light of 2,700 K has of red, green and blue, beside light of 6,500 K; their mean is about zero."""
+OF_WARM = (-0.24, 1.0)
+"""Ends of the uniform factor of `WARM`: about 10,000 and 2,700 K."""
+WHITE_LIGHT_CHANGES = 0.5
+"""How often the colour of light is changed."""
+
 
 def varied(environment: EnvironmentAsset, rng: np.random.Generator) -> EnvironmentAsset:
     """Mirror, tint, change the contrast of, and add one soft light to an environment, each by chance."""
@@ -22,6 +30,18 @@ def varied(environment: EnvironmentAsset, rng: np.random.Generator) -> Environme
     if rng.random() < 0.5:
         radiance = radiance + mean * _soft_light(radiance.shape[:2], rng)
     return replace(environment, radiance=np.ascontiguousarray(radiance, dtype=np.float32))
+
+
+def white_light_changed(environment: EnvironmentAsset, rng: np.random.Generator) -> EnvironmentAsset:
+    """Change the colour temperature of all light of an environment, by chance, in one of two cases.
+
+    Relative to daylight (D65), what a black body of 2,700 K (an incandescent lamp) gives in linear sRGB is about
+    exp(`WARM`), and one of 10,000 K (a clear sky in the shade) about exp(-0.24 `WARM`); the amount is uniform between.
+    """
+    if rng.random() >= WHITE_LIGHT_CHANGES:
+        return environment
+    factors = np.exp(rng.uniform(*OF_WARM) * np.asarray(WARM)).astype(np.float32)
+    return replace(environment, radiance=np.ascontiguousarray(environment.radiance * factors))
 
 
 def _soft_light(shape: tuple[int, ...], rng: np.random.Generator) -> Floats:

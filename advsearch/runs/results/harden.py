@@ -64,7 +64,7 @@ class HardenResult(RunResult):
     table: list[HardenedControl]
     search: str = Field(description="policy and steps of the searches of `before` and `after`")
     stronger_search: str = Field(description="another policy with three times the steps")
-    split: dict[str, SplitSide] = Field(description="by side: `training`, `plain training`, `validation`, `held out`")
+    split: dict[str, SplitSide] = Field(description="by side: `training`, `further training`, `validation`, `held out`")
     rounds: list[TrainingRound]
     hardened: str | None = Field(description="what `model` takes to load the hardened one; null if nothing was kept")
     weights: str | None = Field(description="the hardened weights, safetensors")
