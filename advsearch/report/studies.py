@@ -13,6 +13,7 @@ from advsearch.runs.results.gap import CurvePoint, CurveResult, GapResult, GapRo
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.region import BoxSide, MarginMap
 from advsearch.runs.results.sweep import AxisRow, SweepMap, SweepSummary
+from advsearch.settings import split_names
 
 
 def curve_figure(answer: CurveResult) -> Figures:
@@ -167,7 +168,7 @@ def _cells(axes: Any, answer: SweepSummary, cells: SweepMap) -> None:
     axes.set_yticks(*_ticks(second.values))
     more = len(cells.over)
     over = f", over {more} more {'axes' if more > 1 else 'axis'}" if more else ""
-    axes.set_title(f"{answer.object}, {answer.model}{over}")
+    axes.set_title(f"{_who(answer)}{over}")
 
 
 def _along(axes: Any, answer: SweepSummary, rows: Sequence[AxisRow]) -> None:
@@ -179,7 +180,7 @@ def _along(axes: Any, answer: SweepSummary, rows: Sequence[AxisRow]) -> None:
     axes.set_xticks(*_ticks([row.value for row in rows]), rotation=45 if _long([r.value for r in rows]) else 0)
     axes.set(xlabel=_name(rows[0].axis, rows[0].unit), ylabel="accuracy", ylim=(-0.03, 1.03))
     axes.margins(x=0.08)
-    axes.set_title(f"{answer.object}, {answer.model}")
+    axes.set_title(_who(answer))
     axes.grid(True, axis="y")
     axes.figure.legend(loc="outside lower center", ncols=2)
 
@@ -222,7 +223,12 @@ def _ticks(values: Sequence[Any]) -> tuple[list[int], list[str]]:
 def _written(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return " to ".join(f"{end:.3g}" for end in value)
-    return str(value) if isinstance(value, str) else f"{value:.4g}"
+    return short_name(value) if isinstance(value, str) else f"{value:.4g}"
+
+
+def _who(answer: SweepSummary) -> str:
+    """Objects and models of a sweep, files without their folders."""
+    return ", ".join(short_name(name) for name in (*split_names(answer.object), *split_names(answer.model)))
 
 
 def _long(values: Sequence[Any]) -> bool:
@@ -230,8 +236,12 @@ def _long(values: Sequence[Any]) -> bool:
 
 
 def _map_size(cells: SweepMap) -> tuple[float, float]:
-    wide, high = (min(len(axis.values), MOST_TICKS) for axis in cells.axes)
-    return 3.2 + 0.34 * wide, 1.8 + 0.3 * high
+    """Width and height in inches, with room for the names of the values, those below aslant where they are long."""
+    (wide, below), (high, beside) = (
+        (min(len(axis.values), MOST_TICKS), max(map(len, _ticks(axis.values)[1]))) for axis in cells.axes
+    )
+    aslant = below if _long(cells.axes[0].values) else 0
+    return 3.2 + 0.34 * wide + 0.09 * max(beside - 8, aslant - 8, 0), 1.8 + 0.3 * high + 0.065 * max(aslant - 8, 0)
 
 
 def _worst(row: GapRow) -> float:
