@@ -219,8 +219,8 @@ def _figures(
         one.name: result.surface for one, result in results if isinstance(result, SweepSummary) and result.surface
     }
     table = Table(rows, described.groups, surfaces, cores())
-    for number, figure in enumerate(described.figures):
-        made = compute(table, *read_options(figure, config.recipe))
+    figures = (made for one in described.figures for made in compute(table, *read_options(one, config.recipe)))
+    for number, made in enumerate(figures):
         for suffix, data in draw(made, run.path).items():
             write_bytes(run.path / IMAGES / f"figure-{number + 1}.{suffix}", data)
         yield made

@@ -59,8 +59,9 @@ def answered(values: dict[str, float | str], right: bool) -> Answered:
 def figure(
     described: dict[str, object], answered: Sequence[Answered], groups: dict[str, list[str]] | None = None
 ) -> Any:
-    """The numbers of a figure of these rows."""
-    return compute(Table(answered, groups or {}), *read_options(described, "here"))
+    """The numbers of the only figure of these rows."""
+    (made,) = compute(Table(answered, groups or {}), *read_options(described, "here"))
+    return made
 
 
 # ---- what a file may say --------------------------------------------------------------------------------------------
@@ -426,6 +427,16 @@ def test_the_mean_corruption_error_is_relative_to_the_first_model() -> None:
     assert (one.error.correct, one.error.configurations) == (6, 20)
 
 
+def test_each_model_has_a_figure_unless_it_tells_them_apart() -> None:
+    answered = [*rows({"noon": (2, 6)}, model="one"), *rows({"noon": (5, 6)}, model="two")]
+    described = {"figure": "bars", "by": "environment", "title": "Hard"}
+    found = compute(Table(answered, {}), *read_options(described, "here"))
+    assert [made.title for made in found] == ["Hard: one", "Hard: two"]
+    assert [made.text[0][:29] for made in found] == ["noon: right in 2 of 6 (33 %, ", "noon: right in 5 of 6 (83 %, "]
+    for told in ({"figure": "bars", "by": "model"}, {"figure": "points", "by": "environment", "series": "model"}):
+        assert len(compute(Table(answered, {}), *read_options(told, "here"))) == 1
+
+
 def test_a_curve_puts_each_value_in_its_part_of_the_range() -> None:
     answered = [
         Answered("a", {"object": "mug", "yaw": float(yaw)}, {"yaw": "degrees"}, "mug", yaw < 180) for yaw in range(361)
@@ -441,7 +452,7 @@ def test_every_figure_is_drawn_and_is_a_table(kind: str, tmp_path: Path) -> None
     write_png(tmp_path / "parts" / "views-00-mug" / "images" / "surface.png", np.zeros((8, 8, 3)))
     own = {"agreement": PICTURED, "scaling": TIMED}
     table = Table(own.get(kind, EXAMPLE_ROWS), {"round": ["mug"]}, {"views-00-mug": SURFACE})
-    made: Any = compute(table, *read_options(EXAMPLES[kind], "here"))
+    made: Any = compute(table, *read_options(EXAMPLES[kind], "here"))[0]
     assert made.figure == kind and made.title and made.text and all(one.endswith(".") for one in made.text)
     heads, lines = figure_table(made)
     assert lines and all(len(one) == len(heads) for one in lines)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,9 @@ from advsearch.recipes.figures.ternary import TERNARY
 from advsearch.recipes.table import Table
 from advsearch.report.drawing import Figures, drawn
 from advsearch.runs.results.recipe import RecipeFigure
+
+MODEL = "model"
+"""The column that says which model answered."""
 
 FIGURES: dict[str, Kind[Any, Any]] = {
     "bars": BARS,
@@ -63,14 +67,21 @@ def read_options(described: Mapping[str, object], where: str) -> tuple[str, Opti
         raise FileFormatError(f"{where}: figures: {kind}: {what}: {first['msg'][:200]}; see docs/recipes.md") from None
 
 
-def compute(table: Table, kind: str, options: Options) -> RecipeFigure:
-    """Return the numbers of a figure, and what they say.
+def compute(table: Table, kind: str, options: Options) -> list[RecipeFigure]:
+    """Return the numbers of a figure, and what they say; where it does not tell several models apart, of each model.
 
     Raises:
         InputError: it needs what the answers do not have.
     """
-    made: RecipeFigure = FIGURES[kind].compute(table.of(options.parts), options)
-    return made
+    shown = table.of(options.parts)
+    together = FIGURES[kind].tells_models or MODEL in vars(options).values()
+    if together or len({row.values.get(MODEL) for row in shown.rows}) < 2:
+        return [FIGURES[kind].compute(shown, options)]
+    found = []
+    for name, rows in shown.by(MODEL).items():
+        made: RecipeFigure = FIGURES[kind].compute(replace(shown, rows=rows), options)
+        found.append(made.model_copy(update={"title": f"{made.title}: {name}"}))
+    return found
 
 
 def draw(made: RecipeFigure, run: Path) -> Figures:

@@ -155,4 +155,5 @@ AGREEMENT = Kind(
     _compute,
     _draw,
     lambda made: (6.0, 1.7 + 0.2 * len(made.series) + 0.34 * len(made.series[0].rows if made.series else [])),
+    tells_models=True,
 )

@@ -51,6 +51,7 @@ class Kind(Generic[Chosen, Made]):
         compute: makes these from the answers.
         draw: draws them on a figure of matplotlib; it may look into the recipe's folder.
         size: of that, width and height in inches.
+        tells_models: whether it tells several models apart by itself; of others each model has one.
     """
 
     options: type[Chosen]
@@ -58,6 +59,7 @@ class Kind(Generic[Chosen, Made]):
     compute: Callable[[Table, Chosen], Made]
     draw: Callable[[Made, Any, Path], None]
     size: Callable[[Made], tuple[float, float]]
+    tells_models: bool = False
 
 
 def rate(one: NamedCount, verb: str = "right") -> str:

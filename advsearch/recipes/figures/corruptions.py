@@ -109,4 +109,5 @@ CORRUPTION_ERROR = Kind(
     _compute,
     _draw,
     lambda made: (6.0, 1.4 + (0.2 + 0.09 * len(made.models)) * len(made.models[0].errors)),
+    tells_models=True,
 )

@@ -103,4 +103,4 @@ def _draw(made: ScalingFigure, figure: Any, run: Path) -> None:
     figure.legend(loc="outside lower center", ncols=2)
 
 
-SCALING = Kind(Options, ScalingFigure, _compute, _draw, lambda made: (6.0, 3.4))
+SCALING = Kind(Options, ScalingFigure, _compute, _draw, lambda made: (6.0, 3.4), tells_models=True)

@@ -36,4 +36,6 @@ def _draw(made: SurfaceFigure, figure: Any, run: Path) -> None:
         axes.axis("off")
 
 
-SURFACE = Kind(Options, SurfaceFigure, _compute, _draw, lambda made: (SIZE[0], SIZE[1] * len(made.maps)))
+SURFACE = Kind(
+    Options, SurfaceFigure, _compute, _draw, lambda made: (SIZE[0], SIZE[1] * len(made.maps)), tells_models=True
+)
