@@ -112,6 +112,11 @@ def until(page: Page, happened: Callable[[], object]) -> None:
     raise AssertionError("it did not happen")
 
 
+def width_of_first_picture(page: Page) -> object:
+    """Pixels across of the first card's picture; False until it has arrived, as cards are made anew with each choice."""
+    return page.locator(".card img").first.evaluate("image => image.complete && image.naturalWidth")
+
+
 class QuietHandler(SimpleHTTPRequestHandler):
     """Serves a folder as any server would, and says nothing of it."""
 
@@ -176,7 +181,7 @@ def test_a_sweep_is_explored_from_its_file(browser: Browser, sweep: Path) -> Non
 def test_a_sweep_is_explored_from_the_server(browser: Browser, sweep: Path) -> None:
     with serving(sweep) as server, opened(browser, f"{server.address}runs/first/") as page:
         explored(page)
-        assert page.locator(".card img").first.evaluate("image => image.complete && image.naturalWidth") == 16
+        until(page, lambda: width_of_first_picture(page) == 16)
 
 
 def test_a_sweep_is_explored_from_a_folder_that_any_server_serves(
@@ -188,7 +193,7 @@ def test_a_sweep_is_explored_from_a_folder_that_any_server_serves(
         thread.start()
         with opened(browser, f"http://127.0.0.1:{server.server_port}/") as page:
             explored(page)
-            assert page.locator(".card img").first.evaluate("image => image.complete && image.naturalWidth") == 16
+            until(page, lambda: width_of_first_picture(page) == 16)
         server.shutdown()
         thread.join()
 
