@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +18,7 @@ from advsearch.attacks import count_right
 from advsearch.config import AttackConfig, ReplayConfig
 from advsearch.engine.naming import different
 from advsearch.engine.problem import Problem
-from advsearch.engine.replaying import Way, ways_of
+from advsearch.engine.replaying import OWN_LIGHT, Way, ways_of
 from advsearch.engine.retrial import RetrialCondition, Retrials
 from advsearch.engine.rows import verified_rate
 from advsearch.errors import InputError
@@ -72,27 +74,14 @@ def replay_from_config(
     different((OWN_MODEL, *config.models), "model")
     problem, warnings = problem_from_config(theirs)
     u = kept_answer(folder, problem)
-    ways = [*_ways(config, theirs, problem, summary), *_models(config, theirs, summary)]
-    rows: list[ReplayRow] = []
-    ending, renders = "done", 0
+    ways = [*_ways(config, theirs, problem, summary), *_models(config, theirs, problem, summary)]
+    ending, seed = "done", seeds.stream(theirs.seed, "replay")
     with RunDirectory.of(config, resumed) as run:
+        table = _Table(ways, u, config.trials, seed, run, progress)
         try:
             with interruptible():
-                for way in ways:
-                    if way.missing:
-                        rows.append(_not_done(way, way.missing))
-                        continue
-                    total = 2 * config.trials
-                    progress.stage(f"replaying, {way.name}: {way.text}", total, hint="`trials` or `ways` shorten it")
-                    condition = way.condition()
-                    before = condition.problem.renderer.renders
-                    seed = seeds.stream(theirs.seed, "replay")
-                    retrials = Retrials([condition], run, progress, trials=config.trials, seed=seed)
-                    try:
-                        rows.append(_row(way, condition, retrials, u))
-                    except BlenderError as error:
-                        rows.append(_not_done(way, str(error)))
-                    renders += condition.problem.renderer.renders - before
+                for batch in _batches(ways):
+                    table.fill(batch)
         except KeyboardInterrupt:
             ending = INTERRUPTED
         result = ReplayResult(
@@ -105,8 +94,8 @@ def replay_from_config(
             environment=summary.environment,
             controls=summary.controls,
             ending=ending,
-            table=rows,
-            renders=renders,
+            table=[row for _, row in sorted(table.rows.items())],
+            renders=table.renders,
             warnings=warnings,
             seconds={"total": time.perf_counter() - begun},
             seed=theirs.seed,
@@ -115,6 +104,70 @@ def replay_from_config(
         run.write_summary(result)
         write_page(run.path, result)
         return result
+
+
+@dataclass
+class _Table:
+    """The rows so far.
+
+    Attributes:
+        ways: the conditions of all rows.
+        u: (d,) the answer.
+        trials: of the answer in each row, and of the clean scene.
+        seed: root of theirs.
+        run: keeps them.
+        progress: told of every trial.
+        rows: by the place of their condition among `ways`.
+        renders: pictures that were rendered.
+    """
+
+    ways: Sequence[Way]
+    u: torch.Tensor
+    trials: int
+    seed: int
+    run: RunDirectory
+    progress: Progress
+    rows: dict[int, ReplayRow] = field(default_factory=dict)
+    renders: int = 0
+
+    def fill(self, batch: Sequence[int]) -> None:
+        """Add the rows of some conditions that share their renders: the clean scene under all of them, then the answer.
+
+        A condition that cannot be had, or that Blender fails at, gets a row that says why.
+        """
+        ways = [self.ways[number] for number in batch]
+        missing = next((way.missing for way in ways if way.missing), "")
+        try:
+            if not missing:
+                self._try(batch, ways)
+        except BlenderError as error:
+            missing = str(error)
+        if missing:
+            self.rows |= {number: _not_done(way, missing) for number, way in zip(batch, ways, strict=True)}
+
+    def _try(self, batch: Sequence[int], ways: Sequence[Way]) -> None:
+        text = (
+            ", ".join(dict.fromkeys(way.name for way in ways)) if len(ways) > 1 else f"{ways[0].name}: {ways[0].text}"
+        )
+        total = 2 * self.trials * len(ways)
+        self.progress.stage(f"replaying, {text}", total, hint="`trials` or `ways` shorten it")
+        conditions = [way.condition() for way in ways]
+        renderers = {id(one.problem.renderer): one.problem.renderer for one in conditions}.values()
+        before = sum(one.renders for one in renderers)
+        retrials = Retrials(conditions, self.run, self.progress, trials=self.trials, seed=self.seed)
+        try:
+            for condition in conditions:
+                retrials.clean(condition)
+            for number, way, condition in zip(batch, ways, conditions, strict=True):
+                self.rows[number] = _row(way, condition, retrials, self.u)
+        finally:
+            self.renders += sum(one.renders for one in renderers) - before
+
+
+def _batches(ways: Sequence[Way]) -> list[list[int]]:
+    """The places of the conditions that share their renders, and each of the others by itself."""
+    sharing = [number for number, way in enumerate(ways) if way.shares]
+    return [sharing, *([number] for number, way in enumerate(ways) if not way.shares)]
 
 
 OWN_MODEL = "the run's own"
@@ -152,15 +205,21 @@ def _ways(config: ReplayConfig, theirs: AttackConfig, problem: Problem, summary:
     yield from (way for way in others if way.name in config.chosen)
 
 
-def _models(config: ReplayConfig, theirs: AttackConfig, summary: AttackSummary) -> Iterator[Way]:
-    """Other models, each shown the scene as it takes pictures."""
+def _models(config: ReplayConfig, theirs: AttackConfig, problem: Problem, summary: AttackSummary) -> Iterator[Way]:
+    """Other models, loaded before anything is rendered; those that are shown pictures as the run's own model is take
+    its renders."""
     for name in config.models:
-        own = AttackConfig.of(theirs, model=name, ensemble=None)
+        other = problem_from_config(AttackConfig.of(theirs, model=name, ensemble=None))[0]
+        shares = other.renderer.formation == problem.renderer.formation
+        if shares:
+            other = replace(other, renderer=problem.renderer)
+        source = OWN_LIGHT if shares else name
+        condition = RetrialCondition(f"model: {name}", other, _spp(summary), source, light=source)
+        yield Way("model", partial(_given, condition), name, shares=shares)
 
-        def condition(own: AttackConfig = own, name: str = name) -> RetrialCondition:
-            return RetrialCondition(f"model: {name}", problem_from_config(own)[0], _spp(summary), name)
 
-        yield Way("model", condition, name)
+def _given(condition: RetrialCondition) -> RetrialCondition:
+    return condition
 
 
 def _not_done(way: Way, reason: str) -> ReplayRow:

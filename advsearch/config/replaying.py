@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 from pydantic import field_validator
 
-from advsearch.config.attack import FEWEST_TRIALS, TRIALS
+from advsearch.config.attack import FEWEST_TRIALS
 from advsearch.config.scene import SceneConfig
 from advsearch.settings import Clash, Config, check_once, setting, setting_as_in, split_names
 
@@ -24,6 +24,9 @@ WAYS = (
     "blender",
 )
 """What a replay may change beside the model."""
+
+REPLAY_TRIALS = 10
+"""Half of an attack's: there are many rows, to be compared. The 95 % interval of 10 of 10 begins at 69 %."""
 
 
 class ReplayConfig(Config):
@@ -46,7 +49,7 @@ class ReplayConfig(Config):
         otherwise="none",
     )
     trials: int = setting(
-        TRIALS, "replay", "fresh renders under each condition", unit="renders", ge=FEWEST_TRIALS, le=100_000
+        REPLAY_TRIALS, "replay", "fresh renders under each condition", unit="renders", ge=FEWEST_TRIALS, le=100_000
     )
     threads: int | None = setting_as_in(SceneConfig, "threads")
     run: str | None = setting_as_in(SceneConfig, "run", otherwise="runs/RUN-replay-NNN")

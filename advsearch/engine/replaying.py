@@ -19,6 +19,9 @@ from advsearch.scene.renderer import MAX_SPP
 OWN = "as verified"
 """The way in which nothing is changed."""
 
+OWN_LIGHT = "own"
+"""What conditions share whose pictures come of the radiance that the run itself would render."""
+
 QUALITIES = (90, 75, 50)
 """Of JPEG files."""
 
@@ -46,12 +49,14 @@ class Way:
         condition: it is made anew each time, and holds a scene of its own where it has to.
         text: to what.
         missing: why it cannot be had; empty where it can.
+        shares: whether it takes the radiance of the first condition, so that it costs no renders beside that.
     """
 
     name: str
     condition: Callable[[], RetrialCondition]
     text: str
     missing: str = ""
+    shares: bool = False
 
 
 def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Problem]) -> Iterator[Way]:
@@ -68,7 +73,7 @@ def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Probl
     def same(
         count: int = spp, change: Callable[[Tensor, int], Tensor] = unchanged
     ) -> Callable[[str], RetrialCondition]:
-        return lambda name: RetrialCondition(name, problem, count, "own", change)
+        return lambda name: RetrialCondition(name, problem, count, OWN_LIGHT, change, OWN_LIGHT)
 
     def other(**made: object) -> Callable[[str], RetrialCondition]:
         def condition(name: str) -> RetrialCondition:
@@ -77,16 +82,17 @@ def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Probl
 
         return condition
 
-    def formed(**fields: Any) -> Callable[[str], RetrialCondition]:
-        return lambda name: RetrialCondition(name, replace(problem, renderer=renderer.like(**fields)), spp, name)
+    def formed(light: str | None = None, **fields: Any) -> Callable[[str], RetrialCondition]:
+        changed = replace(problem, renderer=renderer.like(**fields))
+        return lambda name: RetrialCondition(name, changed, spp, name, light=light)
 
     def at(size: tuple[int, int]) -> Callable[[str], RetrialCondition]:
         return lambda name: RetrialCondition(name, sized(size), spp, name)
 
-    def way(name: str, text: str, make: Callable[[str], RetrialCondition]) -> Way:
-        return Way(name, lambda: make(text if name == OWN else f"{name}: {text}"), text)
+    def way(name: str, text: str, make: Callable[[str], RetrialCondition], *, shares: bool = False) -> Way:
+        return Way(name, lambda: make(text if name == OWN else f"{name}: {text}"), text, shares=shares)
 
-    yield way(OWN, OWN, same())
+    yield way(OWN, OWN, same(), shares=True)
     for count in (max(1, spp // 4), min(MAX_SPP, 4 * spp)):
         if count != spp:
             yield way("samples", f"{count} a pixel", same(count))
@@ -104,11 +110,11 @@ def ways_of(problem: Problem, spp: int, sized: Callable[[tuple[int, int]], Probl
     denoiser = "none" if formation.denoiser != "none" else "oidn"
     yield way("denoiser", denoiser, formed(denoiser=denoiser))
     for curve, text in CURVES.items():
-        yield way("curve", f"{curve}, {text}", formed(transfer=curve))
+        yield way("curve", f"{curve}, {text}", formed(OWN_LIGHT, transfer=curve), shares=True)
     for quality in QUALITIES:
-        yield way("jpeg", f"quality {quality}", same(change=_file(quality)))
+        yield way("jpeg", f"quality {quality}", same(change=_file(quality)), shares=True)
     for name, values in SENSORS.items():
-        yield way("sensor", name, same(change=_sensor(values)))
+        yield way("sensor", name, same(change=_sensor(values)), shares=True)
     yield _by_blender(problem, spp)
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from advsearch.attacks import Ending, Verification, run_trials, verify
@@ -34,6 +36,8 @@ class RetrialCondition:
         spp: samples a pixel.
         source: conditions with equal sources are shown the same picture before it is changed.
         change: what happens to a picture (H, W, 3) sRGB in [0, 1] before the model sees it, by the seed of its trial.
+        light: conditions with equal lights get their pictures from one linear radiance: their scenes are the same, only
+            tone curves or models differ. None: this one renders by itself.
     """
 
     name: str
@@ -41,6 +45,7 @@ class RetrialCondition:
     spp: int
     source: Hashable
     change: Callable[[Tensor, int], Tensor] = unchanged
+    light: Hashable = None
 
 
 class Retrials:
@@ -73,6 +78,8 @@ class Retrials:
         self._recorders = {one.name: Recorder(run, one.problem, memory) for one in conditions}
         self._clean: dict[str, tuple[Judgement, ...]] = {}
         self._pictures: dict[tuple[Hashable, int, int], Tensor] = {}
+        self._lights: dict[tuple[Hashable, int, int], Tensor] = {}
+        self._sharing = Counter(one.light for one in conditions if one.light is not None)
         self._pictured = ""
         self._ahead = ahead or Ahead()
 
@@ -143,9 +150,21 @@ class Retrials:
         """The picture of a trial; those of the configuration that is tried now are kept for other conditions."""
         if kind != self._pictured:
             self._pictures.clear()
+            self._lights.clear()
             self._pictured = kind
         key = self._key(condition, seed)
         if key not in self._pictures:
             seen = self._ahead.take(PictureAhead(u, seed, condition.spp, condition.name))
-            self._pictures[key] = condition.problem.picture(u, seed, condition.spp) if seen is None else seen.value
+            self._pictures[key] = self._rendered(condition, u, seed) if seen is None else seen.value
         return self._pictures[key]
+
+    def _rendered(self, condition: RetrialCondition, u: Tensor, seed: int) -> Tensor:
+        """As `Problem.picture`, from the radiance of other conditions with the same light where there are any."""
+        problem, key = condition.problem, (condition.light, seed, condition.spp)
+        if self._sharing[condition.light] < 2:
+            return problem.picture(u, seed, condition.spp)
+        renderer, whole = problem.renderer, problem.whole(u, seed)
+        with torch.no_grad():
+            if key not in self._lights:
+                self._lights[key] = renderer.radiance(whole, seed, condition.spp)
+            return to_8_bit(renderer.space.picture(whole, renderer.formation.display(self._lights[key])))

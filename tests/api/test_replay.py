@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,12 @@ import torch
 
 import advsearch
 from advsearch.api import replay as replaying
-from advsearch.api.attack import attack_once
+from advsearch.api.attack import attack_once, problem_from_config
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig, ReplayConfig
-from advsearch.engine.retrial import Retrials
+from advsearch.engine.retrial import RetrialCondition, Retrials
 from advsearch.errors import FileFormatError, InputError
+from advsearch.progress import NullProgress
 from advsearch.runs.answer import read_answer, write_answer
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Store
@@ -26,6 +28,7 @@ EASY = "small_models:easy"
 SHORT: dict[str, Any] = {
     "object": "mug", "model": EASY, "controls": {"texture": {"epsilon": 0.3}}, "steps": 6, "trials": 6,
     "verify_spp": 4, "spp": 2, "denoise": "none", "baseline": False, "measure": "no", "specialise": False,
+    "resolution": 32,
 }  # fmt: skip
 
 
@@ -75,7 +78,7 @@ def test_a_replay_goes_on_where_it_was_stopped(attacked: Path, tmp_path: Path, m
     def stopped(*given: Any) -> Any:
         nonlocal done
         done += 1
-        if done == 20:
+        if done == 32:  # 4 conditions x 6 of the clean scene, 6 of the answer, and one more
             raise KeyboardInterrupt
         return real(*given)
 
@@ -83,8 +86,36 @@ def test_a_replay_goes_on_where_it_was_stopped(attacked: Path, tmp_path: Path, m
     first = replaying.replay_from_config(config)
     assert first.goes_on and len(first.table) == 1
     again = replaying.replay_from_config(config, resumed=tmp_path / "run")
-    assert again.ending == "done" and len(again.table) == 4 and done == 20 + 4 * 12 - 19
+    assert again.ending == "done" and len(again.table) == 4 and done == 32 + 4 * 12 - 31
     assert again.table[0] == first.table[0]
+
+
+def test_what_changes_only_after_rendering_renders_nothing(attacked: Path, tmp_path: Path) -> None:
+    together = advsearch.replay(
+        attacked, ways="curve,jpeg,sensor,sampler", model="small_models:hard", trials=6, run=tmp_path / "together"
+    )
+    assert together.renders == 2 * 6 * 2, "as verified and the other sampler; each of the clean scene and the answer"
+    assert len(together.table) == 10 and together.table[-1].condition == "small_models:hard"
+    (_, alone) = advsearch.replay(attacked, ways="sampler", trials=6, run=tmp_path / "sampler").table
+    assert alone == together.table[1], "rows are in the order of the conditions"
+
+
+@pytest.mark.parametrize("curve", ["srgb", "gamma", "reinhard"])
+def test_a_shared_radiance_gives_the_same_picture(attacked: Path, tmp_path: Path, curve: str) -> None:
+    problem, _ = problem_from_config(AttackConfig.from_yaml(attacked / "run.yaml"))
+    changed = replace(problem, renderer=problem.renderer.like(transfer=curve))
+    pair = [RetrialCondition(name, one, 4, name, light="own") for name, one in (("a", problem), ("b", changed))]
+    u = torch.from_numpy(read_answer(attacked))
+    with RunDirectory.create(tmp_path / "run") as run:
+        retrials = Retrials(pair, run, NullProgress(), trials=6, seed=0)
+        first, second = (retrials._picture("answer", one, u, 7) for one in pair)
+    assert torch.equal(first, problem.picture(u, 7, 4)) and torch.equal(second, changed.picture(u, 7, 4))
+
+
+def test_a_model_that_cannot_be_loaded_is_refused_before_anything_is_rendered(attacked: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="unknown model"):
+        advsearch.replay(attacked, model="nonesuch", run=tmp_path / "never")
+    assert not (tmp_path / "never").exists()
 
 
 def test_a_run_without_an_answer_is_refused(attacked: Path, tmp_path: Path) -> None:
