@@ -147,7 +147,9 @@ class AttackConfig(DerivativeConfig):
     minimise: bool = setting(False, "search", "make the object easier to recognise, not harder")
     smallest: bool = setting(False, "search", "find the smallest epsilon at which the model is wrong, up to --epsilon")
     printable: bool = setting(
-        False, "search", "prefer a texture or a patch that is smooth and of printable colours, at a cost in margin"
+        False,
+        "search",
+        "prefer a texture or a patch that is smooth and of printable colours; a second search tells the cost in margin",
     )
     aov: str | None = setting_as_in(
         RenderConfig,

@@ -21,6 +21,7 @@ from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.rows import lost_remarks, verified_rate
+from advsearch.engine.searches import UNPRINTED
 from advsearch.errors import InputError
 from advsearch.report.drawing import new_axes
 from advsearch.report.notebook import attack_html, side_by_side
@@ -44,6 +45,7 @@ from advsearch.runs.results.attack import (
     PathSegments,
     PredictionError,
     Printability,
+    PrintCost,
     SearchClaim,
     SearchGradients,
     SharedWork,
@@ -282,7 +284,23 @@ def _printability(problem: Problem, findings: Findings) -> Printability | None:
         return None
     space, domain, search = problem.searched_space, problem.domain, findings.search
     answer = None if search is None else print_terms(space, domain.project(search.best_u))
-    return Printability(clean=print_terms(space, domain.start), answer=answer)
+    return Printability(clean=print_terms(space, domain.start), answer=answer, cost=_print_cost(problem, findings))
+
+
+def _print_cost(problem: Problem, findings: Findings) -> PrintCost | None:
+    """The margin of the answer beside that of the search without terms; None where either was not verified."""
+    verified, other, search = findings.verification, findings.unprinted_verification, findings.unprinted
+    if verified is None or other is None or search is None:
+        return None
+    ours, theirs = (verified_rate(one.adversarial, one.adversarial_trials) for one in (verified, other))
+    return PrintCost(
+        steps=len(search.history),
+        margin_with=ours.margin,
+        margin_without=theirs.margin,
+        cost=theirs.margin - ours.margin,
+        verified=theirs,
+        terms=print_terms(problem.searched_space, problem.domain.project(search.best_u)),
+    )
 
 
 def _alone(values: dict[str, T]) -> T | dict[str, T]:
@@ -354,7 +372,8 @@ def _transport(findings: Findings) -> LinearTransport:
 def _renders(findings: Findings, problem: Problem) -> dict[str, int]:
     """How many pictures each part took, and how many were predicted instead."""
     search, baseline, transport = findings.search, findings.baseline, findings.transport
-    kinds = {"search": search, "baseline": baseline}
+    unprinted = findings.unprinted
+    kinds = {"search": search, "baseline": baseline, UNPRINTED: unprinted}
     products = [
         transport.predicted(kind, len(one.history)) * problem.draws if one and transport else 0
         for kind, one in kinds.items()
@@ -366,7 +385,12 @@ def _renders(findings: Findings, problem: Problem) -> dict[str, int]:
         "baseline": (baseline.renders * problem.draws if baseline else 0) - products[1],
         "verification": findings.verification_renders + len(findings.first_look),
         "products": sum(products),
-    }
+    } | ({} if unprinted is None else {"unprinted": _without_terms(unprinted, problem, products[2])})
+
+
+def _without_terms(search: SearchResult, problem: Problem, predicted: int) -> int:
+    """Pictures and gradients that a search took beside what was predicted."""
+    return search.renders * problem.draws - predicted + max(0, search.gradients - predicted)
 
 
 def _gradients(search: SearchResult) -> SearchGradients:

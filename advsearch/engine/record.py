@@ -42,6 +42,8 @@ class Findings:
         clean: the control group's trials.
         verification: of the policy's answer.
         baseline_verification: of the random search's.
+        unprinted: what the policy claims without print terms, where the search has them.
+        unprinted_verification: of that.
         beaten: verification of the policy's own answer, where the random search's turned out worse for the model and is
             the run's answer instead.
         failures: verification of the first of the different failures that the policy answers with.
@@ -63,6 +65,8 @@ class Findings:
     clean: tuple[Judgement, ...] = ()
     verification: Verification | None = None
     baseline_verification: Verification | None = None
+    unprinted: SearchResult | None = None
+    unprinted_verification: Verification | None = None
     beaten: Verification | None = None
     failures: tuple[Verification, ...] = ()
     average: tuple[Judgement, ...] = ()

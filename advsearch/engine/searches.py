@@ -34,6 +34,9 @@ from advsearch.engine.transport import CleanMatrix, Transport, reason_against
 from advsearch.report.wording import count
 from advsearch.scene.transport.renderer import TransportTooLargeError
 
+UNPRINTED = "search without print terms"
+"""The kind of the search beside one with print terms: what these cost is told by its answer."""
+
 
 @dataclass
 class Searches:
@@ -80,15 +83,19 @@ class Searches:
             findings.transport, findings.rendered_because = None, str(error)
 
     def run(self) -> None:
-        """The search, and the random one beside it, with as many renders."""
+        """The search, the same without print terms where it has them, and the random one, each with as many renders."""
         budget, findings, seed = self.budget, self.findings, self.problem.seed
         frames = Frames(budget.steps)
         findings.frames = frames.pictures
         self.begin("search", f"searching with {self.policy.name}", budget.steps, "`steps` or `seconds` shorten it")
         findings.search = self.search("search", self.policy, budget.steps, self.problem.seed, frames, budget.seconds)
+        steps = budget.steps if budget.seconds is None else _spent(findings.search)
+        if self.problem.printable:
+            title = "searching without print terms, to see what they cost"
+            self.begin("without print terms", title, steps, "`printable=false` leaves both out")
+            findings.unprinted = self.search(UNPRINTED, self.policy, steps, seed)
         if not budget.baseline or self.policy.name == "random":
             return
-        steps = budget.steps if budget.seconds is None else _spent(findings.search)
         self.begin("baseline", "searching at random, to compare", steps, "`baseline=false` leaves it out")
         findings.baseline = self.search("baseline", make_policy("random"), steps, seeds.stream(seed, "baseline"))
 
@@ -152,7 +159,7 @@ class Searches:
             if answer is None:
                 one, kept = coming.proposal, _kept(frames, coming.index)
                 answer = yield evaluation_ahead(problem, kind, one.u, coming.index, one.gradient, one.samples, kept)
-                answer = penalised(answer, problem.searched_space, one.u) if problem.printable else answer
+                answer = penalised(answer, problem.searched_space, one.u) if self._penalises(kind) else answer
 
     def _as_evaluated(self, domain: Domain, policy: Policy[Any]) -> Domain:
         """The domain with what is known of the noise of its evaluations."""
@@ -167,11 +174,15 @@ class Searches:
         def make(tell: OnImage | None) -> Evaluate:
             made = (self.problem if transport is None else transport).evaluator(kind, tell)
             made = made if transport is not None else self.recorder.ahead.evaluator(self.problem, made, kind, tell)
-            return less_print_terms(made, self.problem.searched_space) if self.problem.printable else made
+            return less_print_terms(made, self.problem.searched_space) if self._penalises(kind) else made
 
         if transport is None:
             return self.memory.evaluator(kind, make, frames)
         return self.memory.evaluator(kind, make, frames, transport.passed)
+
+    def _penalises(self, kind: str) -> bool:
+        """Whether print terms are taken from the objective of a search."""
+        return self.problem.printable and kind != UNPRINTED
 
     def begin(self, name: str, title: str, steps: int, shorter: str) -> None:
         """Begin the stage of a search of at most so many steps, and its ranking."""

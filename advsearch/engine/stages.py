@@ -180,24 +180,27 @@ class Attack:
     # ---- verification -----------------------------------------------------------------------------------------------
 
     def verify(self) -> None:
-        """Choose the sample count, then try the clean configuration, the answer and the baseline's with equal seeds.
+        """Choose the sample count, then try the clean configuration, the answer, that without print terms and the
+        baseline's with equal seeds.
 
         The smallest change lies at the decision, where no sample count settles the margin: it is tried with that of the
         clean configuration, as on the way to it.
         """
         findings, problem = self.findings, self.problem
-        found, baseline = findings.search, findings.baseline
+        found, baseline, unprinted = findings.search, findings.baseline, findings.unprinted
         if found is None:
             raise RuntimeError("nothing was searched, so there is nothing to verify")
         answer = problem.domain.project(found.best_u)
         if not self.budget.smallest or findings.sample_count is None:
             self._verifier.choose_spp({"clean": problem.domain.start, "adversarial": answer})
-        groups = 1 + (baseline is not None) + (not self._verifier.clean_tried)
+        groups = 1 + (baseline is not None) + (unprinted is not None) + (not self._verifier.clean_tried)
         self._verifier.begin("checking the answer with fresh renders", groups * self.budget.trials, at_most=True)
         self._verifier.try_clean()
         findings.verification = self._verifier.verified("verification", found)
         if findings.verification.ending is Ending.ALREADY_WRONG:
             findings.smallest = None  # seen with other samples than before: no change at all flips the answer
+        if unprinted is not None:
+            findings.unprinted_verification = self._verifier.verified("unprinted verification", unprinted)
         if baseline is not None:
             decided = findings.verification.ending is Ending.FOUND
             findings.baseline_verification = self._verifier.verified(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from advsearch.report.wording import count, number_text, seconds_text
+from advsearch.report.wording import count, number_text, print_cost_text, seconds_text
 from advsearch.runs.results.attack import AttackSummary, PrintTerms
 
 PLAN_HEADS = ("parameter", "numbers", "derivative", "why", "step")
@@ -23,6 +23,7 @@ def method_facts(summary: AttackSummary) -> dict[str, str]:
         "Not finite": _not_finite(summary),
         "Light paths": f"at most {segments.search} segments in the search, {segments.verification} in the verification",
         "Printability": _printability(summary),
+        "Cost of printability": print_cost_text(summary),
         "Moved before": ", ".join(
             f"{one.parameter} from {number_text(one.scene)} to {number_text(one.used)} {one.unit}".rstrip()
             for one in summary.clean.moved

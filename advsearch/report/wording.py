@@ -191,9 +191,20 @@ def _epsilons(told: Mapping[str, float] | None) -> str:
 def renders_text(summary: AttackSummary) -> str:
     """Return ``40 of the search, 40 gradients, 21 of the verification``."""
     known = {"search": "of the search", "gradient": "gradients", "verification": "of the verification"}
-    known |= {"baseline": "of the random search", "products": "predicted"}
+    known |= {"baseline": "of the random search", "unprinted": "of the search without print terms"}
+    known |= {"products": "predicted"}
     spent = [f"{number} {known.get(name, f'of {name}')}" for name, number in summary.renders.items() if number]
     return ", ".join(spent) or "none"
+
+
+def print_cost_text(summary: AttackSummary) -> str:
+    """Return ``margin 4.1 with the print terms, 6.3 without (200 steps): they cost 2.2 logits``; empty: not known."""
+    cost = None if summary.printability is None else summary.printability.cost
+    if cost is None or cost.cost is None or cost.margin_with is None or cost.margin_without is None:
+        return ""
+    said = f"they cost {cost.cost:.3g} logits" if cost.cost > 0 else "they cost nothing that shows here"
+    margins = f"margin {cost.margin_with:.3g} with the print terms, {cost.margin_without:.3g} without"
+    return f"{margins} (another search of {count(cost.steps, 'step')}, {cost.verified.trials} trials each): {said}"
 
 
 def formation_text(formation: Formation) -> str:

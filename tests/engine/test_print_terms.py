@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -9,8 +10,14 @@ import torch
 from small_models import easy
 
 import advsearch
+from advsearch.api.attack import attack_once
+from advsearch.cli.attack import answer
+from advsearch.config import AttackConfig
 from advsearch.engine.print_terms import off_print, variation
+from advsearch.engine.record import Stages
 from advsearch.errors import InputError
+from advsearch.report.method import method_facts
+from advsearch.report.wording import print_cost_text, renders_text
 
 SHORT: dict[str, Any] = {
     "controls": {"texture": {"epsilon": 0.3}}, "steps": 30, "trials": 6, "verify_spp": 4, "spp": 2, "denoise": "none",
@@ -37,7 +44,44 @@ def test_answers_are_nearer_to_ink() -> None:
     assert found.answer.off_print < 0.3 * float(off_print(plain))
     assert with_terms.found and without.found
     clean = with_terms.artifacts["texture-original"]
+    priced = found.cost
+    assert priced is not None and priced.steps == 30 and priced.verified.trials == 6
+    ours, plainly = with_terms.summary.verified, without.summary.verified
+    assert ours is not None and plainly is not None and priced.margin_with == ours.margin
+    assert priced.cost == pytest.approx(priced.margin_without - priced.margin_with) and priced.cost > 0.0
+    assert priced.margin_without == pytest.approx(plainly.margin, rel=0.1), "as of an attack without"
+    assert priced.terms.variation + priced.terms.off_print > found.answer.variation + found.answer.off_print
+    spent, plain_spent = with_terms.summary.renders, without.summary.renders
+    assert spent["products"] == 2 * plain_spent["products"] and "unprinted" not in plain_spent
+    assert spent["verification"] == plain_spent["verification"] + 6
+    assert f"{spent['unprinted']} of the search without print terms" in renders_text(with_terms.summary)
+    said = print_cost_text(with_terms.summary)
+    assert said.endswith(f"(another search of 30 steps, 6 trials each): they cost {priced.cost:.3g} logits")
+    assert method_facts(with_terms.summary)["Cost of printability"] == said and said in answer(with_terms.summary)
+    assert print_cost_text(without.summary) == ""
     assert found.clean.variation == pytest.approx(float(variation(clean)), rel=1e-4)
+
+
+@pytest.mark.parametrize("stage", ["searching without print terms", "checking the answer"])
+def test_a_stopped_run_tells_the_same_cost(stage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = {**SHORT, "steps": 6, "object": "mug", "model": "small_models:easy", "printable": True}
+    config = AttackConfig(**settings, run=str(tmp_path / "stopped"))
+    whole = attack_once(AttackConfig(**settings, run=str(tmp_path / "whole"))).summary
+    real = Stages.begin
+
+    def stopping(self: Stages, name: str, title: str, *given: Any, **named: Any) -> None:
+        if title.startswith(stage):
+            raise KeyboardInterrupt
+        real(self, name, title, *given, **named)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Stages, "begin", stopping)
+        stopped = attack_once(config).summary
+    assert stopped.ending == "interrupted" and stopped.printability is not None and stopped.printability.cost is None
+    assert stopped.printability.answer is not None and print_cost_text(stopped) == ""
+    resumed = attack_once(config, resumed=tmp_path / "stopped").summary
+    assert resumed.printability == whole.printability and whole.printability is not None
+    assert whole.printability.cost is not None and whole.printability.cost.steps == 6
 
 
 def test_only_colours_are_printed() -> None:

@@ -209,11 +209,29 @@ class PrintTerms(Fields):
     off_print: float = Field(description="mean distance in sRGB from the nearest printable colour")
 
 
+class PrintCost(Fields):
+    """What the terms of `printable` cost in margin: beside a search without them, of as many steps.
+
+    Margins are means over trials with the same seeds, of what is sought: the larger, the worse for the model. Each is
+    of one search, so that a cost below 0 says that the search without terms ended in a worse place.
+    """
+
+    steps: int = Field(description="evaluations of the search without the terms")
+    margin_with: Number = Field(description="of the run's answer, in logits")
+    margin_without: Number = Field(description="of the answer of the search without the terms, in logits")
+    cost: Number = Field(description="the second less the first, in logits")
+    verified: VerifiedRate = Field(description="trials of the answer of the search without the terms")
+    terms: PrintTerms = Field(description="of that answer")
+
+
 class Printability(Fields):
-    """What `printable` was about; the same attack without it tells what it cost in margin."""
+    """What `printable` was about, and what it cost."""
 
     clean: PrintTerms = Field(description="of the clean scene")
     answer: PrintTerms | None = Field(description="of the answer; null if nothing was searched")
+    cost: PrintCost | None = Field(
+        default=None, description="what the terms cost in margin; null if nothing was verified, and in older runs"
+    )
 
 
 class SharedWork(Fields):
@@ -275,7 +293,8 @@ class AttackSummary(SceneResult):
     configuration: dict[str, FoundValue] | None = Field(default=None, description="the answer in a few values")
     shared: SharedWork | None = Field(default=None, description="only with `workers` or `cluster`")
     renders: dict[str, int] = Field(
-        description="of the search, its gradients, the baseline and the verification; `products`: predicted instead"
+        description="of the search, its gradients, the baseline and the verification; `unprinted`: of the search "
+        "without print terms, with its gradients; `products`: predicted instead"
     )
     steps: int = Field(description="evaluations of the search before the reranking")
     non_finite: NotFinite
