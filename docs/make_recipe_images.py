@@ -3,8 +3,8 @@
     python docs/make_recipe_images.py OUT [--data FOLDER] [--only NAME,NAME]
 
 Runs are kept in the folder OUT: what is done there is not done again. On bundled objects they are quick ones. With
---data they are on a folder of meshes, environments and ImageNet classifiers of one's own, at the counts below, fewer
-than a recipe's own. `python docs/make_figures.py` puts what was kept into the page.
+--data they are on a folder of meshes, environments and ImageNet classifiers of one's own, at the recipe's own counts
+but for those below. `python docs/make_figures.py` puts what was kept into the page.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ KEPT = IMAGES / "results.json"
 
 SHOWN = {
     "backgrounds": (1, 2),
-    "texture-shape": (1, 3),
-    "orientation-scale": (2, 3),
+    "texture-shape": (1, 3, 4),
+    "orientation-scale": (1, 2, 3),
     "liquid": (1, 2),
     "viewpoints": (1,),
     "pose-space": (1, 5),
@@ -47,21 +47,13 @@ SHOWN = {
 LABELS = {"mug": "coffee mug,cup", "teapot": "teapot,coffeepot", "banana": "banana", "bowl": "mixing bowl,soup bowl"}
 
 COUNTS: dict[str, dict[str, Any]] = {
-    "backgrounds": {"views": {"samples": 40}},
-    "texture-shape": {"materials": {"samples": 8}},
-    "orientation-scale": {"views": {"samples": 100}},
-    "liquid": {"mixtures": {"samples": 240}},
-    "viewpoints": {"all": {"samples": 80}, "search": {"steps": 200, "trials": 6}, "worst": {"samples": 80}},
-    "pose-space": {"poses": {"samples": 60}},
-    "common-corruptions": {"clean": {"samples": 40}, "corrupted": {"samples": 2}},
     "parts": {"views": {"samples": 200}},
-    "realism": {"renderings": {"samples": 60}, "finer": {"samples": 60}},
     "physical": {"texture": {"draws": 4, "steps": 80, "trials": 60, "verify_spp": 16}},
 }
-"""Settings of the parts on data of one's own."""
+"""Settings of the parts on data of one's own, where a recipe's own counts take more than half an hour there."""
 
-ONE_OBJECT = ("liquid", "common-corruptions", "physical", "parts")
-ALL_OBJECTS = ("orientation-scale",)
+ONE_OBJECT = ("liquid", "common-corruptions", "physical", "parts", "viewpoints")
+ALL_OBJECTS = ("orientation-scale", "backgrounds")
 """Recipes on the mug alone, and on all four objects; others are on the mug and the teapot."""
 
 
@@ -92,7 +84,7 @@ def real(name: str, data: Path, out: Path) -> RecipeResult:
     """Return what a recipe says of data of one's own."""
     run, file = out / f"data-{name}", out / f"{name}.yaml"
     base = str(resources.files("advsearch.recipes") / f"{name}.yaml")
-    parts = {part: {"settings": settings} for part, settings in COUNTS[name].items()}
+    parts = {part: {"settings": settings} for part, settings in COUNTS.get(name, {}).items()}
     out.mkdir(parents=True, exist_ok=True)
     file.write_text(yaml.safe_dump({"base": base, "parts": parts}), encoding="utf-8")
     several = name == "backgrounds"
@@ -144,6 +136,7 @@ def told(name: str, result: RecipeResult, suffix: str) -> dict[str, Any]:
         "environments": [Path(one).name for one in result.environment.split(",")],
         "models": [Path(one).name for one in result.model.split(",")],
         "renders": sum(one.renders for one in result.parts),
+        "seconds": round(result.seconds["total"]),
         "figures": figures,
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -90,10 +91,24 @@ def test_augmentation_is_seeded_bounded_and_leaves_its_input_alone() -> None:
     assert float(first.min()) >= 0.0 and float(first.max()) <= 1.0
     assert torch.equal(first, Augmentation()(batch, generator.manual_seed(1)))
     assert not torch.equal(first, Augmentation()(batch, generator.manual_seed(2)))
-    still = Augmentation(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    still = Augmentation(0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     torch.testing.assert_close(still(batch, generator), batch, rtol=0, atol=1e-5)
-    mirrored = Augmentation(1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)(batch, generator)
+    mirrored = Augmentation(1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)(batch, generator)
     torch.testing.assert_close(mirrored, batch.flip(3), rtol=0, atol=1e-5)
+
+
+def test_augmentation_turns_and_shrinks() -> None:
+    still = Augmentation(0.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    axis = torch.linspace(-1.0, 1.0, 33)
+    down, across = torch.meshgrid(axis, axis, indexing="ij")
+    disc = torch.exp(-8.0 * (down**2 + across**2)).expand(16, 3, -1, -1)
+    bar = torch.exp(-8.0 * (0.1 * down**2 + across**2)).expand(16, 3, -1, -1)
+    turned = replace(still, turn=45.0)
+    torch.testing.assert_close(turned(disc.clone(), torch.Generator()), disc, rtol=0, atol=0.02)
+    assert float((turned(bar.clone(), torch.Generator()) - bar).abs().amax(dim=(1, 2, 3)).median()) > 0.2
+    small = replace(still, smallest_crop=1.25, largest_crop=1.25)(disc.clone(), torch.Generator())
+    shares = small.sum(dim=(1, 2, 3)) / disc.sum(dim=(1, 2, 3))
+    torch.testing.assert_close(shares, torch.full((16,), 1 / 1.25**2), rtol=0.05, atol=0.0)
 
 
 def test_figures_of_known_answers() -> None:

@@ -17,8 +17,9 @@ from small_models import Colours
 from torch import Tensor, nn
 
 from advsearch.api.attack import problem_of
+from advsearch.attacks import Block, Domain
 from advsearch.config import AttackConfig
-from advsearch.engine.hardening.lessons import Lesson, RenderedLesson, TextureLesson, harder, lessons, surprise
+from advsearch.engine.hardening.lessons import Lesson, RenderedLesson, TextureLesson, harder, lessons, surprise, tried
 from advsearch.engine.hardening.pictures import save_pictures, write_archive
 from advsearch.engine.hardening.split import HELD_OUT, TRAINING, Split, check_disjoint, fingerprint
 from advsearch.engine.hardening.training import Course, Score, score
@@ -47,6 +48,17 @@ def pupils() -> list[Lesson]:
     """Three classes by their brightest channel, of which the worst pictures show little."""
     worst = [coloured(n % 3, 0.2, 99 + n) for n in range(24)]
     return [RenderedLesson((n % 3,), coloured(n % 3, 0.4, n), one, one[None]) for n, one in enumerate(worst)]
+
+
+def test_half_of_what_is_tried_has_numbers_at_the_ends_of_their_ranges() -> None:
+    blocks = (Block(2, low=0.2, high=0.6), Block(1, periodic=True), Block(1, options=3))
+    domain = Domain(torch.tensor([0.4, 0.4, 0.5, 0.5]), blocks)
+    drawn = tried(domain, torch.Generator().manual_seed(0), 400)
+    assert torch.equal(drawn, torch.stack([domain.project(row) for row in drawn]))
+    at_ends = (drawn == domain.lower) | (drawn == domain.upper)
+    assert not at_ends[::2].any() and not at_ends[:, 2:].any()
+    assert ((at_ends[1::2, :2].float().mean(dim=0) - 0.5).abs() < 0.1).all()
+    assert set(drawn[:, 3].tolist()) == {float(value) for value in torch.tensor([1 / 6, 0.5, 5 / 6])}
 
 
 def test_lessons_of_textures_let_go_of_their_scene() -> None:

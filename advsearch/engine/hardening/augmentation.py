@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -15,8 +16,10 @@ class Augmentation:
 
     Args:
         flip: probability of a horizontal mirror image.
-        smallest_crop: lower end of the uniform side of the square crop, as a part of the image's side; its place is
-            uniform inside the image. 1 switches cropping off.
+        smallest_crop, largest_crop: ends of the uniform side of the square crop, as parts of the image's side; its
+            place is uniform inside the image or, where it is larger, around it; there the border goes on. 1 and 1
+            switch cropping off.
+        turn: half width of the uniform angle that the crop is turned by, in degrees.
         brightness: half width of the uniform shift, display-referred.
         contrast: half width of the uniform factor around 1 that scales deviations from the image's mean.
         colour: half width of the uniform factor around 1, per channel.
@@ -29,6 +32,8 @@ class Augmentation:
 
     flip: float = 0.5
     smallest_crop: float = 0.8
+    largest_crop: float = 1.0
+    turn: float = 0.0
     brightness: float = 0.1
     contrast: float = 0.25
     colour: float = 0.08
@@ -48,11 +53,15 @@ class Augmentation:
 
     def _crop_and_flip(self, x: Tensor, generator: Generator) -> Tensor:
         count = len(x)
-        scale = _uniform(count, self.smallest_crop, 1.0, generator)
-        shift = _uniform(2 * count, -1.0, 1.0, generator).view(2, count) * (1.0 - scale)
+        scale = _uniform(count, self.smallest_crop, self.largest_crop, generator)
+        shift = _uniform(2 * count, -1.0, 1.0, generator).view(2, count) * (1.0 - scale).abs()
         mirror = 1.0 - 2.0 * _chosen(count, self.flip, generator).float()
-        zero = torch.zeros(count)
-        rows = (torch.stack([scale * mirror, zero, shift[0]], 1), torch.stack([zero, scale, shift[1]], 1))
+        angle = _uniform(count, -self.turn, self.turn, generator) * (math.pi / 180.0)
+        along, across = scale * angle.cos(), scale * angle.sin()
+        rows = (
+            torch.stack([along * mirror, -across, shift[0]], 1),
+            torch.stack([across * mirror, along, shift[1]], 1),
+        )
         grid = F.affine_grid(torch.stack(rows, 1), list(x.shape), align_corners=False)
         return F.grid_sample(x, grid, mode="bilinear", padding_mode="border", align_corners=False)
 

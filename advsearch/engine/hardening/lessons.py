@@ -3,8 +3,8 @@
 Where light arrives linearly (textures, patches), a lesson holds a matrix of light transport of one view, which says the
 picture of any texture and its derivative without rendering: its adversarial texture is searched further each time that
 the lesson comes up (warm starts: Zheng et al. 2020, arXiv 1912.11969). A texture that several views share is one of
-expectation over transformation (EOT, Athalye et al. 2018). Everything else is rendered at random configurations, of
-which the one that is worst for the model as it is counts.
+expectation over transformation (EOT, Athalye et al. 2018). Everything else is rendered at random configurations, half
+of them with numbers at the ends of their ranges; of these the one that is worst for the model as it is counts.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ def lessons(problem: Problem, views: int, tries: int, seed: int, *, shared: bool
     Args:
         problem: with the searched controls, and conditions.
         views: how many; each has conditions of its own.
-        tries: random configurations of each, where no matrix says its pictures.
+        tries: configurations of each, where no matrix says its pictures; see `tried`.
         seed: root of the draws.
         shared: let all views have one adversarial texture.
     """
@@ -130,11 +130,24 @@ def lessons(problem: Problem, views: int, tries: int, seed: int, *, shared: bool
                 made.let_go(whole_space)
                 found.append(TextureLesson(right, plain, plain, space, problem.domain, made, numbers, texture))
             else:
-                drawn = problem.domain.sample(torch.Generator().manual_seed(own), tries)
+                drawn = tried(problem.domain, torch.Generator().manual_seed(own), tries)
                 shown = [problem.renderer(torch.cat([u, numbers]), seed=own, spp=SPP) for u in drawn]
                 plain = problem.renderer(whole, seed=own, spp=SPP)
                 found.append(RenderedLesson(right, plain, shown[0], torch.stack(shown)))
     return found
+
+
+def tried(domain: Domain, generator: torch.Generator, count: int) -> Tensor:
+    """Draw configurations (count, d) at random: in every second one each number is moved to the nearer end of its range
+    by chance, as searches end where several numbers are. Choices, and numbers that are periodic, have no ends."""
+    drawn = domain.sample(generator, count)
+    at_ends = torch.rand(drawn.shape, generator=generator) < 0.5
+    at_ends[::2] = False
+    for block, part in domain.parts():
+        if block.options or block.periodic:
+            at_ends[:, part] = False
+    ends = torch.where(drawn - domain.lower < domain.upper - drawn, domain.lower, domain.upper)
+    return torch.stack([domain.project(row) for row in torch.where(at_ends, ends, drawn)])
 
 
 def _begun(problem: Problem, seed: int) -> Disguise:

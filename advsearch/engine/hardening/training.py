@@ -23,7 +23,7 @@ from advsearch.models import Model
 from advsearch.models.trainable import Trainable
 
 BATCH = 24
-AUGMENTATION = Augmentation(cutout=0.0)
+AUGMENTATION = Augmentation(smallest_crop=0.75, largest_crop=1.15, turn=15.0, cutout=0.0)
 """What happens to pictures while they are trained on; the search for worse ones sees the same."""
 WEIGHT_DECAY = 0.02
 LARGEST_GRADIENT_NORM = 2.0
