@@ -188,6 +188,8 @@ def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor
     """
     tensor = _tensor_in(output)
     expected = f"model {name}: expected logits of shape ({count}, {classes or 'classes'})"
+    if _has_boxes(output):
+        raise ModelError(f'{expected}, got boxes, as a detector gives: add --task detection (task="detection")')
     if tensor is None:
         raise ModelError(f"{expected}, got {type(output).__name__}; wrap the network so that it returns one tensor")
     got = tuple(tensor.shape)
@@ -208,9 +210,23 @@ def _tensor_in(output: Any) -> Tensor | None:
     return output if isinstance(output, Tensor) else None
 
 
+def _has_boxes(output: Any) -> bool:
+    """Whether an answer is a detector's: (boxes (N, K, 4), scores ...), or mappings with "boxes"."""
+    first = output[0] if isinstance(output, (tuple, list)) and output else output
+    if isinstance(first, Mapping):
+        return "boxes" in first or "pred_boxes" in first
+    several = isinstance(output, (tuple, list)) and len(output) > 1
+    return several and isinstance(first, Tensor) and first.dim() == 3 and first.shape[2] == 4
+
+
 def _advice(got: tuple[int, ...]) -> str:
+    if len(got) == 4:
+        return (
+            'a score for each pixel is what a segmenter gives: add --task segmentation (task="segmentation"). If these '
+            "are a classifier's feature maps, wrap the network to pool them"
+        )
     if len(got) > 2:
-        return "these look like feature maps: pass a classifier, or wrap the network to pool its output"
+        return "pass a classifier, or wrap the network to pool its output"
     if len(got) == 2 and got[1] == 1:
         return "one score is not enough: wrap the network to return a score for each of the two classes"
     if len(got) == 1:

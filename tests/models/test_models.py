@@ -304,8 +304,10 @@ def test_usual_containers_of_logits_are_opened(answer: Any) -> None:
     [
         (
             lambda z: z[:, :, None, None],
-            r"expected logits of shape \(1, classes\), got \(1, 3, 1, 1\); these look like feature",
+            r"expected logits of shape \(1, classes\), got \(1, 3, 1, 1\); a score for each pixel .* add --task segm",
         ),
+        (lambda z: (z[:, :, None].expand(-1, -1, 4), z), "got boxes, as a detector gives: add --task detection"),
+        (lambda z: [{"boxes": z}], "got boxes, as a detector gives: add --task detection"),
         (lambda z: z[0], r"got \(3,\); the network dropped its batch dimension"),
         (lambda z: z[:, :1], r"got \(1, 1\); one score is not enough"),
         (lambda z: torch.cat([z, z]), r"got \(2, 3\); wrap the network"),

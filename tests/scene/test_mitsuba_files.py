@@ -79,6 +79,20 @@ def test_the_object_stands_and_the_rest_is_kept(box: Path) -> None:
     assert found.object.surface == {"type": "diffuse", "reflectance": "base color"}
 
 
+@pytest.mark.parametrize("typed", ["large-box", "LargeBox", "large_box"])
+def test_an_id_is_found_whatever_its_case_and_signs(box: Path, typed: str) -> None:
+    found = import_plugins(box, typed)
+    assert [part.name for part in found.surroundings] == ["white", "light", "floor", "ball"]
+
+
+def test_a_name_that_several_ids_are_like_is_refused(box: Path, tmp_path: Path) -> None:
+    other = tmp_path / "two.xml"
+    other.write_text(box.read_text("utf-8").replace('id="ball"', 'id="large-box"'), encoding="utf-8")
+    assert "large-box" not in [part.name for part in import_plugins(other, "large-box").surroundings]
+    with pytest.raises(UnknownNameError, match="large-box"):
+        import_plugins(other, "large_box")
+
+
 def test_a_wrong_id_lists_those_there(box: Path) -> None:
     with pytest.raises(UnknownNameError, match="largebox"):
         import_plugins(box, "largebix")

@@ -7,7 +7,7 @@ Lengths are in object sizes, so that everything is moved and scaled with the obj
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -124,6 +124,16 @@ def _shines(plugin: Mapping[str, object]) -> bool:
     return any(inner.get("type") in LIGHTS for inner in _all(plugin))
 
 
+def _meant(wanted: str, ids: Sequence[str]) -> str:
+    """Return the id that is meant by a name; the name itself where that is none, or several."""
+    alike = [one for one in ids if _letters(one) == _letters(wanted)]
+    return alike[0] if wanted not in ids and len(alike) == 1 else wanted
+
+
+def _letters(name: str) -> str:
+    return "".join(sign for sign in name.casefold() if sign.isalnum())
+
+
 def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedScene:
     """Read a Mitsuba scene.
 
@@ -133,7 +143,8 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
 
     Args:
         scene: an XML file, or a dictionary as Mitsuba's loader takes it.
-        wanted: id of the shape that is the object.
+        wanted: id of the shape that is the object; where there is none, the only one that differs in nothing but case
+            and signs ("largebox" means "large-box", as Mitsuba's own writer calls it).
 
     Raises:
         UnknownNameError: it has no such shape.
@@ -143,6 +154,7 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     tree = read_tree(scene)
     where = scene.name if isinstance(scene, Path) else "scene"
     ids = shape_ids(tree)
+    wanted = _meant(wanted, ids)
     if wanted not in ids:
         raise UnknownNameError(f"shape of {where}", wanted, ids)
     named = dict(_plugins(tree))
