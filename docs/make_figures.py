@@ -385,7 +385,8 @@ def _recipe_on(told: Mapping[str, Any], how: str) -> str:
     what = ", ".join(f"`{one}`" for one in told["objects"])
     places = ", ".join(f"`{one}`" for one in told["environments"])
     models = ", ".join(f"`{one}`" for one in told["models"])
-    text = _wrapped(f"**{how}**: {what} in {places}, seen by {models}; {told['renders']} renders.") + "\n"
+    took = f" in {told['seconds'] / 60:.0f} minutes" if "seconds" in told else ""
+    text = _wrapped(f"**{how}**: {what} in {places}, seen by {models}; {told['renders']} renders{took}.") + "\n"
     for figure in told["figures"]:
         text += f"![{figure['title']}](images/recipes/{figure['image']})\n\n"
         text += _wrapped(f"*{figure['title']}.* " + " ".join(figure["text"])) + "\n"
