@@ -51,8 +51,8 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
         InputError: the number of labels is not the number of classes.
 
     Warns:
-        ModelWarning: it answers with probabilities, differently every time, differently in a batch, or no gradient
-            reaches the image.
+        ModelWarning: it answers with probabilities (a segmenter's too), differently every time, differently in a batch,
+            or no gradient reaches the image.
     """
     grey, noise = _test_images(model)
     with torch.no_grad():
@@ -72,6 +72,11 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
         _warn(
             f"model {model.name} answers with probabilities. Their logarithm is used, so that margins are log-odds, "
             "but gradients vanish where a probability rounds to 0 or 1: remove the final softmax if you can"
+        )
+    if not logits and _pixel_probabilities(model, noise):
+        _warn(
+            f"model {model.name} answers with probabilities for each pixel: margins are differences of these and no "
+            "log-odds, and gradients vanish where one rounds to 0 or 1: remove the final softmax if you can"
         )
     repeatable = _same(rows[:1], again)
     if not repeatable:
@@ -97,13 +102,18 @@ def _run(model: Model, images: Tensor) -> Tensor:
 
     An output of another kind comes as three numbers of each image, (N, 3); see `_numbers`.
     """
+    output, count = _answer(model, images)
+    if model.read is None:
+        return logits_of(output, count, None, model.name)[: len(images)].cpu()
+    outputs = read_by(model.read, output, count, model.name)[: len(images)]
+    return torch.stack([_numbers(one) for one in outputs]).cpu()
+
+
+def _answer(model: Model, images: Tensor) -> tuple[Any, int]:
+    """Return what the network gives for images (N, H, W, 3), and for how many: no fewer than it takes at once."""
     padded = torch.cat([images, images[-1:].expand(max(model.batch_limits[0] - len(images), 0), -1, -1, -1)])
     x = model.preprocessing(padded.to(model.device)).to(model.dtype)
-    output = _guarded(model, lambda: model.module(x))
-    if model.read is None:
-        return logits_of(output, len(padded), None, model.name)[: len(images)].cpu()
-    outputs = read_by(model.read, output, len(padded), model.name)[: len(images)]
-    return torch.stack([_numbers(one) for one in outputs]).cpu()
+    return _guarded(model, lambda: model.module(x)), len(padded)
 
 
 def _numbers(output: Any) -> Tensor:
@@ -141,6 +151,16 @@ def _guarded(model: Model, call: Callable[[], Any]) -> Any:
 def _probabilities(rows: Tensor) -> bool:
     sums = rows.sum(dim=1)
     return bool((rows >= 0).all()) and bool(((sums - 1).abs() < PROBABILITY_TOLERANCE).all())
+
+
+def _pixel_probabilities(model: Model, images: Tensor) -> bool:
+    """Whether what is read in the network's answer is (N, classes, h, w) of probabilities, two classes at least."""
+    assert model.read is not None
+    with torch.no_grad():
+        output = read_by(model.read, *_answer(model, images), model.name)
+    if not isinstance(output, Tensor) or output.ndim != 4 or output.shape[1] < 2:
+        return False
+    return _probabilities(output.movedim(1, -1).reshape(-1, output.shape[1]))
 
 
 def _same(a: Tensor, b: Tensor) -> bool:

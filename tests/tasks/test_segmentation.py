@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from advsearch.attacks.objectives import get_objective
 from advsearch.errors import InputError, ModelError
-from advsearch.models import load_model
+from advsearch.models import ModelWarning, load_model
 from advsearch.tasks import Answer, Facts, Segmentation
 from advsearch.tasks.segmentation import Region
 
@@ -156,3 +156,11 @@ def test_a_task_learns_names_from_its_model() -> None:
 def test_options_are_checked(accuracy: Any) -> None:
     with pytest.raises(InputError, match="task segmentation: accuracy: expected a number over 0, up to 1"):
         Segmentation(accuracy=accuracy)
+
+
+def test_a_segmenter_of_probabilities_is_warned_about() -> None:
+    torch.manual_seed(0)
+    network = nn.Conv2d(3, 3, 3, padding=1).requires_grad_(False)
+    load_model(network, input_size=8, read=TASK.reader, labels=NAMES)  # warnings are errors
+    with pytest.warns(ModelWarning, match="probabilities for each pixel: .* remove the final softmax"):
+        load_model(nn.Sequential(network, nn.Softmax(dim=1)), input_size=8, read=TASK.reader, labels=NAMES)
