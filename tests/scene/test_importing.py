@@ -1161,21 +1161,69 @@ def test_parts_without_faces_are_left_out(tmp_path: Path) -> None:
     assert asset.warnings == ("mixed.glb: 1 parts without faces (points, lines) are left out",)
 
 
-def test_texture_transform_is_said(tmp_path: Path) -> None:
-    data = glb(tmp_path, PBRMaterial(baseColorFactor=[1.0, 0.0, 0.0, 1.0])).read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    header = json.loads(data[20 : 20 + length]) | {"extensionsUsed": ["KHR_texture_transform"]}
-    text = json.dumps(header).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + length :]
-    path = written(
-        tmp_path,
-        "moved.glb",
-        struct.pack("<4sIIII", b"glTF", 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A) + text + rest,
-    )
-    assert import_object(path).warnings == (
-        "moved.glb moves its textures with KHR_texture_transform, which is not applied",
-    )
+def with_header(folder: Path, change: Callable[[dict[str, Any]], None], name: str = "changed.glb") -> Path:
+    """Write a square as .glb with a changed header."""
+    header, rest = glb_parts(glb(folder, PBRMaterial(baseColorFactor=[1.0, 0.0, 0.0, 1.0])).read_bytes())
+    change(header)
+    return written(folder, name, glb_of(header, rest))
+
+
+def _occluded(header: dict[str, Any]) -> None:
+    header["materials"][0]["occlusionTexture"] = {"index": 7}
+
+
+def _morphed(header: dict[str, Any]) -> None:
+    header["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": 0}]
+
+
+@pytest.mark.parametrize(
+    ("change", "notes"),
+    [
+        (
+            lambda header: header.update(extensionsUsed=["KHR_texture_transform"]),
+            [" moves its textures with KHR_texture_transform, which is not applied"],
+        ),
+        (
+            lambda header: header.update(
+                extensionsUsed=["KHR_materials_sheen", "EXT_mesh_gpu_instancing", "KHR_lights_punctual"],
+                extensionsRequired=["KHR_materials_sheen"],
+            ),
+            [
+                " uses EXT_mesh_gpu_instancing, which is not understood and left out",
+                " uses KHR_materials_sheen, which is not understood and left out",
+            ],
+        ),
+        (_occluded, [": 1 occlusion map: left out"]),
+        (_morphed, [": 1 mesh with morph targets, which are left out"]),
+        (
+            lambda header: header.update(skins=[{"joints": [0]}, {}], animations=[{"channels": []}]),
+            [": 2 skins: what is bound to bones stays as it was drawn", ": 1 animation: left out"],
+        ),
+        (lambda header: header.update(skins="none", animations={"a": 1}), []),
+    ],
+)
+def test_what_a_gltf_has_and_is_not_carried_over_is_said(
+    tmp_path: Path, change: Callable[[dict[str, Any]], None], notes: list[str]
+) -> None:
+    path = with_header(tmp_path, change)
+    assert import_object(path).warnings == tuple(f"changed.glb{note}" for note in notes)
+
+
+@pytest.mark.parametrize("name", ["FOO_geometry", "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing"])
+def test_a_gltf_that_needs_what_is_not_understood_is_refused(tmp_path: Path, name: str) -> None:
+    path = with_header(tmp_path, lambda header: header.update(extensionsUsed=[name], extensionsRequired=[name]))
+    with pytest.raises(FileFormatError, match=f"needs {name}, which is not supported; export it without that option"):
+        import_object(path)
+
+
+def test_lights_and_cameras_beside_a_whole_object_are_named(tmp_path: Path) -> None:
+    def lit(header: dict[str, Any]) -> None:
+        header["extensions"] = {"KHR_lights_punctual": {"lights": [{"type": "point"}]}}
+        header["cameras"] = [{"type": "perspective", "perspective": {"yfov": 0.7}}]
+        header["nodes"] += [{"extensions": {"KHR_lights_punctual": {"light": 0}}}, {"camera": 0}, {"camera": 0}]
+
+    (note,) = import_object(with_header(tmp_path, lit)).warnings
+    assert note.startswith("changed.glb: 1 light and 2 cameras are left out of the object; name one node as the object")
 
 
 def test_importing_does_not_pull_in_the_renderer() -> None:

@@ -11,6 +11,9 @@ T = TypeVar("T")
 List = Annotated[list[T], FailFast()]
 """A list of which only the first wrong entry is reported; a million reports take gigabytes."""
 
+Unread = Annotated[JsonValue, Field(exclude=True)]
+"""What is named in a warning and never read."""
+
 Index = Annotated[int, Field(ge=0, lt=1 << 32)]
 Size = Annotated[int, Field(ge=0, lt=1 << 40)]
 _COMPONENTS = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
@@ -57,6 +60,7 @@ class Primitive(_Entry):
     indices: Index | None = None
     material: Index | None = None
     mode: Annotated[int, Field(ge=0, le=6)] = 4
+    targets: Unread = None
 
 
 class MeshEntry(_Entry):
@@ -176,6 +180,7 @@ class MaterialEntry(_Entry):
     emissiveFactor: Annotated[list[Annotated[float, Field(ge=0.0)]], Field(min_length=3, max_length=3)] = [0.0] * 3
     alphaMode: str = "OPAQUE"
     alphaCutoff: float = CUTOFF
+    occlusionTexture: Unread = None
     extensions: _MaterialExtensions | None = None
 
     @property
@@ -260,6 +265,8 @@ class Header(_Entry):
     textures: List[Texture] = []
     images: List[Image] = []
     cameras: List[CameraEntry] = []
+    skins: Unread = None
+    animations: Unread = None
     extensions: _Extensions | None = None
     extensionsUsed: List[str] = []
     extensionsRequired: List[str] = []

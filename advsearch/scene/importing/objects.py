@@ -12,6 +12,7 @@ from PIL import Image
 
 from advsearch.errors import InputError
 from advsearch.scene.assets import Material, ObjectAsset, UpAxis, normalised
+from advsearch.scene.importing import gltf
 from advsearch.scene.importing.blender import read_mesh_bytes
 from advsearch.scene.importing.files import safe_name
 from advsearch.scene.importing.geometry import Soup, assemble, join, repaired
@@ -65,7 +66,10 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
     if up not in (None, "y", "z"):
         raise InputError(f"up axis: expected 'y' or 'z', got {up!r}")
     file = Path(path)
-    parts, notes = read_parts(file, read_mesh_bytes(file, "object", SUFFIXES))
+    data = read_mesh_bytes(file, "object", SUFFIXES)
+    parts, notes = read_parts(file, data)
+    rest = gltf.beside(gltf.read_header(file, data)) if file.suffix.lower() in GLTF else None
+    notes += [] if rest is None else [file.name + rest]
     return object_of(parts, notes, file, safe_name(file), up)
 
 

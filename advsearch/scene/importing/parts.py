@@ -169,8 +169,7 @@ def _file_notes(path: Path, data: bytes, header: Header | None, references: Refe
             notes.append(
                 f"{path.name} uses the material {shown(name)}, which its .mtl file lacks; neutral grey is used instead"
             )
-    if header is not None and "KHR_texture_transform" in header.extensionsUsed:
-        notes.append(f"{path.name} moves its textures with KHR_texture_transform, which is not applied")
+    notes += [path.name + what for what in gltf.left_out(header)] if header else []
     for what, count in gltf.unread(header).items() if header else ():
         if count:
             verb = "is" if what == GLOW else "are"

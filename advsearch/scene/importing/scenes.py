@@ -178,10 +178,10 @@ def contents(path: Path) -> Contents:
     """
     data = read_mesh_bytes(path, "object", SUFFIXES)
     parts, notes = read_parts(path, data)
-    whole = object_of(parts, notes, path, safe_name(path), None)
     if path.suffix.lower() not in GLTF:
-        return Contents(whole)
+        return Contents(object_of(parts, notes, path, safe_name(path), None))
     header = gltf.read_header(path, data)
+    whole = object_of(parts, [*notes, *_changed(path, header)], path, safe_name(path), None)
     nodes: dict[int, list[ImportedPart]] = {}
     for part in parts:
         nodes.setdefault(part.node, []).append(part)
