@@ -20,6 +20,7 @@ from advsearch.config import RecipeConfig, SweepConfig
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
 from advsearch.recipes.description import Recipe, names, read_recipe, titles
 from advsearch.recipes.figures import FIGURES, compute, draw, read_options
+from advsearch.recipes.figures.answers import fitting
 from advsearch.recipes.parts import planned
 from advsearch.recipes.table import Answered, Table
 from advsearch.report.recipes import figure_table, told_once
@@ -515,3 +516,11 @@ EXAMPLES: dict[str, dict[str, object]] = {
     "heat map": {"figure": "heat map", "rows": "object", "columns": "environment"},
     "agreement": {"figure": "agreement", "of": ["renderings", "again"], "names": {"again": "through a sensor"}},
 }
+
+
+@pytest.mark.parametrize(
+    ("share", "shown"),
+    [(0.35, "piggy bank, penny bank"), (0.2, "piggy bank"), (0.1, "piggy b…"), (0.06, "pigg…"), (0.04, "")],
+)
+def test_a_bar_shows_as_much_of_a_name_as_there_is_room_for(share: float, shown: str) -> None:
+    assert fitting("piggy bank, penny bank", share) == shown

@@ -15,6 +15,12 @@ from advsearch.report.wording import interval_text
 from advsearch.runs.results.recipe import AnswersFigure, AnswersRow, GivenAnswer
 
 
+LETTERS = 85
+"""Letters that a bar of the whole width has room for."""
+FEWEST_LETTERS = 4
+"""Of a name that is cut short."""
+
+
 class AnswersOptions(Options):
     """Options of the most frequent answers.
 
@@ -60,6 +66,13 @@ def _given(one: GivenAnswer) -> str:
     return f"{one.name}, given in {one.correct} of {one.configurations} ({share}) and right in {one.right} of these"
 
 
+def fitting(name: str, share: float) -> str:
+    """Return as much of an answer's name as a bar has room for: the first of several names, or its beginning."""
+    room, first = int(share * LETTERS), name.partition(",")[0]
+    fits = next((one for one in (name, first) if len(one) <= room), None)
+    return fits if fits is not None else f"{first[: room - 1].rstrip()}…" if room > FEWEST_LETTERS else ""
+
+
 def _draw(made: AnswersFigure, figure: Any, run: Path) -> None:
     axes = figure.subplots()
     for place, row in enumerate(reversed(made.rows)):
@@ -68,8 +81,7 @@ def _draw(made: AnswersFigure, figure: Any, run: Path) -> None:
             share = one.accuracy or 0.0
             colour = BLUE if 2 * one.right >= one.correct else RED
             axes.barh(place, share, left=left, color=colour, alpha=0.5, height=0.72, edgecolor="white")
-            if share * 62 > len(one.name):
-                axes.text(left + share / 2, place, one.name, ha="center", va="center", fontsize=7)
+            axes.text(left + share / 2, place, fitting(one.name, share), ha="center", va="center", fontsize=7)
             left += share
         axes.barh(place, max(1.0 - left, 0.0), left=left, color=GREY, alpha=0.15, height=0.72)
     axes.set_yticks(range(len(made.rows)), [row.name for row in reversed(made.rows)])
