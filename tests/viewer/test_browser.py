@@ -113,7 +113,7 @@ def until(page: Page, happened: Callable[[], object]) -> None:
 
 
 def width_of_first_picture(page: Page) -> object:
-    """Pixels across of the first card's picture; False until it has arrived, as cards are made anew with each choice."""
+    """Pixels across of the first card's picture; False until it has arrived: cards are made anew with each choice."""
     return page.locator(".card img").first.evaluate("image => image.complete && image.naturalWidth")
 
 

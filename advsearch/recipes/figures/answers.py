@@ -14,7 +14,6 @@ from advsearch.report.phrases import percent
 from advsearch.report.wording import interval_text
 from advsearch.runs.results.recipe import AnswersFigure, AnswersRow, GivenAnswer
 
-
 LETTERS = 85
 """Letters that a bar of the whole width has room for."""
 FEWEST_LETTERS = 4
