@@ -108,7 +108,7 @@ class SceneConfig(Config):
         None,
         "model",
         "names of the model's classes",
-        "a JSON or text file, imagenet, cifar10, cifar100, coco, coco91 or voc",
+        "a JSON or text file, imagenet, cifar10, cifar100, coco, coco90, coco91 or voc",
         metavar="FILE",
         otherwise="the model's own",
     )

@@ -22,9 +22,10 @@ MOST_SUGGESTIONS = 4
 """Labels that a message suggests for an unknown one."""
 
 DATA = Path(__file__).parent / "data"
-SETS = ("imagenet", "cifar10", "cifar100", "coco", "coco91", "voc")
+SETS = ("imagenet", "cifar10", "cifar100", "coco", "coco90", "coco91", "voc")
 """Names of the classes of data sets that many networks are trained on, in the order of their outputs. `coco91` has the
-background first and the numbers that its authors gave, of which 11 have no class; `voc` has the background first."""
+background first and the numbers that its authors gave, of which 11 have no class; `coco90` is that without background;
+`voc` has the background first."""
 
 
 @dataclass(frozen=True)
@@ -125,8 +126,10 @@ def _checked_index(index: int, labels: Sequence[str]) -> int:
 def _unknown(term: str, table: dict[str, list[int]], labels: Sequence[str], named: bool) -> str:
     message = f"the model has no label {term!r}."
     if not named:
+        fitting = "".join(f" or `labels={name}`" for name in sets_of(len(labels)))
         return (
-            f"{message} Its {len(labels)} classes have no names: give a label file (`labels`), or an index such as '#0'"
+            f"{message} Its {len(labels)} classes have no names: give a label file (`labels`){fitting}, or an index "
+            "such as '#0'"
         )
     near = matching_labels(term, labels)[:MOST_SUGGESTIONS]
     if near:
@@ -168,7 +171,7 @@ def read_labels(source: str | Path | Sequence[str]) -> tuple[str, ...]:
     """
     if isinstance(source, (str, Path)):
         if str(source) in SETS:
-            return tuple(json.loads((DATA / "labels.json").read_text("utf-8"))[str(source)])
+            return _label_sets()[str(source)]
         return _read_file(Path(source))
     if not isinstance(source, Sequence):
         raise InputError(f"labels: expected a path or a list of names, got {type(source).__name__}")
@@ -176,6 +179,18 @@ def read_labels(source: str | Path | Sequence[str]) -> tuple[str, ...]:
     if problem:
         raise InputError(f"labels: {problem}")
     return tuple(name.strip() for name in source)
+
+
+def sets_of(classes: int) -> list[str]:
+    """Return the names of `SETS` with that many classes."""
+    return [name for name, names in _label_sets().items() if len(names) == classes]
+
+
+def _label_sets() -> dict[str, tuple[str, ...]]:
+    """Return the names of the classes of each of `SETS`."""
+    stored = json.loads((DATA / "labels.json").read_text("utf-8"))
+    stored["coco90"] = stored["coco91"][1:]
+    return {name: tuple(stored[name]) for name in SETS}
 
 
 def fitting_labels(classes: int, labels: tuple[str, ...] | None, source: str, model: str) -> tuple[str, ...]:
@@ -193,6 +208,7 @@ def fitting_labels(classes: int, labels: tuple[str, ...] | None, source: str, mo
         return labels
     message = (
         f"{source}: {len(labels)} labels, but model {model} has {classes} classes; give one per class, in index order"
+        f"{''.join(f' (`labels={name}` has {classes})' for name in sets_of(classes))}"
     )
     raise FileFormatError(message) if source.startswith("label file") else InputError(message)
 

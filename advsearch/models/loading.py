@@ -11,10 +11,10 @@ from typing import Any
 
 from torch import nn
 
-from advsearch.errors import InputError, UnknownNameError
+from advsearch.errors import InputError, UnknownNameError, resembling
 from advsearch.models import files, imported, reference
 from advsearch.models import preprocessing as pre
-from advsearch.models.labels import fitting_labels, read_labels
+from advsearch.models.labels import SETS, fitting_labels, read_labels
 from advsearch.models.model import Model, Read
 from advsearch.models.preprocessing import Preprocessing
 from advsearch.models.probe import probe
@@ -143,7 +143,15 @@ def _find(spec: object) -> Source | Model:
         return imported.load_callable(text)
     if Path(text).suffix.lower() in files.SUFFIXES or "/" in text or os.sep in text or os.path.exists(text):
         return files.load_file(Path(text))
-    raise UnknownNameError("model", text, ["reference", "torchvision:NAME", "timm:NAME"], FORMS)
+    known = ["reference", *(f"{source}:{'REPOSITORY' if source == 'hf' else 'NAME'}" for source in SOURCES)]
+    raise UnknownNameError("model", text, known, f"{_by_library(text)}{FORMS}")
+
+
+def _by_library(text: str) -> str:
+    """Return how the networks of libraries are written, for a bare name that may be one's; else nothing."""
+    if not re.fullmatch(r"[\w.-]+", text) or resembling(text, ["reference"]):
+        return ""
+    return f"A library's network is written with its library: 'torchvision:{text}' or 'timm:{text}'. "
 
 
 def _described(spec: object) -> str:
@@ -172,7 +180,7 @@ def _given_labels(given: Any) -> tuple[tuple[str, ...] | None, str]:
     if given is None:
         return None, "labels of the model"
     if isinstance(given, (str, os.PathLike)):
-        return read_labels(Path(given)), f"label file {os.fspath(given)}"
+        return read_labels(Path(given)), "labels" if str(given) in SETS else f"label file {os.fspath(given)}"
     return read_labels(given), "labels"
 
 

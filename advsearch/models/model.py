@@ -24,6 +24,13 @@ SMALLEST_PROBABILITY = 1e-30
 #: How far outside [0, 1] a pixel may lie (finite differences overshoot a little) before the image is refused.
 RANGE_TOLERANCE = 0.01
 
+GIVEN_BY = {
+    "classification": "a row of scores is what a classifier gives",
+    "detection": "boxes are what a detector gives",
+    "segmentation": "a score for each pixel is what a segmenter gives",
+}
+"""What networks of a task answer with, by task, for messages."""
+
 
 class ModelWarning(UserWarning):
     """A model that works, but not as an attack would like it to (probabilities, randomness, no gradient)."""
@@ -146,9 +153,9 @@ def read_by(read: Read, answer: Any, count: int, name: str) -> Any:
     try:
         output = read(answer, count)
     except ValueError as error:
-        raise ModelError(
-            f"model {name}: {error}, got {described(answer)}; wrap the network, or ask for another task"
-        ) from None
+        meant, own = _task_of(answer), getattr(getattr(read, "__self__", None), "name", None)
+        advice = _other_task(meant) if meant and meant != own else "wrap the network, or ask for another task"
+        raise ModelError(f"model {name}: {error}, got {described(answer)}; {advice}") from None
     if len(output) != count:
         raise ModelError(f"model {name}: expected an output for each of {count} images, got {len(output)}")
     return output
@@ -188,8 +195,9 @@ def logits_of(output: Any, count: int, classes: int | None, name: str) -> Tensor
     """
     tensor = _tensor_in(output)
     expected = f"model {name}: expected logits of shape ({count}, {classes or 'classes'})"
-    if _has_boxes(output):
-        raise ModelError(f'{expected}, got boxes, as a detector gives: add --task detection (task="detection")')
+    meant = _task_of(output)
+    if meant in ("detection", "segmentation") and (tensor is None or tensor.dim() != 4):
+        raise ModelError(f"{expected}, got {described(output)}; {_other_task(meant)}")
     if tensor is None:
         raise ModelError(f"{expected}, got {type(output).__name__}; wrap the network so that it returns one tensor")
     got = tuple(tensor.shape)
@@ -210,6 +218,15 @@ def _tensor_in(output: Any) -> Tensor | None:
     return output if isinstance(output, Tensor) else None
 
 
+def _task_of(answer: Any) -> str | None:
+    """Return the task whose networks answer like that: boxes, a score for each pixel, or rows of scores; else None."""
+    if _has_boxes(answer):
+        return "detection"
+    tensor = answer.get("out") if isinstance(answer, Mapping) and "out" in answer else _tensor_in(answer)
+    kinds = {2: "classification", 4: "segmentation"}
+    return kinds.get(tensor.dim()) if isinstance(tensor, Tensor) else None
+
+
 def _has_boxes(output: Any) -> bool:
     """Whether an answer is a detector's: (boxes (N, K, 4), scores ...), or mappings with "boxes"."""
     first = output[0] if isinstance(output, (tuple, list)) and output else output
@@ -219,12 +236,13 @@ def _has_boxes(output: Any) -> bool:
     return several and isinstance(first, Tensor) and first.dim() == 3 and first.shape[2] == 4
 
 
+def _other_task(name: str) -> str:
+    return f"{GIVEN_BY[name]}: use `task={name}`"
+
+
 def _advice(got: tuple[int, ...]) -> str:
     if len(got) == 4:
-        return (
-            'a score for each pixel is what a segmenter gives: add --task segmentation (task="segmentation"). If these '
-            "are a classifier's feature maps, wrap the network to pool them"
-        )
+        return f"{_other_task('segmentation')}. If these are a classifier's feature maps, wrap the network to pool them"
     if len(got) > 2:
         return "pass a classifier, or wrap the network to pool its output"
     if len(got) == 2 and got[1] == 1:

@@ -16,7 +16,7 @@ from advsearch.tasks.base import Answer, Facts, Judgement, Mark
 from advsearch.tasks.classes import ClassTask, Labels
 from advsearch.tasks.classification import members, target_lead, wrong_lead
 
-EXPECTED = "expected logits (N, classes, height, width), or a mapping with these as `out` or `logits`"
+EXPECTED = "expected logits (N, classes, height, width), or a mapping with these under 'out' or 'logits'"
 
 Lead = Callable[[Tensor, Labels], Tensor]
 

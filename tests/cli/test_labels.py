@@ -162,12 +162,13 @@ def test_everyday_things_are_found_by_what_else_they_are_called(
 
 
 def test_label_sets_have_the_order_of_their_data_sets() -> None:
-    sizes = {"imagenet": 1000, "cifar10": 10, "cifar100": 100, "coco": 80, "coco91": 91, "voc": 21}
+    sizes = {"imagenet": 1000, "cifar10": 10, "cifar100": 100, "coco": 80, "coco90": 90, "coco91": 91, "voc": 21}
     assert {name: len(read_labels(name)) for name in SETS} == sizes
     assert [read_labels("imagenet")[index] for index in (0, 504, 968, 999)] == [
         "tench", "coffee mug", "cup", "toilet tissue"
     ]  # fmt: skip
     assert [read_labels("coco91")[index] for index in (0, 1, 47, 90)] == ["background", "person", "cup", "toothbrush"]
+    assert read_labels("coco90") == read_labels("coco91")[1:]
     assert [read_labels("coco")[index] for index in (0, 41, 79)] == ["person", "cup", "toothbrush"]
     assert [read_labels("cifar100")[index] for index in (0, 99)] == ["apple", "worm"]
     assert [read_labels("voc")[index] for index in (0, 5, 20)] == ["background", "bottle", "tvmonitor"]

@@ -32,6 +32,8 @@ from advsearch.models import (
     read_labels,
     reference,
 )
+from advsearch.models.labels import fitting_labels, sets_of
+from advsearch.tasks import make_task
 
 DATA = conftest.DATA / "models"
 MOBILENET = DATA / "mobilenet_v2_imagenet.pt2"
@@ -304,10 +306,11 @@ def test_usual_containers_of_logits_are_opened(answer: Any) -> None:
     [
         (
             lambda z: z[:, :, None, None],
-            r"expected logits of shape \(1, classes\), got \(1, 3, 1, 1\); a score for each pixel .* add --task segm",
+            r"logits of shape \(1, classes\), got \(1, 3, 1, 1\); a score for each pixel .*: use `task=segmentation`",
         ),
-        (lambda z: (z[:, :, None].expand(-1, -1, 4), z), "got boxes, as a detector gives: add --task detection"),
-        (lambda z: [{"boxes": z}], "got boxes, as a detector gives: add --task detection"),
+        (lambda z: (z[:, :, None].expand(-1, -1, 4), z), "boxes are what a detector gives: use `task=detection`"),
+        (lambda z: [{"boxes": z}], "boxes are what a detector gives: use `task=detection`"),
+        (lambda z: {"out": z[:, :, None, None]}, "got dict; a score for each pixel .*: use `task=segmentation`"),
         (lambda z: z[0], r"got \(3,\); the network dropped its batch dimension"),
         (lambda z: z[:, :1], r"got \(1, 1\); one score is not enough"),
         (lambda z: torch.cat([z, z]), r"got \(2, 3\); wrap the network"),
@@ -320,6 +323,26 @@ def test_usual_containers_of_logits_are_opened(answer: Any) -> None:
 def test_answers_that_are_not_logits(answer: Any, message: str) -> None:
     with pytest.raises(ModelError, match=message):
         load_model(Answering(answer), input_size=8)
+
+
+@pytest.mark.parametrize(
+    "task, answer, message",
+    [
+        ("detection", lambda z: z, "expected boxes .* a row of scores is what a classifier gives: use `task=classific"),
+        (
+            "detection",
+            lambda z: z[:, :, None, None],
+            "expected boxes .* what a segmenter gives: use `task=segmentation",
+        ),
+        ("detection", lambda z: (z[:, :, None].expand(-1, -1, 4), z), "expected boxes .* tuple; wrap the network, or"),
+        ("segmentation", lambda z: z, "expected logits .* what a classifier gives: use `task=classification`"),
+        ("segmentation", lambda z: [{"boxes": z}], "expected logits .* what a detector gives: use `task=detection`"),
+        ("segmentation", lambda z: z[:, :1, None, None], r"expected logits .*1, 1, 1, 1\); wrap the network, or ask"),
+    ],
+)
+def test_answers_of_another_task_name_it(task: str, answer: Any, message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        load_model(Answering(answer), input_size=8, read=make_task(task).reader)
 
 
 def test_wrong_input_size_says_what_to_pass() -> None:
@@ -471,8 +494,10 @@ def test_label_files_that_are_errors(tmp_path: Path, name: str, content: bytes, 
 def test_labels_that_are_errors(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"label file .*none.json: cannot be read"):
         tiny(labels=tmp_path / "none.json")
-    with pytest.raises(InputError, match=r"labels: 4 labels, but model Tiny has 3 classes"):
+    with pytest.raises(InputError, match=r"labels: 4 labels, but model Tiny has 3 classes; give one per class"):
         tiny(labels=["a", "b", "c", "d"])
+    with pytest.raises(InputError, match=r"^labels: 21 labels, but model Tiny has 3 classes; .* in index order$"):
+        tiny(labels="voc")
     with pytest.raises(InputError, match=r"labels: expected a name .* for class 1, got 5"):
         tiny(labels=["a", 5, "c"])
 
@@ -629,10 +654,24 @@ def test_safetensors_alone_are_not_a_model(tmp_path: Path) -> None:
 def test_unknown_names() -> None:
     with pytest.raises(UnknownNameError, match=r"unknown model 'referense'. Did you mean 'reference'"):
         load_model("referense")
+    known = "Known: hf:REPOSITORY, reference, timm:NAME, torchvision:NAME"
+    with pytest.raises(UnknownNameError, match=rf"{known}.* library: 'torchvision:resnet50' or 'timm:resnet50'. A mod"):
+        load_model("resnet50")
     with pytest.raises(InputError, match=r"write 'nets:build', without the '.py'"):
         load_model("nets.py:build")
     with pytest.raises(InputError, match=r"got the class Tiny \(pass an instance\)"):
         load_model(Tiny)  # type: ignore[arg-type]
+
+
+def test_a_count_of_labels_that_is_that_of_a_data_set_names_it() -> None:
+    for count, name in ((90, "coco90"), (91, "coco91"), (21, "voc")):
+        assert sets_of(count) == [name]
+        with pytest.raises(InputError, match=rf"labels: 80 labels, .* in index order \(`labels={name}` has {count}\)$"):
+            fitting_labels(count, read_labels("coco"), "labels", "net")
+        unnamed = fitting_labels(count, None, "labels", "net")
+        with pytest.raises(InputError, match=rf"give a label file \(`labels`\) or `labels={name}`, or an index"):
+            find_label_set("mug", unnamed, named=False)
+    assert sets_of(3) == []
 
 
 # ---------------------------------------------------------------------------------------------------------------------
