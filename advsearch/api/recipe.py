@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING
 from advsearch.api.keywords import RecipeKeywords, asks, configured
 from advsearch.api.photos import Photographs, photographs_in
 from advsearch.api.subruns import carry_out_part
+from advsearch.api.sweep import job_of
 from advsearch.config import RecipeConfig, SweepConfig
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.controls import CONTROLS
+from advsearch.engine.sweeps.job import check_all
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
 from advsearch.recipes.description import Recipe, read_recipe, recipe_of
@@ -73,8 +75,12 @@ def recipe_from_config(
         InputError: the recipe has a part or a figure that does not work; nothing is written where that is seen before.
     """
     begun = time.perf_counter()
+    if config.photographs is not None and not Path(config.photographs).is_dir():
+        raise InputError(f"photographs: expected a folder, got {config.photographs}")
     described = read_recipe(config.recipe) if resumed is None else None
-    _check(described, config)
+    if described is not None:
+        _check(described, config)
+        _check_later_objects(planned(described, config))
     with RunDirectory.of(config, resumed) as run:
         if described is None:
             described = recipe_of(run.store.noted(NOTE) or {}, f"{run.path}: the recipe that it began with")
@@ -98,16 +104,21 @@ def _seconds(path: Path) -> float:
     return before.seconds["total"] if isinstance(before, RecipeResult) else 0.0
 
 
-def _check(described: Recipe | None, config: RecipeConfig) -> None:
+def _check(described: Recipe, config: RecipeConfig) -> None:
     """Read everything that a recipe says, so that what is wrong in it is told before anything is rendered."""
-    if config.photographs is not None and not Path(config.photographs).is_dir():
-        raise InputError(f"photographs: expected a folder, got {config.photographs}")
-    if described is None:
-        return
     if config.photographs is not None and not _photographed(described, planned(described, config)):
         raise InputError(f"photographs: {config.recipe} keeps no pictures to compare them with; recipe realism does")
     for one in described.figures:
         read_options(one, config.recipe)
+
+
+def _check_later_objects(runs: Sequence[Planned]) -> None:
+    """Load what sweeps of other objects than the first are of; a wrong name or label would end hours of rendering."""
+    seen = {runs[0].config.object}
+    for one in runs:
+        if isinstance(one.config, SweepConfig) and one.config.object not in seen:
+            seen.add(one.config.object)
+            check_all(job_of(one.config))
 
 
 def _photographed(described: Recipe, runs: Iterable[Planned]) -> list[Planned]:

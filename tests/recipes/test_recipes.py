@@ -145,6 +145,23 @@ def test_a_figure_that_cannot_be_made_is_refused(
         figure(described, rows({"noon": (1, 2)}))
 
 
+@pytest.mark.parametrize(
+    ("further", "message"),
+    [
+        (["--object", "mug,nosuch"], "unknown object 'nosuch'"),
+        (["--object", "mug,bowl", "--label", "bowl=unicorn"], "unicorn"),
+    ],
+)
+def test_a_later_object_is_checked_before_anything_is_rendered(
+    further: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(TINY)
+    assert main(["recipe", str(path), *further, "--run", str(tmp_path / "run")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
 def test_python_code_in_a_file_is_not_imported_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(TINY.replace("spp: 1", "spp: 1, model: 'os.path:join'"))
