@@ -26,6 +26,7 @@ from advsearch.cli.flags import SCENE, help_text
 from advsearch.cli.main import add_command
 from advsearch.config import CONFIGS, AttackConfig
 from advsearch.controls import OWN
+from advsearch.recipes.description import names as recipe_names
 from advsearch.runs.results.attack import AttackSummary
 from advsearch.runs.results.base import END, Fields, Result
 from advsearch.runs.results.explain import ExplainResult
@@ -370,14 +371,13 @@ def recipe_results(record: Record) -> str:
     """What `docs/make_recipe_images.py` kept of each recipe, on bundled objects and on other data."""
     path = DOCS / RECIPES
     kept = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    return "\n".join(_recipe(name, found) for name, found in sorted(kept.items())) or "None was kept yet.\n"
+    return "\n".join(_recipe(name, kept.get(name, {})) for name in sorted({*kept, *recipe_names()}))
 
 
 def _recipe(name: str, found: Mapping[str, Any]) -> str:
     text = f"### {name}\n"
-    for kind in ("bundled", "data"):
-        if kind in found:
-            text += "\n" + _recipe_on(found[kind], "With `--quick`" if kind == "bundled" else "On real data")
+    for kind, how in (("bundled", "With `--quick`"), ("data", "On real data")):
+        text += "\n" + (_recipe_on(found[kind], how) if kind in found else f"**{how}**: not run yet.\n")
     return text
 
 
@@ -385,7 +385,8 @@ def _recipe_on(told: Mapping[str, Any], how: str) -> str:
     what = ", ".join(f"`{one}`" for one in told["objects"])
     places = ", ".join(f"`{one}`" for one in told["environments"])
     models = ", ".join(f"`{one}`" for one in told["models"])
-    took = f" in {told['seconds'] / 60:.0f} minutes" if "seconds" in told else ""
+    took = f" in {told['seconds']} seconds" if "seconds" in told else ""
+    took += f", {told['cpu_seconds']} of processors" if told.get("cpu_seconds") is not None else ""
     text = _wrapped(f"**{how}**: {what} in {places}, seen by {models}; {told['renders']} renders{took}.") + "\n"
     for figure in told["figures"]:
         text += f"![{figure['title']}](images/recipes/{figure['image']})\n\n"

@@ -1,10 +1,10 @@
 """Carries out the recipes, and keeps what they say and their figures for docs/recipes.md.
 
-    python docs/make_recipe_images.py OUT [--data FOLDER] [--only NAME,NAME]
+    python docs/make_recipe_images.py OUT [--data FOLDER] [--only NAME,NAME] [--until HH:MM]
 
 Runs are kept in the folder OUT: what is done there is not done again. On bundled objects they are quick ones. With
---data they are on a folder of meshes, environments and ImageNet classifiers of one's own, at the recipe's own counts
-but for those below. `python docs/make_figures.py` puts what was kept into the page.
+--data they are on a folder of meshes, environments and ImageNet classifiers of one's own, at the recipe's own counts.
+`python docs/make_figures.py` puts what was kept into the page.
 """
 
 from __future__ import annotations
@@ -12,11 +12,9 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from importlib import resources
+import time
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 import advsearch
 from advsearch.api.recipe import recipe_from_config
@@ -34,6 +32,7 @@ SHOWN = {
     "backgrounds": (1, 2),
     "texture-shape": (1, 3, 4),
     "orientation-scale": (1, 2, 3),
+    "scaling": (1,),
     "liquid": (1, 2),
     "viewpoints": (1,),
     "pose-space": (1, 5),
@@ -46,12 +45,6 @@ SHOWN = {
 
 LABELS = {"mug": "coffee mug,cup", "teapot": "teapot,coffeepot", "banana": "banana", "bowl": "mixing bowl,soup bowl"}
 
-COUNTS: dict[str, dict[str, Any]] = {
-    "parts": {"views": {"samples": 200}},
-    "physical": {"texture": {"draws": 4, "steps": 80, "trials": 60, "verify_spp": 16}},
-}
-"""Settings of the parts on data of one's own, where a recipe's own counts take more than half an hour there."""
-
 ONE_OBJECT = ("liquid", "common-corruptions", "physical", "parts", "viewpoints")
 ALL_OBJECTS = ("orientation-scale", "backgrounds")
 """Recipes on the mug alone, and on all four objects; others are on the mug and the teapot."""
@@ -63,30 +56,46 @@ def main() -> int:
     parser.add_argument("out", type=Path, help="the folder of the runs")
     parser.add_argument("--data", type=Path, help="a folder with objects/, environments/ and models/")
     parser.add_argument("--only", default=",".join(SHOWN), help="names of recipes")
+    parser.add_argument("--until", default="99:99", help="the time of day after which none is begun")
     args = parser.parse_args()
-    kept: dict[str, dict[str, Any]] = json.loads(KEPT.read_text("utf-8")) if KEPT.exists() else {}
     for name in args.only.split(","):
-        result = real(name, args.data, args.out) if args.data else bundled(name, args.out)
-        kept.setdefault(name, {})["data" if args.data else "bundled"] = told(name, result, "data" if args.data else "")
-        IMAGES.mkdir(parents=True, exist_ok=True)
-        KEPT.write_text(json.dumps(kept, indent=1, ensure_ascii=False, sort_keys=True) + "\n", encoding="utf-8")
+        if time.strftime("%H:%M") >= args.until:
+            print(name, "was not begun", file=sys.stderr)
+            continue
+        run = args.out / (f"data-{name}" if args.data else f"q-{name}")
+        begun, cpu = (run / CONFIG).is_file(), time.process_time()
+        result = real(name, args.data, run) if args.data else bundled(name, run)
+        keep(name, result, "data" if args.data else "", None if begun else time.process_time() - cpu)
         print(name, result.seconds["total"], file=sys.stderr)
     return 0
 
 
-def bundled(name: str, out: Path) -> RecipeResult:
+def keep(name: str, result: RecipeResult, suffix: str, cpu: float | None) -> None:
+    """Keep what there is to tell of a run beside what is kept of others.
+
+    Args:
+        name: of the recipe.
+        result: of the run.
+        suffix: ``data``, or empty for bundled objects.
+        cpu: seconds of processors; None for a run that was begun before, which keeps what was told of it.
+    """
+    IMAGES.mkdir(parents=True, exist_ok=True)
+    kept: dict[str, dict[str, Any]] = json.loads(KEPT.read_text("utf-8")) if KEPT.exists() else {}
+    before = kept.setdefault(name, {}).get(suffix or "bundled", {})
+    new = told(name, result, suffix)
+    same = before.get("seconds") == new["seconds"]
+    new["cpu_seconds"] = round(cpu) if cpu is not None else before.get("cpu_seconds") if same else None
+    kept[name][suffix or "bundled"] = new
+    KEPT.write_text(json.dumps(kept, indent=1, ensure_ascii=False, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def bundled(name: str, run: Path) -> RecipeResult:
     """Return what a recipe says of bundled objects, quickly."""
-    run = out / f"q-{name}"
     return done(run) or gone_on(run) or advsearch.recipe(name, quick=True, run=run)
 
 
-def real(name: str, data: Path, out: Path) -> RecipeResult:
+def real(name: str, data: Path, run: Path) -> RecipeResult:
     """Return what a recipe says of data of one's own."""
-    run, file = out / f"data-{name}", out / f"{name}.yaml"
-    base = str(resources.files("advsearch.recipes") / f"{name}.yaml")
-    parts = {part: {"settings": settings} for part, settings in COUNTS.get(name, {}).items()}
-    out.mkdir(parents=True, exist_ok=True)
-    file.write_text(yaml.safe_dump({"base": base, "parts": parts}), encoding="utf-8")
     several = name == "backgrounds"
     objects = list(LABELS)[: 1 if name in ONE_OBJECT else None if name in ALL_OBJECTS else 2]
     environments = sorted(str(one) for one in (data / "environments").glob("*.hdr"))
@@ -98,7 +107,7 @@ def real(name: str, data: Path, out: Path) -> RecipeResult:
         done(run)
         or gone_on(run)
         or advsearch.recipe(
-            file,
+            name,
             object=[str(data / "objects" / f"{one}.obj") for one in objects],
             environment=environments if several else environments[-1],
             model=[str(data / "models" / one) for one in models],
