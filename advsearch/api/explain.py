@@ -46,6 +46,7 @@ from advsearch.runs.results.explain import (
     RightOf,
     RuleRow,
 )
+from advsearch.runs.results.recipe import RecipeResult
 from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.settings import split_names
@@ -68,7 +69,8 @@ def explain(
     All other arguments are the settings of `advsearch explain`. The run is kept, in `run` or under runs/.
 
     Args:
-        sweeps: name or folder of a run of `sweep` that has ended, or several, whose rows are read together.
+        sweeps: name or folder of a run of `sweep` that has ended, or several, whose rows are read together; of a
+            recipe, its sweeps.
         progress: told how far it is.
 
     Raises:
@@ -88,7 +90,7 @@ def explain_from_config(
     """
     begun, progress = time.perf_counter(), progress or NullProgress()
     progress.stage("reading rows")
-    asked = [_Asked.of(find_run(name)) for name in split_names(config.sweeps)]
+    asked = [_Asked.of(folder) for name in split_names(config.sweeps) for folder in _sweeps_of(find_run(name))]
     rows = [row for one in asked for row in one.rows]
     if len(rows) < FEWEST_ROWS:
         raise InputError(f"explain: expected at least {FEWEST_ROWS} rows, got {len(rows)}; sweep more configurations")
@@ -133,6 +135,17 @@ def explain_from_config(
         run.write_summary(result)
         write_page(run.path, result)
         return result
+
+
+def _sweeps_of(folder: Path) -> list[Path]:
+    """Return the folder of a sweep, or those of the sweeps that a recipe consists of."""
+    made = read_result(folder)
+    if not isinstance(made, RecipeResult):
+        return [folder]
+    parts = [folder / PARTS / part.name for part in made.parts if part.command == SweepConfig.command]
+    if not parts:
+        raise InputError(f"explain: expected sweeps, got {folder}, a recipe without one")
+    return parts
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ class ExplainConfig(Config):
         ...,
         "explain",
         "the sweeps whose rows are read together, separated by commas",
-        "names or folders of runs of sweep",
+        "names or folders of runs of sweep, or of recipes with sweeps",
     )
     confirm: int = setting(
         100,

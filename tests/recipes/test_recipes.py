@@ -145,6 +145,14 @@ def test_a_figure_that_cannot_be_made_is_refused(
         figure(described, rows({"noon": (1, 2)}))
 
 
+def test_the_sweeps_of_a_recipe_are_explained(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(TINY)
+    assert main(["recipe", str(path), "--run", str(tmp_path / "run"), "--quiet"]) == 0
+    with pytest.raises(InputError, match="expected at least 100 rows, got 8; sweep more"):
+        advsearch.explain(tmp_path / "run")
+
+
 @pytest.mark.parametrize(
     ("further", "message"),
     [
