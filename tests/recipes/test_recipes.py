@@ -346,6 +346,44 @@ def test_shape_and_texture_are_told_apart() -> None:
         assert any(row.textured for row in made.rows) == (answers[0] == "zebra")
 
 
+def told_by(answer: Any, shapes: int, textures: int, seed: int) -> str:
+    """Which cue the figure names, of a model that answers by a function of shape, texture and chance."""
+    generator = np.random.default_rng(seed)
+    answered = [
+        Answered("a", {"object": f"s{s}", "material.which": f"t{t}"}, {}, str(answer(s, t, generator)), False)
+        for s in range(shapes)
+        for t in range(textures)
+        for _ in range(8)
+    ]
+    made = figure({"figure": "cues"}, answered)
+    assert made.difference_interval[0] <= made.difference <= made.difference_interval[1]
+    assert sum(one.configurations for one in made.predicted) == 2 * len(answered)
+    (text,) = [one for one in made.text if "most frequent answer about the same object" in one]
+    return next(
+        kind for kind in ("by shape than by texture", "by texture than by shape", "no difference") if kind in text
+    )
+
+
+@pytest.mark.parametrize(("shapes", "textures"), [(2, 13), (13, 2), (6, 13)])
+def test_many_textures_of_few_objects_favour_neither_cue(shapes: int, textures: int) -> None:
+    """Models that answer by one cue in 6 of 10 pictures and else by chance, and models that answer by chance alone."""
+    by_shape = lambda s, t, g: s if g.random() < 0.6 else g.integers(5)  # noqa: E731
+    by_texture = lambda s, t, g: t if g.random() < 0.6 else g.integers(5)  # noqa: E731
+    assert {told_by(by_shape, shapes, textures, seed) for seed in range(5)} == {"by shape than by texture"}
+    assert {told_by(by_texture, shapes, textures, seed) for seed in range(5)} == {"by texture than by shape"}
+    at_chance = [
+        told_by(lambda s, t, g: min(g.geometric(0.4), 6), shapes, textures, seed) == "no difference"
+        for seed in range(40)
+    ]
+    assert sum(at_chance) >= 34  # 95 % intervals: 38 of 40 on average
+
+
+def test_one_object_does_not_tell_shape_from_texture() -> None:
+    answered = [Answered("a", {"object": "mug", "material.which": t}, {}, "mug", True) for t in ("own", "zebra")]
+    made = figure({"figure": "cues"}, answered)
+    assert made.difference is None and any("takes at least two objects and two textures" in one for one in made.text)
+
+
 def test_a_mixture_is_counted_in_the_triangle_that_it_lies_in() -> None:
     """An answer that is given where most is milk, and nowhere else."""
     shares = [(a / 9, b / 9, (9 - a - b) / 9) for a in range(10) for b in range(10 - a)]

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+import random
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import Field
 
-from advsearch.recipes.figures.base import Kind, Options, apart, extremes, rate
-from advsearch.recipes.table import Answered, Table, count_of, counted, most_frequent
+from advsearch.recipes.figures.base import Kind, Options, extremes, rate
+from advsearch.recipes.table import Answered, Table, count_of, counted
 from advsearch.report.drawing import BLUE, RED
 from advsearch.report.phrases import percent
+from advsearch.runs.results.base import Interval
 from advsearch.runs.results.recipe import CuesFigure, CuesRow, NamedCount
+
+SEED, RESAMPLES = 0, 2000
+"""Of the answers that predict, and of the bootstrap."""
+
+FEWEST_CELLS = 4
+"""Pairs of object and texture: two of each."""
 
 
 class CuesOptions(Options):
@@ -30,14 +42,22 @@ class CuesOptions(Options):
 
 def _compute(table: Table, options: CuesOptions) -> CuesFigure:
     rows = [_row(name, inside, options.classes.get(name, [])) for name, inside in table.by(options.texture).items()]
-    predicted = [_predicted(table, "shape", options.shape), _predicted(table, "texture", options.texture)]
+    cells = _cells(table, options)
+    total = sum(one.answers for one in cells)
+    predicted = [
+        count_of("shape", sum(one.by_shape for one in cells), total),
+        count_of("texture", sum(one.by_texture for one in cells), total),
+    ]
+    difference = _difference(cells)
     return CuesFigure(
         figure="cues",
         title=options.title or "Answers by shape and by texture",
-        text=[*_by_texture(table, options, rows), *_which(*predicted), *_hardest(rows)],
+        text=[*_by_texture(table, options, rows), *_which(predicted, difference), *_hardest(rows)],
         shape=options.shape,
         texture=options.texture,
         predicted=predicted,
+        difference=None if difference is None else difference[0],
+        difference_interval=None if difference is None else difference[1],
         rows=rows,
     )
 
@@ -51,17 +71,55 @@ def _names(answer: str, classes: list[str]) -> bool:
     return any(name.strip() in classes for name in [answer, *answer.split(",")])
 
 
-def _predicted(table: Table, name: str, column: str) -> NamedCount:
-    """How often an answer is the most frequent one with the same value in the other half, every second row.
+@dataclass(frozen=True)
+class _Cell:
+    """One object with one texture: how many answers there are, and how many each cue predicts."""
 
-    To leave out one answer alone would not do: in a balanced table it makes its own kind the rarest.
+    answers: int
+    by_shape: int
+    by_texture: int
+
+
+def _cells(table: Table, options: CuesOptions) -> list[_Cell]:
+    """Predict the answers about each object with each texture by those about it with others, and with others by it.
+
+    Each cue predicts the most frequent one of as many answers: those about the same object with other textures, and
+    about the same texture on other objects, drawn so that both are as many as the fewer are. None of the predicted
+    answers is among them, so that a model which answers by neither cue is predicted as well by both.
     """
-    halves = [Table(table.rows[half::2], table.groups) for half in (0, 1)]
-    hits = 0
-    for own, other in (halves, halves[::-1]):
-        first = {value: most_frequent(rows)[0][0] for value, rows in other.by(column).items()}
-        hits += sum(row.answer == first.get(value) for value, rows in own.by(column).items() for row in rows)
-    return count_of(name, hits, len(table.rows))
+    generator = random.Random(SEED)
+    inside: dict[tuple[float | str, float | str], list[str]] = {}
+    for row in table.rows:
+        key = table.value(row, options.shape), table.value(row, options.texture)
+        inside.setdefault(key, []).append(row.answer)
+    found = []
+    for (shape, texture), answers in inside.items():
+        same_shape = [one for (s, t), more in inside.items() if s == shape and t != texture for one in more]
+        same_texture = [one for (s, t), more in inside.items() if t == texture and s != shape for one in more]
+        count = min(len(same_shape), len(same_texture))
+        if count:
+            first = [_most(generator.sample(one, count)) for one in (same_shape, same_texture)]
+            found.append(_Cell(len(answers), answers.count(first[0]), answers.count(first[1])))
+    return found
+
+
+def _most(answers: Sequence[str]) -> str:
+    return min(Counter(answers).items(), key=lambda one: (-one[1], one[0]))[0]
+
+
+def _difference(cells: Sequence[_Cell]) -> tuple[float, Interval] | None:
+    """Return by how much more the shape predicts than the texture, and the 95 % interval of that.
+
+    The two are shares of the same answers, and answers about one object with one texture go together: the interval is
+    a percentile bootstrap over pairs of object and texture. None with fewer than `FEWEST_CELLS` of these.
+    """
+    if len(cells) < FEWEST_CELLS:
+        return None
+    answers = np.array([one.answers for one in cells], dtype=np.float64)
+    more = np.array([one.by_shape - one.by_texture for one in cells], dtype=np.float64)
+    drawn = np.random.default_rng(SEED).integers(len(cells), size=(RESAMPLES, len(cells)))
+    low, high = np.quantile(more[drawn].sum(axis=1) / answers[drawn].sum(axis=1), [0.025, 0.975])
+    return float(more.sum() / answers.sum()), (float(low), float(high))
 
 
 def _by_texture(table: Table, options: CuesOptions, rows: list[CuesRow]) -> list[str]:
@@ -77,15 +135,23 @@ def _by_texture(table: Table, options: CuesOptions, rows: list[CuesRow]) -> list
     return said
 
 
-def _which(shape: NamedCount, texture: NamedCount) -> list[str]:
+def _which(predicted: Sequence[NamedCount], difference: tuple[float, Interval] | None) -> list[str]:
+    shape, texture = predicted
+    if difference is None:
+        return [
+            "Whether the answers go more by shape or by texture is not said: that takes at least two objects and two "
+            f"textures, {FEWEST_CELLS} pairs in all."
+        ]
+    mean, (low, high) = difference
     said = (
-        f"From the other half of the answers, the most frequent one for the same object is right about "
-        f"{percent(shape.accuracy)} of them, and the most frequent one for the same texture about "
-        f"{percent(texture.accuracy)}"
+        f"The most frequent answer about the same object with other textures is given in {percent(shape.accuracy)}, "
+        f"and that about the same texture on other objects, of as many answers, in {percent(texture.accuracy)}: "
+        f"{100 * mean:.0f} points more by shape (95 % interval {100 * low:.0f} to {100 * high:.0f}, over pairs of "
+        "object and texture)"
     )
-    if apart(texture, shape):
+    if low > 0.0:
         return [f"{said}: the model goes more by shape than by texture."]
-    if apart(shape, texture):
+    if high < 0.0:
         return [f"{said}: the model goes more by texture than by shape."]
     return [f"{said}: no difference is shown."]
 

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from advsearch.runs.results.base import Fields, RunResult
+from advsearch.runs.results.base import Fields, Interval, RunResult
 from advsearch.runs.results.sweep import CountedAnswers, SurfaceTable
 
 
@@ -122,8 +122,13 @@ class CuesFigure(RecipeFigure):
     shape: str = Field(description="what has the shape")
     texture: str = Field(description="what has the texture")
     predicted: list[NamedCount] = Field(
-        description="how often an answer is the most frequent one of the other half with the same shape, or texture"
+        description="how often an answer is the most frequent one about the same shape with other textures, or about "
+        "the same texture on other shapes; both of as many answers"
     )
+    difference: float | None = Field(
+        default=None, description="share that the shape predicts less that of the texture; null with too few of them"
+    )
+    difference_interval: Interval | None = Field(default=None, description="95 %, over pairs of shape and texture")
     rows: list[CuesRow]
 
 
