@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import types
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from torch import Tensor, nn
 
 from advsearch.errors import FileFormatError, ModelError, UnknownNameError
 from advsearch.models import ModelWarning, load_model
+from advsearch.tasks import Detection
 
 IMAGES = torch.rand((2, 8, 8, 3), generator=torch.Generator().manual_seed(0))
 
@@ -41,6 +43,27 @@ class Pixels(Net):
         return {"out": torch.einsum("nchw,kc->nkhw", x, self.weight), "aux": x}
 
 
+class Finds(Net):
+    """One box for each of a list of pictures, over the whole of it: the interface of torchvision's detectors."""
+
+    def __init__(self, fixed_size: tuple[int, int] | None, min_size: tuple[int, ...] | int) -> None:
+        super().__init__()
+        self.transform = types.SimpleNamespace(fixed_size=fixed_size, min_size=min_size)
+
+    def forward(self, images: Any) -> Any:
+        assert isinstance(images, list) and len(images) <= 4
+        return [self.found(image) for image in images]
+
+    def found(self, image: Tensor) -> dict[str, Tensor]:
+        _, height, width = image.shape
+        return {
+            "boxes": torch.tensor([[0.0, 0.0, width, height]]),
+            "labels": torch.tensor([1]),
+            "scores": image.mean()[None],
+            "masks": image[None, :1],
+        }
+
+
 def expected(scale: float, shift: float, bias: Tensor) -> Tensor:
     return ((IMAGES - shift) / scale).mean(dim=(1, 2)) @ Net().weight.detach().T + bias
 
@@ -61,18 +84,34 @@ def torchvision(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
         def transforms() -> Any:
             return types.SimpleNamespace(crop_size=[8], mean=[0.5, 0.5, 0.5], std=[0.25, 0.25, 0.25])
 
+    class OwnResizing(Weights):
+        @staticmethod
+        def transforms() -> Any:
+            return types.SimpleNamespace()
+
     def get_model(name: str, weights: object, weights_backbone: object = "default") -> nn.Module:
-        assert (name == "tiny_pixels") == (weights_backbone is None)
+        assert name.startswith("tiny_net") == (weights_backbone == "default")
         library.asked = weights
-        return Pixels() if name == "tiny_pixels" else Net()
+        return networks[name]()
+
+    networks: dict[str, Callable[[], nn.Module]] = {
+        "tiny_net": Net,
+        "tiny_pixels": Pixels,
+        "tiny_rcnn": lambda: Finds(None, (16, 24)),
+        "tiny_fcos": lambda: Finds(None, 20),
+        "tiny_ssd": lambda: Finds((12, 10), (10,)),
+    }
 
     library: Any = types.ModuleType("torchvision")
     library.models = types.ModuleType("torchvision.models")
     library.models.segmentation, library.models.detection = object(), object()
     names = {library.models: ["tiny_net", "vgg11"], library.models.segmentation: ["tiny_pixels"]}
+    names[library.models.detection] = ["tiny_rcnn", "tiny_fcos", "tiny_ssd"]
     library.models.list_models = lambda module: names.get(module, [])
     library.models.get_model = get_model
-    library.models.get_model_weights = lambda name: types.SimpleNamespace(DEFAULT=Weights())
+    library.models.get_model_weights = lambda name: types.SimpleNamespace(
+        DEFAULT=(OwnResizing if name in names[library.models.detection] else Weights)()
+    )
     library.weights = tmp_path / "weights.pth"
     monkeypatch.setitem(sys.modules, "torchvision", library)
     return library
@@ -97,6 +136,20 @@ def test_torchvision_segments(torchvision: Any) -> None:
     model = load_model("torchvision:tiny_pixels", read=lambda answer, count: answer)
     assert model.labels == ("mug", "bowl", "vase")
     assert model(IMAGES).shape == (2, 3, 8, 8)
+
+
+@pytest.mark.parametrize(("name", "size"), [("tiny_rcnn", (24, 24)), ("tiny_fcos", (20, 20)), ("tiny_ssd", (10, 12))])
+def test_torchvision_finds_objects_at_the_size_that_it_would_resize_to(
+    torchvision: Any, name: str, size: tuple[int, int]
+) -> None:
+    model = load_model(f"torchvision:{name}", read=Detection().reader)
+    assert (model.input_size, model.labels, model.batch_limits) == (size, ("mug", "bowl", "vase"), (1, 4))
+    assert (model.preprocessing.mean, model.preprocessing.std) == ((0.0,) * 3, (1.0,) * 3), "it normalises by itself"
+    found = model(IMAGES.repeat(3, 1, 1, 1))
+    assert len(found) == 6 and found[0]["boxes"].tolist() == [[0.0, 0.0, size[1], size[0]]]
+    torch.testing.assert_close(found[1]["scores"], IMAGES[1].mean()[None], atol=0.02, rtol=0.0)
+    assert Detection().on(model).answers(found)[0][0].label == "bowl"
+    assert load_model(f"torchvision:{name}", read=Detection().reader, input_size=8).input_size == (8, 8)
 
 
 def test_what_a_library_unpickles_is_refused(torchvision: Any, tmp_path: Path) -> None:

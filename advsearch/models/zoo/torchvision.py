@@ -14,12 +14,15 @@ from advsearch.models.preprocessing import PRESETS, Triple
 from advsearch.models.source import Source, load_weights, source_of
 from advsearch.models.zoo.library import library, reading
 
+MOST_DETECTED = 4
+"""Most pictures that a detector is given at once: at 800 x 800 each takes a gigabyte or two with its derivative."""
+
 
 def load(spec: str) -> Source:
     """Return ``torchvision:NAME[@weights.safetensors]``, with torchvision's default weights where none are given.
 
     Size, normalisation and labels are those of the default weights, where torchvision tells them. Its detectors
-    normalise by themselves.
+    normalise by themselves, and resize too: their size is the one that they would resize a square picture to.
 
     Raises:
         ModelError: torchvision is missing or broken, its weights cannot be had, or those that were given do not fit.
@@ -38,9 +41,42 @@ def load(spec: str) -> Source:
         module: nn.Module = models.get_model(name, weights=None if weights else default, **parts)
     if weights is not None:
         load_weights(module, weights, name)
+    if name in finds:
+        return _detector(module, name, default)
     source = source_of(_FromDictionary(module) if name in segments else module, name)
-    source = _with_defaults(source, default, module if name in classifies else None)
-    return replace(source, mean=None, std=None) if name in finds else source
+    return _with_defaults(source, default, module if name in classifies else None)
+
+
+def _detector(module: nn.Module, name: str, default: Any | None) -> Source:
+    """Return the source of a detector; without the size that it resizes to, it takes pictures as they are."""
+    source = _with_defaults(source_of(_FromList(module), name), default, None)
+    source = replace(source, mean=None, std=None, batch_limits=(1, MOST_DETECTED))
+    size = _size_inside(getattr(module, "transform", None))
+    return source if size is None else replace(source, input_size=size)
+
+
+def _size_inside(transform: Any) -> tuple[int, int] | None:
+    """Return (height, width) that a detector's transformation makes of a square picture; None if it does not tell."""
+    fixed = getattr(transform, "fixed_size", None)
+    if fixed:
+        return int(fixed[1]), int(fixed[0])
+    shortest = getattr(transform, "min_size", None)
+    if not shortest:
+        return None
+    side = int(shortest if isinstance(shortest, int) else shortest[-1])
+    return side, side
+
+
+class _FromList(nn.Module):
+    """What a detector finds in each of a list of pictures."""
+
+    def __init__(self, network: nn.Module) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, images: Tensor) -> list[dict[str, Tensor]]:
+        found: list[dict[str, Tensor]] = self.network(list(images))
+        return found
 
 
 class _FromDictionary(nn.Module):
