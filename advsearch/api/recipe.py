@@ -10,16 +10,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import torch
+
+from advsearch.api.attack import check_from_config
 from advsearch.api.keywords import RecipeKeywords, asks, configured
 from advsearch.api.photos import Photographs, photographs_in
 from advsearch.api.subruns import carry_out_part
 from advsearch.api.sweep import job_of
-from advsearch.config import RecipeConfig, SweepConfig
+from advsearch.config import AttackConfig, RecipeConfig, SweepConfig
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.controls import CONTROLS
 from advsearch.engine.sweeps.job import check_all
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
+from advsearch.recipes.columns import check_figures, declared_columns
 from advsearch.recipes.description import Recipe, read_recipe, recipe_of
 from advsearch.recipes.figures import compute, draw, read_options
 from advsearch.recipes.parts import Planned, listed, made_of, planned
@@ -80,7 +84,7 @@ def recipe_from_config(
     described = read_recipe(config.recipe) if resumed is None else None
     if described is not None:
         _check(described, config)
-        _check_later_objects(planned(described, config))
+        check_figures(described, _check_runs(planned(described, config)), config.recipe)
     with RunDirectory.of(config, resumed) as run:
         if described is None:
             described = recipe_of(run.store.noted(NOTE) or {}, f"{run.path}: the recipe that it began with")
@@ -112,13 +116,38 @@ def _check(described: Recipe, config: RecipeConfig) -> None:
         read_options(one, config.recipe)
 
 
-def _check_later_objects(runs: Sequence[Planned]) -> None:
-    """Load what sweeps of other objects than the first are of; a wrong name or label would end hours of rendering."""
-    seen = {runs[0].config.object}
+def _check_runs(runs: Sequence[Planned]) -> dict[str, set[str]]:
+    """Load everything that the runs name; a wrong name or label would end hours of rendering.
+
+    Returns:
+        For each part the parameters that its rows will have.
+    """
+    known: dict[str, set[str]] = {}
+    columns: dict[str, set[str]] = {}
+    searches = {one.name: one.config for one in runs}
     for one in runs:
-        if isinstance(one.config, SweepConfig) and one.config.object not in seen:
-            seen.add(one.config.object)
-            check_all(job_of(one.config))
+        plain = {name: value for name, value in one.config.plain().items() if name not in ("seed", WORKERS)}
+        same = f"{plain} {one.around}"
+        if same not in known:
+            known[same] = _check_run(one.config, searches[one.around] if one.around else None)
+        counted = {WORKERS} if getattr(one.config, WORKERS, None) is not None else set()
+        columns[one.part] = columns.get(one.part, set()) | known[same] | counted
+    return columns
+
+
+def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
+    """Load what a run names, and return the parameters of its rows; those of `search` where it draws around one."""
+    if search is not None:
+        return declared_columns(search, trials=False)
+    if isinstance(config, AttackConfig):
+        check_from_config(config)
+    if not isinstance(config, SweepConfig):
+        return declared_columns(config, trials=True)
+    job = job_of(config)
+    check_all(job)
+    space = job.space(job.places[0], job.sizes[0])
+    halfway = torch.full_like(space.start, 0.5)
+    return {name for u in (space.start, halfway) for name in space.describe(u)}
 
 
 def _photographed(described: Recipe, runs: Iterable[Planned]) -> list[Planned]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 from advsearch.report.phrases import percent
@@ -30,12 +31,17 @@ COUNT_HEADS = ["right", "accuracy", "95 % interval"]
 
 
 def told_once(figures: Sequence[RecipeFigure]) -> list[list[str]]:
-    """Return what each figure says; of one that says the same as the figure before it, that."""
-    before: list[list[str]] = [[], *(one.text for one in figures[:-1])]
-    return [
-        one.text if one.text != other else ["It says the same as the figure before it."]
-        for one, other in zip(figures, before, strict=False)
-    ]
+    """Return what each figure says without counts that a figure before it has told; where nothing is left, that."""
+    said: set[str] = set()
+    told = []
+    for number, one in enumerate(figures):
+        same = number > 0 and one.text == figures[number - 1].text
+        new = [text for text in one.text if text not in said or not re.search(r"\d of \d", text)]
+        told.append(
+            ["It says the same as the figure before it."] if same else new or ["It says what figures before it say."]
+        )
+        said |= set(one.text)
+    return told
 
 
 def figure_table(made: AnyFigure) -> Numbers:

@@ -18,6 +18,7 @@ from advsearch.attacks import clopper_pearson
 from advsearch.cli.main import main
 from advsearch.config import RecipeConfig, SweepConfig
 from advsearch.errors import AdvsearchError, FileFormatError, InputError, UnknownNameError
+from advsearch.recipes.columns import check_figures
 from advsearch.recipes.description import Recipe, names, read_recipe, titles
 from advsearch.recipes.figures import FIGURES, compute, draw, read_options
 from advsearch.recipes.figures.answers import fitting
@@ -158,6 +159,7 @@ def test_the_sweeps_of_a_recipe_are_explained(tmp_path: Path) -> None:
     [
         (["--object", "mug,nosuch"], "unknown object 'nosuch'"),
         (["--object", "mug,bowl", "--label", "bowl=unicorn"], "unicorn"),
+        (["--environment", "studio,nowhere"], "unknown environment 'nowhere'"),
     ],
 )
 def test_a_later_object_is_checked_before_anything_is_rendered(
@@ -168,6 +170,34 @@ def test_a_later_object_is_checked_before_anything_is_rendered(
     assert main(["recipe", str(path), *further, "--run", str(tmp_path / "run")]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("figure", "message"),
+    [
+        (
+            "{figure: curve, along: camera.elevatoin}",
+            "unknown column 'camera.elevatoin'. Did you mean 'camera.elevation'",
+        ),
+        ("{figure: points, by: object, series: trial}", "unknown column 'trial'"),
+        ("{figure: bars, by: object, of: [vievs]}", "unknown part 'vievs'. Did you mean 'views'?"),
+    ],
+)
+def test_a_figure_of_what_no_row_will_have_is_refused_before_anything_is_rendered(
+    figure: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(f"{TINY}  - {figure}\n")
+    assert main(["recipe", str(path), "--run", str(tmp_path / "run")]) == 2
+    said = capsys.readouterr().err
+    assert message in said and f"It stands in {path}, figure 3 ({figure[9:].split(',')[0]}), as `" in said
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("name", names())
+def test_the_figures_of_every_bundled_recipe_name_columns_that_there_are(name: str) -> None:
+    described, config = read_recipe(name), RecipeConfig(recipe=name, quick=True, object="mug")
+    check_figures(described, carrying_out._check_runs(planned(described, config)), name)
 
 
 def test_python_code_in_a_file_is_not_imported_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -318,7 +348,7 @@ def test_sentences_call_values_what_they_are() -> None:
     names = {"thin": "the object as it is", "thick": "the object in fog"}
     curve = figure({"figure": "curve", "along": "yaw", "by": "trial", "bins": 2, "names": names}, fogs)
     assert curve.text[1].startswith("For the object in fog, accuracy is lowest")
-    assert curve.text[-1].startswith("No difference between the kinds of trials is shown")
+    assert "No difference between the kinds of trials is shown" in curve.text[-1]
 
 
 def test_two_of_many_have_to_be_further_apart_than_two_of_two() -> None:
@@ -411,7 +441,10 @@ def test_where_a_mixture_has_one_answer_it_is_shown_how_far_that_leads() -> None
     ]
     made = figure({"figure": "ternary", "shares": ["w", "m", "c"], "side": 4}, answered)
     assert [one.name for one in made.leads] == ["w", "m", "c"] and made.leads[1].mean < 2.5 < 4.0 < made.leads[0].mean
-    assert made.text[0].startswith("mug is every answer") and "most of the mixture is m: 2." in made.text[1]
+    assert (
+        made.text[0].startswith("The answer is mug in every picture, so that shares")
+        and "most of the mixture is m: 2." in made.text[1]
+    )
     assert "The difference is shown" in made.text[1]
     cells = made.answers[0].cells
     empty = sum(cell.lead is None for cell in cells)
@@ -429,7 +462,41 @@ def test_where_a_mixture_has_one_answer_it_is_shown_how_far_that_leads() -> None
 def test_two_figures_that_say_the_same_say_it_once() -> None:
     one, two = (figure({"figure": "bars", "by": "environment"}, rows({"noon": (at, 20)})) for at in (8, 9))
     same = ["It says the same as the figure before it."]
-    assert told_once([one, one, two, one]) == [one.text, same, two.text, one.text] and told_once([]) == []
+    before = ["It says what figures before it say."]
+    assert told_once([one, one, two, one]) == [one.text, same, two.text, before] and told_once([]) == []
+
+
+def test_curves_along_two_parameters_say_once_what_holds_for_both() -> None:
+    answered_ = [
+        answered({"object": "ball" if n % 2 else "mug", "yaw": float(n % 7), "zoom": float(n % 5)}, n % 4 == 0)
+        for n in range(70)
+    ]
+    one, two = (
+        figure({"figure": "curve", "along": along, "by": "object", "bins": 2}, answered_) for along in ("yaw", "zoom")
+    )
+    assert one.text[-1] == two.text[-1] and one.text[-1].startswith("Over the whole range, the lowest accuracy is that")
+    assert one.text[-1] in told_once([one, two])[0] and one.text[-1] not in told_once([one, two])[1]
+
+
+def test_a_fall_is_told_of_the_group_that_has_one() -> None:
+    """Mugs are right near 0 and wrong behind, balls as often everywhere; 350 degrees are near 0."""
+    made = figure(
+        {"figure": "curve", "along": "yaw", "by": "group", "range": (0, 360), "away_from": 0, "turn": 360},
+        [
+            answered({"object": name, "yaw": yaw}, (yaw < 90 or yaw > 270) if name == "mug" else n % 2 == 0)
+            for name in ("mug", "ball")
+            for yaw in (10.0, 60.0, 120.0, 200.0, 300.0, 350.0)
+            for n in range(20)
+        ],
+        {"round objects": ["ball"]},
+    )
+    mug, ball, both = made.text[-3:]
+    assert mug.startswith("other objects: right in 80 of 80") and mug.endswith("it falls.")
+    assert "where yaw is within 90 of 0, right in 0 of 40" in mug and "accuracy falls by 100 points" in mug
+    assert ball.endswith("accuracy falls by 0 points (95 % interval -20 to 20): no fall is shown.")
+    assert both.startswith("Accuracy falls by 100 points") and both.endswith(
+        "more for other objects than for round objects: the difference is shown."
+    )
 
 
 def test_photographs_agree_with_the_renderings_whose_configurations_they_show() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +10,7 @@ from pydantic import Field
 
 from advsearch.errors import InputError
 from advsearch.recipes.figures.base import Kind, Options, extremes, plural
+from advsearch.recipes.figures.trend import fall_of, said
 from advsearch.recipes.table import Answered, Table, count_of, written
 from advsearch.report.drawing import BLUE, GREY, RED
 from advsearch.runs.results.recipe import CurveBin, CurveFigure, CurveLine, NamedCount
@@ -27,6 +28,8 @@ class CurveOptions(Options):
         bins: parts of the range.
         range: its ends; by default the least and the largest value.
         names: what the lines are called, where not by their values.
+        away_from: a value; it is said whether accuracy falls with the distance from it.
+        turn: after how much the parameter comes round, for that distance: 360 for a heading in degrees.
     """
 
     along: str
@@ -34,6 +37,8 @@ class CurveOptions(Options):
     bins: int = Field(default=12, ge=1, le=100)
     range: tuple[float, float] | None = None
     names: dict[str, str] = Field(default_factory=dict)
+    away_from: float | None = None
+    turn: float | None = Field(default=None, gt=0.0)
 
 
 def _compute(table: Table, options: CurveOptions) -> CurveFigure:
@@ -52,7 +57,8 @@ def _compute(table: Table, options: CurveOptions) -> CurveFigure:
         figure="curve",
         title=options.title or f"Accuracy along {options.along}",
         text=[one for line in lines for one in _said(line, options.along, unit, len(lines))]
-        + _between(lines, options.by),
+        + _between(lines, options.by)
+        + _trend(groups, options, (low, high), unit, table),
         along=options.along,
         unit=unit,
         by=options.by,
@@ -87,9 +93,30 @@ def _span(one: CurveBin, unit: str) -> str:
 
 
 def _between(lines: Sequence[CurveLine], by: str | None) -> list[str]:
-    return (
-        extremes(lines, "Over the whole range the lowest", "the highest", plural(by)) if by and len(lines) > 1 else []
-    )
+    """Which line is lowest and which highest, as one text, so that curves along other parameters do not repeat it."""
+    if not by or len(lines) < 2:
+        return []
+    whose = [line.model_copy(update={"name": f"that of {line.name}"}) for line in lines]
+    lowest, highest = "Over the whole range, the lowest accuracy", "the highest"
+    return [" ".join(extremes(whose, lowest, highest, plural(by)))]
+
+
+def _trend(
+    groups: Mapping[str, Sequence[Answered]], options: CurveOptions, ends: tuple[float, float], unit: str, table: Table
+) -> list[str]:
+    """Whether accuracy falls with the distance from a value: up to halfway against beyond, for each line."""
+    middle, turn = options.away_from, options.turn
+    if middle is None:
+        return []
+    halfway = turn / 4.0 if turn else max(abs(end - middle) for end in ends) / 2.0
+    numbers = {name: Table(rows, table.groups).numbers(options.along) for name, rows in groups.items()}
+    falls = [
+        fall_of(options.names.get(name, name), rows, numbers[name], middle, turn, halfway)
+        for name, rows in groups.items()
+    ]
+    named = "" if unit in ("", "1", "name") else f" {unit}"
+    near = f"within {written(halfway)}{named} of {written(middle)}"
+    return said([one for one in falls if one], options.along, near)
 
 
 def _draw(made: CurveFigure, figure: Any, run: Path) -> None:

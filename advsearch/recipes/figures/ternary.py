@@ -141,8 +141,8 @@ def _told(answer: str, leads: Sequence[MixtureLead]) -> list[str]:
     shown = low.mean + wide * low.error < high.mean - wide * high.error
     widened = f"their intervals, widened for having been chosen among {len(leads)},"
     return [
-        f"{answer} is every answer, so that its share shows nothing. Colours are how far the right answer leads the "
-        "best wrong one: the margin with its sign turned, in logits for a classifier.",
+        f"The answer is {answer} in every picture, so that shares of answers tell nothing. Colours are how far the "
+        "right answer leads the best wrong one: the margin with its sign turned, in logits for a classifier.",
         f"It leads least where most of the mixture is {low.name}: {_mean(low)}; most where most of it is {high.name}: "
         f"{_mean(high)}. "
         + (
