@@ -1,6 +1,6 @@
 """Carries out the recipes, and keeps what they say and their figures for docs/recipes.md.
 
-    python docs/make_recipe_images.py OUT [--data FOLDER] [--only NAME,NAME] [--until HH:MM]
+    python docs/make_recipe_images.py OUT [--data FOLDER] [--only NAME,NAME] [--until HH:MM] [--anew]
 
 Runs are kept in the folder OUT: what is done there is not done again. On bundled objects they are quick ones. With
 --data they are on a folder of meshes, environments and ImageNet classifiers of one's own, at the recipe's own counts.
@@ -17,11 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import advsearch
-from advsearch.api.recipe import recipe_from_config
+from advsearch.api.recipe import NOTE, recipe_from_config
 from advsearch.config import RecipeConfig
+from advsearch.recipes.description import read_recipe
 from advsearch.report.recipes import told_once
 from advsearch.runs.directory import CONFIG
 from advsearch.runs.results.recipe import RecipeResult
+from advsearch.runs.store import NAME as STORE
+from advsearch.runs.store import Store
 from advsearch.runs.summary import NAME, read_result
 
 DOCS = Path(__file__).resolve().parent
@@ -57,12 +60,17 @@ def main() -> int:
     parser.add_argument("--data", type=Path, help="a folder with objects/, environments/ and models/")
     parser.add_argument("--only", default=",".join(SHOWN), help="names of recipes")
     parser.add_argument("--until", default="99:99", help="the time of day after which none is begun")
+    parser.add_argument(
+        "--anew", action="store_true", help="make the figures of runs that are done anew, as they are now"
+    )
     args = parser.parse_args()
     for name in args.only.split(","):
         if time.strftime("%H:%M") >= args.until:
             print(name, "was not begun", file=sys.stderr)
             continue
         run = args.out / (f"data-{name}" if args.data else f"q-{name}")
+        if args.anew:
+            renew(name, run)
         begun, cpu = (run / CONFIG).is_file(), time.process_time()
         result = real(name, args.data, run) if args.data else bundled(name, run)
         keep(name, result, "data" if args.data else "", None if begun else time.process_time() - cpu)
@@ -83,7 +91,7 @@ def keep(name: str, result: RecipeResult, suffix: str, cpu: float | None) -> Non
     kept: dict[str, dict[str, Any]] = json.loads(KEPT.read_text("utf-8")) if KEPT.exists() else {}
     before = kept.setdefault(name, {}).get(suffix or "bundled", {})
     new = told(name, result, suffix)
-    same = before.get("seconds") == new["seconds"]
+    same = before.get("renders") == new["renders"]
     new["cpu_seconds"] = round(cpu) if cpu is not None else before.get("cpu_seconds") if same else None
     kept[name][suffix or "bundled"] = new
     KEPT.write_text(json.dumps(kept, indent=1, ensure_ascii=False, sort_keys=True) + "\n", encoding="utf-8")
@@ -127,6 +135,15 @@ def done(run: Path) -> RecipeResult | None:
 def gone_on(run: Path) -> RecipeResult | None:
     """Return the result of a run that was begun, once it is done."""
     return recipe_from_config(RecipeConfig.from_yaml(run / CONFIG), resumed=run) if (run / CONFIG).is_file() else None
+
+
+def renew(name: str, run: Path) -> None:
+    """Make the figures of a run that is done anew, those that its recipe has now; nothing is rendered."""
+    if done(run):
+        with Store(run / STORE) as store:
+            kept = {**(store.noted(NOTE) or {}), "figures": read_recipe(name).figures}
+            store.set_note(NOTE, json.dumps(kept))
+        gone_on(run)
 
 
 def told(name: str, result: RecipeResult, suffix: str) -> dict[str, Any]:
