@@ -265,10 +265,11 @@ def result_fields(kind: type[Fields]) -> Callable[[Record], str]:
         names = list(kind.model_fields)
         names.sort(key=lambda name: name in END)
         told = {name: _field(kind.model_fields[name]) for name in names}
+        written = {name: kind.model_fields[name].alias or name for name in names}
         plain = [f"`{name}`" for name in ("schema", "command") if issubclass(kind, Result)]
         plain += [f"`{name}`" for name in names if not told[name]]
         first = [[", ".join(plain), "what was asked for, and of what"]] if plain else []
-        return table(["field", "holds"], first + [[f"`{name}`", told[name]] for name in names if told[name]])
+        return table(["field", "holds"], first + [[f"`{written[name]}`", told[name]] for name in names if told[name]])
 
     return make
 
@@ -278,7 +279,7 @@ def _field(field: FieldInfo) -> str:
     inside = [one for one in _types(field.annotation) if isinstance(one, type) and issubclass(one, Fields)]
     text = field.description or (_first_sentence(inside[0]) if inside else "")
     parts = [
-        f"`{name}`" + (f" ({part.description})" if part.description else "")
+        f"`{part.alias or name}`" + (f" ({part.description})" if part.description else "")
         for name, part in (inside[0].model_fields.items() if inside else ())
     ]
     return f"{text}: {', '.join(parts)}" if parts else text

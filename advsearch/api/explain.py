@@ -6,10 +6,12 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice, zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -124,6 +126,7 @@ def explain_from_config(
             importance=[] if importance is None else _weights(importance, found.factors),
             envelope=None if envelope is None else _envelope_row(envelope, found.factors, config.accuracy),
             pairs=pairs,
+            pairs_sought=min(config.pairs, len(found) - right),
             clusters=clusters,
             renders=renders.count,
             ending=INTERRUPTED if renders.interrupted else "done",
@@ -240,19 +243,23 @@ class _Renders:
     def pairs(
         self, rules: Sequence[CountedRule], rows: Sequence[Answered], asked: Sequence[_Asked]
     ) -> Iterator[NearestRight]:
-        """The nearest right configuration to a typical failure of each rule, along the parameters of the rule."""
-        for number, rule in enumerate(rules[: self.config.pairs]):
-            index = _typical(self.found, rule.conditions)
-            if index is None:
-                continue
+        """The nearest right configurations to typical failures, along the parameters of their rule or else the others.
+
+        A failure that no parameter alone puts right has none.
+        """
+        for number, (index, conditions) in enumerate(typical_failures(self.found, rules, self.config.pairs)):
             one, row = _sweep_of(index, asked), rows[index]
-            near = [
-                found
-                for condition in rule.conditions
-                if (found := self._nearest(f"pair-{number + 1}", one, row, self.found.factors[condition.place]))
-            ]
-            if near:
-                yield min(near, key=self._moved)
+            first = [condition.place for condition in conditions]
+            others = [place for place in range(len(self.found.factors)) if place not in first]
+            for places in (first, *([place] for place in others)):
+                near = [
+                    found
+                    for place in places
+                    if (found := self._nearest(f"pair-{number + 1}", one, row, self.found.factors[place]))
+                ]
+                if near:
+                    yield min(near, key=self._moved)
+                    break
 
     def clusters(self, one: _Asked, run: RunDirectory) -> FailureClusters | None:
         """Render failures of a sweep again, and group them by what its model decides by."""
@@ -336,13 +343,31 @@ class _Renders:
         )
 
 
-def _typical(found: Observations, conditions: Conditions) -> int | None:
-    """The failure under the conditions that is nearest to the middle of them all, by ranks; None without any."""
-    failures = np.flatnonzero(covered(conditions, found) & ~found.right)
-    if not len(failures):
-        return None
+def typical_failures(found: Observations, rules: Sequence[CountedRule], most: int) -> list[tuple[int, Conditions]]:
+    """Return failures with the conditions of the rule that they are under, the most typical first.
+
+    Rules take turns, and what fails under none of them is the last to take one. Of each the failure nearest to the
+    middle of its failures, by ranks, comes first.
+
+    Args:
+        found: the rows.
+        rules: which rows they cover is said by their conditions; a row belongs to the first.
+        most: failures at most.
+    """
+    left = ~found.right
+    queues: list[list[tuple[int, Conditions]]] = []
+    for conditions in (*(rule.conditions for rule in rules), ()):
+        own = left & covered(conditions, found)
+        left = left & ~own
+        queues.append([(index, conditions) for index in _by_typicality(found, np.flatnonzero(own))])
+    turns = (one for turn in zip_longest(*queues) for one in turn if one is not None)
+    return list(islice(turns, most))
+
+
+def _by_typicality(found: Observations, failures: npt.NDArray[np.intp]) -> list[int]:
     ranks = found.values.argsort(axis=0).argsort(axis=0)[failures] / len(found)
-    return int(failures[np.abs(ranks - ranks.mean(axis=0)).sum(axis=1).argmin()])
+    away = np.abs(ranks - ranks.mean(axis=0)).sum(axis=1) if len(failures) else np.zeros(0)
+    return [int(one) for one in failures[np.argsort(away, kind="stable")]]
 
 
 def _sweep_of(index: int, asked: Sequence[_Asked]) -> _Asked:

@@ -29,6 +29,7 @@ def answer(result: ExplainResult) -> str:
         explain_text,
         explained_text,
         pair_text,
+        pairs_text,
         rule_text,
         share_text,
         weight_rows,
@@ -41,6 +42,7 @@ def answer(result: ExplainResult) -> str:
         heads = f"What decides (Sobol indices; {explained_text(result)} of the answers' variance are explained):"
         parts.append(f"{heads}\n{output.columns([list(WEIGHT_HEADS), *weight_rows(result)])}")
     parts.append(f"Envelope. {envelope_text(result)}")
+    parts += [f"One thing changed. {pairs_text(result)}"] if result.pairs_sought else []
     parts += [f"One thing changed. {pair_text(pair)}" for pair in result.pairs]
     if result.clusters is not None:
         parts.append(f"Kinds. {clusters_text(result.clusters)}")

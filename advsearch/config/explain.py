@@ -35,7 +35,7 @@ class ExplainConfig(Config):
         le=100_000,
     )
     pairs: int = setting(
-        3,
+        12,
         "explain",
         "failures for which the nearest right configuration is sought; 0 for none",
         unit="failures",

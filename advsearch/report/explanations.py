@@ -75,6 +75,17 @@ def pair_text(pair: NearestRight) -> str:
     )
 
 
+def pairs_text(result: ExplainResult) -> str:
+    """Return for how many failures a right configuration near was sought, and for how many it was found."""
+    failures = result.total - result.right
+    left = failures - result.pairs_sought
+    others = f" The other {left} were not tried; `pairs` says how many are." if left else ""
+    return (
+        f"Of the {result.pairs_sought} most typical of {failures} failures, {len(result.pairs)} are right once one "
+        f"parameter is another.{others}"
+    )
+
+
 def clusters_text(found: FailureClusters) -> str:
     """Return how many kinds of failures there are."""
     again = f"the {found.failures} failures that were rendered again"

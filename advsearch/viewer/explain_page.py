@@ -14,6 +14,7 @@ from advsearch.report.explanations import (
     explain_text,
     explained_text,
     pair_text,
+    pairs_text,
     share_text,
     weight_rows,
 )
@@ -54,7 +55,7 @@ def explain_page(run: Path, result: ExplainResult) -> str:
         else None,
         element("h2", "Where it can be relied on"),
         element("p", envelope_text(result)),
-        join(element("h2", "One thing changed"), *(_pair(run, one) for one in result.pairs)) if result.pairs else None,
+        _pairs(run, result) if result.pairs_sought else None,
         join(
             element("h2", "Kinds of failures"),
             element("p", clusters_text(result.clusters)),
@@ -92,6 +93,11 @@ def _cluster(run: Path, one: FailureCluster) -> Html | None:
         return None
     image = element("img", src=data_url(file.read_bytes(), "image/png"), alt=cluster_text(one))
     return element("figure", image, element("figcaption", cluster_text(one)))
+
+
+def _pairs(run: Path, result: ExplainResult) -> Html:
+    pairs = (_pair(run, one) for one in result.pairs)
+    return join(element("h2", "One thing changed"), element("p", pairs_text(result)), *pairs)
 
 
 def _pair(run: Path, pair: NearestRight) -> Html:

@@ -21,8 +21,9 @@ from advsearch.errors import FileFormatError, InputError
 from advsearch.explanations.importance import Importance
 from advsearch.explanations.observations import Factor, Observations
 from advsearch.explanations.renders import along, inside, lies_inside
-from advsearch.explanations.rules import RuleCondition
+from advsearch.explanations.rules import CountedRule, RuleCondition
 from advsearch.recipes.table import Answered
+from advsearch.report.explanations import pairs_text
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.explain import ExplainResult
 from advsearch.runs.store import NAME, Row, Store
@@ -122,20 +123,36 @@ def test_the_nearest_right_answer_differs_in_one_value(
     swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def rendered(self: Any, name: str, config: SweepConfig) -> list[Answered]:
-        values = config.grid["camera.elevation"]
-        assert isinstance(values, list) and len(config.grid["light.power"]) == 1  # type: ignore[arg-type]
+        high, power = config.grid["camera.elevation"], config.grid["light.power"]
+        assert isinstance(high, list) and isinstance(power, list) and min(len(high), len(power)) == 1
         return [
-            Answered(
-                "", {"camera.elevation": one, "light.power": 1.0}, {}, "bowl" if one > HIGH else "mug", one <= HIGH
-            )
-            for one in values
+            Answered("", {"camera.elevation": a, "light.power": b}, {}, "bowl" if a > HIGH else "mug", a <= HIGH)
+            for a in high
+            for b in power
         ]
 
     monkeypatch.setattr(explaining._Renders, "_rows", rendered)
     result = advsearch.explain(swept, confirm=0, pairs=1, clusters=0, run=tmp_path / "run")
     (pair,) = result.pairs
     assert pair.parameter == "camera.elevation" and float(pair.wrong_at) > HIGH >= float(pair.right_at) > 50.0
-    assert (pair.answered, pair.answered_there) == ("bowl", "mug")
+    assert (pair.answered, pair.answered_there) == ("bowl", "mug") and result.pairs_sought == 1
+    several = advsearch.explain(swept, confirm=0, pairs=12, clusters=0, run=tmp_path / "several")
+    assert several.pairs_sought == 12 and several.pairs[0] == pair and len(several.pairs) >= 6
+    assert len({str(one.values) for one in several.pairs}) == len(several.pairs)
+    left = several.total - several.right - 12
+    assert f"Of the 12 most typical of {left + 12} failures, {len(several.pairs)} are right" in pairs_text(several)
+    assert f"The other {left} were not tried" in pairs_text(several)
+
+
+def test_typical_failures_take_turns_between_rules_and_those_under_none() -> None:
+    """Failures at 1, 2 and 3 are under the rule, of which 2 is in the middle; one at 9 is not."""
+    values = np.array([[1.0], [2.0], [3.0], [9.0], [10.0]])
+    found = Observations((Factor("yaw"),), values, np.array([False, False, False, False, True]))
+    rule = CountedRule((RuleCondition(0, high=5.0),), 0, 3, 1, 2)
+    order = explaining.typical_failures(found, [rule], 12)
+    assert [index for index, _ in order[:2]] == [1, 3] and {index for index, _ in order[2:]} == {0, 2}
+    assert order[0][1] == rule.conditions and order[1][1] == ()
+    assert explaining.typical_failures(found, [], 2)[0][1] == () and len(explaining.typical_failures(found, [], 2)) == 2
 
 
 def test_what_cannot_be_explained_is_refused_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

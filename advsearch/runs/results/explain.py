@@ -102,6 +102,9 @@ class ExplainResult(RunResult, RightOf):
     importance: list[ParameterWeight] = Field(description="empty where next to nothing is explained")
     envelope: EnvelopeRow | None = Field(description="null where no box promises it")
     pairs: list[NearestRight]
+    pairs_sought: int = Field(
+        default=0, description="failures for which one was sought, the most typical; others are left out"
+    )
     clusters: FailureClusters | None = Field(default=None, description="null where nothing was rendered for them")
     renders: int = Field(description="pictures that were rendered")
     warnings: list[str] = Field(description="sentences that a reader has to know")
