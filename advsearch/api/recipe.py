@@ -23,11 +23,11 @@ from advsearch.controls import CONTROLS
 from advsearch.engine.sweeps.job import check_all
 from advsearch.errors import InputError
 from advsearch.progress import NullProgress, Progress
-from advsearch.recipes.columns import check_figures, declared_columns
+from advsearch.recipes.columns import ANY, check_figures
 from advsearch.recipes.description import Recipe, read_recipe, recipe_of
 from advsearch.recipes.figures import compute, draw, read_options
 from advsearch.recipes.parts import Planned, listed, made_of, planned
-from advsearch.recipes.table import WORKERS, Answered, Table, photographs_of, rows_of
+from advsearch.recipes.table import TRIAL, WORKERS, Answered, Table, photographs_of, rows_of
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import AnswerDistribution, AttackSummary, DescribedValue, FoundValue
@@ -138,16 +138,26 @@ def _check_runs(runs: Sequence[Planned]) -> dict[str, set[str]]:
 def _check_run(config: SceneConfig, search: SceneConfig | None) -> set[str]:
     """Load what a run names, and return the parameters of its rows; those of `search` where it draws around one."""
     if search is not None:
-        return declared_columns(search, trials=False)
+        return _declared_columns(search, trials=False)
     if isinstance(config, AttackConfig):
         check_from_config(config)
     if not isinstance(config, SweepConfig):
-        return declared_columns(config, trials=True)
+        return _declared_columns(config, trials=True)
     job = job_of(config)
     check_all(job)
     space = job.space(job.places[0], job.sizes[0])
     halfway = torch.full_like(space.start, 0.5)
     return {name for u in (space.start, halfway) for name in space.describe(u)}
+
+
+def _declared_columns(config: SceneConfig, *, trials: bool) -> set[str]:
+    """Return what the rows of a run may have, by what its controls declare; `trials` where they are an attack's."""
+    names = [*config.controls, *getattr(config, "over", {})]
+    found = {TRIAL} if trials else set[str]()
+    for name in names:
+        declared = CONTROLS[kind].parameters if (kind := name.partition(":")[0]) in CONTROLS else ()
+        found |= {f"{name}.{one.name}" for one in declared} or {f"{name}.{ANY}"}
+    return found
 
 
 def _photographed(described: Recipe, runs: Iterable[Planned]) -> list[Planned]:

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 
-from advsearch.config.scene import SceneConfig
-from advsearch.controls import CONTROLS
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.recipes.description import PHOTOGRAPHS, Recipe
 from advsearch.recipes.figures import read_options
 from advsearch.recipes.figures.base import Options
-from advsearch.recipes.table import ANSWER, GROUP, PART, TRIAL
+from advsearch.recipes.table import ANSWER, GROUP, PART
 
 OUTER = ("object", "environment", "model", ANSWER, PART)
 """Columns of every recipe."""
@@ -23,16 +21,6 @@ NAMING = ("by", "series", "rows", "columns", "along", "texture", "shape", "share
 
 ANY = "*"
 """Stands for the parameters of a control that does not say beforehand which it has."""
-
-
-def declared_columns(config: SceneConfig, *, trials: bool) -> set[str]:
-    """Return what the rows of a run may have, by what its controls declare; `trials` where they are an attack's."""
-    names = [*config.controls, *getattr(config, "over", {})]
-    found = {TRIAL} if trials else set[str]()
-    for name in names:
-        declared = CONTROLS[kind].parameters if (kind := name.partition(":")[0]) in CONTROLS else ()
-        found |= {f"{name}.{one.name}" for one in declared} or {f"{name}.{ANY}"}
-    return found
 
 
 def check_figures(recipe: Recipe, columns: Mapping[str, Collection[str]], where: str) -> None:

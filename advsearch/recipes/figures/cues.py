@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from pydantic import Field
 
 from advsearch.recipes.figures.base import Kind, Options, extremes, rate
@@ -115,11 +114,14 @@ def _difference(cells: Sequence[_Cell]) -> tuple[float, Interval] | None:
     """
     if len(cells) < FEWEST_CELLS:
         return None
-    answers = np.array([one.answers for one in cells], dtype=np.float64)
-    more = np.array([one.by_shape - one.by_texture for one in cells], dtype=np.float64)
-    drawn = np.random.default_rng(SEED).integers(len(cells), size=(RESAMPLES, len(cells)))
-    low, high = np.quantile(more[drawn].sum(axis=1) / answers[drawn].sum(axis=1), [0.025, 0.975])
-    return float(more.sum() / answers.sum()), (float(low), float(high))
+    generator = random.Random(SEED)
+    drawn = sorted(_mean(generator.choices(cells, k=len(cells))) for _ in range(RESAMPLES))
+    outside = round(RESAMPLES * 0.025)
+    return _mean(cells), (drawn[outside], drawn[-1 - outside])
+
+
+def _mean(cells: Sequence[_Cell]) -> float:
+    return sum(one.by_shape - one.by_texture for one in cells) / sum(one.answers for one in cells)
 
 
 def _by_texture(table: Table, options: CuesOptions, rows: list[CuesRow]) -> list[str]:
