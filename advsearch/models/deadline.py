@@ -20,6 +20,9 @@ from advsearch import files
 LONGEST = 120
 """Seconds that a file's first passes may take each, and its loading, where that runs a part of it."""
 
+GRACE = 5
+"""Seconds for a call to end that was asked to."""
+
 _TRIAL = "import io, sys, torch; torch.jit.load(io.BytesIO(sys.stdin.buffer.read()), map_location='cpu')"
 
 Result = TypeVar("Result")
@@ -35,11 +38,15 @@ class TookTooLong(Exception):
         )
 
 
-def within(call: Callable[[], Result]) -> Result:
+def within(call: Callable[[], Result], stop: Callable[[], None] | None = None) -> Result:
     """Return what `call` returns, or raise what it raises.
 
+    Args:
+        call: what may never end.
+        stop: asks it to end when the time is up; None where nothing can.
+
     Raises:
-        TookTooLong: it has not ended in `LONGEST` seconds (times `ADVSEARCH_LIMITS`); its thread goes on.
+        TookTooLong: it has not ended in `LONGEST` seconds (times `ADVSEARCH_LIMITS`); its thread may go on.
     """
     results: list[Result] = []
     errors: list[BaseException] = []
@@ -55,10 +62,13 @@ def within(call: Callable[[], Result]) -> Result:
     thread = threading.Thread(target=work, daemon=True)  # a daemon's: the process may end before it
     thread.start()
     thread.join(files.scaled(LONGEST))
+    if thread.is_alive():
+        if stop is not None:
+            stop()
+            thread.join(GRACE)
+        raise TookTooLong
     if errors:
         raise errors[0]
-    if not results:
-        raise TookTooLong
     return results[0]
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from advsearch import files
 from advsearch.errors import ModelError
 from advsearch.models.deadline import TookTooLong, within
 from advsearch.models.labels import fitting_labels
@@ -32,7 +33,10 @@ SMALLEST = 1e-5
 """Smallest change that is looked at, as a share of the answers: what is less may be rounding."""
 
 PROGRAMS = (torch.fx.GraphModule, torch.jit.ScriptModule)
-"""What torch makes of a model file."""
+"""What torch makes of a model file. Others that are made of one have a method `stop`, which ends what they run."""
+
+LARGEST = 1 << 26
+"""Most pixels of all the images that a network takes at once, at least: 67 million are 800 MB of numbers."""
 
 
 def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> Model:
@@ -47,7 +51,8 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
         labels_source: where the labels came from, for the message when their number is wrong.
 
     Raises:
-        ModelError: it cannot be run on such an image, answers something other than logits, or with NaN or infinity.
+        ModelError: it takes more than `LARGEST`, cannot be run on such an image, answers something other than logits,
+            or with NaN or infinity.
         InputError: the number of labels is not the number of classes.
 
     Warns:
@@ -93,7 +98,14 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
 
 def _test_images(model: Model) -> tuple[Tensor, Tensor]:
     """Return a grey and a noise image, each (1, H, W, 3) in [0, 1]."""
-    shape = (1, *model.input_size, 3)
+    (height, width), count = model.input_size, max(model.batch_limits[0], 1)
+    if count * height * width > files.scaled(LARGEST):
+        raise ModelError(
+            f"model {model.name}: takes {count:,} images of {height:,} x {width:,} pixels at once, expected at most "
+            f"{files.scaled(LARGEST):,} pixels; if you trust it, {files.FACTOR}=10 in the environment allows ten times "
+            "as many"
+        )
+    shape = (1, height, width, 3)
     return torch.full(shape, 0.5), torch.rand(shape, generator=torch.Generator().manual_seed(0))
 
 
@@ -135,7 +147,8 @@ def _guarded(model: Model, call: Callable[[], Any]) -> Any:
     A program has to end, for nothing ends it; code of one's own that does not is ended by Ctrl-C.
     """
     try:
-        return within(call) if isinstance(model.module, PROGRAMS) else call()
+        stop = getattr(model.module, "stop", None)
+        return within(call, stop) if stop or isinstance(model.module, PROGRAMS) else call()
     except TookTooLong as error:
         raise ModelError(f"model {model.name}: {error}") from None
     except Exception as error:  # any network may raise anything

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -39,10 +40,12 @@ def load_picture(path: Path) -> None:
 
 
 def load_model(path: Path) -> None:
-    """Read a model and ask it once."""
-    from advsearch.models import load_model
+    """Read a model and ask it once; what is wrong with its answers names the model, so it is called as its file."""
+    from advsearch.models import ModelWarning, load_model
 
-    load_model(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ModelWarning)  # ONNX has no gradient
+        load_model(path, name=str(path))
 
 
 def load_labels(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Models (.pt2, TorchScript), label files and YAML with settings."""
+"""Models (.pt2, TorchScript, ONNX), label files and YAML with settings."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from functools import cache
 import torch
 from torch import Tensor, nn
 
+from fuzz import onnx_files
 from fuzz.case import Case, Maker, Random
 from fuzz.mutations import NUMBERS, as_json, confused, damaged
 
@@ -100,6 +101,67 @@ def model(random: Random) -> Case:
     return Case(f"model: {kind} {what}", "model", f"net.{suffix}", {f"net.{suffix}": content})
 
 
+def onnx(random: Random) -> Case:
+    """A damaged or hostile ONNX file, its weights in other files too."""
+    honest = onnx_files.weighted(onnx_files.floats("w", [1.0, 2.0, 3.0]))
+    places = (
+        "../outside/secret.bin",
+        "link.bin",
+        "folder/secret.bin",
+        "pipe",
+        "/dev/zero",
+        ".",
+    )
+    places += ("/proc/self/environ", "*/_ORT_MEM_ADDR_/*", "own.bin", "own.bin\0x", "none.bin", "net.onnx", "")
+    spot, place = random.choice(("", "-4", "9" * 19, "8", "x")), random.choice(places)
+    length = random.choice((None, None, "12", "-1", "4", "9" * 19))
+
+    def referring() -> bytes:
+        said = "folder/" + place if place == "net.onnx" else place
+        tensor = onnx_files.elsewhere("w", [3], said, spot or "0", length)
+        return onnx_files.weighted(tensor, as_constant=random.random() < 0.5)
+
+    def sized(*shape: int | str) -> bytes:
+        return onnx_files.weighted(onnx_files.floats("w", [1.0, 2.0, 3.0]), shape=shape)
+
+    kinds: dict[str, Callable[[], bytes]] = {
+        "damaged": lambda: damaged(random, honest)[1],
+        "damaged again": lambda: damaged(random, damaged(random, honest)[1] or b"a")[1],
+        "noise": lambda: random.randbytes(3_000),
+        "a pickle": lambda: pickle.dumps(Planted()),
+        "an operator of nobody": lambda: onnx_files.classifier([onnx_files.node("Evil", ["m"], ["y"], domain="evil")]),
+        "a tensor larger than said": lambda: onnx_files.weighted(onnx_files.floats("w", [1.0], [1 << 40, 1 << 40])),
+        "a negative side": lambda: onnx_files.weighted(onnx_files.floats("w", [1.0] * 3, [-3])),
+        "a huge constant": lambda: onnx_files.multiplied(1 << 21, 1),
+        "a huge input": lambda: sized("N", 3, 1 << 30, 1 << 30),
+        "a huge batch": lambda: sized(1 << 40, 3, 16, 16),
+        "an empty input": lambda: sized(0, 3, 0, 0),
+        "graphs in graphs": lambda: nested(2_000),
+        "20,000 nodes": lambda: onnx_files.classifier(
+            [
+                onnx_files.node("Identity", [f"a{k}" if k else "m"], [f"a{k + 1}" if k < 19_999 else "y"])
+                for k in range(20_000)
+            ]
+        ),
+    }
+    kinds |= {f"weights elsewhere {k}": referring for k in range(len(kinds))}
+    what = random.choice(sorted(kinds))
+    content = kinds[what]()
+    what = f"weights in {place!r} from {spot!r}, {length}" if "elsewhere" in what else what
+    files = {"net.onnx": content, "own.bin": bytes(64)}
+    links = {"link.bin": "../outside/secret.bin", "folder": "../outside"}
+    return Case(f"model: onnx {what}", "model", "net.onnx", files, links, pipes=("pipe",))
+
+
+def nested(levels: int) -> bytes:
+    """Return an ONNX file of conditions in conditions."""
+    content = onnx_files.graph([], [], [], [onnx_files.value("y", ["N", 3])])
+    for _ in range(levels):
+        both = onnx_files.inner("then_branch", content), onnx_files.inner("else_branch", b"")
+        content = onnx_files.graph([onnx_files.node("If", ["t"], ["y"], *both)], [], [], [])
+    return onnx_files.model(content)
+
+
 def labels(random: Random) -> Case:
     """A damaged or hostile label file."""
     names = ["coffee mug", "bowl", "teapot", "vase"]
@@ -157,4 +219,4 @@ def settings(random: Random) -> Case:
     return Case(f"yaml: {what}", "settings", "run.yaml", {"run.yaml": kinds[what]()}, pipes=("pipe",))
 
 
-MAKERS: tuple[Maker, ...] = (model, labels, settings, model)
+MAKERS: tuple[Maker, ...] = (model, labels, settings, model, onnx)

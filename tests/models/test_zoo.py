@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import struct
+import subprocess
 import sys
 import types
 from collections.abc import Callable
@@ -11,6 +14,7 @@ from typing import Any
 
 import pytest
 import torch
+from fuzz import onnx_files
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
@@ -286,22 +290,30 @@ def test_onnx_absent(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 class Session:
     """The few functions of onnxruntime's sessions that are used."""
 
-    def __init__(self, path: str, options: object, providers: object) -> None:
+    shape: tuple[Any, ...] | list[Any] = ("N", 3, 8, 8)
+
+    def __init__(self, path: str, options: object, **more: object) -> None:
         if not Path(path).read_bytes():
             raise RuntimeError("no graph was found in the protobuf")
 
     def get_inputs(self) -> Any:
-        return [types.SimpleNamespace(name="x", type="tensor(float)", shape=["N", 3, 8, 8])]
+        return [types.SimpleNamespace(name="x", type="tensor(float)", shape=list(self.shape))]
 
-    def run(self, _: None, given: dict[str, Any]) -> list[Any]:
+    def run(self, _: None, given: dict[str, Any], options: object) -> list[Any]:
         with torch.no_grad():
             return [Net()(torch.from_numpy(given["x"])).numpy()]
 
 
-def test_onnx_answers_without_gradients(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def stand_in_runtime(monkeypatch: pytest.MonkeyPatch) -> Any:
     runtime: Any = types.ModuleType("onnxruntime")
-    runtime.SessionOptions, runtime.InferenceSession, runtime.__version__ = types.SimpleNamespace, Session, "0"
+    runtime.SessionOptions = runtime.RunOptions = types.SimpleNamespace
+    runtime.InferenceSession, runtime.__version__ = Session, "1.24.0"
     monkeypatch.setitem(sys.modules, "onnxruntime", runtime)
+    return runtime
+
+
+def test_onnx_answers_without_gradients(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    stand_in_runtime(monkeypatch)
     (tmp_path / "net.onnx").write_bytes(b"\x08\x09")
     with pytest.warns(ModelWarning, match="no gradient of model net reaches its image"):
         model = load_model(tmp_path / "net.onnx")
@@ -309,43 +321,99 @@ def test_onnx_answers_without_gradients(monkeypatch: pytest.MonkeyPatch, tmp_pat
     torch.testing.assert_close(model(IMAGES), expected(1.0, 0.0, torch.zeros(3)))
 
 
-def onnx_file(path: Path, weights: str | None = None) -> Path:
-    """Write a network of three classes; its weights may be said to lie in another file."""
-    onnx = pytest.importorskip("onnx", reason="onnx is not installed: it writes the files of this test")
-    pytest.importorskip("onnxruntime", reason="onnxruntime is not installed: advsearch[onnx]")
-    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
-    numbers = torch.randn((3, 192), generator=torch.Generator().manual_seed(1))
-    tensor = helper.make_tensor("w", kind, [3, 192], numbers.flatten().tolist())
-    if weights is not None:
-        tensor.ClearField("float_data")
-        tensor.data_location = onnx.TensorProto.EXTERNAL
-        for key, value in (("location", weights), ("offset", "0"), ("length", str(numbers.numel() * 4))):
-            entry = tensor.external_data.add()
-            entry.key, entry.value = key, value
-    nodes = [helper.make_node("Flatten", ["x"], ["f"]), helper.make_node("Gemm", ["f", "w"], ["y"], transB=1)]
-    ends = [
-        helper.make_tensor_value_info(name, kind, shape) for name, shape in (("x", ["N", 3, 8, 8]), ("y", ["N", 3]))
-    ]
-    graph = helper.make_graph(nodes, "g", ends[:1], ends[1:], [tensor])
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    path.write_bytes(model.SerializeToString())
+def real_onnxruntime() -> None:
+    pytest.importorskip("onnxruntime", minversion="1.24", reason="onnxruntime is not installed: advsearch[onnx]")
+
+
+def onnx_file(folder: Path, content: bytes) -> Path:
+    path = folder / "net.onnx"
+    path.write_bytes(content)
     return path
 
 
 def test_onnx_by_the_real_runtime(tmp_path: Path) -> None:
-    path = onnx_file(tmp_path / "net.onnx")
+    real_onnxruntime()
+    path = onnx_file(tmp_path, onnx_files.weighted(onnx_files.floats("w", [1.0, -2.0, 3.0]), shape=("N", 3, 8, 8)))
     with pytest.warns(ModelWarning, match="no gradient"):
         model = load_model(path)
-    weight = torch.randn((3, 192), generator=torch.Generator().manual_seed(1))
-    torch.testing.assert_close(model(IMAGES), IMAGES.permute(0, 3, 1, 2).flatten(1) @ weight.T)
+    torch.testing.assert_close(model(IMAGES), IMAGES.mean(dim=(1, 2)) * torch.tensor([1.0, -2.0, 3.0]))
 
 
-@pytest.mark.parametrize("elsewhere", ["../weights.bin", "/dev/zero"])
-def test_onnx_reads_nothing_elsewhere(tmp_path: Path, elsewhere: str) -> None:
+ELSEWHERE = ["../weights.bin", "/etc/passwd", "/dev/zero", "link.bin", "folder/weights.bin", "*/_ORT_MEM_ADDR_/*"]
+
+
+@pytest.mark.parametrize("in_a_node", [False, True], ids=["stored", "in a node"])
+@pytest.mark.parametrize("place", ELSEWHERE)
+def test_onnx_reads_nothing_elsewhere(tmp_path: Path, place: str, in_a_node: bool) -> None:
+    real_onnxruntime()
     (tmp_path / "weights.bin").write_bytes(bytes(4096))
-    (tmp_path / "inside").mkdir()
+    inside = tmp_path / "inside"
+    inside.mkdir()
+    (inside / "link.bin").symlink_to("../weights.bin")
+    (inside / "folder").symlink_to("..")
+    content = onnx_files.weighted(onnx_files.elsewhere("w", [3], place), as_constant=in_a_node)
     with pytest.raises(FileFormatError, match="cannot be read as ONNX"):
-        load_model(onnx_file(tmp_path / "inside" / "net.onnx", elsewhere))
+        load_model(onnx_file(inside, content))
+
+
+def test_onnx_reads_weights_beside_it(tmp_path: Path) -> None:
+    real_onnxruntime()
+    (tmp_path / "own.bin").write_bytes(struct.pack("<4f", 0.0, 1.0, -2.0, 3.0))
+    content = onnx_files.weighted(onnx_files.elsewhere("w", [3], "own.bin", offset="4"), shape=("N", 3, 8, 8))
+    with pytest.warns(ModelWarning, match="no gradient"):
+        model = load_model(onnx_file(tmp_path, content))
+    torch.testing.assert_close(model(IMAGES), IMAGES.mean(dim=(1, 2)) * torch.tensor([1.0, -2.0, 3.0]))
+
+
+@pytest.mark.parametrize("version", ["1.23.2", "1.9.0", "unknown"])
+def test_an_onnxruntime_that_reads_elsewhere_is_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, version: str
+) -> None:
+    runtime = stand_in_runtime(monkeypatch)
+    runtime.__version__ = version
+    message = (
+        rf"net.onnx: needs onnxruntime 1.24 or newer, got {version}, .*: pip install --upgrade 'advsearch\[onnx\]'"
+    )
+    with pytest.raises(ModelError, match=message):
+        load_model(onnx_file(tmp_path, b"\x08\x09"))
+
+
+@pytest.mark.parametrize(
+    "content", [onnx_files.endless(), onnx_files.multiplied(3_000, 1_000)], ids=["loop", "products"]
+)
+def test_onnx_without_an_end_ends_with_one_sentence(tmp_path: Path, content: bytes) -> None:
+    real_onnxruntime()
+    code = "import sys; from advsearch.cli.main import main; sys.exit(main(['labels', 'mug', '--model', sys.argv[1]]))"
+    command = [sys.executable, "-c", code, str(onnx_file(tmp_path, content))]
+    environment = {**os.environ, "ADVSEARCH_LIMITS": "0.03"}  # 3 seconds
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    said = [line for line in done.stderr.splitlines() if line.startswith("advsearch: error")]
+    assert done.returncode == 2 and len(said) == 1, done.stderr
+    assert "no answer within 3 seconds; if you trust it, ADVSEARCH_LIMITS=10 in the environment" in said[0]
+
+
+@pytest.mark.parametrize(
+    ("shape", "message"),
+    [
+        (
+            ["N", 3, 1 << 30, 1 << 30],
+            r"takes 1 images of 1,073,741,824 x .* expected at most 67,108,864 pixels; if you",
+        ),
+        ([1 << 40, 3, 8, 8], r"takes 1,099,511,627,776 images of 8 x 8 pixels at once, expected at most"),
+        (
+            [0, 3, 0, 0],
+            r"net.onnx: expected one input, a batch of floating-point images .* got x tensor\(float\) \[0, 3",
+        ),
+        (["N", 3, 8], r"net.onnx: expected one input, a batch of floating-point images of 4 dimensions"),
+    ],
+)
+def test_an_input_of_onnx_that_is_no_picture(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, shape: list[Any], message: str
+) -> None:
+    stand_in_runtime(monkeypatch)
+    monkeypatch.setattr(Session, "shape", shape)
+    with pytest.raises(ModelError, match=message):
+        load_model(onnx_file(tmp_path, b"\x08\x09"))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
