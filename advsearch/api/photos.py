@@ -259,7 +259,8 @@ def _by_attack(run: Path, config: AttackConfig) -> Sequence[_PhotoJudge]:
         u = problem.domain.start if rendering == "clean" else kept_answer(run, problem)
         trial = rendering.rpartition("verification-")[2]
         whole = problem.whole(u, seeds.stream(problem.seed, "verification", int(trial)) if trial.isdigit() else None)
-        return own.truth(problem.facts(partial(problem.space.describe, whole), partial(problem.renderer.mask, whole)))
+        look = partial(problem.renderer.surfaces, whole)
+        return own.truth(problem.facts(partial(problem.space.describe, whole), look))
 
     return [
         _PhotoJudge(config.object, model, own, _size(config, model), len(alone[0]), partial(truth, own))

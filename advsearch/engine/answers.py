@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from torch import Tensor
-
 from advsearch.described import Value
 from advsearch.engine.loading import PictureSettings, Scene
-from advsearch.engine.rendering import render
+from advsearch.engine.rendering import render, sight_of
 from advsearch.errors import InputError
 from advsearch.models import Model
+from advsearch.scene.surfaces import Surfaces
 from advsearch.tasks import Answer, Facts, Task
 
 LOOK_SPP = 16
@@ -20,8 +19,8 @@ Described = Callable[[], Mapping[str, Value]]
 """What says the configuration in named values, when it is asked."""
 
 
-Looked = Callable[[], Tensor]
-"""What says where the object is seen, (H, W) bool, when it is asked."""
+Looked = Callable[[], Surfaces]
+"""What says what the camera sees, when it is asked."""
 
 
 def facts_of(scene: Scene, name: str, label: str | None, describe: Described, look: Looked | None = None) -> Facts:
@@ -32,7 +31,7 @@ def facts_of(scene: Scene, name: str, label: str | None, describe: Described, lo
         name: the object's, for messages.
         label: what was said to be right.
         describe: says the configuration; what it does not say has the value that the scene was given.
-        look: says where the object is seen in the configuration; None where there is none.
+        look: says what is seen in the configuration; None where there is none.
     """
     fixed = {key: value for key, value in scene.description.values.items() if value is not None}
 
@@ -40,7 +39,8 @@ def facts_of(scene: Scene, name: str, label: str | None, describe: Described, lo
         said = {key: one["value"] for key, one in describe().items()}
         return {key: float(v) for key, v in {**fixed, **said}.items() if isinstance(v, (int, float))}
 
-    return Facts(name, label, scene.description.object.label, numbers, look)
+    sight = None if look is None else lambda: sight_of(look())
+    return Facts(name, label, scene.description.object.label, numbers, sight)
 
 
 def check_truth(task: Task, model: Model, scene: Scene, facts: Facts, pictures: PictureSettings) -> None:

@@ -180,7 +180,7 @@ class Problem:
         return self.task.truth(self._facts(whole))
 
     def _facts(self, whole: Tensor) -> Facts:
-        return self.facts(lambda: self.space.describe(whole), lambda: self.renderer.mask(whole))
+        return self.facts(lambda: self.space.describe(whole), lambda: self.renderer.surfaces(whole))
 
     def describe(self, u: Tensor, draw: int | None = None) -> dict[str, Value]:
         """Say a configuration of the searched controls in named values with units, under the conditions of a draw.

@@ -30,7 +30,7 @@ from advsearch.scene.description import OBJECT, ORBIT_CAMERA, SceneDescription
 from advsearch.scene.formation import ImageFormation, to_8_bit
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER
 from advsearch.scene.surfaces import Surfaces
-from advsearch.tasks import Answer, AnyTask, Facts, Mark, make_task
+from advsearch.tasks import Answer, AnyTask, Facts, Mark, Sight, make_task
 
 MOST_ANSWERS = 5
 """Answers of the model that are kept of a picture."""
@@ -236,7 +236,7 @@ def render(
             answers = asked.answers(output, MOST_ANSWERS)[0]
             marks: tuple[Mark, ...] = ()
             if asked.varies:
-                facts = _facts(description, label, partial(renderer.mask, space.start), space.describe(space.start))
+                facts = _facts(description, label, partial(renderer.surfaces, space.start), space.describe(space.start))
                 try:
                     marks = tuple(asked.marks(output, asked.truth(facts))[0])
                 except InputError as error:
@@ -253,12 +253,17 @@ def render(
 
 
 def _facts(
-    description: SceneDescription, label: str | None, look: Callable[[], Tensor], values: Mapping[str, Value]
+    description: SceneDescription, label: str | None, look: Callable[[], Surfaces], values: Mapping[str, Value]
 ) -> Facts:
     """What a view gives a task to judge by."""
     said = {**description.values, **{name: one["value"] for name, one in values.items()}}
     numbers = {name: float(one) for name, one in said.items() if isinstance(one, (int, float))}
-    return Facts(description.object_name, label, description.object.label, lambda: numbers, look)
+    return Facts(description.object_name, label, description.object.label, lambda: numbers, lambda: sight_of(look()))
+
+
+def sight_of(surfaces: Surfaces) -> Sight:
+    """Return what a task judges by, of what the camera sees."""
+    return Sight(surfaces.seen(OBJECT), surfaces.depth)
 
 
 def _caption(answer: Answer) -> str:

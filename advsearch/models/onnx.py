@@ -99,5 +99,5 @@ def _check_version(path: Path, version: str) -> None:
     if found is None or (int(found[1]), int(found[2])) < OLDEST:
         raise ModelError(
             f"model {path}: needs onnxruntime {'.'.join(map(str, OLDEST))} or newer, got {version}, which may read "
-            "weights from anywhere that a file names: pip install --upgrade 'advsearch[onnx]'"
+            "weights from anywhere that a file names: pip install -U 'advsearch[onnx]'"
         )

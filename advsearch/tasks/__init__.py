@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from advsearch.errors import UnknownNameError
 from advsearch.options import check_options
 from advsearch.registry import Registry
-from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Task
+from advsearch.tasks.base import Answer, Facts, Judgement, Mark, Sight, Task
 from advsearch.tasks.classification import Classification
 from advsearch.tasks.detection import Detection
 from advsearch.tasks.segmentation import Segmentation
@@ -54,6 +54,7 @@ __all__ = [
     "Judgement",
     "Mark",
     "Segmentation",
+    "Sight",
     "Task",
     "make_task",
 ]

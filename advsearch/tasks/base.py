@@ -86,6 +86,19 @@ class Mark:
     mask: Tensor | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What the camera sees first through the middle of each pixel of a picture, without noise.
+
+    Attributes:
+        mask: (H, W) bool, where it is the object.
+        depth: (H, W) float, how far it is, see `Facts.depth`.
+    """
+
+    mask: Tensor
+    depth: Tensor
+
+
 @dataclass(frozen=True)
 class Facts:
     """What a scene gives a task to judge by, in one configuration.
@@ -95,21 +108,18 @@ class Facts:
         label: what was said to be right (the setting `label`); None if nothing was.
         own_label: what the object says it is; None if it does not.
         describe: the numbers of the configuration by parameter ("pose.yaw"), in the units that rows have.
-        look: says where the object is seen in the picture, see `mask`; None where no configuration is meant.
+        look: says what is seen in the picture, see `mask` and `depth`; None where no configuration is meant.
     """
 
     object: str
     label: str | None = None
     own_label: str | None = None
     describe: Callable[[], Mapping[str, float]] = dict
-    look: Callable[[], Tensor] | None = None
+    look: Callable[[], Sight] | None = None
 
     @cached_property
-    def mask(self) -> Tensor:
-        """The pixels of the picture in which the object is the first thing that the camera sees, (H, W) bool.
-
-        Each is asked for at its middle. Where something hides the object, it is not seen; an image corruption leaves
-        the mask as it is.
+    def sight(self) -> Sight:
+        """What is seen of the configuration; the camera looks when this is asked for, and once.
 
         Raises:
             InputError: no configuration is meant.
@@ -120,6 +130,29 @@ class Facts:
             )
         return self.look()
 
+    @property
+    def mask(self) -> Tensor:
+        """The pixels of the picture in which the object is the first thing that the camera sees, (H, W) bool.
+
+        Each is asked for at its middle. Where something hides the object, it is not seen; an image corruption leaves
+        the mask as it is.
+
+        Raises:
+            InputError: as for `sight`.
+        """
+        return self.sight.mask
+
+    @property
+    def depth(self) -> Tensor:
+        """How far what is seen in each pixel is from the camera, along the ray, in object sizes, (H, W) float32.
+
+        Infinite where there is nothing but the environment. Asked for and unaffected as the mask is.
+
+        Raises:
+            InputError: as for `sight`.
+        """
+        return self.sight.depth
+
     @cached_property
     def box(self) -> tuple[int, int, int, int] | None:
         """The smallest box round what is seen of the object: x0, y0, x1, y1 in pixels from the top left.
@@ -127,7 +160,7 @@ class Facts:
         The pixels have x0 <= x < x1 and y0 <= y < y1. None where nothing is seen.
 
         Raises:
-            InputError: as for `mask`.
+            InputError: as for `sight`.
         """
         columns, rows = (self.mask.any(dim=side).nonzero().flatten().tolist() for side in (0, 1))
         return (columns[0], rows[0], columns[-1] + 1, rows[-1] + 1) if rows else None

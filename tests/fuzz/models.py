@@ -104,7 +104,7 @@ def model(random: Random) -> Case:
 def onnx(random: Random) -> Case:
     """A damaged or hostile ONNX file, its weights in other files too."""
     honest = onnx_files.weighted(onnx_files.floats("w", [1.0, 2.0, 3.0]))
-    places = (
+    places: tuple[str, ...] = (
         "../outside/secret.bin",
         "link.bin",
         "folder/secret.bin",

@@ -371,9 +371,7 @@ def test_an_onnxruntime_that_reads_elsewhere_is_refused(
 ) -> None:
     runtime = stand_in_runtime(monkeypatch)
     runtime.__version__ = version
-    message = (
-        rf"net.onnx: needs onnxruntime 1.24 or newer, got {version}, .*: pip install --upgrade 'advsearch\[onnx\]'"
-    )
+    message = rf"net.onnx: needs onnxruntime 1.24 or newer, got {version}, .*: pip install -U 'advsearch\[onnx\]'"
     with pytest.raises(ModelError, match=message):
         load_model(onnx_file(tmp_path, b"\x08\x09"))
 

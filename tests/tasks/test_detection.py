@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from advsearch.attacks.objectives import check_objective, get_objective
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model
-from advsearch.tasks import Answer, Detection, Facts, Judgement
+from advsearch.tasks import Answer, Detection, Facts, Judgement, Sight
 from advsearch.tasks.boxes import corners, detections_in, overlap, share_inside, strongest
 from advsearch.tasks.detection import GOALS, Place, log_odds
 
@@ -349,7 +349,7 @@ def test_a_task_learns_names_size_and_unit_from_its_model() -> None:
     assert task.judge(output, at)[0].right, "2 to 6 of 16 are 4 to 12 of 32"
     unnamed = Detection(unit="fractions").on(load_model(Pixels(), input_size=(8, 16), read=Detection().reader))
     assert unnamed.labels == ("class 0", "class 1", "class 2") and unnamed.unit == "fractions"
-    facts = Facts("mug", "#2", look=lambda: torch.ones(4, 4).bool())
+    facts = Facts("mug", "#2", look=lambda: Sight(torch.ones(4, 4).bool(), torch.ones(4, 4)))
     assert unnamed.truth(facts) == Place((2,), (0, 0, 4, 4), (4, 4))
     assert Detection().on(load_model(replace(model, labels=()), labels=NAMES)).labels == NAMES, "named afterwards"
     with pytest.raises(InputError, match="labels: 2 labels, but model Pixels has 3 classes"):

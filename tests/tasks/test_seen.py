@@ -6,6 +6,9 @@ import csv
 import io
 import json
 import math
+import re
+import sys
+import types
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +26,9 @@ from advsearch.models import load_model
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import plain
 from advsearch.runs.store import Row, Store
-from advsearch.tasks import Answer, Facts, Judgement, Task
+from advsearch.tasks import Answer, Facts, Judgement, Sight, Task
+
+DOCS = Path(__file__).parents[2] / "docs"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +61,7 @@ class Middle(nn.Module):
 
 
 def seen(rows: list[list[int]]) -> Facts:
-    return Facts("mug", look=lambda: torch.tensor(rows).bool())
+    return Facts("mug", look=lambda: Sight(torch.tensor(rows).bool(), torch.tensor(rows).float()))
 
 
 def test_a_box_holds_what_is_seen() -> None:
@@ -68,8 +73,15 @@ def test_a_box_holds_what_is_seen() -> None:
 
 
 def test_without_a_configuration_there_is_nothing_to_see() -> None:
-    with pytest.raises(InputError, match="needs to see mug, which depends on the configuration; set `varies = True`"):
-        Facts("mug").box  # noqa: B018
+    for name in ("box", "mask", "depth"):
+        with pytest.raises(InputError, match="needs to see mug, which depends on the configuration; set `varies = Tr"):
+            getattr(Facts("mug"), name)
+
+
+def test_the_camera_looks_once_for_all_that_is_seen() -> None:
+    looks = iter([Sight(torch.ones(2, 2).bool(), torch.full((2, 2), 3.0))])
+    facts = Facts("mug", look=lambda: next(looks))
+    assert facts.box == (0, 0, 2, 2) and facts.depth.tolist() == [[3.0, 3.0]] * 2 and bool(facts.mask.all())
 
 
 KEPT = {"boxes": [[1, 2.5, 3, 4]], "words": ["a, b", 'c"d', None], "deep": {"er": [[True]]}}
@@ -134,3 +146,50 @@ def test_exports_and_show_have_it_too(
     assert main(["show", "attacked", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["clean"]["payload"]["boxes"] and found["task"] == "edge"
+
+
+# ---- a network of depth, from the page on extending ------------------------------------------------------------------
+
+
+class Flat(nn.Module):
+    """A depth of 2 everywhere, (N, 24, 24), but for a hundred-thousandth of what is seen."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return 2.0 + 1e-5 * x.mean(dim=1)
+
+
+def depth_task() -> Any:
+    (page,) = (
+        text for text in (DOCS / "extending.md").read_text("utf-8").split("`my_package/")[1:] if text[:6] == "depth."
+    )
+    module = types.ModuleType("my_package.depth")
+    sys.modules["my_package.depth"] = module  # where a dataclass looks for its types
+    exec(re.findall(r"```python\n(.*?)```", page, re.S)[0], vars(module))
+    return module.Depth
+
+
+def test_a_depth_is_judged_by_the_one_of_each_configuration(tmp_path: Path) -> None:
+    task = depth_task()(factor=1.05)
+    model = load_model(Flat(), input_size=24, read=task.reader)
+    yaws = [0.0, 90.0]
+    fast: dict[str, Any] = {"spp": 1, "denoise": "none", "task": task}
+    advsearch.sweep("banana", model, {"pose.yaw": yaws}, trials=0, run=str(tmp_path / "run"), **fast)
+    with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
+        rows = list(store.rows("sweep"))
+    renderer = advsearch.load_scene("banana").renderer({"pose": {"yaw": [0.0, 90.0]}}, resolution=24)
+    surfaces = [renderer.surfaces(torch.tensor([u])) for u in (0.0, 1.0)]
+    offs = [(2.0 / one.depth[one.seen("object")]).log() for one in surfaces]
+    expected = [float((off - off.mean()).abs().mean()) - math.log(1.05) for off in offs]
+    assert [row.margin for row in rows] == pytest.approx(expected, abs=1e-4) and expected[0] != expected[1]
+    distances = torch.cat([one.depth[one.seen("object")] for one in surfaces])
+    assert 0.5 < float(distances.min()) < float(distances.max()) < 20.0, "in object sizes"
+    attack: dict[str, Any] = {
+        "controls": ["pose"],
+        "policy": "random",
+        "steps": 2,
+        "trials": 6,
+        "verify_spp": 1,
+        "measure": "no",
+    }
+    found = advsearch.attack("banana", model, run=str(tmp_path / "attack"), baseline=False, **attack, **fast)
+    assert found.summary.task == "depth" and found.summary.label_set[0].endswith(" away")

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from advsearch.attacks.objectives import get_objective
 from advsearch.errors import InputError, ModelError
 from advsearch.models import ModelWarning, load_model
-from advsearch.tasks import Answer, Facts, Segmentation
+from advsearch.tasks import Answer, Facts, Segmentation, Sight
 from advsearch.tasks.segmentation import Region
 
 NAMES = ("background", "bottle", "chair")
@@ -142,7 +142,7 @@ def test_a_task_learns_names_from_its_model() -> None:
     model = load_model(Mapped(), input_size=4, read=Segmentation().reader, labels=NAMES)
     task = Segmentation().on(model, target="chair")
     assert (task.labels, task.target) == (NAMES, (2,)) and model.differentiable
-    facts = Facts("bottle", None, "bottle", look=lambda: MASK)
+    facts = Facts("bottle", None, "bottle", look=lambda: Sight(MASK, torch.ones(MASK.shape)))
     assert task.truth(facts) == TRUTH and task.truth_names(TRUTH) == ("bottle",)
     with pytest.raises(InputError, match="target: the model has no label 'table'"):
         Segmentation().on(model, target="table")

@@ -122,7 +122,7 @@ class Job:
             place: the scene.
             model: number of the model.
             values: the configuration as it is described.
-            look: says where the object is seen in it; None where no configuration is meant.
+            look: says what is seen in it; None where no configuration is meant.
         """
         return self.tasks[model].truth(self._facts(place, values, look))
 

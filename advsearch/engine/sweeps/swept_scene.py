@@ -132,7 +132,7 @@ class SweptScene:
         if not job.tasks[number].varies:
             return self._truths[number]
         renderer = self.renderers[job.sizes[number]]
-        return job.truth(job.places[self.number], number, values, lambda: renderer.mask(u))
+        return job.truth(job.places[self.number], number, values, lambda: renderer.surfaces(u))
 
     def picture(self, number: int, u: Tensor, seed: int, spp: int) -> Tensor:
         """The picture (H, W, 3) that one model sees of one configuration."""
