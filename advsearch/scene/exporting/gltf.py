@@ -126,7 +126,6 @@ def _described(made: _Buffer, meshes: Sequence[PosedMesh], picture: Callable[[Fl
     """Return the header of a file with some meshes in one scene, and put their bytes into the buffer."""
     header: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "advsearch"},
-        "extensionsUsed": ["KHR_materials_clearcoat", "KHR_materials_emissive_strength", "KHR_materials_specular"],
         "scene": 0,
         "scenes": [{"nodes": list(range(len(meshes)))}],
         "nodes": [{"name": one.name, "mesh": number} for number, one in enumerate(meshes)],
@@ -161,7 +160,8 @@ def _described(made: _Buffer, meshes: Sequence[PosedMesh], picture: Callable[[Fl
             material["emissiveTexture"] = {"index": _texture(header, made.view(encoded), encoded)}
             material.setdefault("extensions", {})["KHR_materials_emissive_strength"] = {"emissiveStrength": most}
         header["materials"].append(material)
-    return header
+    used = sorted({name for material in header["materials"] for name in material.get("extensions", ())})
+    return {**header, "extensionsUsed": used} if used else header
 
 
 def _texture(header: dict[str, Any], view: int, picture: bytes) -> int:
