@@ -10,6 +10,7 @@ import json
 import math
 import os
 import stat
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -24,6 +25,9 @@ JsonValue = bool | int | float | str | list["JsonValue"] | dict[str, "JsonValue"
 JsonObject = dict[str, JsonValue]
 """A JSON object, before a type has taken it or once it has been written out."""
 
+MESHES = (".obj", ".ply", ".stl", ".gltf", ".glb", ".blend")
+"""Endings of the files that an object can be read from."""
+
 DEPTH = 100
 """Deepest nesting of JSON, in lists and objects."""
 
@@ -37,6 +41,11 @@ _KINDS = (
     (stat.S_ISCHR, "a device; name an ordinary file"),
     (stat.S_ISBLK, "a device; name an ordinary file"),
 )
+
+
+def either(endings: Sequence[str]) -> str:
+    """Return endings of files as a sentence lists them: ".a, .b or .c"."""
+    return " or ".join([*([", ".join(endings[:-1])] if endings[1:] else []), endings[-1]])
 
 
 def scaled(limit: int) -> int:

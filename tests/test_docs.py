@@ -66,6 +66,7 @@ from advsearch.engine.loading import as_controls
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.axes import read_axes
 from advsearch.evaluation.stability.suite import chosen
+from advsearch.files import MESHES
 from advsearch.models import loading, reference
 from advsearch.recipes.description import names as recipes
 from advsearch.recipes.description import read_recipe
@@ -78,7 +79,6 @@ from advsearch.runs.results.matrix import MatrixResult
 from advsearch.runs.results.render import RenderResult
 from advsearch.scene import environments, exposure, library
 from advsearch.scene.description import FRAME_FILL
-from advsearch.scene.importing import objects
 from advsearch.scene.importing.images import TEXTURE_LIMIT
 from advsearch.scene.importing.scenes import MITSUBA_FILE, split_node
 from advsearch.scene.mitsuba_backend import scene as mitsuba_scene
@@ -188,7 +188,7 @@ def test_everything_bundled_and_every_scene_parameter_is_in_the_page_about_scene
     page = (DOCS / "scenes.md").read_text("utf-8")
     names = [*SETTINGS, *library.list_objects(), *library.list_environments()]
     assert not [name for name in names if f"| `{name}` |" not in page]
-    endings = (*objects.SUFFIXES, *environments.SUFFIXES)
+    endings = (*MESHES, *environments.SUFFIXES)
     assert not [ending for ending in endings if f"`{ending}`" not in page]
 
 
@@ -402,7 +402,7 @@ def check_names(config: Config) -> None:
     resolve(config.set_)
     lights = config.environments if isinstance(config, SweepConfig) else (config.lit_by,)
     for name in config.objects:
-        suffixes = (*objects.SUFFIXES, MITSUBA_FILE)
+        suffixes = (*MESHES, MITSUBA_FILE)
         assert name in (*library.list_objects(), ALL) or Path(split_node(name)[0]).suffix in suffixes
         needs_label = not isinstance(config, (RenderConfig, HardenConfig)) and name not in library.list_objects()
         assert config.label is not None or not needs_label, "a file does not bring a label"

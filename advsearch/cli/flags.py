@@ -9,6 +9,7 @@ import argparse
 import re
 from collections.abc import Collection, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, TypeVar
 
 from advsearch.config import CONFIGS, AttackConfig
@@ -22,6 +23,9 @@ SCENE = (
     "a .glb or .gltf file, or a Mitsuba .xml file: the object is one of its nodes or shapes by name, and the rest its "
     "surroundings (the same as --object FILE#NAME)"
 )
+
+MOST_NAMES = 50
+"""Names of what is in a scene that one message lists."""
 
 Given = TypeVar("Given", bound=Config)
 
@@ -67,9 +71,30 @@ def config_from(args: argparse.Namespace, config: type[Given], **otherwise: Any)
         if one.field in args:
             text, read = getattr(args, one.field), READERS.get(one.form)
             data[one.field] = text if read is None else read(text, one.flag)
+    if "scene" in args and data.get("object") is None:
+        raise InputError(f"object: expected something in {args.scene}, got nothing; name one of {_inside(args.scene)}")
     if "scene" in args and isinstance(data.get("object"), str):
         data["object"] = ",".join(f"{args.scene}#{name}" for name in split_names(data["object"]))
     return config(**data)
+
+
+def _inside(scene: str) -> str:
+    """Return the names of what can be the object in a scene file, as a message lists them.
+
+    Raises:
+        FileFormatError: the file cannot be read.
+        InputError: there is nothing.
+    """
+    from advsearch.scene.importing.files import shown
+    from advsearch.scene.importing.scenes import MITSUBA_FILE, node_names
+    from advsearch.scene.mitsuba_backend.files.scene import contents
+
+    path = Path(scene)
+    names = contents(path).objects if path.suffix.lower() == MITSUBA_FILE else node_names(path)
+    if not names:
+        raise InputError(f"--scene: {path} has nothing that can be the object; expected a shape or a node with a mesh")
+    more = f" or {len(names) - MOST_NAMES:,} more" if len(names) > MOST_NAMES else ""
+    return ", ".join(shown(name, quoted=False) for name in names[:MOST_NAMES]) + more
 
 
 def with_flags(message: str) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from advsearch.cli import output
 from advsearch.errors import InputError
+from advsearch.files import MESHES, either
 
 HELP = "say, and picture, what is understood of a mesh or scene file"
 MORE = ". Nothing is written but the picture"
@@ -22,7 +23,7 @@ VIEWS, SIDE = 4, 192
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.add_argument("file", metavar="FILE", help="a .glb, .gltf, .blend, .obj, .ply, .stl or Mitsuba's .xml file")
+    parser.add_argument("file", metavar="FILE", help=f"a {either(MESHES)} file, or an .xml file of Mitsuba")
     parser.add_argument("--out", metavar="FILE", help="a picture of all that is in it, from four sides (.png)")
     output.add_flags(parser)
 

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import field_validator
 
 from advsearch.config.scene import SceneConfig
+from advsearch.files import MESHES, either
 from advsearch.settings import Clash, Config, setting, setting_as_in, split_names
 
 ALL_OBJECTS = "*"
@@ -41,7 +42,7 @@ class RecipeConfig(Config):
         "object",
         default=None,
         description="what the model should recognise; several separated by commas",
-        expects="names of objects or .obj, .ply, .glb, .gltf or .stl files",
+        expects=f"names of objects or {either(MESHES)} files",
         otherwise="what the recipe names",
     )
     environment: str | None = setting_as_in(

@@ -10,6 +10,7 @@ from pydantic import JsonValue, field_validator, model_validator
 
 from advsearch.config.named import name_in, read_named
 from advsearch.errors import InputError
+from advsearch.files import MESHES, either
 from advsearch.options import by_key
 from advsearch.settings import Clash, Config, check_once, number_or_text, setting, split_names
 
@@ -53,7 +54,7 @@ class SceneConfig(Config):
         ...,
         "scene",
         "what the model should recognise",
-        "the name of an object or a .obj, .ply, .glb, .gltf or .stl file",
+        f"the name of an object or a {either(MESHES)} file",
     )
     environment: str | None = setting(
         None,

@@ -12,6 +12,7 @@ from advsearch.config.attack import FEWEST_TRIALS, AttackConfig
 from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.rendering import RenderConfig
 from advsearch.config.scene import ControlsByName, SceneConfig
+from advsearch.files import MESHES, either
 from advsearch.settings import Clash, number_or_text, setting, setting_as_in, split_names
 
 Grid = dict[str, object]
@@ -40,7 +41,7 @@ class SweepConfig(SceneConfig):
         SceneConfig,
         "object",
         description="what the model should recognise; several separated by commas",
-        expects="names of objects or .obj, .ply, .glb, .gltf or .stl files",
+        expects=f"names of objects or {either(MESHES)} files",
     )
     environment: str | None = setting_as_in(
         SceneConfig,

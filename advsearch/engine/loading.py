@@ -137,7 +137,7 @@ def load_scene(
     """Load a scene.
 
     Args:
-        object: a bundled name ("mug"), a path to an .obj, .ply or .glb file, or an asset.
+        object: a bundled name ("mug"), a path to a mesh (`advsearch.files.MESHES`), or an asset.
         environment: a bundled name, a path to an .hdr or .exr file, an asset; default "studio".
         scene: the file or, of Mitsuba, the dictionary (`mi.cornell_box()`) in which `object` is a node or the id of a
             shape; a file may as well be written before it: "scene.glb#chair", "box.xml#large-box".

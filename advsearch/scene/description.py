@@ -20,7 +20,7 @@ from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
-from advsearch.scene.parts import BallLamp, MeshPart, PlacedCamera, PluginPart, PointLamp, ScenePart, mesh_part
+from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part
 from advsearch.scene.photograph import Photograph, photograph_of
 
 Doubles = npt.NDArray[np.float64]
@@ -144,9 +144,9 @@ class SceneDescription:
         return any(one.emission is not None for one in self.meshes.values())
 
     @property
-    def lamps(self) -> Mapping[str, PointLamp | BallLamp]:
+    def lamps(self) -> Mapping[str, Lamp]:
         """Every light beside the environment, by name."""
-        return {one.name: one for one in self.parts if isinstance(one, (PointLamp, BallLamp))}
+        return {one.name: one for one in self.parts if isinstance(one, Lamp)}
 
     @property
     def lit(self) -> bool:
@@ -276,9 +276,7 @@ def describe(
         around = _mitsuba(Path(str(file)) if plugins is None else plugins, node or str(object_spec), up, given or {})
     else:
         around = ImportedScene(_object(object_spec, up)) if node is None else _scene(Path(str(file)), node, up)
-    shining = (
-        isinstance(part, PointLamp) or (isinstance(part, PluginPart) and part.shines) for part in around.surroundings
-    )
+    shining = (isinstance(part, Lamp) or (isinstance(part, PluginPart) and part.shines) for part in around.surroundings)
     lit_by = environment_spec or (NO_MAP if any(shining) else DEFAULT_ENVIRONMENT)
     check_ground(given or {}, lit_by)
     if (node is not None or mitsuba) and not {"ground.size", "ground.kind"} & set(given or {}):

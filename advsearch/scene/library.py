@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError, UnknownNameError
+from advsearch.files import MESHES, either
 from advsearch.scene.assets import EnvironmentAsset, Material, Mesh, ObjectAsset
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ _PLY = (
 )
 """The header of a bundled mesh."""
 _MAP_HINT = "A path to an .hdr or .exr file works too."
-_OBJECT_HINT = "A path to an .obj, .ply or .glb file works too."
+_OBJECT_HINT = f"A path to a file that ends in {either(MESHES)} works too."
 
 
 def _data() -> Traversable:

@@ -107,6 +107,61 @@ class PointLamp(ScenePart):
         return way, np.array(self.intensity) / max(float(way @ way), 1e-12)
 
 
+WIDEST, NARROWEST = 89.9, 0.1
+"""Angles of a spot's edge, degrees."""
+SOFTEST = 0.99
+"""Largest share of that angle at which the light begins to fall off."""
+
+
+@dataclass(frozen=True, eq=False)
+class SpotLamp(ScenePart):
+    """A point that shines in a cone, as Mitsuba's `spot`; the camera does not see it.
+
+    Up to `beam` from its axis it shines evenly, and from there to `cutoff` its intensity falls off linearly with the
+    angle. Takes `NAME.intensity` (3,) linear radiant intensity, for which the interior adjoint is right.
+
+    Attributes:
+        name: of the lamp.
+        dark: its intensity is 0 whatever happens.
+        position: object sizes.
+        direction: unit vector along its axis; z down where that is 0.
+        intensity: base value on the axis, linear radiant intensity for each colour channel.
+        cutoff: angle from the axis beyond which it is dark, degrees; taken to `NARROWEST` to `WIDEST`.
+        beam: angle up to which it shines fully, degrees; taken to at most `SOFTEST` of the other one.
+    """
+
+    dark: bool = False
+    position: Triple = (0.0, 0.0, 2.0)
+    direction: Triple = (0.0, 0.0, -1.0)
+    intensity: Triple = (0.0, 0.0, 0.0)
+    cutoff: float = 45.0
+    beam: float = 0.0
+
+    @property
+    def cone(self) -> tuple[float, float]:
+        """Cutoff and beam in degrees, as far as Mitsuba can have them."""
+        cutoff = min(max(self.cutoff, NARROWEST), WIDEST)
+        return cutoff, min(self.beam, SOFTEST * cutoff)
+
+    @property
+    def to_world(self) -> Doubles:
+        """(4, 4) pose of the lamp, which shines along its own +z."""
+        ahead = np.array(self.direction) if any(self.direction) else np.array([0.0, 0.0, -1.0])
+        aside = np.cross(np.eye(3)[np.abs(ahead).argmin()], ahead)
+        aside /= np.linalg.norm(aside)
+        matrix = np.eye(4)
+        matrix[:3] = np.stack([aside, np.cross(ahead, aside), ahead, np.array(self.position)], axis=1)
+        return matrix
+
+    def lighting(self, place: Doubles) -> tuple[Doubles, Doubles]:
+        """As of a point, within its cone."""
+        way, faced = PointLamp(self.name, position=self.position, intensity=self.intensity).lighting(place)
+        cutoff, beam = self.cone
+        along = -way @ self.to_world[:3, 2] / max(float(np.linalg.norm(way)), 1e-12)
+        angle = math.degrees(math.acos(min(max(float(along), -1.0), 1.0)))
+        return way, faced * min(max((cutoff - angle) / (cutoff - beam), 0.0), 1.0)
+
+
 @dataclass(frozen=True, eq=False)
 class BallLamp(ScenePart):
     """A ball that shines outwards with the same radiance everywhere; the camera sees it where it is in view.
@@ -134,6 +189,9 @@ class BallLamp(ScenePart):
         """As of a point; the irradiance of a uniform ball is `pi L r^2 / d^2` (see the `light` control)."""
         intensity = tuple(math.pi * self.radius**2 * one for one in self.radiance)
         return PointLamp(self.name, position=self.place, intensity=intensity).lighting(place)  # type: ignore[arg-type]
+
+
+Lamp = PointLamp | SpotLamp | BallLamp
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.settings import Config, all_finite, parse_assignment, read_yaml, settings
 
 WRONG: dict[str, tuple[Any, str]] = {
-    "object": ("", "expected the name of an object or a .obj, .ply, .glb, .gltf or .stl file, got ''"),
+    "object": ("", "expected the name of an object or a .obj, .ply, .stl, .gltf, .glb or .blend file, got ''"),
     "environment": ([], "expected the name of an environment, a .hdr or .exr file, or none, got "),
     "up": ("x", "expected y or z, got x"),
     "camera": ("", "expected a name that advsearch import lists, or orbit, got ''"),
@@ -145,7 +145,7 @@ def test_all_problems_are_told_at_once() -> None:
     with pytest.raises(InputError) as error:
         AttackConfig.model_validate({"epsilon": -1, "steps": 0})
     assert flags.with_flags(str(error.value)) == (
-        "--object: expected the name of an object or a .obj, .ply, .glb, .gltf or .stl file, got nothing; "
+        "--object: expected the name of an object or a .obj, .ply, .stl, .gltf, .glb or .blend file, got nothing; "
         "--epsilon: expected a number greater than 0 and at most 1e+06, got -1; "
         "--steps: expected a whole number from 1 to 1000000, got 0"
     )
@@ -274,7 +274,7 @@ def test_no_value_of_any_setting_ends_in_a_traceback(config: type[Config]) -> No
         ("--estimator adjoint --estimator differences", "--estimator: * is given twice; leave one of them out"),
         ("--policy 'pgd={momentum: .nan}'", "--policy: expected the name of a policy, or NAME={OPTION: VALUE}, got {"),
         ("--over 'camera={azimuth: [0, .inf]}'", "--over: expected names of controls, or NAME={PARAMETER: VALUE or "),
-        ("--object ,", "--object: expected the name of an object or a .obj, .ply, .glb, .gltf or .stl file, got ,"),
+        ("--object ,", "--object: expected the name of an object or a .obj, .ply, .stl, .gltf, .glb or .blend file, got ,"),
     ],
 )
 def test_slips_on_the_command_line_are_refused_in_one_sentence(line: str, message: str) -> None:

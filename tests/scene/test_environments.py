@@ -286,7 +286,7 @@ BAD: dict[str, tuple[Callable[[Path], Path], str]] = {
     ),
     "missing": (lambda folder: folder / "no.hdr", r"no such environment file\. Check the path"),
     "empty": (raw("bad.hdr", b""), r"the environment file is empty; export or download it again"),
-    "ending": (raw("bad.png", b"x"), r"expected an environment file ending in \.hdr, \.exr, got '\.png'; convert it"),
+    "ending": (raw("bad.png", b"x"), r"expected an environment file ending in \.hdr or \.exr, got '\.png'; convert it"),
     "png as hdr": (raw("bad.hdr", b"\x89PNG\r\n\x1a\n\0"), r"expected a Radiance \.hdr picture, got a PNG picture"),
     "hdr as exr": (raw("bad.exr", HEADER), r"expected an OpenEXR picture, got a Radiance picture \(\.hdr\)"),
     "noise as exr": (raw("bad.exr", NOISE), r"expected an OpenEXR picture, got binary data of another kind"),

@@ -810,7 +810,7 @@ BAD: dict[str, tuple[Callable[[Path], Path], str]] = {
     "empty": (raw("thing.ply", b""), r"thing\.ply: the object file is empty; export or download it again"),
     "ending": (
         raw("thing.fbx", b"x"),
-        r"ending in .*\.stl, \.blend, got '\.fbx'; convert it",
+        r"ending in .*\.glb or \.blend, got '\.fbx'; convert it",
     ),
     "no ending": (raw("thing", b"x"), r"got a name without ending; convert it to one of these"),
     "png as obj": (raw("thing.obj", png()), r"expected a Wavefront OBJ file .*, got a PNG picture; export or download"),
@@ -1172,6 +1172,26 @@ def _occluded(header: dict[str, Any]) -> None:
     header["materials"][0]["occlusionTexture"] = {"index": 7}
 
 
+def _held(*names: str) -> Callable[[dict[str, Any]], None]:
+    """Give the material extensions that the file does not list."""
+    return lambda header: header["materials"][0].update(extensions={name: {} for name in names})
+
+
+def _painted(header: dict[str, Any]) -> None:
+    header["materials"][0]["alphaMode"] = "BLEND"
+    primitive = header["meshes"][0]["primitives"][0]
+    positions = header["accessors"][primitive["attributes"]["POSITION"]]
+    bytes_of = {**positions, "componentType": 5121, "type": "VEC4"}
+    header["accessors"].append({key: bytes_of[key] for key in ("bufferView", "componentType", "count", "type")})
+    primitive["attributes"]["COLOR_0"] = len(header["accessors"]) - 1
+
+
+def _elsewhere(header: dict[str, Any]) -> None:
+    first = len(header["nodes"])
+    header["nodes"] += [{"mesh": 0}, {"mesh": 0}]
+    header["scenes"].append({"nodes": [first]})
+
+
 def _morphed(header: dict[str, Any]) -> None:
     header["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": 0}]
 
@@ -1189,10 +1209,33 @@ def _morphed(header: dict[str, Any]) -> None:
                 extensionsRequired=["KHR_materials_sheen"],
             ),
             [
-                " uses EXT_mesh_gpu_instancing, which is not understood and left out",
+                " repeats meshes with EXT_mesh_gpu_instancing; each is there once",
                 " uses KHR_materials_sheen, which is not understood and left out",
             ],
         ),
+        (
+            _held("KHR_materials_unlit", "KHR_materials_transmission", "KHR_materials_ior", "ACME_paint"),
+            [
+                " uses ACME_paint, which is not understood and left out",
+                " uses KHR_materials_ior, which is not understood and left out",
+                " lets light pass through surfaces with KHR_materials_transmission; here they are opaque",
+                " has surfaces that keep their colour in any light (KHR_materials_unlit); here they are lit as others",
+            ],
+        ),
+        (_held("KHR_materials_emissive_strength"), []),
+        (
+            _held("KHR_materials_pbrSpecularGlossiness"),
+            [" has KHR_materials_pbrSpecularGlossiness, of which only diffuse colour and glossiness are read"],
+        ),
+        (lambda header: header.update(extras={"extensions": {"ACME_note": 1}}), []),
+        (
+            _painted,
+            [
+                ": 1 mesh with an opacity in vertex colours, which is left out",
+                ": its vertex or face colours were baked into a texture",
+            ],
+        ),
+        (_elsewhere, [": 1 further scene: left out", ": 2 nodes with a mesh outside of its scene: left out"]),
         (_occluded, [": 1 occlusion map: left out"]),
         (_morphed, [": 1 mesh with morph targets, which are left out"]),
         (

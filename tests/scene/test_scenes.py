@@ -20,7 +20,11 @@ from advsearch.errors import FileFormatError, InputError, UnknownNameError
 from advsearch.scene.description import describe
 from advsearch.scene.geometry import camera_to_world
 from advsearch.scene.importing.scenes import LUMENS, split_node
-from advsearch.scene.parts import PointLamp
+from advsearch.scene.mitsuba_backend.files.writing import write_scene
+from advsearch.scene.mitsuba_backend.files.xml import read_scene
+from advsearch.scene.mitsuba_backend.parts import translation
+from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.parts import PointLamp, SpotLamp
 
 ROUND = {"roughnessFactor": 0.8, "metallicFactor": 0.0}
 
@@ -154,13 +158,78 @@ def test_what_is_not_carried_over_is_named(file: Path, data: bytes) -> None:
         header["materials"][0] |= {"normalTexture": {"index": 0}, **glow}
         header["textures"] = header.get("textures") or [{"source": 0}]
         header["images"] = header.get("images") or [{"uri": "none.png"}]
-        header["extensions"]["KHR_lights_punctual"]["lights"][0]["type"] = "spot"
+        header["extensions"]["KHR_lights_punctual"]["lights"][0] |= {"type": "directional", "range": 3.0}
         header["cameras"].append({"type": "orthographic"})
 
     file.write_bytes(with_header(data, more))
     notes = " ".join(describe(f"{file}#crate").notes)
-    for words in ("of its own of 1 material is left out", "1 spot lights", "1 cameras without"):
+    for words in (
+        "of its own of 1 material is left out",
+        "room.glb: 1 directional light, here as lamps 1000 object sizes away",
+        "room.glb: 1 light with a range, which is left out: light reaches beyond it",
+        "room.glb: 1 camera without perspective: left out",
+    ):
         assert words in notes
+
+
+def shone(header: dict[str, Any], cone: dict[str, float], rotation: list[float]) -> None:
+    """Make a spot of the lamp."""
+    header["extensions"]["KHR_lights_punctual"]["lights"][0] |= {"type": "spot", "spot": cone}
+    header["nodes"][-2]["rotation"] = rotation
+
+
+DOWN = [-math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)]
+"""Turns -z, along which lights shine, to -y."""
+
+
+def test_a_spot_shines_in_its_cone(file: Path, data: bytes) -> None:
+    cone = {"innerConeAngle": math.radians(10.0), "outerConeAngle": math.radians(30.0)}
+    file.write_bytes(with_header(data, lambda header: shone(header, cone, DOWN)))
+    scene = describe(f"{file}#crate")
+    assert scene.environment is None and not any("spot" in note for note in scene.notes)
+    lamp = scene.lamps["bulb"]
+    assert isinstance(lamp, SpotLamp)
+    assert lamp.direction == pytest.approx((0.0, 0.0, -1.0), abs=1e-9)
+    assert lamp.position == pytest.approx((-0.5, 0.0, 2.5))
+    candela = np.array([1.0, 0.5, 0.0]) * 683.0
+    for angle, share in ((0.0, 1.0), (9.0, 1.0), (20.0, 0.5), (31.0, 0.0)):
+        out = 2.5 * math.tan(math.radians(angle))
+        _, here = lamp.lighting(np.array([out - 0.5, 0.0, 0.0]))
+        metres = 5.0 / math.cos(math.radians(angle))
+        assert here == pytest.approx(share * candela / LUMENS / metres**2 * 4.0 / 2.0**2, abs=1e-9)
+
+
+def test_a_spot_lights_in_mitsuba_as_it_is_metered() -> None:
+    lamp = SpotLamp("lamp", position=(0.0, 0.0, 2.0), direction=(0.6, 0.0, -0.8), intensity=(3.0, 2.0, 1.0), beam=10.0)
+    mi = mitsuba()
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(10)}
+    scene = mi.load_dict({"type": "scene", "floor": floor, **translation(lamp).plugins})
+    for x in (-1.0, 0.0, 0.5, 1.5, 3.0, 5.0):
+        seen = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, 0.3, 1.0), mi.Vector3f(0.0, 0.0, -1.0)))
+        _, weight = scene.sample_emitter_direction(seen, mi.Point2f(0.5, 0.5))
+        assert np.array(weight).ravel() == pytest.approx(lamp.lighting(np.array([x, 0.3, 0.0]))[1], rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    "cone",
+    [
+        {},
+        {"outerConeAngle": math.pi / 2},
+        {"innerConeAngle": 1.0, "outerConeAngle": 1.0},
+        {"innerConeAngle": 1e30, "outerConeAngle": 1e-30},
+    ],
+)
+def test_a_spot_of_any_cone_is_rendered(cone: dict[str, float], file: Path, data: bytes) -> None:
+    file.write_bytes(with_header(data, lambda header: shone(header, cone, DOWN)))
+    seen = advsearch.render(advsearch.load_scene(f"{file}#crate"), resolution=16, spp=4, denoise="none")
+    assert np.isfinite(np.asarray(seen.views[0].picture)).all()
+
+
+@pytest.mark.parametrize("cone", [{"outerConeAngle": 0.0}, {"outerConeAngle": 2.0}, {"innerConeAngle": -0.1}])
+def test_a_spot_whose_cone_is_none_is_refused(cone: dict[str, float], file: Path, data: bytes) -> None:
+    file.write_bytes(with_header(data, lambda header: shone(header, cone, DOWN)))
+    with pytest.raises(FileFormatError, match=r"expected glTF whose .*ConeAngle is (greater|less) than"):
+        describe(f"{file}#crate")
 
 
 @pytest.mark.parametrize("spec", ["room.obj#crate", "crate#a.png", "room.glb"])
@@ -230,3 +299,47 @@ def test_import_says_what_was_understood(file: Path, capsys: pytest.CaptureFixtu
     assert main(["import", str(file)]) == 0
     said = capsys.readouterr().out
     assert f"{file}#crate" in said and "pose:floor" in said and "--camera NAME): front" in said
+
+
+def test_a_scene_without_an_object_is_answered_with_what_is_in_it(
+    file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    box = tmp_path / "box.xml"
+    box.write_text('<scene version="3.0.0"><shape type="cube" id="large-box"/><shape type="sphere" id="ball"/></scene>')
+    for command in (["attack", "--label", "ball"], ["render", "--out", str(tmp_path / "a.png")]):
+        for scene, names in ((file, "floor, the wall, crate"), (box, "large-box, ball")):
+            assert main([*command, "--scene", str(scene)]) == 2
+            expected = f"--object: expected something in {scene}, got nothing; name one of {names}"
+            assert expected in capsys.readouterr().err
+
+
+def test_a_scene_with_nothing_for_an_object_and_none_at_all_are_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = tmp_path / "empty.xml"
+    empty.write_text('<scene version="3.0.0"><emitter type="point"/></scene>')
+    assert main(["attack", "--scene", str(empty)]) == 2
+    assert f"--scene: {empty} has nothing that can be the object" in capsys.readouterr().err
+    assert main(["attack", "--scene", str(tmp_path / "none.glb")]) == 2
+    assert "none.glb: no such scene file" in capsys.readouterr().err
+
+
+def test_import_names_every_ending(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "room.json").write_text("{}")
+    assert main(["import", str(tmp_path / "room.json")]) == 2
+    expected = (
+        "expected an object file ending in .obj, .ply, .stl, .gltf, .glb, .blend or .xml, got '.json'; convert it"
+    )
+    assert expected in capsys.readouterr().err
+    assert main(["render", "--object", "bottl", "--out", str(tmp_path / "a.png")]) == 2
+    assert "A path to a file that ends in .obj, .ply, .stl, .gltf, .glb or .blend works too." in capsys.readouterr().err
+
+
+def test_a_spot_goes_out_as_mitsubas(file: Path, data: bytes, tmp_path: Path) -> None:
+    file.write_bytes(with_header(data, lambda header: shone(header, {"outerConeAngle": 0.5}, DOWN)))
+    renderer = advsearch.load_scene(f"{file}#crate").renderer("pose", resolution=16)
+    write_scene(renderer.scene, {}, tmp_path / "scene.xml", "")
+    lamp = read_scene(tmp_path / "scene.xml")["bulb"]
+    assert isinstance(lamp, dict)
+    assert lamp["type"] == "spot" and lamp["cutoff_angle"] == pytest.approx(math.degrees(0.5))
+    assert lamp["intensity"]["value"] == pytest.approx([0.25, 0.125, 0.0])

@@ -52,7 +52,7 @@ def read_bytes(path: Path, what: str, suffixes: Sequence[str]) -> bytes:
         if path.suffix.lower() not in suffixes:
             got = f"got {path.suffix!r}" if path.suffix else "got a name without ending"
             raise FileFormatError(
-                f"{path}: expected an {what} file ending in {', '.join(suffixes)}, {got}; convert it to one of these"
+                f"{path}: expected an {what} file ending in {files.either(suffixes)}, {got}; convert it to one of these"
             )
         data = files.read_bytes(path, f"an {what} file", LARGEST_FILE)
     except FileNotFoundError as error:

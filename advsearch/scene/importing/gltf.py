@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator
 from pathlib import Path
 
 from pydantic import ValidationError
 
 from advsearch import files
+from advsearch.files import JsonObject, JsonValue
 from advsearch.scene.importing.files import damaged, looks_like, shown, text_of
-from advsearch.scene.importing.gltf_checks import READ, check_header
+from advsearch.scene.importing.gltf_checks import check_header
 from advsearch.scene.importing.gltf_entries import Asset, Header, MaterialEntry, Primitive, TextureUse
 from advsearch.scene.importing.references import GLOW, NORMAL_MAPS
 
@@ -58,8 +58,24 @@ def read_header(path: Path, data: bytes) -> Header:
         header = Header.model_validate(content)
     except ValidationError as error:
         raise damaged(path, *_first(error)) from None
+    header = header.model_copy(update={"extensionsUsed": sorted({*header.extensionsUsed, *_extensions(content)})})
     check_header(path, header)
     return header
+
+
+def _extensions(content: JsonObject) -> set[str]:
+    """Return the names of the extensions that entries have, in the file's list of them or not."""
+    found: set[str] = set()
+    level: list[JsonValue] = [content]
+    while level:
+        entry = level.pop()
+        if isinstance(entry, list):
+            level.extend(entry)
+        elif isinstance(entry, dict):
+            held = entry.get("extensions")
+            found.update(held if isinstance(held, dict) else ())
+            level.extend(value for key, value in entry.items() if key != "extras")
+    return found
 
 
 def rewritten(path: Path, data: bytes, header: Header) -> bytes:
@@ -125,39 +141,6 @@ def unread(header: Header) -> dict[str, int]:
         NORMAL_MAPS: sum(one.normalTexture is not None and not one.plain().normalTexture for one in header.materials),
         GLOW: sum(any(one.emission) and not _lit_alike(one) for one in header.materials),
     }
-
-
-def left_out(header: Header) -> Iterator[str]:
-    """Yield what the file has that is not carried over, each as the end of a sentence that begins with its name."""
-    if "KHR_texture_transform" in header.extensionsUsed:
-        yield " moves its textures with KHR_texture_transform, which is not applied"
-    for name in sorted(set(header.extensionsUsed) - {*READ, "KHR_texture_transform"}):
-        yield f" uses {shown(name, quoted=False)}, which is not understood and left out"
-    morphed = sum(any(primitive.targets for primitive in mesh.primitives) for mesh in header.meshes)
-    found = {
-        "occlusion map{s}: left out": sum(one.occlusionTexture is not None for one in header.materials),
-        "mesh{es} with morph targets, which are left out": morphed,
-        "skin{s}: what is bound to bones stays as it was drawn": _length(header.skins),
-        "animation{s}: left out": _length(header.animations),
-    }
-    for what, count in found.items():
-        if count:
-            yield f": {count} {what.format(s='s' if count > 1 else '', es='es' if count > 1 else '')}"
-
-
-def beside(header: Header) -> str | None:
-    """Return what a file read as one object leaves out of its scene, as the end of a sentence; None if nothing."""
-    carried = [node.lamp is not None for node in header.nodes], [node.camera is not None for node in header.nodes]
-    lights, cameras = (sum(one) for one in carried)
-    if not lights and not cameras:
-        return None
-    kinds = ((lights, "lights"), (cameras, "cameras"))
-    counted = " and ".join(f"{count} {kind if count > 1 else kind[:-1]}" for count, kind in kinds if count)
-    return f": {counted} are left out of the object; name one node as the object, FILE#NODE, to keep the rest around it"
-
-
-def _length(entries: object) -> int:
-    return len(entries) if isinstance(entries, list) else 0
 
 
 def _lit_alike(material: MaterialEntry) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, FailFast, Field, JsonValue
@@ -109,12 +110,21 @@ class CameraEntry(_Entry):
     name: str | None = None
 
 
+class Cone(_Entry):
+    """Of a spot light: angles from its axis in radians, up to which it shines fully and beyond which not at all."""
+
+    innerConeAngle: Annotated[float, Field(ge=0.0)] = 0.0
+    outerConeAngle: Annotated[float, Field(gt=0.0, lt=1.571)] = math.pi / 4.0
+
+
 class Light(_Entry):
     """A light of KHR_lights_punctual: `intensity` in candela, of a directional one in lux."""
 
     type: Literal["point", "spot", "directional"]
     color: Annotated[list[float], Field(min_length=3, max_length=3)] = [1.0, 1.0, 1.0]
     intensity: Annotated[float, Field(ge=0.0)] = 1.0
+    spot: Cone = Cone()
+    range: Annotated[float, Field(gt=0.0)] | None = None
     name: str | None = None
 
 

@@ -1,4 +1,4 @@
-"""Objects from mesh files: ``--object path.obj|.ply|.glb|.gltf|.stl``."""
+"""Objects from mesh files: ``--object path.obj`` and the other endings of `advsearch.files.MESHES`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import numpy.typing as npt
 from PIL import Image
 
 from advsearch.errors import InputError
+from advsearch.files import MESHES
 from advsearch.scene.assets import Material, ObjectAsset, UpAxis, normalised
-from advsearch.scene.importing import gltf
+from advsearch.scene.importing import gltf, gltf_notes
 from advsearch.scene.importing.blender import read_mesh_bytes
 from advsearch.scene.importing.files import safe_name
 from advsearch.scene.importing.geometry import Soup, assemble, join, repaired
@@ -22,9 +23,6 @@ from advsearch.scene.importing.texture import textured
 from advsearch.scene.importing.upright import guess_up
 
 Floats = npt.NDArray[np.float32]
-
-SUFFIXES = (".obj", ".ply", ".glb", ".gltf", ".stl", ".blend")
-"""The mesh files that can be imported."""
 
 MOST_WARNINGS = 20
 """Warnings about one file."""
@@ -56,7 +54,7 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
     The same file gives the same bytes every time.
 
     Args:
-        path: a file that ends in one of `SUFFIXES`; files that it refers to are looked up beside it.
+        path: a file that ends in one of `advsearch.files.MESHES`; files that it refers to are looked up beside it.
         up: the axis that points up in the file; None for what the format or else the shape says.
 
     Raises:
@@ -66,9 +64,9 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
     if up not in (None, "y", "z"):
         raise InputError(f"up axis: expected 'y' or 'z', got {up!r}")
     file = Path(path)
-    data = read_mesh_bytes(file, "object", SUFFIXES)
+    data = read_mesh_bytes(file, "object", MESHES)
     parts, notes = read_parts(file, data)
-    rest = gltf.beside(gltf.read_header(file, data)) if file.suffix.lower() in GLTF else None
+    rest = gltf_notes.beside(gltf.read_header(file, data)) if file.suffix.lower() in GLTF else None
     notes += [] if rest is None else [file.name + rest]
     return object_of(parts, notes, file, safe_name(file), up)
 

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.importing import gltf
+from advsearch.scene.importing import gltf, gltf_notes
 from advsearch.scene.importing.checks import check_faces, checked
 from advsearch.scene.importing.files import damaged, shown, text_of
 from advsearch.scene.importing.gltf_entries import Header
@@ -169,7 +169,7 @@ def _file_notes(path: Path, data: bytes, header: Header | None, references: Refe
             notes.append(
                 f"{path.name} uses the material {shown(name)}, which its .mtl file lacks; neutral grey is used instead"
             )
-    notes += [path.name + what for what in gltf.left_out(header)] if header else []
+    notes += [path.name + what for what in gltf_notes.left_out(header)] if header else []
     for what, count in gltf.unread(header).items() if header else ():
         if count:
             verb = "is" if what == GLOW else "are"

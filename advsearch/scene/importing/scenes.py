@@ -17,15 +17,16 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.files import MESHES
 from advsearch.scene.assets import ObjectAsset
-from advsearch.scene.importing import gltf
+from advsearch.scene.importing import gltf, gltf_notes
 from advsearch.scene.importing.blender import read_mesh_bytes
 from advsearch.scene.importing.files import safe_name, shown
 from advsearch.scene.importing.geometry import FLAT
 from advsearch.scene.importing.gltf_entries import CameraEntry, Header, Light, Node
-from advsearch.scene.importing.objects import SUFFIXES, object_of
+from advsearch.scene.importing.objects import object_of
 from advsearch.scene.importing.parts import GLTF, ImportedPart, read_parts
-from advsearch.scene.parts import PlacedCamera, PointLamp, ScenePart, mesh_part
+from advsearch.scene.parts import PlacedCamera, PointLamp, ScenePart, SpotLamp, mesh_part
 
 Doubles = npt.NDArray[np.float64]
 
@@ -37,8 +38,6 @@ MITSUBA_FILE = ".xml"
 """Ending of Mitsuba's scenes."""
 LUMENS = 683.0
 """Lumens of a watt, as exporters of glTF count: the eye's at 555 nm."""
-FAR = 1000.0
-"""Distance of a directional light, in object sizes."""
 MOST_SURROUNDINGS = 200
 """Meshes and lamps around an object."""
 TAKEN = frozenset(("object", "environment", "ground", "camera", "orbit"))
@@ -71,9 +70,9 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     """Read a scene from a .glb or .gltf file.
 
     The object is repaired, normalised and textured as `import_object` does it; so is every other node with a mesh,
-    which stays in its place beside it. Point and spot lights of KHR_lights_punctual become lamps without a cone,
-    directional ones distant lamps; perspective cameras are kept by name. What is not carried over is among the
-    object's warnings.
+    which stays in its place beside it. Point and spot lights of KHR_lights_punctual become lamps, directional
+    ones distant lamps; perspective cameras are kept by name. What is not carried over is among the object's
+    warnings.
 
     Args:
         path: of the file.
@@ -120,6 +119,18 @@ def import_scene(path: Path, node: str) -> ImportedScene:
     return ImportedScene(
         object_of(own, notes, path, f"{safe_name(path)}-{clean(node)}", "y"), tuple(surroundings), cameras
     )
+
+
+def node_names(path: Path) -> list[str]:
+    """Return what `import_scene` takes as the object of a glTF file, several of the same name once.
+
+    Raises:
+        FileFormatError: as for `import_object`.
+    """
+    header = gltf.read_header(path, read_mesh_bytes(path, "scene", GLTF))
+    drawn = {index for index, node in enumerate(header.nodes) if node.mesh is not None}
+    found = (header.label(index) for index in range(len(header.nodes)) if _below(header, index) & drawn)
+    return list(dict.fromkeys(found))
 
 
 def _mesh_names(header: Header, parts: Sequence[ImportedPart], names: _Names) -> dict[int, str]:
@@ -171,12 +182,12 @@ class Contents:
 
 
 def contents(path: Path) -> Contents:
-    """Return what is understood of a mesh or scene file.
+    """Return what is understood of a mesh or glTF file; one of Mitsuba has a function of that name of its own.
 
     Raises:
         FileFormatError, InputError: as for `import_object`.
     """
-    data = read_mesh_bytes(path, "object", SUFFIXES)
+    data = read_mesh_bytes(path, "object", (*MESHES, MITSUBA_FILE))
     parts, notes = read_parts(path, data)
     if path.suffix.lower() not in GLTF:
         return Contents(object_of(parts, notes, path, safe_name(path), None))
@@ -300,17 +311,33 @@ def _matrix(node: Node) -> Doubles:
     return matrix
 
 
-def _lamp(name: str, light: Light, pose: Doubles, frame: FileFrame) -> PointLamp:
+def _lamp(name: str, light: Light, pose: Doubles, frame: FileFrame) -> PointLamp | SpotLamp:
     """A light at its place; light falls off with the square of the distance in object sizes as it does in the file."""
     power = np.array(light.color) * light.intensity / LUMENS
     if light.type == "directional":
         way = UPRIGHT @ pose[:3, 2]  # it shines along its -z
-        place, power = FAR * way / max(float(np.linalg.norm(way)), 1e-12), power * FAR**2
+        place, power = gltf_notes.FAR * way / max(float(np.linalg.norm(way)), 1e-12), power * gltf_notes.FAR**2
     else:
         place, power = frame.inside(UPRIGHT @ pose[:3, 3]), power / frame.size**2
     x, y, z = map(float, place)
     red, green, blue = map(float, power)
-    return PointLamp(name, dark=not power.any(), position=(x, y, z), intensity=(red, green, blue))
+    if light.type != "spot":
+        return PointLamp(name, dark=not power.any(), position=(x, y, z), intensity=(red, green, blue))
+    along = UPRIGHT @ -pose[:3, 2]
+    across, up, ahead = map(float, along / max(float(np.linalg.norm(along)), 1e-12))
+    return SpotLamp(
+        name,
+        dark=not power.any(),
+        position=(x, y, z),
+        direction=(across, up, ahead),
+        intensity=(red, green, blue),
+        cutoff=math.degrees(light.spot.outerConeAngle),
+        beam=math.degrees(light.spot.innerConeAngle),
+    )
+
+
+def _changed(path: Path, header: Header) -> list[str]:
+    return [path.name + what for what in gltf_notes.lights_and_cameras(header)]
 
 
 def _camera(camera: CameraEntry, pose: Doubles, frame: FileFrame) -> PlacedCamera:
@@ -321,15 +348,3 @@ def _camera(camera: CameraEntry, pose: Doubles, frame: FileFrame) -> PlacedCamer
     matrix[:3, 3] = frame.inside(UPRIGHT @ pose[:3, 3])
     larger = max(camera.perspective.aspectRatio or 1.0, 1.0)
     return PlacedCamera(matrix, math.degrees(2.0 * math.atan(math.tan(camera.perspective.yfov / 2.0) * larger)))
-
-
-def _changed(path: Path, header: Header) -> Iterator[str]:
-    """Yield sentences about lights and cameras that are not what they are in the file."""
-    kinds = [light.type for light in header.lights]
-    if "spot" in kinds:
-        yield f"{path.name}: {kinds.count('spot')} spot lights shine in all directions: their cones are left out"
-    if "directional" in kinds:
-        yield f"{path.name}: {kinds.count('directional')} directional lights are lamps {FAR:g} object sizes away"
-    flat = sum(camera.perspective is None for camera in header.cameras)
-    if flat:
-        yield f"{path.name}: {flat} cameras without perspective are left out"

@@ -19,7 +19,17 @@ from advsearch.scene.mitsuba_backend.meshes import (
 from advsearch.scene.mitsuba_backend.plugins import loadable
 from advsearch.scene.mitsuba_backend.population import population
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
-from advsearch.scene.parts import BallLamp, HazePart, MeshPart, PluginNumbers, PluginPart, PointLamp, ScenePart
+from advsearch.scene.parts import (
+    BallLamp,
+    HazePart,
+    Lamp,
+    MeshPart,
+    PluginNumbers,
+    PluginPart,
+    PointLamp,
+    ScenePart,
+    SpotLamp,
+)
 
 ABSENT = {"type": "uniform", "value": 0.0}
 IDLE_LOBES: Plugin = {name: ABSENT for name in ("clearcoat", "sheen")}
@@ -114,6 +124,20 @@ def _point(part: PointLamp) -> Translation:
 
 
 @translation.register
+def _spot(part: SpotLamp) -> Translation:
+    name, (cutoff, beam) = part.name, part.cone
+    inputs = (SceneInput(f"{name}.intensity", f"{name}.intensity.value", color, interior=True, shape=(3,)),)
+    lamp = {
+        "type": "spot",
+        "to_world": mitsuba().ScalarTransform4f(part.to_world),
+        "intensity": _rgb(part.intensity),
+        "cutoff_angle": cutoff,
+        "beam_width": beam,
+    }
+    return Translation({name: lamp}, inputs)
+
+
+@translation.register
 def _ball(part: BallLamp) -> Translation:
     name = part.name
     ball = {
@@ -159,6 +183,6 @@ def leave_dark_lamps_out(plugins: Plugin, parts: Sequence[ScenePart]) -> None:
         parts: of the scene.
     """
     for part in parts:
-        if isinstance(part, (PointLamp, BallLamp)) and part.dark:
+        if isinstance(part, Lamp) and part.dark:
             plugin = plugins[part.name]
             plugin.get("emitter", plugin)["sampling_weight"] = 0.0

@@ -27,7 +27,16 @@ from advsearch.scene.mitsuba_backend.parts import translation
 from advsearch.scene.mitsuba_backend.plugins import loadable
 from advsearch.scene.mitsuba_backend.scene import NO_ROULETTE, MitsubaScene
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
-from advsearch.scene.parts import BallLamp, HazePart, MeshPart, PluginNumbers, PluginPart, PointLamp, ScenePart
+from advsearch.scene.parts import (
+    BallLamp,
+    HazePart,
+    MeshPart,
+    PluginNumbers,
+    PluginPart,
+    PointLamp,
+    ScenePart,
+    SpotLamp,
+)
 
 NAME = "scene.xml"
 
@@ -158,7 +167,7 @@ def _part(part: ScenePart, left: Plugin) -> Plugin:
             part = replace(part, emission=radiance.reshape(-1, *radiance.shape[-2:] if radiance.ndim > 1 else (1, 3)))
         light = emitter(part)
         found: Plugin = {"type": "ply", "bsdf": surface, **({"emitter": light} if light else {})}
-    elif isinstance(part, PointLamp):
+    elif isinstance(part, (PointLamp, SpotLamp)):
         found = translation(replace(part, **_triples(given))).plugins[part.name]
     elif isinstance(part, BallLamp):
         ball = given.pop("ball", None)
