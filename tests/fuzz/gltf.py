@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -16,7 +18,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from fuzz.case import OUTSIDE, Case, Maker, Random
-from fuzz.mutations import INTEGERS, as_json, confused, damaged
+from fuzz.mutations import INTEGERS, VALUES, as_json, confused, damaged
 from fuzz.pictures import picture, sample
 
 
@@ -166,6 +168,102 @@ def trees(random: Random) -> Case:
     return case(random, what, header, binary)
 
 
+NAMES = (
+    "KHR_materials_transmission",
+    "KHR_materials_unlit",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_pbrSpecularGlossiness",
+    "KHR_lights_punctual",
+    "EXT_texture_webp",
+    "EXT_mesh_gpu_instancing",
+    "KHR_texture_transform",
+    "ACME_paint",
+    "x" * 5_000,
+    "\x1b[31m",
+    "{name}",
+    "\u202e",
+    "",
+)
+HOSTILE = (0.0, -1.0, 1, 1e-30, 1e-3, 1e30, 1e11, 1e308, -1e308, 3.0, 0.5, float("nan"), "1", [1])
+
+
+def extensions(random: Random) -> Case:
+    """Extensions anywhere, with anything in them, listed or not, and required."""
+    header, binary = parts(box_glb())
+    what = random.choice(("inside", "listed", "required", "many", "lists of none"))
+    names = random.sample(NAMES, 3)
+    held: dict[str, Any] = {name: random.choice((*VALUES, {"attributes": {"TRANSLATION": 7}})) for name in names}
+    if what == "inside":
+        homes = [header, *(random.choice(header[kind]) for kind in ("nodes", "meshes", "materials", "textures"))]
+        random.choice(homes)["extensions"] = held
+    elif what == "many":
+        header["extensionsUsed"] = [f"ACME_{k}" for k in range(random.choice((100, 200_000)))]
+    elif what == "lists of none":
+        header[random.choice(("extensionsUsed", "extensionsRequired"))] = random.choice(VALUES)
+    else:
+        header["extensionsUsed"] = names
+        header["extensionsRequired"] = names if what == "required" else []
+    return case(random, f"extensions {what}", header, binary)
+
+
+def moving(random: Random) -> Case:
+    """Skins, animations, morph targets, and scenes beside the one that is read."""
+    header, binary = parts(box_glb())
+    what = random.choice(("skins", "animations", "targets", "scenes", "skin of a node", "weights"))
+    anything = random.choice((*VALUES, [{}] * random.choice((1, 100_000)), [{"joints": [10**9, -1]}]))
+    primitive = header["meshes"][0]["primitives"][0]
+    if what == "targets":
+        primitive["targets"] = random.choice((anything, [{"POSITION": 10**9}], [{"POSITION": 0}] * 1_000))
+        header["meshes"][0]["weights"] = random.choice(([1e308], [float("nan")], "x", []))
+    elif what == "scenes":
+        header["scenes"] += random.choice(([{}] * 10_000, [{"nodes": [10**9]}], [{"nodes": [0, 0, 0]}], [None]))
+    elif what == "skin of a node":
+        header["nodes"][-1]["skin"] = random.choice((0, 10**9, -1, "x"))
+    elif what == "weights":
+        primitive["attributes"] |= {
+            "JOINTS_0": primitive["attributes"]["POSITION"],
+            "WEIGHTS_0": random.choice((0, 999)),
+        }
+    else:
+        header[what] = anything
+    return case(random, what, header, binary)
+
+
+def lights(random: Random) -> Case:
+    """Lights, of them spots above all, and cameras, with hostile numbers, around a node."""
+    header, binary = parts(box_glb())
+    light: dict[str, Any] = {"type": random.choice(("spot", "spot", "spot", "point", "directional", "sun"))}
+    light["spot"] = {"innerConeAngle": 0.2, "outerConeAngle": 0.6}
+    place: dict[str, Any] = {"translation": [0.0, 3.0, 0.0], "rotation": [-0.7, 0.0, 0.0, 0.7]}
+    camera: dict[str, Any] = {"type": "perspective", "perspective": {"yfov": 0.8, "aspectRatio": 1.5}}
+    for _ in range(random.choice((1, 1, 1, 2))):
+        what = random.choice(
+            ("inner", "outer", "spot", "intensity", "color", "range", "place", "camera", "use", "name")
+        )
+        value = random.choice((*HOSTILE, math.pi / 2, math.pi / 4))
+        if what in ("inner", "outer"):
+            light["spot"] = {**light["spot"], f"{what}ConeAngle": value} if isinstance(light["spot"], dict) else {}
+        elif what == "color":
+            light["color"] = random.choice(([value] * 3, [1, 1, value], [1.0], value))
+        elif what == "place":
+            three = [value, 0.0, random.choice(HOSTILE)]
+            place |= random.choice(({"translation": three}, {"scale": three}, {"rotation": [*three, value]}))
+        elif what == "camera":
+            camera["perspective"] = {"yfov": value, "aspectRatio": random.choice(HOSTILE)}
+            camera["type"] = random.choice(("perspective", "orthographic"))
+        elif what == "use":
+            place["extensions"] = {"KHR_lights_punctual": random.choice(({"light": 7}, {}, {"light": "0"}, 0))}
+        else:
+            light[what] = random.choice(VALUES) if what == "spot" else value
+    use = {"extensions": {"KHR_lights_punctual": {"light": 0}}, **place}
+    header["extensions"] = {"KHR_lights_punctual": {"lights": [light] * random.choice((1, 1, 1, 5_000))}}
+    header["cameras"] = [camera]
+    first = len(header["nodes"])
+    header["nodes"] += [use, {**place, "camera": 0}]
+    header["scenes"][0]["nodes"] += [first, first + 1]
+    return replace(case(random, f"lights {light['type']}", header, binary), loader="node")
+
+
 def images(random: Random) -> Case:
     """Images that are hostile, or somewhere else."""
     header, binary = parts(box_glb())
@@ -204,4 +302,16 @@ def images(random: Random) -> Case:
     )
 
 
-MAKERS: tuple[Maker, ...] = (bytes_damaged, types_confused, counts, trees, images, types_confused, text)
+MAKERS: tuple[Maker, ...] = (
+    bytes_damaged,
+    types_confused,
+    counts,
+    trees,
+    images,
+    types_confused,
+    text,
+    extensions,
+    moving,
+    lights,
+    lights,
+)

@@ -15,6 +15,23 @@ def load_object(path: Path) -> None:
     advsearch.load_scene(path).renderer("texture", resolution=16)
 
 
+def load_node(path: Path) -> None:
+    """Read a glTF scene, with its first node as the object and the rest around it, and render it from every camera."""
+    import advsearch
+    from advsearch.scene.importing.scenes import node_names
+
+    names = node_names(path)
+    if names:
+        spec = f"{path}#{names[0]}"
+        scene = advsearch.load_scene(spec)
+        for camera in (None, *scene.description.cameras):
+            seen = scene if camera is None else advsearch.load_scene(spec, camera=camera)
+            renderer = seen.renderer("pose", resolution=8, denoise="none")
+            radiance = renderer.radiance(renderer.start, spp=1)
+            if not radiance.isfinite().all():
+                raise ArithmeticError(f"its picture from {camera or 'the orbit'} has pixels that are no numbers")
+
+
 def load_mitsuba(path: Path) -> None:
     """Read a Mitsuba scene, with its first shape that can be one as the object, and put it into Mitsuba."""
     import advsearch
@@ -139,6 +156,7 @@ def misbehave(path: Path) -> None:
 
 LOADERS: dict[str, Callable[[Path], object]] = {
     "object": load_object,
+    "node": load_node,
     "mitsuba": load_mitsuba,
     "environment": load_environment,
     "picture": load_picture,
@@ -158,7 +176,7 @@ def warm_up(loaders: Iterable[str]) -> None:
     """Import what the loaders need, so that the libraries are not counted as the first case's memory and time."""
     import advsearch
 
-    if {"object", "mitsuba", "blend", "environment", "picture"} & set(loaders):
+    if {"object", "node", "mitsuba", "blend", "environment", "picture"} & set(loaders):
         advsearch.load_scene("book").renderer("texture", resolution=16)
         from PIL import Image
 

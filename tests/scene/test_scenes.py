@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 from pathlib import Path
 from typing import Any
@@ -299,6 +300,42 @@ def test_import_says_what_was_understood(file: Path, capsys: pytest.CaptureFixtu
     assert main(["import", str(file)]) == 0
     said = capsys.readouterr().out
     assert f"{file}#crate" in said and "pose:floor" in said and "--camera NAME): front" in said
+
+
+@pytest.mark.parametrize(
+    ("node", "change", "words"),
+    [
+        (-2, {"translation": [0.0, 1e300, 0.0]}, "expected the light bulb within 1e+12 object sizes"),
+        (-1, {"translation": [1e300, 0.0, 0.0]}, "expected the camera front within 1e+12 object sizes"),
+        (-1, {"scale": [0.0, 0.0, 0.0]}, "expected the camera front to look somewhere, got axes without length"),
+    ],
+)
+def test_a_light_or_camera_out_of_reach_is_refused(
+    node: int, change: dict[str, Any], words: str, file: Path, data: bytes
+) -> None:
+    file.write_bytes(with_header(data, lambda header: header["nodes"][node].update(change)))
+    with pytest.raises(InputError, match=re.escape(words)):
+        describe(f"{file}#crate")
+
+
+def test_a_light_that_is_too_bright_or_takes_light_away_is_refused(file: Path, data: bytes) -> None:
+    def lit(header: dict[str, Any], **change: Any) -> None:
+        header["extensions"]["KHR_lights_punctual"]["lights"][0] |= change
+
+    for kind in ("point", "directional"):
+        file.write_bytes(with_header(data, lambda header, kind=kind: lit(header, type=kind, intensity=1e306)))
+        with pytest.raises(InputError, match=r"expected the light bulb within .* and no brighter than that, got more"):
+            describe(f"{file}#crate")
+    file.write_bytes(with_header(data, lambda header: lit(header, color=[1.0, -1.0, 0.0])))
+    with pytest.raises(FileFormatError, match=r"color\[1\] is greater than or equal to 0"):
+        describe(f"{file}#crate")
+
+
+@pytest.mark.parametrize("angle", [3.1, 3.1415])
+def test_a_camera_that_sees_all_is_refused(angle: float, file: Path, data: bytes) -> None:
+    file.write_bytes(with_header(data, lambda header: header["cameras"][0]["perspective"].update(yfov=angle)))
+    with pytest.raises(InputError, match="expected the camera front with a field of view up to 170 degrees, got 1"):
+        describe(f"{file}#crate")
 
 
 def test_a_scene_without_an_object_is_answered_with_what_is_in_it(

@@ -121,7 +121,7 @@ class Light(_Entry):
     """A light of KHR_lights_punctual: `intensity` in candela, of a directional one in lux."""
 
     type: Literal["point", "spot", "directional"]
-    color: Annotated[list[float], Field(min_length=3, max_length=3)] = [1.0, 1.0, 1.0]
+    color: Annotated[list[Annotated[float, Field(ge=0.0)]], Field(min_length=3, max_length=3)] = [1.0, 1.0, 1.0]
     intensity: Annotated[float, Field(ge=0.0)] = 1.0
     spot: Cone = Cone()
     range: Annotated[float, Field(gt=0.0)] | None = None

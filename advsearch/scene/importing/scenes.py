@@ -38,6 +38,10 @@ MITSUBA_FILE = ".xml"
 """Ending of Mitsuba's scenes."""
 LUMENS = 683.0
 """Lumens of a watt, as exporters of glTF count: the eye's at 555 nm."""
+FURTHEST = 1e12
+"""Distance of a light or camera in object sizes, and radiant intensity of a light."""
+WIDEST_VIEW = 170.0
+"""Field of view of a camera along the larger side of its picture, degrees."""
 MOST_SURROUNDINGS = 200
 """Meshes and lamps around an object."""
 TAKEN = frozenset(("object", "environment", "ground", "camera", "orbit"))
@@ -66,6 +70,7 @@ def split_node(spec: str) -> tuple[str, str | None]:
     return (found[1], found[3]) if found and not Path(spec).exists() else (spec, None)
 
 
+@np.errstate(all="ignore")  # what is out of range is refused
 def import_scene(path: Path, node: str) -> ImportedScene:
     """Read a scene from a .glb or .gltf file.
 
@@ -110,11 +115,15 @@ def import_scene(path: Path, node: str) -> ImportedScene:
         surroundings.append(mesh_part(name, made, matrix, made.material))
     for index in lamps:
         light = header.lights[header.nodes[index].lamp or 0]
-        surroundings.append(_lamp(names.free(light.name or header.label(index)), light, poses[index], frame))
+        lamp = _lamp(names.free(light.name or header.label(index)), light, poses[index], frame)
+        _check_lamp(path, lamp)
+        surroundings.append(lamp)
     cameras = {
         name: _camera(header.cameras[header.nodes[index].camera or 0], poses[index], frame)
         for index, name in _camera_names(header, poses).items()
     }
+    for name, camera in cameras.items():
+        _check_camera(path, name, camera)
     notes.extend(_changed(path, header))
     return ImportedScene(
         object_of(own, notes, path, f"{safe_name(path)}-{clean(node)}", "y"), tuple(surroundings), cameras
@@ -181,6 +190,7 @@ class Contents:
     cameras: tuple[str, ...] = ()
 
 
+@np.errstate(all="ignore")
 def contents(path: Path) -> Contents:
     """Return what is understood of a mesh or glTF file; one of Mitsuba has a function of that name of its own.
 
@@ -338,6 +348,35 @@ def _lamp(name: str, light: Light, pose: Doubles, frame: FileFrame) -> PointLamp
 
 def _changed(path: Path, header: Header) -> list[str]:
     return [path.name + what for what in gltf_notes.lights_and_cameras(header)]
+
+
+def _check_lamp(path: Path, lamp: PointLamp | SpotLamp) -> None:
+    """Refuse places and powers that are no numbers, or too large for the renderer's."""
+    if not all(abs(one) <= FURTHEST for one in (*lamp.position, *lamp.intensity)):  # NaN is not
+        raise InputError(
+            f"{path}: expected the light {lamp.name} within {FURTHEST:g} object sizes, and no brighter than that, got "
+            "more; correct its place or its intensity, or remove it"
+        )
+
+
+def _check_camera(path: Path, name: str, camera: PlacedCamera) -> None:
+    """Refuse a place that is no number or too large, axes that are none, and fields of view that a plane has not."""
+    if not all(abs(one) <= FURTHEST for one in camera.to_world[:3, 3]):
+        raise InputError(
+            f"{path}: expected the camera {name} within {FURTHEST:g} object sizes, got more; correct its place, or "
+            "remove it"
+        )
+    lengths = np.linalg.norm(camera.to_world[:3, :3], axis=0)
+    if not np.allclose(lengths, 1.0):
+        raise InputError(
+            f"{path}: expected the camera {name} to look somewhere, got axes without length; correct the scale of its "
+            "node, or remove it"
+        )
+    if not 0.0 < camera.fov <= WIDEST_VIEW:
+        raise InputError(
+            f"{path}: expected the camera {name} with a field of view up to {WIDEST_VIEW:g} degrees, got "
+            f"{camera.fov:.4g}; correct it, or remove it"
+        )
 
 
 def _camera(camera: CameraEntry, pose: Doubles, frame: FileFrame) -> PlacedCamera:
