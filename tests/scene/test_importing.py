@@ -1252,6 +1252,28 @@ def test_what_a_gltf_has_and_is_not_carried_over_is_said(
     assert import_object(path).warnings == tuple(f"changed.glb{note}" for note in notes)
 
 
+@pytest.mark.parametrize(
+    ("wrap", "reach", "said"),
+    [(33071, 1.0, False), (33071, 1.5, True), (33648, 3.0, True), (10497, 3.0, False)],
+)
+def test_textures_that_end_at_their_edges_are_said_where_that_is_seen(
+    tmp_path: Path, wrap: int, reach: float, said: bool
+) -> None:
+    picture = Image.fromarray(np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
+    square = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]], process=False)
+    uv = np.array([[0, 0], [reach, 0], [reach, reach], [0, reach]])
+    square.visual = trimesh.visual.TextureVisuals(uv=uv, material=PBRMaterial(baseColorTexture=picture))
+    header, rest = glb_parts(square.export(file_type="glb"))
+    header["samplers"] = [{"wrapS": wrap}]
+    header["textures"][0]["sampler"] = 0
+    warnings = import_object(written(tmp_path, "edge.glb", glb_of(header, rest))).warnings
+    expected = "edge.glb has textures that are not to repeat beyond their edges; here they do"
+    assert (expected in warnings) is said
+    header["textures"][0]["sampler"] = 3
+    with pytest.raises(FileFormatError, match="expected glTF with 4 samplers, as it refers to, got 1"):
+        import_object(written(tmp_path, "edge.glb", glb_of(header, rest)))
+
+
 @pytest.mark.parametrize("name", ["FOO_geometry", "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing"])
 def test_a_gltf_that_needs_what_is_not_understood_is_refused(tmp_path: Path, name: str) -> None:
     path = with_header(tmp_path, lambda header: header.update(extensionsUsed=[name], extensionsRequired=[name]))

@@ -96,6 +96,7 @@ def rewritten(path: Path, data: bytes, header: Header) -> bytes:
                 for index, node in enumerate(header.nodes)
             ],
             "cameras": [],
+            "samplers": [],
             "extensions": None,
             "extensionsRequired": [],
             "extensionsUsed": [],

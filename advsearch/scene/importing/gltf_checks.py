@@ -50,6 +50,7 @@ def check_header(path: Path, header: Header) -> None:
         _check_index(path, "bufferViews", accessor.bufferView, header.bufferViews)
     for texture in header.textures:
         _check_index(path, "images", texture.plain().source, header.images)
+        _check_index(path, "samplers", texture.sampler, header.samplers)
     for image in header.images:
         _check_index(path, "bufferViews", image.bufferView, header.bufferViews)
     for material in header.materials:

@@ -244,8 +244,18 @@ class _TextureExtensions(_Entry):
     webp: _WebpSource | None = Field(default=None, alias="EXT_texture_webp")
 
 
+REPEAT = 10497
+"""How a texture goes on beyond its edges, of the three ways that glTF has."""
+
+
+class Sampler(_Entry):
+    wrapS: int = REPEAT
+    wrapT: int = REPEAT
+
+
 class Texture(_Entry):
     source: Index | None = None
+    sampler: Index | None = None
     extensions: _TextureExtensions | None = None
 
     def plain(self) -> Texture:
@@ -274,6 +284,7 @@ class Header(_Entry):
     materials: List[MaterialEntry] = []
     textures: List[Texture] = []
     images: List[Image] = []
+    samplers: List[Sampler] = []
     cameras: List[CameraEntry] = []
     skins: Unread = None
     animations: Unread = None

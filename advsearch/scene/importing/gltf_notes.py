@@ -9,7 +9,7 @@ from collections.abc import Iterator
 
 from advsearch.scene.importing.files import shown
 from advsearch.scene.importing.gltf_checks import READ
-from advsearch.scene.importing.gltf_entries import CUT_OUTS, Header, MeshEntry
+from advsearch.scene.importing.gltf_entries import CUT_OUTS, REPEAT, Header, MaterialEntry, MeshEntry
 
 _OPAQUE = " lets light pass through surfaces with {name}; here they are opaque"
 
@@ -76,6 +76,19 @@ def lights_and_cameras(header: Header) -> Iterator[str]:
         "camera{s} without perspective: left out": sum(one.perspective is None for one in header.cameras),
     }
     yield from (f": {_counted(count, what)}" for what, count in found.items() if count)
+
+
+EDGES = " has textures that are not to repeat beyond their edges; here they do"
+
+
+def repeats(header: Header, material: MaterialEntry) -> bool:
+    """Whether the textures of a material go on beyond their edges as all do here."""
+    surface = material.plain().pbrMetallicRoughness
+    uses = (surface.baseColorTexture, surface.metallicRoughnessTexture) if surface else ()
+    numbers = [use.index for use in (*uses, material.normalTexture, material.emissiveTexture) if use is not None]
+    samplers = [header.textures[number].sampler for number in numbers]
+    found = [header.samplers[number] for number in samplers if number is not None]
+    return all(one.wrapS == one.wrapT == REPEAT for one in found)
 
 
 def _counted(count: int, what: str) -> str:

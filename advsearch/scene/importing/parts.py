@@ -111,13 +111,28 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     materials = len(references.materials) if header is None else len(header.materials)
     pictures = Pictures(materials, references.get, references.refused)
     reader = SurfaceReader(path.name, named, pictures, header)
-    parts = []
+    parts, edges = [], set[str]()
     for mesh, matrix, node in meshes:
         part = _part(mesh, reader.surface(mesh.visual), linear=path.suffix.lower() in GLTF)
         if _has_face_uvs(path, data):  # trimesh has shuffled the vertices, but not what belongs to them
             part = replace(part, normals=None, colors=None)
         parts.append(replace(_placed(part, matrix), node=node))
-    return parts, notes + reader.notes
+        if header is not None and _leaves_its_textures(mesh, part, header):
+            edges.add(path.name + gltf_notes.EDGES)
+    return parts, [*notes, *edges, *reader.notes]
+
+
+BEYOND = 0.01
+"""How far texture coordinates may lie outside of a texture before it matters how that goes on."""
+
+
+def _leaves_its_textures(mesh: Any, part: ImportedPart, header: Header) -> bool:
+    """Whether a part looks its textures up beyond their edges, where these are not to repeat."""
+    entry = gltf.entry_of(header, getattr(getattr(mesh.visual, "material", None), "name", None))
+    if part.uvs is None or entry is None or gltf_notes.repeats(header, entry):
+        return False
+    used = part.uvs[part.faces]
+    return not (used.min() >= -BEYOND and used.max() <= 1.0 + BEYOND)
 
 
 def _parse(path: Path, data: bytes, references: References) -> list[tuple[Any, Array, int]]:
