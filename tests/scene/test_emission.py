@@ -235,6 +235,18 @@ def test_what_is_cut_out_emits_nothing(tmp_path: Path) -> None:
     assert not picture[SIZE // 2, SIZE // 2].any() and float(picture.max()) == pytest.approx(2.0, rel=1e-3)
 
 
+@pytest.mark.parametrize(("cutoff", "dark"), [(0.5, False), (1e30, True)])
+def test_a_part_that_is_cut_out_whole_is_dark_beside_another(cutoff: float, dark: bool, tmp_path: Path) -> None:
+    scene = room(None)
+    shines = [one.visual.material.emissiveFactor is not None for one in scene.geometry.values()]
+    file = tmp_path / "room.glb"
+    lamp = {"emissiveFactor": [1.0, 1.0, 1.0], "alphaMode": "MASK", "alphaCutoff": cutoff}
+    file.write_bytes(changed(scene.export(file_type="glb"), shines.index(True), **lamp))
+    described = describe(str(file), given=SEEN)
+    assert described.emits is not dark
+    MitsubaScene(described, (SIZE, SIZE))
+
+
 def test_a_moved_surface_lights_from_where_it_is(tmp_path: Path) -> None:
     """Whatever Mitsuba kept of the place where it was."""
     scene = describe(f"{written(tmp_path, room(stripes()), 5.0)}#wall", "none", given=SEEN)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import struct
 import subprocess
 import sys
@@ -24,7 +25,7 @@ from advsearch.errors import FileFormatError, InputError
 from advsearch.scene import library
 from advsearch.scene.assets import Material, Mesh, ObjectAsset
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing import unwrap
+from advsearch.scene.importing import objects, unwrap
 from advsearch.scene.importing.images import area_average, display_image
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.texture import sampled
@@ -1272,6 +1273,18 @@ def test_textures_that_end_at_their_edges_are_said_where_that_is_seen(
     header["textures"][0]["sampler"] = 3
     with pytest.raises(FileFormatError, match="expected glTF with 4 samplers, as it refers to, got 1"):
         import_object(written(tmp_path, "edge.glb", glb_of(header, rest)))
+
+
+def test_a_mesh_that_does_not_come_out_whole_is_refused_by_the_name_of_its_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(soup: object) -> None:
+        raise InputError("mesh uvs: found NaN or infinite values; repair the mesh")
+
+    monkeypatch.setattr(objects, "assemble", broken)  # as with skews of 2**32, where xatlas makes no numbers
+    path = glb(tmp_path, PBRMaterial(baseColorFactor=[1.0, 0.0, 0.0, 1.0]))
+    with pytest.raises(InputError, match=re.escape(f"{path}: mesh uvs: found NaN or infinite values; repair")):
+        import_object(path)
 
 
 @pytest.mark.parametrize("name", ["FOO_geometry", "KHR_draco_mesh_compression", "EXT_mesh_gpu_instancing"])

@@ -12,7 +12,7 @@ from PIL import Image
 
 from advsearch.errors import InputError
 from advsearch.files import MESHES
-from advsearch.scene.assets import Material, ObjectAsset, UpAxis, normalised
+from advsearch.scene.assets import Material, Mesh, ObjectAsset, UpAxis, normalised
 from advsearch.scene.importing import gltf, gltf_notes
 from advsearch.scene.importing.blender import read_mesh_bytes
 from advsearch.scene.importing.files import safe_name
@@ -94,7 +94,7 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     material, blends = _material(soup, surfaces)
     return ObjectAsset(
         name=name,
-        mesh=normalised(assemble(soup)),
+        mesh=_mesh(soup, file),
         base_color=np.ascontiguousarray(maps.color[:, :, :3]),
         material=material,
         source=str(file),
@@ -106,6 +106,13 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     )
 
 
+def _mesh(soup: Soup, file: Path) -> Mesh:
+    try:
+        return normalised(assemble(soup))
+    except InputError as error:  # which knows of no file
+        raise InputError(f"{file}: {error}") from None
+
+
 def _let_out(emission: Floats | None, opacity: Floats | None) -> Floats | None:
     """Return the radiance (H, W, 3) of what is not cut out; None where it is dark."""
     if emission is None or opacity is None:
@@ -114,7 +121,8 @@ def _let_out(emission: Floats | None, opacity: Floats | None) -> Floats | None:
     width, height = max(sizes)
     share = np.asarray(Image.fromarray(opacity).resize((width, height), Image.Resampling.BILINEAR))[:, :, None]
     columns, rows = ((np.arange(n) * m) // n for n, m in ((width, sizes[0][0]), (height, sizes[0][1])))
-    return np.asarray(emission[rows][:, columns] * share, np.float32)
+    found = np.asarray(emission[rows][:, columns] * share, np.float32)
+    return found if found.any() else None
 
 
 def _first(warnings: list[str], name: str) -> tuple[str, ...]:

@@ -71,7 +71,7 @@ def sampling_weights(parts: Iterable[MeshPart]) -> dict[str, float]:
             corners = (part.mesh.vertices.astype(np.float64) @ part.to_world[:3, :3].T)[part.mesh.faces]
             doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             powers[part.name] = float(part.emission.mean() * np.linalg.norm(doubled, axis=1).sum())
-    total = sum(powers.values())
+    total = max(sum(powers.values()), 1e-30)  # of faces without area it is 0
     return {name: (1.0 - LEAST) * power / total + LEAST / len(powers) for name, power in powers.items()}
 
 
