@@ -399,7 +399,7 @@ def test_a_reference_has_two_parts_whatever_they_take_and_stops_in_time() -> Non
         return np.array([float(seed)])
 
     parts = one_by_one(part)
-    assert len(gather(parts, TimeBudget(0.1, clock), seed=0)) == 2
+    assert [len(gather(parts, TimeBudget(one, clock), seed=0)) for one in (0.1, 0.0)] == [2, 2]
     found = gather(parts, TimeBudget(5.5, clock), seed=0)
     assert len(found) == 5 and len({float(one[0]) for one in found}) == 5
     assert len(gather(parts, TimeBudget(1e9, clock), seed=0, most=7)) == 7

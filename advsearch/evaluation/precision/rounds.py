@@ -200,7 +200,7 @@ def gather(
 
     def wanted() -> Iterator[int]:
         for number in range(most):
-            if number >= least and slowest > budget.left:
+            if number >= least and slowest >= budget.left:
                 return
             one = seeds.stream(seed, name, number)
             begun[one] = budget.left
