@@ -42,7 +42,8 @@ def main() -> int:
     if there:
         config = HardenConfig.from_yaml(args.run / CONFIG)
     else:
-        config = HardenConfig(**{**SETTINGS, **changes, "run": str(args.run)})
+        first = {} if "controls" in changes else SETTINGS
+        config = HardenConfig(**{**first, **changes, "run": str(args.run)})
     result = harden_from_config(config, resumed=args.run if there else None)
     print(" | ".join(HEADS))
     for row in hardened_rows(result):

@@ -28,6 +28,7 @@ from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model, reference
 from advsearch.models.trainable import Trainable, trainable
+from advsearch.scene.formation import to_8_bit
 from advsearch.scene.library import load_environment
 
 LABELS = [f"class {number}" for number in range(14)]
@@ -47,7 +48,7 @@ def coloured(right: int, level: float, seed: int) -> Tensor:
 def pupils() -> list[Lesson]:
     """Three classes by their brightest channel, of which the worst pictures show little."""
     worst = [coloured(n % 3, 0.2, 99 + n) for n in range(24)]
-    return [RenderedLesson((n % 3,), coloured(n % 3, 0.4, n), one, one[None]) for n, one in enumerate(worst)]
+    return [RenderedLesson.of((n % 3,), coloured(n % 3, 0.4, n), one[None]) for n, one in enumerate(worst)]
 
 
 def test_half_of_what_is_tried_has_numbers_at_the_ends_of_their_ranges() -> None:
@@ -167,11 +168,11 @@ def test_the_reference_model_is_loaded_with_other_weights(tmp_path: Path) -> Non
 
 def test_the_worst_of_what_was_rendered_is_that_of_the_model_as_it_is() -> None:
     model = student().model
-    pictures = torch.stack([coloured(0, level, 7) for level in (0.0, 0.3, 0.6)])
-    lesson = RenderedLesson((1,), pictures[0], pictures[0], pictures)
+    pictures = to_8_bit(torch.stack([coloured(0, level, 7) for level in (0.0, 0.3, 0.6)]))
+    lesson = RenderedLesson.of((1,), pictures[0], pictures)
     harder([lesson], model)
     loss = surprise(model(pictures), [(1,)] * 3)
-    assert torch.equal(lesson.worst, pictures[int(loss.argmax())])
+    assert torch.equal(lesson.worst, pictures[int(loss.argmax())]) and lesson.pictures.dtype == torch.uint8
     both = surprise(torch.tensor([[1.0, 1.0, 1.0, 1.0]]), [(0, 2)])
     assert both.item() == pytest.approx(0.6931, abs=1e-3)
 

@@ -89,10 +89,16 @@ class RenderedLesson(Lesson):
     """A lesson whose pictures were rendered.
 
     Attributes:
-        pictures: (N, H, W, 3) at random configurations.
+        pictures: (N, H, W, 3) uint8, as an 8-bit file has them, at random configurations; there are many.
     """
 
     pictures: Tensor
+
+    @classmethod
+    def of(cls, right: tuple[int, ...], plain: Tensor, pictures: Tensor) -> RenderedLesson:
+        """Return a lesson of pictures (N, H, W, 3) in [0, 1], of which the first counts as the worst so far."""
+        levels = (pictures * 255.0).round().to(torch.uint8)
+        return cls(right, plain, levels[0] / 255.0, levels)
 
 
 def plain_lessons(problem: Problem, views: int, seed: int) -> list[Lesson]:
@@ -133,7 +139,7 @@ def lessons(problem: Problem, views: int, tries: int, seed: int, *, shared: bool
                 drawn = tried(problem.domain, torch.Generator().manual_seed(own), tries)
                 shown = [problem.renderer(torch.cat([u, numbers]), seed=own, spp=SPP) for u in drawn]
                 plain = problem.renderer(whole, seed=own, spp=SPP)
-                found.append(RenderedLesson(right, plain, shown[0], torch.stack(shown)))
+                found.append(RenderedLesson.of(right, plain, torch.stack(shown)))
     return found
 
 
@@ -183,8 +189,8 @@ def harder(
         for one in part:
             if isinstance(one, RenderedLesson):
                 with torch.no_grad():
-                    loss = surprise(model(one.pictures), [one.right] * len(one.pictures))
-                one.worst = one.pictures[int(loss.argmax())]
+                    loss = surprise(model(one.pictures / 255.0), [one.right] * len(one.pictures))
+                one.worst = one.pictures[int(loss.argmax())] / 255.0
 
 
 def _ascend(chosen: Sequence[TextureLesson], model: Model, steps: int, change: Callable[[Tensor], Tensor]) -> None:

@@ -28,7 +28,7 @@ AUGMENTATION = Augmentation(smallest_crop=0.75, largest_crop=1.15, turn=15.0, cu
 WEIGHT_DECAY = 0.02
 LARGEST_GRADIENT_NORM = 2.0
 WARM_UP = 0.1
-KEEP = 2.0
+KEEP = 1.0
 """Weight of the given model's answers to plain pictures, beside that of the right ones."""
 AVERAGE = 0.98
 """Weight of the past in the average of the weights, per step."""
