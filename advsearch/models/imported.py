@@ -32,11 +32,15 @@ def split_weights(spec: str) -> tuple[str, Path | None]:
 # package.module:callable
 
 
-def load_callable(spec: str) -> Source | Model:
+def load_callable(spec: str, libraries: Iterable[str] = ()) -> Source | Model:
     """Return the model behind ``package.module:callable[@weights.safetensors]``.
 
     The module is looked for on `sys.path` and in the current directory. The attribute is an `nn.Module`, a `Model`, or
     something that returns one when called without arguments (a function, or a class of modules).
+
+    Args:
+        spec: what is written above.
+        libraries: what else may stand before the colon; a module that there is not may be one of them, misspelt.
 
     Raises:
         ModelError: it cannot be imported, raises, returns something else, or the weights do not fit.
@@ -46,7 +50,7 @@ def load_callable(spec: str) -> Source | Model:
     target, weights = split_weights(spec)
     check_import(target)
     module_name, _, attribute = target.partition(":")
-    value: Any = _import_module(module_name, spec)
+    value: Any = _import_module(module_name, spec, libraries)
     for part in attribute.split("."):
         if not hasattr(value, part):
             known = [key for key in vars(value) if not key.startswith("_") and callable(getattr(value, key))]
@@ -64,13 +68,15 @@ def load_callable(spec: str) -> Source | Model:
     return source_of(built, spec)
 
 
-def _import_module(name: str, spec: str) -> ModuleType:
+def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType:
     with current_directory_importable():
         try:
             return importlib.import_module(name)
         except ModuleNotFoundError as error:
             if error.name is not None and (name == error.name or name.startswith(error.name + ".")):
-                message = f"no module named {error.name!r} on the Python path or in {os.getcwd()}"
+                near = difflib.get_close_matches(name, list(libraries), n=1)
+                meant = f"; did you mean '{near[0]}:{spec.partition(':')[2]}'?" if near else ""
+                message = f"no module named {error.name!r} on the Python path or in {os.getcwd()}{meant}"
             else:
                 message = f"module {name!r} needs {error.name!r}, which is not installed"
             raise ModelError(f"model {spec}: {message}") from error

@@ -140,7 +140,7 @@ def _find(spec: object) -> Source | Model:
     if re.fullmatch(r"[\w.-]+\.py:[\w.]+", text):
         raise InputError(f"model {text!r}: write {text.replace('.py:', ':')!r}, without the '.py'")
     if named_code(text) is not None:
-        return imported.load_callable(text)
+        return imported.load_callable(text, SOURCES)
     if Path(text).suffix.lower() in files.SUFFIXES or "/" in text or os.sep in text or os.path.exists(text):
         return files.load_file(Path(text))
     known = ["reference", *(f"{source}:{'REPOSITORY' if source == 'hf' else 'NAME'}" for source in SOURCES)]

@@ -745,6 +745,7 @@ def test_callables_with_weights(nets: Path) -> None:
     "spec, error, message",
     [
         ("no_such_nets:Net", ModelError, "no module named 'no_such_nets' on the Python path or in "),
+        ("torchvison:resnet50", ModelError, r"no module named 'torchvison' .*; did you mean 'torchvision:resnet50'\?"),
         ("needy_nets:Net", ModelError, "module 'needy_nets' needs 'not_there_at_all', which is not installed"),
         ("wrong_nets:Net", ModelError, r"importing 'wrong_nets' failed \(ZeroDivisionError: .* at .*wrong_nets.py:1\)"),
         ("my_nets:Nets", UnknownNameError, "unknown attribute of my_nets 'Nets'. Did you mean 'Net'"),
