@@ -14,8 +14,10 @@ from torch import Tensor
 
 from advsearch.attacks.domain import Domain
 from advsearch.attacks.failures import Failures, FoundFailure, most_different
-from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, seeded
+from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
+from advsearch.attacks.policies.coordinates import Coordinates, box_coordinates
 from advsearch.attacks.policies.scaling import half_widths, wraps
+from advsearch.attacks.policies.surrogate import MOST_OWN, Seen, Surrogate
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.seeds import stream
 
@@ -37,6 +39,18 @@ TOURNAMENT = 4
 WIDER = 4.0
 """How much larger steps are in the parameters that span the archive: that is where there are cells to fill."""
 
+CANDIDATES = 300
+"""Configurations that the surrogate chooses a generation from."""
+
+ELSEWHERE = 0.5
+"""Share of these whose parameters of the archive are drawn anew."""
+
+BETTER = 0.1
+"""What a larger objective in a cell that fails already counts for, beside a failure in another."""
+
+MEMORY = 300
+"""The surrogate is made from so many of the best configurations and so many of the latest."""
+
 
 @dataclass(frozen=True, eq=False)
 class ArchiveState:
@@ -50,6 +64,7 @@ class ArchiveState:
         points: (n, d) float32, this generation's configurations.
         values: objectives of the first of them.
         wrong: whether each of these was a success.
+        seen: what the surrogate is made from; None where there are too many numbers, or a norm ball.
     """
 
     domain: Domain
@@ -61,6 +76,7 @@ class ArchiveState:
     points: Tensor
     values: tuple[float, ...] = ()
     wrong: tuple[bool, ...] = ()
+    seen: Seen | None = None
 
 
 @dataclass(frozen=True)
@@ -75,8 +91,12 @@ class MapElites(Policy[ArchiveState]):
         P(a + sigma s z + line (b - a) y),
 
     z a vector and y a number, standard normal, s half of each number's range, four times that for the parameters of
-    the archive: what makes the model fail in one cell is tried in others. A discrete choice is that of a. One in ten
-    configurations, and one in ten choices, are drawn anew, so that no part of the domain is out of reach.
+    the archive: what makes the model fail in one cell is tried in others. A discrete choice is that of a, or, one in
+    ten, drawn anew. One in ten configurations is drawn anew, so that no part of the domain is out of reach.
+
+    In a box of few numbers (16) renders are saved as by Gaier, Asteroth and Mouret 2017 (arXiv 1702.03713): 300 are
+    made so, of half of them the parameters of the archive drawn anew, and a Gaussian process fitted to what was seen
+    chooses a generation among them: of different cells, those that most likely fail where nothing does yet.
 
     The objective is noisy, so a cell may keep a configuration that was lucky; only verified ones count as failures.
 
@@ -134,7 +154,10 @@ class MapElites(Policy[ArchiveState]):
             extra_fields={"wrong": ((), np.bool_)},
         )
         first = [domain.begin[None], domain.sample(seeded(seed, 0), self.population - 1)]
-        return ArchiveState(domain, seed, spanned, half_widths(domain), archive, 0, torch.cat(first))
+        box = box_coordinates(domain)
+        few = box.count == domain.dim <= MOST_OWN
+        seen = Seen(box, torch.empty(0, box.count), memory=MEMORY) if few else None
+        return ArchiveState(domain, seed, spanned, half_widths(domain), archive, 0, torch.cat(first), seen=seen)
 
     def propose(self, state: ArchiveState, n: int) -> tuple[tuple[Proposal, ...], ArchiveState]:
         return tuple(Proposal(u) for u in state.points[len(state.values) :][:n]), state
@@ -142,7 +165,8 @@ class MapElites(Policy[ArchiveState]):
     def update(self, state: ArchiveState, evaluated: Evaluated) -> ArchiveState:
         values = tuple(evaluation.objective for _, evaluation in evaluated)
         wrong = tuple(evaluation.success for _, evaluation in evaluated)
-        state = replace(state, values=(*state.values, *values), wrong=(*state.wrong, *wrong))
+        seen = None if state.seen is None else state.seen.extended(evaluated)
+        state = replace(state, values=(*state.values, *values), wrong=(*state.wrong, *wrong), seen=seen)
         return state if len(state.values) < len(state.points) else self._next(_kept(state))
 
     def failures(self, state: ArchiveState) -> Failures:
@@ -167,38 +191,66 @@ class MapElites(Policy[ArchiveState]):
 
     def _next(self, state: ArchiveState) -> ArchiveState:
         """Draw a generation; the archive belongs to nobody else yet."""
-        number = state.generation + 1
-        return replace(state, generation=number, points=self._drawn(state, number), values=(), wrong=())
-
-    def _drawn(self, state: ArchiveState, number: int) -> Tensor:
-        """Return (population, d) configurations made of kept ones."""
-        domain, rng = state.domain, seeded(state.seed, number)
+        state = replace(state, generation=state.generation + 1, values=(), wrong=())
+        rng = seeded(state.seed, state.generation)
         if state.archive.empty:
-            return domain.sample(rng, self.population)
-        archive = copy.deepcopy(state.archive)  # it draws with a generator of its own
-        drawn = archive.sample_elites((TOURNAMENT + 1) * self.population)
-        kept = torch.from_numpy(drawn["solution"]).unflatten(0, (TOURNAMENT + 1, self.population))
-        best = torch.from_numpy(drawn["objective"]).unflatten(0, (TOURNAMENT + 1, self.population))[1:].argmax(0)
-        samples = domain.sample(rng, self.population)
-        anew = (torch.rand(self.population, generator=rng) < ANEW).tolist()
-        return torch.stack(
-            [
-                samples[k] if anew[k] else self._bred(state, kept[1 + int(best[k]), k], kept[0, k], samples[k], rng)
-                for k in range(len(anew))
-            ]
-        )
+            return replace(state, points=state.domain.sample(rng, self.population))
+        anew = int((torch.rand(self.population, generator=rng) < ANEW).sum())
+        samples, seen = state.domain.sample(rng, self.population), state.seen
+        if seen is None:
+            bred = [state.domain.project(u) for u in self._bred(state, samples[anew:], rng)]
+            return replace(state, points=torch.stack([*samples[:anew], *bred]))
+        with one_thread():
+            surrogate, seen = seen.surrogate()
+            points = _likeliest(state, surrogate, self._candidates(state, seen.space, rng), self.population - anew)
+        return replace(state, points=torch.cat([samples[:anew], points]), seen=seen)
 
-    def _bred(self, state: ArchiveState, a: Tensor, b: Tensor, sample: Tensor, rng: torch.Generator) -> Tensor:
-        """Return the configuration made of a and b; its options are those of a, now and then of `sample`."""
-        domain = state.domain
-        noise = torch.randn(domain.dim, generator=rng)
-        along = self.line * float(torch.randn(1, generator=rng))
-        noise[state.spanned] *= WIDER
-        u = domain.project(a + self.sigma * state.half * noise + along * (b - a))
-        for block, part in domain.parts():
+    def _candidates(self, state: ArchiveState, box: Coordinates, rng: torch.Generator) -> Tensor:
+        """Return (n, d) configurations of a box to choose from: bred ones, some of which are moved to any cell."""
+        samples = box.low + box.width * torch.rand(CANDIDATES, box.count, generator=rng)
+        points, moved = self._bred(state, samples, rng), int(ELSEWHERE * CANDIDATES)
+        points[:moved, state.spanned] = samples[:moved, state.spanned]
+        return box.put(points, box.tidy((points - box.low) / box.width))
+
+    def _bred(self, state: ArchiveState, samples: Tensor, rng: torch.Generator) -> Tensor:
+        """Return (n, d), each made of two kept ones and maybe out of bounds; options are those of the first, now and
+        then of a sample (n, d)."""
+        count, dim = samples.shape
+        archive = copy.deepcopy(state.archive)  # it draws with a generator of its own
+        drawn = archive.sample_elites((TOURNAMENT + 1) * count)
+        kept = torch.from_numpy(drawn["solution"]).unflatten(0, (TOURNAMENT + 1, count))
+        best = torch.from_numpy(drawn["objective"]).unflatten(0, (TOURNAMENT + 1, count))[1:].argmax(0)
+        first, second = kept[1 + best, torch.arange(count)], kept[0]
+        noise = torch.randn(count, dim, generator=rng)
+        noise[:, state.spanned] *= WIDER
+        along = self.line * torch.randn(count, 1, generator=rng)
+        points: Tensor = first + self.sigma * state.half * noise + along * (second - first)
+        anew = torch.rand(count, dim, generator=rng) < ANEW
+        for block, part in state.domain.parts():
             if block.options:
-                u[part] = sample[part] if float(torch.rand(1, generator=rng)) < ANEW else a[part]
-        return u
+                points[:, part] = torch.where(anew[:, part], samples[:, part], first[:, part])
+        return points
+
+
+def _likeliest(state: ArchiveState, surrogate: Surrogate, points: Tensor, count: int) -> Tensor:
+    """Return (count, d) of the candidates (n, d), of different cells as long as there are: those that most likely fail
+    where nothing fails yet. Where something does, being worse than it counts for `BETTER` as much."""
+    archive = state.archive
+    mean, deviation = surrogate.predict(surrogate.space.take(points))
+    kept = archive.data()
+    objective, wrong = torch.from_numpy(kept["objective"]), torch.from_numpy(kept["wrong"])
+    enough = float(objective[wrong].min() if bool(wrong.any()) else objective.max())
+    failing = dict(zip(kept["index"][kept["wrong"]].tolist(), objective[wrong].tolist(), strict=True))
+    cells = archive.index_of(points[:, state.spanned].double().numpy()).tolist()
+    to_beat = torch.tensor([failing.get(cell, enough) for cell in cells])
+    weight = torch.tensor([BETTER if cell in failing else 1.0 for cell in cells])
+    likely = weight * torch.special.ndtr((mean - to_beat) / deviation)
+    order = likely.argsort(descending=True, stable=True).tolist()
+    first = dict[int, int]()  # the likeliest of each cell, in order
+    for number in order:
+        first.setdefault(cells[number], number)
+    others = [number for number in order if first[cells[number]] != number]
+    return points[[*first.values(), *others][:count]]
 
 
 def _kept(state: ArchiveState) -> ArchiveState:

@@ -23,7 +23,7 @@ from advsearch.attacks.policies.base import (
 )
 from advsearch.attacks.policies.coordinates import Coordinates, box_coordinates
 from advsearch.attacks.policies.pgd import PGD, PGDState
-from advsearch.attacks.policies.surrogate import Scales, Surrogate, fit
+from advsearch.attacks.policies.surrogate import Seen
 
 SCREEN, SCREEN_MIXED = 0.5, 0.25
 """Share of the renders that the screen takes, in a box alone and beside a norm ball."""
@@ -52,12 +52,6 @@ with a noise as large as all differences it settles too soon on a lucky point.""
 
 NEAR, FAR, CENTRES = 256, 128, 4
 """Candidates near the best points, candidates anywhere, and the number of best points."""
-
-REFIT = 5
-"""The surrogate's lengths and noise are fitted again after so many new points, or a tenth of all if that is more."""
-
-MEMORY = 100
-"""The surrogate sees so many of the best points and so many of the latest."""
 
 
 @dataclass(frozen=True)
@@ -90,12 +84,9 @@ class AutoState:
     """Where the search stands.
 
     Attributes:
-        box: the coordinates that are screened.
+        seen: where the box coordinates, which are screened, have been, the norm balls at their start.
         screen: (m, k) where the screen looks after the start.
         spent: renders so far.
-        points: (n, k) where the box coordinates have been, the norm balls at their start.
-        values: the n objectives there.
-        scales: of the surrogate, fitted to the first `fitted` points.
         ascent: of PGD, once it has begun.
         climbing: whether the latest proposal was the ascent's.
         last: the objective of the ascent's latest evaluation.
@@ -103,19 +94,20 @@ class AutoState:
     """
 
     domain: Domain
-    box: Coordinates
+    seen: Seen
     plan: Plan
     seed: int
     screen: Tensor
-    points: Tensor
-    values: tuple[float, ...] = ()
     spent: int = 0
-    scales: Scales | None = None
-    fitted: int = 0
     ascent: PGDState | None = None
     climbing: bool = False
     last: float = -math.inf
     trial: Trial | None = None
+
+    @property
+    def box(self) -> Coordinates:
+        """The coordinates that are screened."""
+        return self.seen.space
 
 
 @dataclass(frozen=True)
@@ -141,14 +133,14 @@ class Auto(Policy[AutoState]):
 
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> AutoState:
         box = box_coordinates(domain)
-        points = torch.empty(0, box.count)
-        plan = make_plan(domain, box, steps)
+        nothing, plan = torch.empty(0, box.count), make_plan(domain, box, steps)
+        seen = Seen(box, nothing)
         if box.count == 0:
-            return AutoState(domain, box, plan, 0, points, points, ascent=_pgd(domain).start(domain, generator, steps))
+            return AutoState(domain, seen, plan, 0, nothing, ascent=_pgd(domain).start(domain, generator, steps))
         seed = draw_seed(generator)
         with one_thread():
             screen = box.screen(seed, max(0, plan.screen - 1))
-        return AutoState(domain, box, plan, seed, screen, points)
+        return AutoState(domain, seen, plan, seed, screen)
 
     def propose(self, state: AutoState, n: int) -> tuple[tuple[Proposal, ...], AutoState]:
         state = replace(state, climbing=False, trial=None)
@@ -178,9 +170,7 @@ class Auto(Policy[AutoState]):
                 u = state.domain.project(state.box.put(ascent.u, state.trial.x))
                 ascent = replace(ascent, u=u, counts=ascent.counts + Counts(rejected=1))
             return replace(state, ascent=ascent, last=evaluation.objective)
-        points = torch.cat([state.points, *(state.box.take(u)[None] for u, _ in evaluated)])
-        values = (*state.values, *(evaluation.objective for _, evaluation in evaluated))
-        return replace(state, points=points, values=values)
+        return replace(state, seen=state.seen.extended(evaluated))
 
     def counts(self, state: AutoState) -> Counts:
         return NO_COUNTS if state.ascent is None else _pgd(state.domain).counts(state.ascent)
@@ -207,7 +197,7 @@ def make_plan(domain: Domain, box: Coordinates, steps: int) -> Plan:
 
 def _screen(state: AutoState, most: int) -> list[Tensor]:
     """Return up to so many configurations (d,): the start, then the screen; none where both are done."""
-    done = len(state.values)
+    done = len(state.seen.values)
     before = [] if done else [state.domain.begin]
     rest = [_at(state, x) for x in state.screen[max(0, done - 1) :][: most - len(before)]]
     return before + rest
@@ -220,10 +210,10 @@ def _at(state: AutoState, x: Tensor) -> Tensor:
 
 def _next_point(state: AutoState) -> tuple[Tensor, AutoState]:
     """Return what the surrogate likes best: (k,) in the unit box."""
-    generator = seeded(state.seed, len(state.values))
-    if not any(math.isfinite(value) for value in state.values):
+    generator = seeded(state.seed, len(state.seen.values))
+    if not state.seen.finite:
         return state.box.tidy(torch.rand(state.box.count, generator=generator)), state
-    surrogate, state = _surrogate(state)
+    surrogate, seen = state.seen.surrogate()
     best = surrogate.x[surrogate.predict(surrogate.x)[0].argsort(descending=True, stable=True)]
     centres = torch.randint(0, min(CENTRES, len(best)), (NEAR,), generator=generator)
     centres[: NEAR // 2] = 0
@@ -231,22 +221,7 @@ def _next_point(state: AutoState) -> tuple[Tensor, AutoState]:
     far = state.box.tidy(torch.rand(FAR, state.box.count, generator=generator))
     candidates = torch.cat([best[:1], near, far])
     mean, deviation = surrogate.predict(candidates)
-    return candidates[int((mean + CURIOSITY * deviation).argmax())], state
-
-
-def _surrogate(state: AutoState) -> tuple[Surrogate, AutoState]:
-    """The process behind the points seen so far, its scales fitted again if it is time."""
-    n = len(state.values)
-    values = torch.tensor(state.values, dtype=torch.float64)
-    finite = torch.isfinite(values)
-    values = torch.where(finite, values, values[finite].min())
-    kept = torch.arange(n)
-    if n > 2 * MEMORY:
-        best = values[: n - MEMORY].argsort(descending=True, stable=True)[:MEMORY]
-        kept = torch.cat([best, kept[n - MEMORY :]])
-    due = state.scales is None or n - state.fitted >= max(REFIT, state.fitted // 10)
-    surrogate = fit(state.box, state.points[kept], values[kept], None if due else state.scales)
-    return surrogate, replace(state, scales=surrogate.scales, fitted=n) if due else state
+    return candidates[int((mean + CURIOSITY * deviation).argmax())], replace(state, seen=seen)
 
 
 # ---- the ascent -----------------------------------------------------------------------------------------------------
@@ -262,8 +237,9 @@ def _pgd(domain: Domain) -> PGD:
 def _begin_ascent(state: AutoState) -> AutoState:
     """Let PGD go on from the best of the points seen so far, with small steps in the box."""
     x = state.box.take(state.domain.begin)
-    if any(math.isfinite(value) for value in state.values):
-        surrogate, state = _surrogate(state)
+    if state.seen.finite:
+        surrogate, seen = state.seen.surrogate()
+        state = replace(state, seen=seen)
         x = surrogate.x[int(surrogate.predict(surrogate.x)[0].argmax())]
     blocks = tuple(
         replace(block, reach=REACH * block.radius) if block.norm == "box" else block for block in state.domain.blocks

@@ -47,13 +47,13 @@ class Coordinates:
         return len(self.where)
 
     def take(self, u: Tensor) -> Tensor:
-        """Return the point (k,) at which a configuration stands."""
-        return ((u[self.where] - self.low) / self.width).clamp_(0.0, 1.0)
+        """Return the points (..., k) at which configurations (..., d) stand."""
+        return ((u[..., self.where] - self.low) / self.width).clamp_(0.0, 1.0)
 
     def put(self, u: Tensor, x: Tensor) -> Tensor:
-        """Return a copy of a configuration, moved to a point."""
+        """Return a copy of configurations (..., d), moved to points (..., k)."""
         u = u.clone()
-        u[self.where] = torch.clamp(self.low + self.width * x, self.low, self.low + self.width)
+        u[..., self.where] = torch.clamp(self.low + self.width * x, self.low, self.low + self.width)
         return u
 
     def tidy(self, x: Tensor) -> Tensor:

@@ -8,11 +8,12 @@ of a finite set of candidates, so that the last bits of a matrix factorisation d
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from advsearch.attacks.policies.base import Evaluated
 from advsearch.attacks.policies.coordinates import Coordinates
 
 LENGTHS = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
@@ -29,6 +30,12 @@ LONGEST = 8.0
 
 EVIDENCE = 1.0
 """Gain in log-likelihood that a coordinate's own length must bring; less would fit the noise."""
+
+REFIT = 5
+"""Lengths and noise are fitted again after so many new points, or a tenth of all if that is more."""
+
+MEMORY = 100
+"""So many of the best points and so many of the latest count, unless more are asked for."""
 
 MOST_OWN = 16
 """Up to so many coordinates have lengths of their own; more share one."""
@@ -70,6 +77,62 @@ class Surrogate:
         solved = torch.linalg.solve_triangular(self.factor, cross.mT, upper=False)
         left = (1.0 - solved.square().sum(dim=0)).clamp_(min=1e-12)
         return self.mean + cross @ self.weights, (self.variance * left).sqrt_()
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What was evaluated, and the process behind it.
+
+    Attributes:
+        space: of the points.
+        points: (n, k) in the unit box.
+        values: the n objectives there; what could not be evaluated is not finite.
+        scales: of the process, fitted to the first `fitted` points.
+        memory: so many of the best points and so many of the latest count; for the scales `MEMORY`.
+    """
+
+    space: Coordinates
+    points: Tensor
+    values: tuple[float, ...] = ()
+    scales: Scales | None = None
+    fitted: int = 0
+    memory: int = MEMORY
+
+    @property
+    def finite(self) -> bool:
+        """Whether anything could be evaluated."""
+        return any(math.isfinite(value) for value in self.values)
+
+    def extended(self, evaluated: Evaluated) -> Seen:
+        """Return it with further configurations and what came of them."""
+        points = torch.cat([self.points, *(self.space.take(u)[None] for u, _ in evaluated)])
+        return replace(self, points=points, values=(*self.values, *(one.objective for _, one in evaluated)))
+
+    def surrogate(self) -> tuple[Surrogate, Seen]:
+        """Return the process behind what was seen, its scales fitted again if it is time; something is finite.
+
+        What could not be evaluated counts as the smallest value; of many points the best and the latest count.
+        """
+        n = len(self.values)
+        values = torch.tensor(self.values, dtype=torch.float64)
+        finite = torch.isfinite(values)
+        values = torch.where(finite, values, values[finite].min())
+        scales, fitted = self.scales, self.fitted
+        if scales is None or n - fitted >= max(REFIT, fitted // 10):
+            kept = _best_and_latest(values, MEMORY)
+            scales, fitted = _best_scales(self.space, self.points[kept], values[kept]), n
+        kept = _best_and_latest(values, self.memory)
+        found = fit(self.space, self.points[kept], values[kept], scales)
+        return found, replace(self, scales=scales, fitted=fitted)
+
+
+def _best_and_latest(values: Tensor, memory: int) -> Tensor:
+    """Return places of so many of the largest values and so many of the last; of all if there are no more."""
+    last = len(values) - memory
+    if last <= memory:
+        return torch.arange(len(values))
+    best = values[:last].argsort(descending=True, stable=True)[:memory]
+    return torch.cat([best, torch.arange(last, len(values))])
 
 
 def kernel(a: Tensor, b: Tensor) -> Tensor:

@@ -46,8 +46,8 @@ def diversity() -> ModuleType:
 @pytest.mark.parametrize("scene", ["ball", "corner", "choice"])
 def test_three_times_as_many_cells_fail_as_in_random_search(scene: str) -> None:
     cells = diversity().failing_cells
-    ours, theirs = (len(cells(scene, policy, 600, 0.2, 3)) for policy in ("archive", "random"))
-    assert theirs > 3 and ours >= 3 * theirs
+    ours, theirs = (len(cells(scene, policy, 300, 0.2, 3)) for policy in ("archive", "random"))
+    assert theirs > 0 and ours >= 3 * max(theirs, 10)
 
 
 @pytest.mark.parametrize(
@@ -72,6 +72,29 @@ def test_a_cell_keeps_the_largest_objective_and_nothing_that_could_not_be_evalua
     assert kept["objective"].tolist() == [3.0]
     assert kept["wrong"].tolist() == [True]
     assert kept["solution"][0].tolist() == pytest.approx([0.2, 0.9])
+
+
+def test_a_generation_is_of_different_cells_and_goes_where_nothing_fails_yet() -> None:
+    """Failures lie at a large second number, whatever the first; cells are over the first."""
+    domain = Domain(torch.full((3,), 0.5), (Block(1, name="a"), Block(1, name="b"), Block(1, name="c")))
+    policy = MapElites(over="a", cells=20, population=5)
+    state = policy.start(domain, torch.Generator().manual_seed(0), 200)
+    for _ in range(12):
+        told = [(u, Evaluation(float(u[1]) - 0.7, None, float(u[1]) > 0.7)) for u in state.points]
+        before, state = state, policy.update(state, told)
+    last = (before.points[:, 0] * 20).int().tolist()
+    assert len(set(last)) >= 4 and bool((before.points[:, 1] > 0.7).sum() >= 4)
+    assert policy.failures(state).found >= 19
+
+
+@pytest.mark.parametrize("blocks", [(Block(17),), (Block(2), Block(3, norm="l2", epsilon=0.1))])
+def test_many_numbers_and_norm_balls_have_no_surrogate(blocks: tuple[Block, ...]) -> None:
+    policy = MapElites()
+    domain = Domain(torch.full((sum(one.size for one in blocks),), 0.5), blocks)
+    state = policy.start(domain, torch.Generator().manual_seed(0), 100)
+    assert state.seen is None
+    after = policy.update(state, [(u, Evaluation(float(u[0]), None, False)) for u in state.points])
+    assert after.points.shape == state.points.shape and all(domain.contains(u) for u in after.points)
 
 
 def test_when_nothing_can_be_evaluated_it_goes_on_at_random() -> None:
