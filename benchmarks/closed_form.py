@@ -55,11 +55,11 @@ BUDGETS: Mapping[str, Mapping[str, tuple[int | None, ...]]] = {
         "hills, box": (None, None),
     },
     "archive": {
-        "linear, linf": (100, 10_000, None, None),
+        "linear, linf": (100, 5000, None, None),
         "linear, l2": (100, 1000, None, None),
-        "linear, box": (50, 5000, None, None),
-        "quadratic, box": (2000, 2000, None, None),
-        "hills, box": (500, 2000),
+        "linear, box": (50, 500, None, None),
+        "quadratic, box": (50, 100, None, None),
+        "hills, box": (50, 200),
     },
     "auto": {
         "linear, linf": (10, 10, 10, 10),
