@@ -19,7 +19,7 @@ from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
 from advsearch.config import AttackConfig, PrecisionConfig, SceneConfig
 from advsearch.config.scene import one_only
-from advsearch.controls import make_space
+from advsearch.controls import Space, make_space
 from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
 from advsearch.engine.ahead import Ahead, seen_by
@@ -54,6 +54,7 @@ from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import RunDirectory, check_free, is_run, run_path
 from advsearch.runs.results.gap import CurveResult
 from advsearch.runs.results.matrix import MatrixResult
+from advsearch.scene.description import SceneDescription
 from advsearch.scene.leaving_out import EVERYTHING, NOTHING
 from advsearch.scene.mitsuba_backend.samplers import next_count
 from advsearch.scene.surfaces import aovs_of
@@ -311,12 +312,15 @@ def _policy_options(config: AttackConfig) -> JsonObject:
 
 
 def check_from_config(config: AttackConfig) -> None:
-    """Refuse what a configuration names that is not there, or of which nothing could be judged; nothing is rendered.
+    """Refuse what a configuration names that is not there, contradicts itself, or could not be judged; nothing is
+    rendered.
 
     Raises:
         InputError: as for `attack_from_config`.
     """
-    _task(_job(config))
+    job = _job(config)
+    _, _, pictures = _task(job)
+    _space(job, framed(job.scene.description, pictures.size(job.loaded[0])))
 
 
 def _task(job: _Job) -> tuple[Task, Callable[[Described, Looked], Facts], PictureSettings]:
@@ -332,13 +336,18 @@ def _task(job: _Job) -> tuple[Task, Callable[[Described, Looked], Facts], Pictur
     return task, facts, pictures
 
 
+def _space(job: _Job, description: SceneDescription) -> Space:
+    """The searched controls and those that vary by chance, on a framed scene."""
+    return make_space((*job.controls, *job.over), description)
+
+
 def _problem(job: _Job) -> Problem:
     config, (model, _) = job.config, job.loaded
     description = job.scene.description
     task, facts, pictures = _task(job)
     resolution = pictures.size(model)
     description = framed(description, resolution)
-    space = make_space((*job.controls, *job.over), description)
+    space = _space(job, description)
     renderer = make_renderer(
         description,
         space,

@@ -31,6 +31,8 @@ from advsearch.runs.results.recipe import BarsFigure, HeatMapFigure, RecipeResul
 from advsearch.runs.results.sweep import SurfaceMap
 from advsearch.runs.summary import read_result
 
+SCENES = Path(__file__).resolve().parents[2] / "scenes" / "data" / "environments"
+
 TINY = """
 title: Is the mug seen?
 settings: {object: [mug, bowl], environment: [studio, noon], resolution: 16, spp: 1}
@@ -198,6 +200,14 @@ def test_a_figure_of_what_no_row_will_have_is_refused_before_anything_is_rendere
 def test_the_figures_of_every_bundled_recipe_name_columns_that_there_are(name: str) -> None:
     described, config = read_recipe(name), RecipeConfig(recipe=name, quick=True, object="mug")
     check_figures(described, carrying_out._check_runs(planned(described, config)), name)
+
+
+@pytest.mark.parametrize("name", names())
+def test_every_bundled_recipe_takes_an_environment_of_ones_own(tmp_path: Path, name: str) -> None:
+    room = tmp_path / "room.exr"
+    room.write_bytes((SCENES / "loft.exr").read_bytes())
+    runs = planned(read_recipe(name), RecipeConfig(recipe=name, quick=True, object="mug", environment=str(room)))
+    assert runs and carrying_out._check_runs(runs).keys() == {one.part for one in runs}
 
 
 def test_python_code_in_a_file_is_not_imported_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
