@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from advsearch.cli import output
 from advsearch.errors import InputError
 from advsearch.files import MESHES, either
+
+if TYPE_CHECKING:
+    from advsearch.scene.importing.scenes import Contents
 
 HELP = "say, and picture, what is understood of a mesh or scene file"
 MORE = ". Nothing is written but the picture"
@@ -40,10 +46,17 @@ def run(args: argparse.Namespace) -> int:
         from advsearch.scene.importing.scenes import MITSUBA_FILE, contents
 
         if Path(args.file).suffix.lower() == MITSUBA_FILE:
-            return _mitsuba(args, out)
-        found = contents(Path(args.file))
-        if out is not None:
-            advsearch.render(advsearch.load_scene(found.object), around=VIEWS, resolution=SIDE).save(out)
+            tell = _mitsuba(args, out)
+        else:
+            found = contents(Path(args.file))
+            tell = partial(_tell_mesh_file, args, found)
+            if out is not None:
+                advsearch.render(advsearch.load_scene(found.object), around=VIEWS, resolution=SIDE).save(out)
+    return tell()  # standard output is kept clean until here
+
+
+def _tell_mesh_file(args: argparse.Namespace, found: Contents) -> int:
+    """Print what was understood of a mesh or glTF file."""
     whole = found.object
     facts = {
         "triangles": len(whole.mesh.faces),
@@ -82,8 +95,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _mitsuba(args: argparse.Namespace, out: Path | None) -> int:
-    """Print, and picture as its first camera sees it, what was understood of a Mitsuba scene."""
+def _mitsuba(args: argparse.Namespace, out: Path | None) -> Callable[[], int]:
+    """Read and picture, as its first camera sees it, a Mitsuba scene; return what prints what was understood."""
     import advsearch
     from advsearch.scene.mitsuba_backend.files.scene import contents
 
@@ -105,6 +118,11 @@ def _mitsuba(args: argparse.Namespace, out: Path | None) -> int:
         "lights": list(found.lights),
         "cameras": list(found.cameras),
     }
+    return partial(_tell_scene, args, listed, warnings)
+
+
+def _tell_scene(args: argparse.Namespace, listed: Mapping[str, Any], warnings: Sequence[str]) -> int:
+    """Print what was understood of a Mitsuba scene: names by what they are."""
     if args.json:
         told = {"file": args.file, **listed, "warnings": list(warnings), "out": args.out}
         output.print_json({"schema": 1, "command": "import", **told})
@@ -114,8 +132,8 @@ def _mitsuba(args: argparse.Namespace, out: Path | None) -> int:
         if names:
             shown = [f"{name} ({names[name]})" if isinstance(names, dict) else name for name in names]
             print(f"{what}: {', '.join(shown)}")
-    if found.objects:
-        print(f"One of them as the object, the rest around it: --scene {args.file} --object {found.objects[-1]}")
+    if listed["objects"]:
+        print(f"One of them as the object, the rest around it: --scene {args.file} --object {listed['objects'][-1]}")
     for warning in warnings:
         print(f"Note: {warning}")
     return 0

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -219,3 +222,12 @@ def test_haze_is_one_grey_medium_in_a_ball_around_the_camera(changed: dict[str, 
         haze, used = found
         scale = changed.get("fog", {}).get("scale", 1.0)
         assert (haze.radius, haze.density) == pytest.approx((4.0, 0.2 * scale)) and used == {"ball", "fog"}
+
+
+def test_import_says_on_standard_output_what_a_scene_has(box: Path) -> None:
+    """In a process of its own, as standard output is kept clean of Mitsuba's by the descriptor."""
+    command = [sys.executable, "-m", "advsearch", "import", str(box)]
+    found = json.loads(subprocess.run([*command, "--json"], check=True, capture_output=True, text=True).stdout)
+    assert found["command"] == "import" and found["objects"] and found["cameras"]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    assert printed.startswith(f"{box}: a Mitsuba scene") and f"--object {found['objects'][-1]}" in printed
