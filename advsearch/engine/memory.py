@@ -21,7 +21,7 @@ from advsearch.errors import InputError
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.replay import Entry, LoggedEvaluation, LoggedJudgement
 from advsearch.runs.store import Row
-from advsearch.scene.formation import to_8_bit
+from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.tasks import Answer, Judgement
 
 PLAN = "gradient plan"
@@ -210,7 +210,7 @@ def _entry(
     if found.gradient is not None:
         arrays["gradient"] = found.gradient.detach().numpy()
     if picture is not None:
-        arrays["picture"] = (picture * 255.0).round().to(torch.uint8).numpy()
+        arrays["picture"] = levels_of(picture).numpy()
     return Entry(kind, number, facts, arrays)
 
 

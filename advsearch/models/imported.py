@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import nn
 
-from advsearch.errors import ModelError, UnknownNameError
+from advsearch.errors import ModelError, UnknownNameError, resembling
 from advsearch.models.model import Model
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source, load_weights, source_of
@@ -74,7 +74,7 @@ def _import_module(name: str, spec: str, libraries: Iterable[str]) -> ModuleType
             return importlib.import_module(name)
         except ModuleNotFoundError as error:
             if error.name is not None and (name == error.name or name.startswith(error.name + ".")):
-                near = difflib.get_close_matches(name, list(libraries), n=1)
+                near = resembling(name, libraries)
                 meant = f"; did you mean '{near[0]}:{spec.partition(':')[2]}'?" if near else ""
                 message = f"no module named {error.name!r} on the Python path or in {os.getcwd()}{meant}"
             else:

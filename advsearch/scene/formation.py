@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from advsearch.errors import InputError
@@ -72,6 +73,11 @@ class ImageFormation:
             light = (radiance * self.gain).clamp_min(0.0)
             return linear_to_srgb(light / (1.0 + light))
         return linear_to_srgb(radiance * self.gain)
+
+
+def levels_of(display: Tensor) -> Tensor:
+    """Return the levels (uint8) that an 8-bit file has for values in [0, 1]; not differentiable."""
+    return (display.detach() * 255.0).round().to(torch.uint8)
 
 
 def to_8_bit(display: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from advsearch.attacks.failures import Failures, FoundFailure, most_different
 from advsearch.attacks.policies.base import Evaluated, Policy, Proposal, draw_seed, one_thread, seeded
 from advsearch.attacks.policies.coordinates import Coordinates, box_coordinates
 from advsearch.attacks.policies.scaling import half_widths, wraps
-from advsearch.attacks.policies.surrogate import MOST_OWN, Seen, Surrogate
+from advsearch.attacks.policies.surrogate import MOST_OWN, Observed, Surrogate
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.seeds import stream
 
@@ -76,7 +76,7 @@ class ArchiveState:
     points: Tensor
     values: tuple[float, ...] = ()
     wrong: tuple[bool, ...] = ()
-    seen: Seen | None = None
+    seen: Observed | None = None
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ class MapElites(Policy[ArchiveState]):
         first = [domain.begin[None], domain.sample(seeded(seed, 0), self.population - 1)]
         box = box_coordinates(domain)
         few = box.count == domain.dim <= MOST_OWN
-        seen = Seen(box, torch.empty(0, box.count), memory=MEMORY) if few else None
+        seen = Observed(box, torch.empty(0, box.count), memory=MEMORY) if few else None
         return ArchiveState(domain, seed, spanned, half_widths(domain), archive, 0, torch.cat(first), seen=seen)
 
     def propose(self, state: ArchiveState, n: int) -> tuple[tuple[Proposal, ...], ArchiveState]:

@@ -23,7 +23,7 @@ from advsearch.attacks.policies.base import (
 )
 from advsearch.attacks.policies.coordinates import Coordinates, box_coordinates
 from advsearch.attacks.policies.pgd import PGD, PGDState
-from advsearch.attacks.policies.surrogate import Seen
+from advsearch.attacks.policies.surrogate import Observed
 
 SCREEN, SCREEN_MIXED = 0.5, 0.25
 """Share of the renders that the screen takes, in a box alone and beside a norm ball."""
@@ -94,7 +94,7 @@ class AutoState:
     """
 
     domain: Domain
-    seen: Seen
+    seen: Observed
     plan: Plan
     seed: int
     screen: Tensor
@@ -134,7 +134,7 @@ class Auto(Policy[AutoState]):
     def start(self, domain: Domain, generator: torch.Generator, steps: int) -> AutoState:
         box = box_coordinates(domain)
         nothing, plan = torch.empty(0, box.count), make_plan(domain, box, steps)
-        seen = Seen(box, nothing)
+        seen = Observed(box, nothing)
         if box.count == 0:
             return AutoState(domain, seen, plan, 0, nothing, ascent=_pgd(domain).start(domain, generator, steps))
         seed = draw_seed(generator)

@@ -80,7 +80,7 @@ class Surrogate:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class Observed:
     """What was evaluated, and the process behind it.
 
     Attributes:
@@ -103,12 +103,12 @@ class Seen:
         """Whether anything could be evaluated."""
         return any(math.isfinite(value) for value in self.values)
 
-    def extended(self, evaluated: Evaluated) -> Seen:
+    def extended(self, evaluated: Evaluated) -> Observed:
         """Return it with further configurations and what came of them."""
         points = torch.cat([self.points, *(self.space.take(u)[None] for u, _ in evaluated)])
         return replace(self, points=points, values=(*self.values, *(one.objective for _, one in evaluated)))
 
-    def surrogate(self) -> tuple[Surrogate, Seen]:
+    def surrogate(self) -> tuple[Surrogate, Observed]:
         """Return the process behind what was seen, its scales fitted again if it is time; something is finite.
 
         What could not be evaluated counts as the smallest value; of many points the best and the latest count.

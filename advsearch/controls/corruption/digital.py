@@ -14,6 +14,7 @@ from PIL import Image
 from torch import Tensor
 
 from advsearch.controls.corruption.tools import REFERENCE, at_level, picture, planes
+from advsearch.scene.formation import levels_of
 
 BRIGHTNESS = ((0.1,), (0.2,), (0.3,), (0.4,), (0.5,))
 """Added to the value of hue, saturation and value."""
@@ -80,7 +81,7 @@ def coded(image: Tensor, quality: int) -> Tensor:
         image: (H, W, 3) display-referred sRGB in [0, 1].
         quality: 1 to 100, as of libjpeg.
     """
-    levels = (image.detach().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
+    levels = levels_of(image.clamp(0.0, 1.0)).cpu().numpy()
     file = io.BytesIO()
     Image.fromarray(levels).save(file, "JPEG", quality=quality)
     with Image.open(file) as read:

@@ -21,7 +21,7 @@ from advsearch.attacks import Domain
 from advsearch.controls import Space
 from advsearch.engine.problem import Problem
 from advsearch.models import Model
-from advsearch.scene.formation import to_8_bit
+from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.scene.transport.plan import why_not
 from advsearch.scene.transport.renderer import LinearRenderer
 
@@ -97,7 +97,7 @@ class RenderedLesson(Lesson):
     @classmethod
     def of(cls, right: tuple[int, ...], plain: Tensor, pictures: Tensor) -> RenderedLesson:
         """Return a lesson of pictures (N, H, W, 3) in [0, 1], of which the first counts as the worst so far."""
-        levels = (pictures * 255.0).round().to(torch.uint8)
+        levels = levels_of(pictures)
         return cls(right, plain, levels[0] / 255.0, levels)
 
 
