@@ -3,31 +3,40 @@ after."""
 
 from __future__ import annotations
 
+import gc
 import json
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from advsearch import seeds
-from advsearch.api.attack import LOADING, attack_on, problem_of
+from advsearch.api.attack import LOADING, executor_for
+from advsearch.api.harden_scenes import (
+    CLEAN_VIEWS,
+    ROBUST,
+    TIMES,
+    Attacking,
+    Drawing,
+    Looking,
+    SceneWork,
+    Wanted,
+    splits_of,
+)
 from advsearch.api.keywords import HardenKeywords, asks, configured
 from advsearch.attacks import clopper_pearson
-from advsearch.attacks.verification import WORST_CASE
-from advsearch.bundled.objects import OBJECTS
-from advsearch.config import AttackConfig, HardenConfig
-from advsearch.config.hardening import ALL
-from advsearch.engine.hardening.lessons import Lesson, RenderedLesson, lessons, plain_lessons
+from advsearch.cluster.executor import Executor, InProcess
+from advsearch.config import HardenConfig
+from advsearch.engine.hardening.lessons import Lesson
 from advsearch.engine.hardening.pictures import FOLDER
 from advsearch.engine.hardening.rounds import VALIDATION_VIEWS, WEIGHTS, TrainingRounds
 from advsearch.engine.hardening.split import FURTHER, HELD_OUT, TRAINING, VALIDATION, Split, check_disjoint
 from advsearch.engine.hardening.training import Course, Examples, MakeOptimiser, right_share
-from advsearch.engine.loading import Scene
-from advsearch.engine.naming import AnyModel, load_models, model_name, scene_settings
-from advsearch.engine.problem import Problem
+from advsearch.engine.naming import AnyModel, check_not_spread, load_models, model_name
 from advsearch.engine.run_settings import RunSettings
-from advsearch.errors import InputError
+from advsearch.errors import ClusterError, InputError
 from advsearch.interrupts import interruptible
 from advsearch.models import Model
 from advsearch.models.imported import split_weights
@@ -36,43 +45,24 @@ from advsearch.progress import NullProgress, Progress
 from advsearch.report.hardening import hardened_figure
 from advsearch.runs.directory import ARTIFACTS, IMAGES, RunDirectory, is_run, run_path
 from advsearch.runs.files import write_bytes
+from advsearch.runs.results.attack import SharedWork
 from advsearch.runs.results.base import INTERRUPTED
 from advsearch.runs.results.harden import HardenedControl, HardenResult, Share, SplitSide
 from advsearch.runs.store import Row
-from advsearch.scene.library import list_environments
-from advsearch.settings import split_names
 from advsearch.tasks import make_task
 from advsearch.viewer.pages import write_page
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-ROBUST = "robust"
-"""Of a scene in which nothing was found; otherwise there is an ending."""
 MEASURED, MEANS = "measured", "means"
 """Notes under which the store keeps what is done."""
 
-OVER: dict[str, dict[str, object]] = {
-    "camera": {"azimuth": [0.0, 360.0], "elevation": [8.0, 55.0], "roll": [-6.0, 6.0]},
-    "environment": {"rotation": [0.0, 360.0], "exposure": [-0.8, 0.5]},
-}
-"""What varies by chance from view to view, unless it is searched."""
-
-TRIES = 6
-"""Random configurations of a view that is rendered, of which the worst is trained on."""
-CLEAN_VIEWS = 2
-PLAIN_VIEWS = 3
-"""Further views of each scene as it is."""
-FURTHER_SCENES, FURTHER_VIEWS = 3, 2
-"""Scenes that come with each one of the training, and views of each, as they are: clean accuracy is lost where there
-are too few. What is rendered is searched there too, as its lessons hold few worst pictures."""
+FURTHER_SCENES = 12
+"""Scenes that come with each one of the training: what is learned is lost on other scenes where there are few, and so
+is clean accuracy."""
 CLEAN_SCENES = 4
 """Held-out scenes whose plain pictures are looked at, for each one that is attacked."""
-CLEAN_SPP = 16
-
-STRONGER = {"name": "portfolio", "policies": [{"name": "restarts", "policy": "pgd"}, "cmaes", "random"]}
-"""The policy of the stronger search, with three times the steps."""
-TIMES = 3
 
 
 @asks(HardenConfig, HardenKeywords)
@@ -103,6 +93,8 @@ def harden(
     Raises:
         InputError: anything that the caller can put right; nothing is written then.
     """
+    if not isinstance(model, (str, Path)):
+        check_not_spread(settings)
     config = configured(HardenConfig, model=model_name(model), **settings)
     path = run_path(config.run) if resume and config.run is not None else None
     resumed = path if path is not None and is_run(path) else None
@@ -134,10 +126,10 @@ def _carry_out(
     course = Course(student, loaded, config.rate, config.epochs, seeds.stream(config.seed, "order"), optimiser, beside)
     with RunDirectory.of(config, resumed) as run:
         _same_means(run, {"optimiser": optimiser is not None, "beside": beside is not None}, resumed)
-        work = Hardening(config, run, loaded, course, splits, progress)
+        work = Hardening(config, run, loaded, course, SceneWork(config, loaded, splits), progress)
         try:
-            with interruptible():
-                work.carry_out()
+            with interruptible(), executor_for(config, "advsearch.api.harden_scenes:scenes_of", progress) as executor:
+                work.carry_out(executor or InProcess(work.scenes))
             ending = "done"
         except KeyboardInterrupt:
             ending = INTERRUPTED
@@ -167,39 +159,6 @@ def _same_means(run: RunDirectory, given: dict[str, bool], resumed: Path | None)
             )
 
 
-def splits_of(config: HardenConfig, model: Model) -> dict[str, Split]:
-    """Return the sides of the split by name.
-
-    Raises:
-        InputError: there is nothing on a side, or one environment on both.
-    """
-    objects = tuple(OBJECTS) if config.object == ALL else config.objects
-    known = tuple(name for name in objects if name not in OBJECTS or _has_class(model, OBJECTS[name].label))
-    if not known:
-        raise InputError(f"object: model {model.name} has a class for none of {', '.join(objects)}; name others")
-    files = [name for name in known if name not in OBJECTS]
-    if files and config.held_out is None:
-        raise InputError(
-            f"held_out: {', '.join(files)} has no other instances; name objects of its class that training never sees"
-        )
-    held = known if config.held_out is None else split_names(config.held_out)
-    training = split_names(config.environment) if config.environment else list_environments("train")
-    asked = config.held_out_environment
-    measured = split_names(asked) if asked else list_environments("heldout")
-    taught = [
-        Split(name, known, training, seeds.stream(config.seed, name), True) for name in (TRAINING, FURTHER, VALIDATION)
-    ]
-    measured_on = Split(HELD_OUT, held, measured, seeds.stream(config.seed, HELD_OUT))
-    return {one.name: one for one in (*taught, measured_on)}
-
-
-def _has_class(model: Model, label: str) -> bool:
-    try:
-        return bool(model.label_set(label).indices)
-    except InputError:
-        return False
-
-
 @dataclass
 class Hardening:
     """One run of `harden`.
@@ -209,16 +168,18 @@ class Hardening:
         run: keeps what is done.
         model: as it was given.
         course: trains a copy of it.
-        splits: by name.
+        scenes: does what there is to do with single ones.
         progress: told how far it is.
+        seconds: that its parts took.
     """
 
     config: HardenConfig
     run: RunDirectory
     model: Model
     course: Course
-    splits: Mapping[str, Split]
+    scenes: SceneWork
     progress: Progress
+    seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         config = self.config
@@ -226,24 +187,44 @@ class Hardening:
         self.rounds = TrainingRounds(self.run, self.course, self._drawn, *amounts, self.progress)
         self.measured: dict[str, str] = json.loads(self.run.store.note(MEASURED) or "{}")
         self.clean: dict[str, Share] = {}
-        self._set = scene_settings(self.config.set_, self.config.exposure)
+        self._executor: Executor = InProcess(self.scenes)
 
     @property
     def student(self) -> Trainable:
         """What is trained."""
         return self.course.student
 
+    @property
+    def splits(self) -> Mapping[str, Split]:
+        """The sides of the split by name."""
+        return self.scenes.splits
+
     # ---- the parts --------------------------------------------------------------------------------------------------
 
-    def carry_out(self) -> None:
-        """Measure, train, and measure again."""
-        sides = self.splits
+    def carry_out(self, executor: Executor) -> None:
+        """Measure, train, and measure again; the executor does what there is to do with scenes."""
+        self._executor, sides = executor, self.splits
         check_disjoint(sides[HELD_OUT], [sides[name] for name in (TRAINING, FURTHER, VALIDATION)], self._counts)
-        self._measure("before", "attacking the model as it is", self.model, 1)
-        self.rounds.carry_out(self.config.rounds)
-        self._measure("after", "attacking the hardened model", self.student.model, 1)
-        self._measure("stronger", "attacking it with a stronger search", self.student.model, TIMES)
-        self._look()
+        gc.freeze()  # as of `scenes_of`
+        try:
+            with self._timed("measurement"):
+                self._measure("before", "attacking the model as it is", 1)
+            with self._timed("training"):
+                self.rounds.carry_out(self.config.rounds)
+            with self._timed("measurement"):
+                self._measure("after", "attacking the hardened model", 1)
+                self._measure("stronger", "attacking it with a stronger search", TIMES)
+                self._look()
+        finally:
+            gc.unfreeze()
+
+    @contextmanager
+    def _timed(self, part: str) -> Iterator[None]:
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - begun
 
     @property
     def _counts(self) -> dict[str, int]:
@@ -253,85 +234,74 @@ class Hardening:
         counts = {TRAINING: searched, FURTHER: FURTHER_SCENES * searched}
         return {**counts, VALIDATION: self.rounds.judged, HELD_OUT: held}
 
-    def _alone(self, control: str, name: str, **changes: object) -> AttackConfig:
-        """What one control is searched with, on an object of a name."""
-        config, given = self.config, self.config.controls[control]
-        shared = RunSettings(config.epsilon, config.norm, config.texture_resolution)
-        own = vars(shared.alone(control, given))
-        found: dict[str, object] = {"object": name, "environment": None, "set_": {}, "exposure": 0.0, **own, **changes}
-        found |= {"controls": {control: given}, "measure": "no", "baseline": False}
-        return AttackConfig.of(config, **found)
+    def _each(self, wanted: Sequence[Wanted]) -> Iterator[tuple[int, Any]]:
+        """Have done what is wanted of scenes; yield the place of each and what came of it, in any order.
+
+        Raises:
+            ClusterError: workers died of one.
+        """
+        for done in self._executor.results((range(place, place + 1) for place in range(len(wanted))), wanted):
+            if done.lost:
+                raise ClusterError(f"{wanted[done.numbers.start]}: {done.lost}")
+            facts = self._executor.facts
+            self.progress.advance(1, **({} if facts is None else facts.told))
+            yield done.numbers.start, done.value[0]
+
+    # ---- lessons ----------------------------------------------------------------------------------------------------
 
     def _drawn(self, title: str, split: str, places: Sequence[int], views: int) -> list[Lesson]:
-        """Lessons of scenes for each control; in every fourth scene of the training all views share a texture, and
-        further scenes come on top."""
-        side, found, rendered = self.splits[split], list[Lesson](), list[str]()
-        further = FURTHER_SCENES if split == TRAINING else 0
-        self.progress.stage(title, len(places) * (len(self.config.controls) + further))
-        for control in self.config.controls:
-            for number in places:
-                problem, seed = self._problem(side, number, control)
-                drawn = lessons(problem, views, TRIES, seed, shared=split == TRAINING and number % 4 == 3)
-                found += drawn + plain_lessons(problem, PLAIN_VIEWS, seed)
-                self.progress.advance(1)
-            if isinstance(drawn[0], RenderedLesson):
-                rendered.append(control)
-        return found + self._further([place * further + more for place in places for more in range(further)], rendered)
+        """Lessons of scenes: for each control whose pictures a matrix says, and for all others together.
 
-    def _further(self, places: Sequence[int], rendered: Sequence[str]) -> list[Lesson]:
-        """Lessons of scenes that come with those of the training: plain ones, and of controls that are rendered."""
-        side, found, first = self.splits[FURTHER], list[Lesson](), next(iter(self.config.controls))
-        for number in places:
-            for control in dict.fromkeys([first, *rendered]):
-                problem, seed = self._problem(side, number, control)
-                if control in rendered:
-                    found += lessons(problem, FURTHER_VIEWS, TRIES, seed)
-                if control == first:
-                    found += plain_lessons(problem, FURTHER_VIEWS, seed)
-            self.progress.advance(1)
-        return found
-
-    def _problem(self, side: Split, number: int, control: str) -> tuple[Problem, int]:
-        """What a scene is searched as, and the root of the draws of its lessons."""
-        name, scene = side.scene(number, self._set)
-        problem = problem_of(self._alone(control, name, over=_without(control)), scene, self.model)
-        return problem, seeds.stream(side.seed, "views", number)
+        In every fourth scene of the training all views share a texture, and further scenes come on top: of what is
+        rendered new scenes teach more than further views.
+        """
+        controls, linear = tuple(self.config.controls), self.scenes.linear
+        rendered, training = tuple(one for one in controls if one not in linear), split == TRAINING
+        wanted = [
+            Drawing(split, number, (one,), views, 1, training and number % 4 == 3)
+            for one in linear
+            for number in places
+        ]
+        more = [FURTHER_SCENES * place + one for place in places for one in range(FURTHER_SCENES)] if training else []
+        if rendered:
+            wanted += [Drawing(split, number, rendered, 1 if training else views, 0) for number in places]
+            wanted += [Drawing(FURTHER, number, rendered, 1, 0) for number in more]
+        else:
+            wanted += [Drawing(FURTHER, number, controls[:1], 0, 1) for number in more]
+        self.progress.stage(title, len(wanted))
+        found = dict(self._each(wanted))
+        return [one for place in range(len(wanted)) for one in found[place]]
 
     # ---- measurement ------------------------------------------------------------------------------------------------
 
-    def _measure(self, which: str, title: str, model: Model, times: int) -> None:
-        """Attack every held-out scene over each control; what is known is not attacked again."""
-        config = self.config
-        self.progress.stage(title, config.measured * len(config.controls), hint="`measured` and `steps` shorten it")
-        harder_search = {} if times == 1 else {"policy": STRONGER, "steps": times * config.steps}
+    def _measure(self, which: str, title: str, times: int) -> None:
+        """Attack every held-out scene over each control; what is known is not attacked again, and what was found is not
+        sought any harder."""
+        config, wanted = self.config, list[Attacking]()
+        weights = None if which == "before" else (self.run.path / ARTIFACTS / WEIGHTS).read_bytes()
         for number in range(config.measured):
-            name, scene = self.splits[HELD_OUT].scene(number, self._set)
             for control in config.controls:
-                key = f"{which} {control} {number}"
-                if key not in self.measured:
-                    beaten = times > 1 and self.measured[f"after {control} {number}"] != ROBUST
-                    seed = seeds.stream(config.seed, f"measured {control}", number)
-                    asked = self._alone(control, name, seed=seed, **harder_search)
-                    self.measured[key] = "found before" if beaten else _attacked(asked, scene, model)
-                    self.run.store.set_note(MEASURED, json.dumps(self.measured))
-                    wrong = self.measured[key] != ROBUST
-                    self.run.record(Row(f"{which} {control}", number, seed=seed, spp=config.verify_spp, success=wrong))
-                self.progress.advance(1)
+                if times > 1 and self.measured[f"after {control} {number}"] != ROBUST:
+                    self._note(which, control, number, "found before")
+                elif f"{which} {control} {number}" not in self.measured:
+                    wanted.append(Attacking(control, number, times, weights))
+        self.progress.stage(title, len(wanted), hint="`measured` and `steps` shorten it")
+        for place, ending in self._each(wanted):
+            self._note(which, wanted[place].control, wanted[place].number, ending)
+
+    def _note(self, which: str, control: str, number: int, ending: str) -> None:
+        """Keep how an attack ended."""
+        self.measured[f"{which} {control} {number}"] = ending
+        self.run.store.set_note(MEASURED, json.dumps(self.measured))
+        seed = seeds.stream(self.config.seed, f"measured {control}", number)
+        wrong = ending != ROBUST
+        self.run.record(Row(f"{which} {control}", number, seed=seed, spp=self.config.verify_spp, success=wrong))
 
     def _look(self) -> None:
         """Ask both models about plain pictures of held-out scenes."""
-        count, control = self._counts[HELD_OUT], next(iter(self.config.controls))
-        self.progress.stage("looking at plain pictures of held-out scenes", count)
-        seen: list[Lesson] = []
-        for number in range(count):
-            name, scene = self.splits[HELD_OUT].scene(number, self._set)
-            problem = problem_of(self._alone(control, name, over=_without(control)), scene, self.model)
-            for view in range(CLEAN_VIEWS):
-                seed = seeds.stream(self.splits[HELD_OUT].seed, "plain", number * CLEAN_VIEWS + view)
-                picture = problem.picture(problem.domain.start, seed, CLEAN_SPP)
-                right = tuple(int(one) for one in problem.truth())
-                seen.append(Lesson(right, picture, picture))
-            self.progress.advance(1)
+        wanted = [Looking(number) for number in range(self._counts[HELD_OUT])]
+        self.progress.stage("looking at plain pictures of held-out scenes", len(wanted))
+        seen = [one for _, some in self._each(wanted) for one in some]
         for which, model in (("before", self.model), ("after", self.student.model)):
             self.clean[which] = _share(round(right_share(model, seen, "plain") * len(seen)), len(seen))
 
@@ -360,8 +330,8 @@ class Hardening:
             one.model_copy(update={"kept": done and n == self.rounds.best}) for n, one in enumerate(self.rounds.done)
         ]
         weights = self.run.path / ARTIFACTS / WEIGHTS
-        views = {TRAINING: config.views, FURTHER: FURTHER_VIEWS, VALIDATION: VALIDATION_VIEWS, HELD_OUT: CLEAN_VIEWS}
-        names = list(config.controls)
+        views = {TRAINING: config.views, FURTHER: 1, VALIDATION: VALIDATION_VIEWS, HELD_OUT: CLEAN_VIEWS}
+        names, facts = list(config.controls), self._executor.facts
         return HardenResult(
             run=str(self.run.path),
             environment=",".join(self.splits[TRAINING].environments),
@@ -390,30 +360,12 @@ class Hardening:
             hardened=_loads(config.model, weights) if done else None,
             weights=str(weights) if done else None,
             pictures=str(self.run.path / ARTIFACTS / FOLDER) if done else None,
+            shared=SharedWork.of_facts(facts, facts.machines if facts else {}),
             warnings=warnings,
-            seconds={"total": seconds},
+            seconds={**self.seconds, "total": seconds},
             seed=config.seed,
             command_line=config.command_line(),
         )
-
-
-def _without(control: str) -> dict[str, dict[str, object]]:
-    """What varies by chance beside a searched control."""
-    kind = control.partition(":")[0].partition(".")[0]
-    return {other: given for other, given in OVER.items() if other != kind}
-
-
-def _attacked(config: AttackConfig, scene: Scene, model: Model) -> str:
-    """How an attack ended: "robust" where it found nothing and the clean scene is right in as many trials as a verified
-    answer would have to be wrong in."""
-    found = attack_on(config, scene, model).summary
-    if found.ending == INTERRUPTED:
-        raise KeyboardInterrupt
-    control = found.clean.control
-    steady = control is not None and control.correct >= WORST_CASE.needed(control.trials)
-    if found.ending in ("found", "already wrong"):
-        return found.ending
-    return ROBUST if steady else "unsteady"
 
 
 def _share(right: int, count: int) -> Share:

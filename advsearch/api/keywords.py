@@ -160,6 +160,8 @@ class HardenKeywords(RunKeywords, total=False):
     rate: float
     clean_loss: float
     measured: int
+    workers: int | None
+    cluster: str | None
     quick: bool
 
 

@@ -28,6 +28,7 @@ def answer(result: HardenResult) -> str:
         ["load it with", f"--model {result.hardened}" if result.hardened else ""],
         ["weights", result.weights or ""],
         ["pictures", result.pictures or ""],
+        ["workers", wording.workers_text(result.shared)],
         ["time", wording.seconds_text(result.seconds["total"])],
         ["run", str(result.run)],
     ]

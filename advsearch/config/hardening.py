@@ -40,8 +40,6 @@ class HardenConfig(AttackConfig):
         "task",
         "measure",
         "estimators",
-        "workers",
-        "cluster",
     )
 
     object: str = setting_as_in(
@@ -74,9 +72,11 @@ class HardenConfig(AttackConfig):
         min_length=1,
     )
     layers: Literal["all", "last"] = setting("all", "training", "layers that are trained")
-    rounds: int = setting(4, "training", "rounds of search and training", ge=1, le=1000)
-    scenes: int = setting(84, "training", "new scenes a round for each control", ge=1, le=100_000)
-    views: int = setting(2, "training", "views of each scene", ge=1, le=1000)
+    rounds: int = setting(2, "training", "rounds of search and training", ge=1, le=1000)
+    scenes: int = setting(
+        168, "training", "new scenes a round for each control; of what is rendered 13 times as many", ge=1, le=100_000
+    )
+    views: int = setting(2, "training", "views of each scene, unless it is rendered", ge=1, le=1000)
     epochs: int = setting(8, "training", "how often a round looks at each view", ge=1, le=10_000)
     rate: float = setting(1e-3, "training", "the highest learning rate", gt=0.0, le=1.0)
     clean_loss: float = setting(
@@ -85,6 +85,9 @@ class HardenConfig(AttackConfig):
     measured: int = setting(28, "verification", "held-out scenes that are attacked, before and after", ge=1, le=100_000)
     trials: int | None = setting_as_in(AttackConfig, "trials", default=6)
     verify_spp: int | None = setting_as_in(AttackConfig, "verify_spp", default=32)
+    workers: int | None = setting_as_in(
+        AttackConfig, "workers", description="processes that share the scenes that are drawn and attacked"
+    )
     quick: bool = setting(False, "training", "minutes instead of an hour: fewer rounds, scenes and steps")
 
     @model_validator(mode="before")

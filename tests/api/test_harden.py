@@ -12,6 +12,9 @@ import torch
 
 import advsearch
 from advsearch.api import harden as hardening
+from advsearch.api import harden_scenes
+from advsearch.api.attack import executor_for
+from advsearch.api.harden_scenes import SceneWork
 from advsearch.cli.harden import answer
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig, HardenConfig
@@ -46,7 +49,7 @@ def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, 
         done.append((config.object, config.steps))
         return "found" if config.object == "book" else "robust"
 
-    monkeypatch.setattr(hardening, "_attacked", attacked)
+    monkeypatch.setattr(harden_scenes, "attacked", attacked)
     monkeypatch.setattr(hardening, "CLEAN_SCENES", 1)
     monkeypatch.setattr(hardening, "FURTHER_SCENES", 1)
     return done
@@ -74,7 +77,7 @@ def test_a_run_trains_measures_and_goes_on(attacks: list[tuple[str, int]], monke
     assert attacks[2:] == [("ball", 40), ("book", 40), ("ball", 120)]  # what was found is not sought any harder
     assert result.rounds[:2] == [one.model_copy(update={"kept": result.rounds[k].kept}) for k, one in
                                  enumerate(first.rounds)]  # fmt: skip
-    assert [one.lessons for one in result.rounds] == [0, 6, 12] and sum(one.kept for one in result.rounds) == 1
+    assert [one.lessons for one in result.rounds] == [0, 3, 6] and sum(one.kept for one in result.rounds) == 1
     assert result.before is not None and (result.before.right, result.before.count) == (1, 2)
     assert result.clean_after is not None and result.clean_after.count == 4
     assert read_result(Path("runs/run")) == result
@@ -82,23 +85,51 @@ def test_a_run_trains_measures_and_goes_on(attacks: list[tuple[str, int]], monke
     assert not set(held.environments) & set(result.split["training"].environments)
     assert result.hardened == f"small_models:Colours@{result.weights}"
     assert advsearch.load_model(result.hardened, input_size=32).classes == 14
-    assert len(list(Path(str(result.pictures)).glob("*/*.png"))) == 2 * (2 + 3 + 2)
+    assert len(list(Path(str(result.pictures)).glob("*/*.png"))) == 2 * (2 + 1 + 1)
     assert "robust to texture" in answer(result)
     page = Path("runs/run/report.html").read_text("utf-8")
     assert "Of 2 held-out scenes the searches leave 1 right, before 1;" in page and "data:image/png" in page
 
 
-def test_what_is_rendered_is_searched_in_further_scenes_too(attacks: list[tuple[str, int]]) -> None:
-    config = HardenConfig(**{**SMALL, "controls": "texture,pose", "labels": "labels.json"})
+def work_of(config: HardenConfig, run: RunDirectory, course: Course) -> hardening.Hardening:
+    """What carries out a run with the reference model."""
+    scenes = SceneWork(config, load(), harden_scenes.splits_of(config, load()))
+    return hardening.Hardening(config, run, load(), course, scenes, NullProgress())
+
+
+def test_what_is_rendered_is_searched_together_and_in_further_scenes_too(attacks: list[tuple[str, int]]) -> None:
+    config = HardenConfig(**{**SMALL, "controls": "texture,pose,light", "labels": "labels.json"})
     with RunDirectory.create_for(config) as run:
         course = Course(Trainable(torch.nn.Linear(2, 3), load()), load(), 0.1, 1, 0)
-        work = hardening.Hardening(config, run, load(), course, hardening.splits_of(config, load()), NullProgress())
-        found = [type(one) for one in work._drawn("scenes", TRAINING, range(1), 1)]
-        held_back = [type(one) for one in work._drawn("scenes", VALIDATION, range(1), 1)]
-    plain = [Lesson] * 3
-    assert held_back == [TextureLesson, *plain, RenderedLesson, *plain]
-    assert found == [*held_back, Lesson, Lesson, RenderedLesson, RenderedLesson]
+        work = work_of(config, run, course)
+        found = work._drawn("scenes", TRAINING, range(1), 1)
+        held_back = work._drawn("scenes", VALIDATION, range(1), 2)
+    assert [type(one) for one in held_back] == [TextureLesson] * 2 + [Lesson] + [RenderedLesson] * 2
+    assert [type(one) for one in found] == [TextureLesson, Lesson, RenderedLesson, RenderedLesson]
+    tries = [len(one.pictures) for one in [*found, *held_back] if isinstance(one, RenderedLesson)]
+    assert tries == [harden_scenes.TRIES] * 2 + [harden_scenes.TRIES_TO_CHOOSE] * 2
     shutil.rmtree(run.path)
+
+
+def test_workers_do_what_this_process_does(attacks: list[tuple[str, int]]) -> None:
+    config = HardenConfig(**{**SMALL, "model": "reference", "controls": "texture,pose", "epsilon": {"texture": 0.03}})
+    wanted: list[harden_scenes.Wanted] = [
+        harden_scenes.Drawing(TRAINING, 1, ("texture",), 1, 1),
+        harden_scenes.Drawing(TRAINING, 0, ("pose",), 1, 0),
+        harden_scenes.Looking(0),
+    ]
+    here = SceneWork(config, load(), harden_scenes.splits_of(config, load()))(wanted)
+    shared = config.model_copy(update={"workers": 1})
+    with executor_for(shared, "advsearch.api.harden_scenes:scenes_of", NullProgress()) as pool:
+        assert pool is not None
+        ranges = [range(place, place + 1) for place in range(len(wanted))]
+        there = {done.numbers.start: done.value[0] for done in pool.results(ranges, wanted)}
+    for place, lessons in enumerate(here):
+        assert isinstance(lessons, list) and len(lessons) == len(there[place])
+        for one, other in zip(lessons, there[place], strict=True):
+            assert type(one) is type(other) and torch.equal(one.plain, other.plain)
+            if isinstance(one, TextureLesson) and isinstance(other, TextureLesson):
+                torch.testing.assert_close(one.picture(one.texture.u), other.picture(other.texture.u))
 
 
 def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple[str, int]]) -> None:
@@ -108,7 +139,7 @@ def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple
         noted = [{"lessons": 1, "part": 1.0, "clean": clean, "robust": robust, "kept": False} for clean, robust in rows]
         run.store.set_note(ROUNDS, json.dumps(noted))
         course: Any = None
-        work = hardening.Hardening(config, run, load(), course, {}, NullProgress())
+        work = work_of(config, run, course)
         assert work.rounds.best == 3
         work.rounds.clean_loss = 0.05
         assert work.rounds.best == 2
@@ -131,7 +162,7 @@ def test_a_round_ends_with_the_part_of_the_way_that_is_best(
 
     monkeypatch.setattr("advsearch.engine.hardening.rounds.score", judged)
     with RunDirectory.create_for(config) as run:
-        work = hardening.Hardening(config, run, load(), Course(student, load(), 0.1, 1, 0), {}, NullProgress())
+        work = work_of(config, run, Course(student, load(), 0.1, 1, 0))
         work.rounds._keep(0, [], Score(1.0, 0.5), 0, 0.0)
         for loss, expected in ((0.05, 0.4), (0.2, 1.0), (0.001, 0.25)):
             net.load_state_dict({name: one + 1.0 for name, one in given.items()})

@@ -109,6 +109,11 @@ def plain_lessons(problem: Problem, views: int, seed: int) -> list[Lesson]:
     return [Lesson(right, picture, picture) for picture in pictures]
 
 
+def has_matrix(problem: Problem) -> bool:
+    """Whether a matrix of light transport says the pictures of what is searched."""
+    return why_not(problem.renderer, [one.name for one in problem.space.controls[problem.searched :]]) is None
+
+
 def lessons(problem: Problem, views: int, tries: int, seed: int, *, shared: bool = False) -> list[Lesson]:
     """Draw lessons from one scene whose view and light vary by chance.
 
@@ -119,8 +124,7 @@ def lessons(problem: Problem, views: int, tries: int, seed: int, *, shared: bool
         seed: root of the draws.
         shared: let all views have one adversarial texture.
     """
-    varying = [one.name for one in problem.space.controls[problem.searched :]]
-    linear, found = why_not(problem.renderer, varying) is None, list[Lesson]()
+    linear, found = has_matrix(problem), list[Lesson]()
     right = tuple(int(index) for index in problem.truth())
     common, whole_space = _begun(problem, seed), replace(problem.space, scene=None)
     space = replace(problem.searched_space, scene=None)
@@ -144,14 +148,22 @@ def lessons(problem: Problem, views: int, tries: int, seed: int, *, shared: bool
 
 
 def tried(domain: Domain, generator: torch.Generator, count: int) -> Tensor:
-    """Draw configurations (count, d) at random: in every second one each number is moved to the nearer end of its range
-    by chance, as searches end where several numbers are. Choices, and numbers that are periodic, have no ends."""
+    """Draw configurations (count, d) at random. In half of them each number is moved to the nearer end of its range by
+    chance, as searches end where several numbers are. Choices, and numbers that are periodic, have no ends.
+
+    Of several controls each moves alone in turn, then all of them at once.
+    """
     drawn = domain.sample(generator, count)
-    at_ends = torch.rand(drawn.shape, generator=generator) < 0.5
-    at_ends[::2] = False
-    for block, part in domain.parts():
+    at_ends = (torch.rand(drawn.shape, generator=generator) < 0.5) & (torch.rand(count, 1, generator=generator) < 0.5)
+    owners = [block.name.rpartition(".")[0] for block, _ in domain.parts()]
+    controls = list(dict.fromkeys(owners))
+    for owner, (block, part) in zip(owners, domain.parts(), strict=True):
         if block.options or block.periodic:
             at_ends[:, part] = False
+        turn = torch.arange(count) % (len(controls) + 1)
+        still = (turn != controls.index(owner)) & (turn != len(controls))
+        drawn[still, part] = domain.start[part]
+        at_ends[still, part] = False
     ends = torch.where(drawn - domain.lower < domain.upper - drawn, domain.lower, domain.upper)
     return torch.stack([domain.project(row) for row in torch.where(at_ends, ends, drawn)])
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import torch
 from safetensors import torch as safetensors
 
+from advsearch import threads
 from advsearch.engine.hardening.lessons import Lesson, harder
 from advsearch.engine.hardening.pictures import ARCHIVE, FOLDER, save_pictures, write_archive
 from advsearch.engine.hardening.split import TRAINING, VALIDATION
@@ -102,9 +103,10 @@ class TrainingRounds:
                 continue  # done before this run was stopped
             student.net.load_state_dict(self._weights(number - 1))
             self.progress.stage(f"round {number}: training", self.course.steps(len(pool)))
-            harder(pool, student.model, FIRST_STEPS)
-            self.course.round(number, pool, lambda: self.progress.advance(1))
-            found, part = self._mixed(held_back)
+            with threads.all_for_torch():
+                harder(pool, student.model, FIRST_STEPS)
+                self.course.round(number, pool, lambda: self.progress.advance(1))
+                found, part = self._mixed(held_back)
             self._keep(number, new, found, len(pool), part)
 
     def _mixed(self, held_back: Sequence[Lesson]) -> tuple[Score, float]:

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
+from advsearch.runs.results.attack import SharedWork
 from advsearch.runs.results.base import Fields, Interval, RunResult
 
 
@@ -69,6 +70,9 @@ class HardenResult(RunResult):
     hardened: str | None = Field(description="what `model` takes to load the hardened one; null if nothing was kept")
     weights: str | None = Field(description="the hardened weights, safetensors")
     pictures: str | None = Field(description="folder of the pictures of the training, a folder for each class")
+    shared: SharedWork | None = Field(
+        default=None, description="how [workers](cluster.md) did that shared the work; absent without"
+    )
     warnings: list[str] = Field(description="sentences that a reader has to know")
 
     @property
