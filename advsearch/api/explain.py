@@ -107,7 +107,7 @@ def explain_from_config(
         renders = _Renders(run.path, progress, config, found)
         table = [_rule_row(rule, found.factors, renders.confirmed(rule, n, asked)) for n, rule in enumerate(rules)]
         pairs = list(renders.pairs(rules, rows, asked))
-        clusters = renders.clusters(asked[0], run)
+        clusters = renders.clusters(asked, run)
         first = asked[0].summary
         right = int(found.right.sum())
         result = ExplainResult(
@@ -261,28 +261,38 @@ class _Renders:
                     yield min(near, key=self._moved)
                     break
 
-    def clusters(self, one: _Asked, run: RunDirectory) -> FailureClusters | None:
-        """Render failures of a sweep again, and group them by what its model decides by."""
-        failing = [number for number, row in enumerate(one.rows) if not row.correct]
-        if self.interrupted or not self.config.clusters or len(one.config.models) > 1 or not failing:
+    def clusters(self, asked: Sequence[_Asked], run: RunDirectory) -> FailureClusters | None:
+        """Render failures of one model's sweeps again, and group them by what it decides by."""
+        alone = [one for one in asked if len(one.config.models) == 1]
+        alike = [one for one in alone if one.config.models == alone[0].config.models]
+        failing = [(one, number) for one in alike for number, row in enumerate(one.rows) if not row.correct]
+        if self.interrupted or not self.config.clusters or not failing:
             return None
+        if len(alike) < len(asked):
+            name = alike[0].config.model
+            self.warnings.append(f"Kinds are of the failures of model {name} alone, where it was swept by itself.")
         generator = np.random.default_rng(seeds.stream(self.config.seed, "clusters"))
-        numbers = sorted(int(n) for n in generator.permutation(failing)[: self.config.clusters])
-        self.progress.stage("rendering failures again", len(numbers), hint="`clusters` says how many")
+        picked = [failing[n] for n in sorted(generator.permutation(len(failing))[: self.config.clusters])]
+        self.progress.stage("rendering failures again", len(picked), hint="`clusters` says how many")
         try:
             with interruptible():
-                pictures, features = pictures_again(one.config, numbers, self.progress)
+                shown = [
+                    pictures_again(one.config, numbers, self.progress)
+                    for one in alike
+                    if (numbers := [number for owner, number in picked if owner is one])
+                ]
         except KeyboardInterrupt:
             self.interrupted = True
             return None
         except (InputError, ModelError) as error:
             self.warnings.append(f"No failures were grouped: {error}")
             return None
-        self.count += len(numbers)
+        self.count += len(picked)
+        pictures, features = torch.cat([some for some, _ in shown]), shown[0][1]
         found = find_clusters(features(pictures).double().numpy(), self.config.seed)
         listed = []
         for place, members in enumerate(found.members):
-            own = [one.rows[numbers[k]] for k in members]
+            own = [picked[k][0].rows[picked[k][1]] for k in members]
             path = run.save_image(f"cluster-{place + 1}", pictures[members[0]])
             answers = dict(Counter(row.answer for row in own).most_common())
             picture = str(path.relative_to(self.folder))
@@ -291,7 +301,7 @@ class _Renders:
             )
         return FailureClusters(
             features=features.source,
-            failures=len(numbers),
+            failures=len(picked),
             silhouette=found.silhouette,
             apart=found.apart,
             listed=listed,

@@ -38,8 +38,8 @@ def swept(tmp_path: Path) -> Path:
     return stored(tmp_path / "swept", lambda elevation: elevation > HIGH)
 
 
-def stored(path: Path, wrong: Any, rows: int = 600) -> Path:
-    config = SweepConfig(object="mug", controls="camera,light", samples=rows, run=str(path))
+def stored(path: Path, wrong: Any, rows: int = 600, model: str = "reference") -> Path:
+    config = SweepConfig(object="mug", controls="camera,light", samples=rows, run=str(path), model=model)
     generator = np.random.default_rng(1)
     with RunDirectory.create_for(config) as run:
         made = []
@@ -254,3 +254,22 @@ def test_failures_are_grouped_by_what_the_model_decides_by(
     assert "2 kinds among the 50 failures" in page and page.count("data:image/png") == 2
     assert main(["show", str(tmp_path / "run")]) == 0
     assert "images/cluster-1.png" in capsys.readouterr().out
+
+
+def test_failures_of_all_sweeps_of_a_model_are_grouped_together(
+    swept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    second = stored(tmp_path / "second", lambda elevation: elevation > HIGH)
+    third = stored(tmp_path / "third", lambda elevation: elevation > HIGH, model="third")
+    asked: list[str] = []
+
+    def again(config: SweepConfig, numbers: Any, progress: Any) -> tuple[torch.Tensor, Read]:
+        asked.append(config.model)
+        return torch.full((len(numbers), 4, 4, 3), 0.6 * len(asked) - 0.4), Read()
+
+    monkeypatch.setattr(explaining, "pictures_again", again)
+    result = advsearch.explain([swept, second, third], confirm=0, pairs=0, clusters=60, run=tmp_path / "run")
+    found = result.clusters
+    assert asked == ["reference"] * 2 and found is not None and found.failures == 60
+    assert found.apart and len(found.listed) == 2
+    assert any("Kinds are of the failures of model reference alone" in text for text in result.warnings)
