@@ -242,7 +242,7 @@ class Hardening:
         """
         for done in self._executor.results((range(place, place + 1) for place in range(len(wanted))), wanted):
             if done.lost:
-                raise ClusterError(f"{wanted[done.numbers.start]}: {done.lost}")
+                raise ClusterError(f"harden, scene {wanted[done.numbers.start].number}: {done.lost}")
             facts = self._executor.facts
             self.progress.advance(1, **({} if facts is None else facts.told))
             yield done.numbers.start, done.value[0]

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 from safetensors import torch as safetensors
@@ -88,7 +88,7 @@ class Attacking:
     control: str
     number: int
     times: int
-    weights: bytes | None
+    weights: bytes | None = field(repr=False)
 
 
 @dataclass(frozen=True)
