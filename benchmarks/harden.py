@@ -4,10 +4,9 @@
 
 It is `advsearch harden --model reference --control texture,pose,light --epsilon texture=0.03` with its defaults of
 rounds, scenes and steps and a worker for each core; settings may be changed (`rounds=2 measured=14 controls=texture
-epsilon=0.03`). A run that was
-stopped goes on. Asked for, of each control: at least half of the way from the robust accuracy before to the clean
-accuracy, under the search and under the stronger one; of clean accuracy at most 2 points lost. Exit status 3 where that
-falls short.
+epsilon=0.03`). A run that was stopped goes on. Asked for, of each control: at least half of the way from the robust
+accuracy before to the clean accuracy, under the search and under the stronger one; of clean accuracy at most 2 points
+lost. Exit status 3 where that falls short.
 """
 
 from __future__ import annotations

@@ -38,7 +38,6 @@ from advsearch.engine.naming import AnyModel, check_not_spread, load_models, mod
 from advsearch.engine.run_settings import RunSettings
 from advsearch.errors import ClusterError, InputError
 from advsearch.interrupts import interruptible
-from advsearch.models import Model
 from advsearch.models.imported import split_weights
 from advsearch.models.trainable import Trainable, trainable
 from advsearch.progress import NullProgress, Progress
@@ -126,7 +125,7 @@ def _carry_out(
     course = Course(student, loaded, config.rate, config.epochs, seeds.stream(config.seed, "order"), optimiser, beside)
     with RunDirectory.of(config, resumed) as run:
         _same_means(run, {"optimiser": optimiser is not None, "beside": beside is not None}, resumed)
-        work = Hardening(config, run, loaded, course, SceneWork(config, loaded, splits), progress)
+        work = Hardening(run, course, SceneWork(config, loaded, splits), progress)
         try:
             with interruptible(), executor_for(config, "advsearch.api.harden_scenes:scenes_of", progress) as executor:
                 work.carry_out(executor or InProcess(work.scenes))
@@ -164,25 +163,21 @@ class Hardening:
     """One run of `harden`.
 
     Attributes:
-        config: what was asked.
         run: keeps what is done.
-        model: as it was given.
-        course: trains a copy of it.
-        scenes: does what there is to do with single ones.
+        course: trains a copy of the model.
+        scenes: does what there is to do with single ones; has what was asked and the model as it was given.
         progress: told how far it is.
         seconds: that its parts took.
     """
 
-    config: HardenConfig
     run: RunDirectory
-    model: Model
     course: Course
     scenes: SceneWork
     progress: Progress
     seconds: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        config = self.config
+        self.config = config = self.scenes.config
         amounts = (config.scenes, config.views, config.clean_loss)
         self.rounds = TrainingRounds(self.run, self.course, self._drawn, *amounts, self.progress)
         self.measured: dict[str, str] = json.loads(self.run.store.note(MEASURED) or "{}")
@@ -302,7 +297,7 @@ class Hardening:
         wanted = [Looking(number) for number in range(self._counts[HELD_OUT])]
         self.progress.stage("looking at plain pictures of held-out scenes", len(wanted))
         seen = [one for _, some in self._each(wanted) for one in some]
-        for which, model in (("before", self.model), ("after", self.student.model)):
+        for which, model in (("before", self.scenes.model), ("after", self.student.model)):
             self.clean[which] = _share(round(right_share(model, seen, "plain") * len(seen)), len(seen))
 
     # ---- what came out ----------------------------------------------------------------------------------------------

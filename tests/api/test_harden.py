@@ -94,7 +94,7 @@ def test_a_run_trains_measures_and_goes_on(attacks: list[tuple[str, int]], monke
 def work_of(config: HardenConfig, run: RunDirectory, course: Course) -> hardening.Hardening:
     """What carries out a run with the reference model."""
     scenes = SceneWork(config, load(), harden_scenes.splits_of(config, load()))
-    return hardening.Hardening(config, run, load(), course, scenes, NullProgress())
+    return hardening.Hardening(run, course, scenes, NullProgress())
 
 
 def test_what_is_rendered_is_searched_together_and_in_further_scenes_too(attacks: list[tuple[str, int]]) -> None:

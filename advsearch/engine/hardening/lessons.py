@@ -157,10 +157,10 @@ def tried(domain: Domain, generator: torch.Generator, count: int) -> Tensor:
     at_ends = (torch.rand(drawn.shape, generator=generator) < 0.5) & (torch.rand(count, 1, generator=generator) < 0.5)
     owners = [block.name.rpartition(".")[0] for block, _ in domain.parts()]
     controls = list(dict.fromkeys(owners))
+    turn = torch.arange(count) % (len(controls) + 1)
     for owner, (block, part) in zip(owners, domain.parts(), strict=True):
         if block.options or block.periodic:
             at_ends[:, part] = False
-        turn = torch.arange(count) % (len(controls) + 1)
         still = (turn != controls.index(owner)) & (turn != len(controls))
         drawn[still, part] = domain.start[part]
         at_ends[still, part] = False
