@@ -198,13 +198,19 @@ def problem_from_config(config: SceneConfig, *, denoise: str | None = None) -> t
     return problem, [*job.loaded[1], *sentences(problem.space.moved)]
 
 
-def problem_of(config: AttackConfig, scene: Scene, model: Model) -> Problem:
+def problem_of(config: AttackConfig, scene: Scene, model: Model, *, differentiated: bool = True) -> Problem:
     """Return the problem of a configuration on a scene and a model that are there, in place of those that it names.
+
+    Args:
+        config: what is asked for.
+        scene: a loaded one.
+        model: a loaded one.
+        differentiated: whether outlines may be; see `make_renderer`.
 
     Raises:
         InputError: as for `attack_from_config`.
     """
-    return _problem(_given(config, scene, model))
+    return _problem(_given(config, scene, model), differentiated=differentiated)
 
 
 def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
@@ -341,7 +347,7 @@ def _space(job: _Job, description: SceneDescription) -> Space:
     return make_space((*job.controls, *job.over), description)
 
 
-def _problem(job: _Job) -> Problem:
+def _problem(job: _Job, *, differentiated: bool = True) -> Problem:
     config, (model, _) = job.config, job.loaded
     description = job.scene.description
     task, facts, pictures = _task(job)
@@ -357,6 +363,7 @@ def _problem(job: _Job) -> Problem:
         config.estimators,
         leave_out=EVERYTHING if config.specialise else NOTHING,
         sampler=config.pixel_sampler,
+        differentiated=differentiated,
     )
     features_seed = seeds.stream(config.seed, "clean features")
     objective, note = objective_for(job.objective, task, model, renderer, features_seed, config.ensemble)

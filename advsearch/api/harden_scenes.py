@@ -210,7 +210,7 @@ class SceneWork:
         name, scene = side.scene(number, self._set)
         kinds = {control.partition(":")[0].partition(".")[0] for control in controls}
         over = {other: given for other, given in OVER.items() if other not in kinds}
-        problem = problem_of(self._of(controls, name, over=over), scene, self.model)
+        problem = problem_of(self._of(controls, name, over=over), scene, self.model, differentiated=False)
         return problem, seeds.stream(side.seed, "views", number)
 
     @property

@@ -180,8 +180,14 @@ def make_renderer(
     estimators: Mapping[str, str] | None = None,
     leave_out: Collection[str] = EVERYTHING,
     sampler: str = SAMPLER,
+    *,
+    differentiated: bool = True,
 ) -> Renderer:
-    """Put a described scene, with what the space's controls need in it, into Mitsuba at one size."""
+    """Put a described scene, with what the space's controls need in it, into Mitsuba at one size.
+
+    How fast coordinates move outlines is measured only where pictures are differentiated with respect to them: it takes
+    a third of the time in which a scene is loaded and a few small pictures are rendered.
+    """
     size = (resolution, resolution) if isinstance(resolution, int) else resolution
     description = space.scene or description
     if not description.lit:
@@ -197,7 +203,7 @@ def make_renderer(
         gain=description.gain,
     )
     scene = MitsubaScene(description, size, filter=formation.filter, leave_out=leave_out, sampler=sampler)
-    motion = Motion(description, size, scene.assembly)
+    motion = Motion(description, size, scene.assembly) if differentiated else None
     return Renderer(scene, space, formation, seed, motion=motion, estimators=estimators)
 
 

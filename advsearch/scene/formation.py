@@ -39,6 +39,7 @@ class ImageFormation:
             nothing (Reinhard, Stark, Shirley and Ferwerda 2002, Photographic tone reproduction for digital images,
             equation 3); or "linear", neither clipped nor encoded, for checks of derivatives: the mean of a noisy
             picture after a curve is not the curve of the mean.
+        quick: whether the denoiser is the one that takes half of the time and leaves a little more error.
     """
 
     denoiser: str = "oidn"
@@ -48,6 +49,7 @@ class ImageFormation:
     resolution: tuple[int, int] = (128, 128)
     gain: float = 1.0
     transfer: str = "srgb"
+    quick: bool = False
 
     def __post_init__(self) -> None:
         if self.denoiser not in DENOISERS:

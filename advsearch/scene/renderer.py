@@ -259,7 +259,7 @@ class Renderer:
         rendered = self._finite(self.scene.radiance(inputs, noise, spp, hide=hide))
         if self.formation.denoiser == "oidn":
             albedo, normal = self.scene.guides(inputs, seeds.stream(self.root_seed, "guides", seed), spp)
-            clean = self._denoise(rendered[..., :3].contiguous(), albedo, normal)
+            clean = self._denoise(rendered[..., :3].contiguous(), albedo, normal, quick=self.formation.quick)
             rendered = torch.cat([clean, rendered[..., 3:]], dim=-1) if hide else clean
         self.renders += 1
         return rendered

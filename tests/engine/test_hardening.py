@@ -179,9 +179,11 @@ def test_the_worst_of_what_was_rendered_is_that_of_the_model_as_it_is() -> None:
     model = student().model
     pictures = to_8_bit(torch.stack([coloured(0, level, 7) for level in (0.0, 0.3, 0.6)]))
     lesson = RenderedLesson.of((1,), pictures[0], pictures)
-    harder([lesson], model)
-    loss = surprise(model(pictures), [(1,)] * 3)
-    assert torch.equal(lesson.worst, pictures[int(loss.argmax())]) and lesson.pictures.dtype == torch.uint8
+    other = RenderedLesson.of((2,), pictures[0], pictures[:2])
+    harder([other, lesson], model)
+    for one, right in ((lesson, (1,)), (other, (2,))):
+        loss = surprise(model(one.pictures / 255.0), [right] * len(one.pictures))
+        assert torch.equal(one.worst, pictures[int(loss.argmax())]) and one.pictures.dtype == torch.uint8
     both = surprise(torch.tensor([[1.0, 1.0, 1.0, 1.0]]), [(0, 2)])
     assert both.item() == pytest.approx(0.6931, abs=1e-3)
 
@@ -193,7 +195,7 @@ def test_a_round_teaches_plain_and_worst_pictures() -> None:
     course = Course(made, student().model, 0.04, 12, seed=3)
     course.round(1, lessons, lambda: ticks.append(1))
     after = score(made.model, lessons)
-    assert len(ticks) == course.steps(len(lessons)) == 12
+    assert len(ticks) == course.steps(lessons) == 12
     more = [Lesson((5,), coloured(0, 0.4, 1), coloured(0, 0.4, 1))] * 24  # nothing makes them harder
     assert score(made.model, [*lessons, *more]) == Score(after.clean / 2, after.robust)
     assert before.robust < 0.6 and after.clean >= 0.9 and after.robust >= 0.9

@@ -25,9 +25,11 @@ from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.scene.transport.plan import why_not
 from advsearch.scene.transport.renderer import LinearRenderer
 
-SPP, DEPTH = 4, 4
-"""Samples a pixel of a lesson's paths and pictures, and segments of the longest: many lessons with some noise teach
-more than few without."""
+SPP, DEPTH = 2, 4
+"""Samples a pixel of a lesson's pictures, and segments of the longest path: many lessons with some noise teach more
+than few without."""
+MATRIX_SPP = 4
+"""Samples a pixel of a matrix of light transport."""
 STEP = 0.5
 """A step of an adversarial texture, as a share of its budget."""
 TOGETHER = 32
@@ -105,7 +107,9 @@ def plain_lessons(problem: Problem, views: int, seed: int) -> list[Lesson]:
     """Draw views of one scene as it is: lessons that nothing makes harder. Arguments as for `lessons`."""
     right = tuple(int(index) for index in problem.truth())
     drawn = [seeds.stream(seed, "plain lesson", number) for number in range(views)]
-    pictures = [problem.picture(problem.domain.start, one, SPP) for one in drawn]
+    quickly = problem.renderer.like(quick=True)
+    with torch.no_grad(), quickly.scene.shorter(DEPTH):
+        pictures = [quickly(problem.whole(problem.domain.start, one), seed=one, spp=SPP) for one in drawn]
     return [Lesson(right, picture, picture) for picture in pictures]
 
 
@@ -124,7 +128,7 @@ def lessons(problem: Problem, views: int, tries: int, seed: int, *, shared: bool
         seed: root of the draws.
         shared: let all views have one adversarial texture.
     """
-    linear, found = has_matrix(problem), list[Lesson]()
+    linear, quickly, found = has_matrix(problem), problem.renderer.like(quick=True), list[Lesson]()
     right = tuple(int(index) for index in problem.truth())
     common, whole_space = _begun(problem, seed), replace(problem.space, scene=None)
     space = replace(problem.searched_space, scene=None)
@@ -134,15 +138,15 @@ def lessons(problem: Problem, views: int, tries: int, seed: int, *, shared: bool
             whole = problem.whole(problem.domain.start, own)
             numbers = whole[problem.domain.dim :]
             if linear:
-                made = LinearRenderer(problem.renderer, whole, own, spp=SPP, quick=True)
+                made = LinearRenderer(problem.renderer, whole, own, spp=MATRIX_SPP, quick=True)
                 plain = made(whole)
                 texture = common if shared else _begun(problem, own)
                 made.let_go(whole_space)
                 found.append(TextureLesson(right, plain, plain, space, problem.domain, made, numbers, texture))
             else:
                 drawn = tried(problem.domain, torch.Generator().manual_seed(own), tries)
-                shown = [problem.renderer(torch.cat([u, numbers]), seed=own, spp=SPP) for u in drawn]
-                plain = problem.renderer(whole, seed=own, spp=SPP)
+                shown = [quickly(torch.cat([u, numbers]), seed=own, spp=SPP) for u in drawn]
+                plain = quickly(whole, seed=own, spp=SPP)
                 found.append(RenderedLesson.of(right, plain, torch.stack(shown)))
     return found
 
@@ -198,11 +202,18 @@ def harder(
     for begin in range(0, len(chosen), TOGETHER):
         part = chosen[begin : begin + TOGETHER]
         _ascend([one for one in part if isinstance(one, TextureLesson)], model, steps, change)
-        for one in part:
-            if isinstance(one, RenderedLesson):
-                with torch.no_grad():
-                    loss = surprise(model(one.pictures / 255.0), [one.right] * len(one.pictures))
-                one.worst = one.pictures[int(loss.argmax())] / 255.0
+        _choose([one for one in part if isinstance(one, RenderedLesson)], model)
+
+
+@torch.no_grad()
+def _choose(chosen: Sequence[RenderedLesson], model: Model) -> None:
+    """Choose the worst picture of each."""
+    if not chosen:
+        return
+    pictures = torch.cat([one.pictures for one in chosen]) / 255.0
+    loss = surprise(model(pictures), [one.right for one in chosen for _ in one.pictures])
+    for one, own in zip(chosen, loss.split([len(one.pictures) for one in chosen]), strict=True):
+        one.worst = one.pictures[int(own.argmax())] / 255.0
 
 
 def _ascend(chosen: Sequence[TextureLesson], model: Model, steps: int, change: Callable[[Tensor], Tensor]) -> None:

@@ -102,7 +102,7 @@ class TrainingRounds:
             if number < len(self.done):
                 continue  # done before this run was stopped
             student.net.load_state_dict(self._weights(number - 1))
-            self.progress.stage(f"round {number}: training", self.course.steps(len(pool)))
+            self.progress.stage(f"round {number}: training", self.course.steps(pool))
             with threads.all_for_torch():
                 harder(pool, student.model, FIRST_STEPS)
                 self.course.round(number, pool, lambda: self.progress.advance(1))

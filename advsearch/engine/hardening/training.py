@@ -28,6 +28,9 @@ AUGMENTATION = Augmentation(smallest_crop=0.75, largest_crop=1.15, turn=15.0, cu
 WEIGHT_DECAY = 0.02
 LARGEST_GRADIENT_NORM = 2.0
 WARM_UP = 0.1
+OFTEN = 3
+"""How often an epoch looks at a lesson that a matrix of light transport says the pictures of: each time it has another
+texture, while what was rendered stays as it is."""
 KEEP = 1.0
 """Weight of the given model's answers to plain pictures, beside that of the right ones."""
 AVERAGE = 0.98
@@ -89,7 +92,7 @@ class Course:
             optimiser: torch.optim.Optimizer = torch.optim.AdamW(parameters, lr=self.rate, weight_decay=WEIGHT_DECAY)
         else:
             optimiser = self.optimiser(parameters)
-        steps, done = self.steps(len(chosen)), 0
+        steps, done = self.steps(chosen), 0
         highest = [float(group["lr"]) for group in optimiser.param_groups]
         rates = torch.optim.lr_scheduler.OneCycleLR(
             optimiser, highest, total_steps=steps + 1, pct_start=WARM_UP, cycle_momentum=False
@@ -97,7 +100,7 @@ class Course:
         average = [one.detach().clone() for one in parameters]
         rng = np.random.default_rng([self.seed, number])
         for _ in range(self.epochs):
-            order = rng.permutation(len(chosen))
+            order = rng.permutation(_looks(chosen))
             for begin in range(0, len(order), BATCH):
                 batch = [chosen[place] for place in order[begin : begin + BATCH]]
                 self._step(batch, optimiser, int(rng.integers(2**62)))
@@ -111,9 +114,9 @@ class Course:
             for kept, one in zip(average, parameters, strict=True):
                 one.copy_(kept)
 
-    def steps(self, count: int) -> int:
-        """Steps of a round over so many lessons."""
-        return self.epochs * -(-count // BATCH)
+    def steps(self, chosen: Sequence[Lesson]) -> int:
+        """Steps of a round over lessons."""
+        return self.epochs * -(-len(_looks(chosen)) // BATCH)
 
     def _step(self, batch: Sequence[Lesson], optimiser: torch.optim.Optimizer, seed: int) -> None:
         def change(images: Tensor) -> Tensor:
@@ -157,6 +160,11 @@ class Course:
             self._further = iter(self.beside)
             found = next(self._further)
         return found
+
+
+def _looks(chosen: Sequence[Lesson]) -> list[int]:
+    """Places of lessons, as often as an epoch looks at each."""
+    return [place for place, one in enumerate(chosen) for _ in range(OFTEN if isinstance(one, TextureLesson) else 1)]
 
 
 def score(model: Model, held_back: Sequence[Lesson]) -> Score:

@@ -36,13 +36,14 @@ class Denoiser:
     def __init__(self, resolution: tuple[int, int]) -> None:
         self._buffers = [torch.zeros(*resolution, 3) for _ in range(4)]
 
-    def __call__(self, radiance: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
+    def __call__(self, radiance: Tensor, albedo: Tensor, normal: Tensor, *, quick: bool = False) -> Tensor:
         """Return the denoised linear radiance.
 
         Args:
             radiance: (H, W, 3) float32 linear radiance, at least 0.
             albedo: (H, W, 3) float32 reflectance of the first hit in [0, 1].
             normal: (H, W, 3) float32 shading normal of the first hit in [-1, 1].
+            quick: take half of the time, by a smaller network.
 
         Raises:
             EnvironmentSetupError: the package is not installed.
@@ -57,7 +58,8 @@ class Denoiser:
         gain = _gain(radiance.detach())
         for buffer, image in ((color, radiance.detach() * gain), (guide, albedo), (direction, normal)):
             buffer.copy_(image.detach())
-        mitsuba_oidn.denoise(color, guide, direction, hdr=True, input_scale=1.0, output=output)
+        quality = mitsuba_oidn.Quality.Fast if quick else mitsuba_oidn.Quality.Default
+        mitsuba_oidn.denoise(color, guide, direction, hdr=True, quality=quality, input_scale=1.0, output=output)
         return (output / gain).to(radiance.device)
 
 
