@@ -29,6 +29,7 @@ from advsearch.api.keywords import HardenKeywords, asks, configured
 from advsearch.attacks import clopper_pearson
 from advsearch.cluster.executor import Executor, InProcess
 from advsearch.config import HardenConfig
+from advsearch.config.hardening import FURTHER_SCENES
 from advsearch.engine.hardening.lessons import Lesson
 from advsearch.engine.hardening.pictures import FOLDER
 from advsearch.engine.hardening.rounds import VALIDATION_VIEWS, WEIGHTS, TrainingRounds
@@ -57,9 +58,6 @@ if TYPE_CHECKING:
 MEASURED, MEANS = "measured", "means"
 """Notes under which the store keeps what is done."""
 
-FURTHER_SCENES, FURTHER_PLAIN_SCENES = 12, 6
-"""Scenes that come with each one of the training, where something is rendered that is harder, and where plain pictures
-alone are: what is learned is lost on other scenes where there are few, and so is clean accuracy."""
 CLEAN_SCENES = 4
 """Held-out scenes whose plain pictures are looked at, for each one that is attacked."""
 
@@ -226,14 +224,8 @@ class Hardening:
         """Scenes of each split, by its name; of those that are held out a part is attacked."""
         config = self.config
         held, searched = CLEAN_SCENES * config.measured, config.scenes * config.rounds
-        counts = {TRAINING: searched, FURTHER: self._further * searched}
+        counts = {TRAINING: searched, FURTHER: FURTHER_SCENES * searched}
         return {**counts, VALIDATION: self.rounds.judged, HELD_OUT: held}
-
-    @property
-    def _further(self) -> int:
-        """Further scenes that come with each one of the training."""
-        rendered = set(self.config.controls) - set(self.scenes.linear)
-        return FURTHER_SCENES if rendered else FURTHER_PLAIN_SCENES
 
     def _each(self, wanted: Sequence[Wanted]) -> Iterator[tuple[int, Any]]:
         """Have done what is wanted of scenes; yield the place of each and what came of it, in any order.
@@ -263,8 +255,7 @@ class Hardening:
             for one in linear
             for number in places
         ]
-        further = self._further if training else 0
-        more = [further * place + one for place in places for one in range(further)]
+        more = [FURTHER_SCENES * place + one for place in places for one in range(FURTHER_SCENES)] if training else []
         if rendered:
             wanted += [Drawing(split, number, rendered, 1 if training else views, 0) for number in places]
             wanted += [Drawing(FURTHER, number, rendered, 1, 0) for number in more]

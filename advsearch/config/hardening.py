@@ -12,6 +12,10 @@ from advsearch.settings import setting, setting_as_in
 ALL = "all"
 """The objects of a command that takes all bundled ones."""
 
+FURTHER_SCENES = 6
+"""Scenes that come with each one of the training, of which nothing is drawn but one view: what is learned is lost on
+other scenes where there are few, and so is clean accuracy."""
+
 QUICK: dict[str, int] = {"rounds": 1, "scenes": 14, "views": 2, "epochs": 6, "measured": 14, "steps": 20}
 """What `quick` takes where nothing else was said: minutes instead of an hour."""
 
@@ -74,10 +78,20 @@ class HardenConfig(AttackConfig):
     layers: Literal["all", "last"] = setting("all", "training", "layers that are trained")
     rounds: int = setting(2, "training", "rounds of search and training", ge=1, le=1000)
     scenes: int = setting(
-        168, "training", "new scenes a round for each control; of what is rendered 13 times as many", ge=1, le=100_000
+        336,
+        "training",
+        f"new scenes a round for each control; of what is rendered {FURTHER_SCENES + 1} times as many",
+        ge=1,
+        le=100_000,
     )
     views: int = setting(2, "training", "views of each scene, unless it is rendered", ge=1, le=1000)
-    epochs: int = setting(8, "training", "how often a round looks at each view", ge=1, le=10_000)
+    epochs: int = setting(
+        3,
+        "training",
+        "how often a round looks at each view; three times as often where a texture is searched",
+        ge=1,
+        le=10_000,
+    )
     rate: float = setting(1e-3, "training", "the highest learning rate", gt=0.0, le=1.0)
     clean_loss: float = setting(
         0.02, "training", "clean accuracy that may be lost; weights that lose more are not kept", ge=0.0, le=1.0

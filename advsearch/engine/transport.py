@@ -165,8 +165,8 @@ class Predictor(ABC):
 
 
 @dataclass(frozen=True, eq=False)
-class Linearised:
-    """A matrix and where it was made.
+class ExpansionPoint:
+    """Where a picture was linearised, and the matrix that was made there.
 
     Attributes:
         u: the configuration.
@@ -187,7 +187,7 @@ class CleanMatrix:
         made: None until the first of them needs it.
     """
 
-    made: Linearised | None = None
+    made: ExpansionPoint | None = None
 
 
 @dataclass
@@ -213,9 +213,9 @@ class Transport(Predictor):
     deviations: list[Deviation] = field(default_factory=list)
     seconds: float = 0.0
     _optimism: float = 0.0
-    _start: Linearised | None = None
+    _start: ExpansionPoint | None = None
     _collected: int = 0
-    _present: dict[str, Linearised] = field(default_factory=dict)
+    _present: dict[str, ExpansionPoint] = field(default_factory=dict)
 
     @property
     def samples(self) -> int:
@@ -269,7 +269,7 @@ class Transport(Predictor):
         return self._ready(self._begin, "start")[1]
 
     @property
-    def _begin(self) -> Linearised:
+    def _begin(self) -> ExpansionPoint:
         if self._start is None:
             self.prepare()
         assert self._start is not None
@@ -277,7 +277,7 @@ class Transport(Predictor):
 
     def passed(self, kind: str, index: int, u: Tensor) -> None:
         if index in self.renewals.get(kind, ()):
-            self._present[kind] = Linearised(u.detach().clone(), index)
+            self._present[kind] = ExpansionPoint(u.detach().clone(), index)
 
     def evaluator(self, kind: str, on_image: OnImage | None = None) -> Evaluate:
         traced = self.problem.evaluator(kind, on_image)
@@ -321,17 +321,17 @@ class Transport(Predictor):
         self._present[kind], renderer = self._ready(present, kind)
         return renderer if index < self._end(kind) else None
 
-    def _ready(self, place: Linearised, kind: str) -> tuple[Linearised, PredictingRenderer]:
+    def _ready(self, place: ExpansionPoint, kind: str) -> tuple[ExpansionPoint, PredictingRenderer]:
         made = place if place.renderer is not None else self._made(place.u, kind, place.index)
         assert made.renderer is not None
         return made, made.renderer
 
-    def _made(self, u: Tensor, kind: str, index: int, tick: Tick = lambda samples: None) -> Linearised:
+    def _made(self, u: Tensor, kind: str, index: int, tick: Tick = lambda samples: None) -> ExpansionPoint:
         begun = time.perf_counter()
         seed = seeds.stream(self.problem.seed, f"transport {kind}", index)
         made = predicting(self.problem.renderer, u, seed, tick)
         self.seconds += time.perf_counter() - begun
-        return Linearised(u.detach().clone(), index, made)
+        return ExpansionPoint(u.detach().clone(), index, made)
 
     def deviation(self, linear: PredictingRenderer, at: Tensor, u: Tensor, index: int) -> Deviation:
         """Compare what a prediction says of the change since its matrix was made at `at` with what traced pictures

@@ -52,7 +52,6 @@ def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, 
     monkeypatch.setattr(harden_scenes, "attacked", attacked)
     monkeypatch.setattr(hardening, "CLEAN_SCENES", 1)
     monkeypatch.setattr(hardening, "FURTHER_SCENES", 1)
-    monkeypatch.setattr(hardening, "FURTHER_PLAIN_SCENES", 1)
     return done
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -57,14 +58,16 @@ class ColouredRows:
 
     Args:
         rows, columns: its size.
-        small: keep it in 16 bits a share; it is unpacked for each product.
+        small: keep it in 16 bits a share, and as many a column where there are no more than 65,536; it is unpacked for
+            each product.
     """
 
     def __init__(self, rows: int, columns: int, small: bool) -> None:
         self._shape, self._small = (rows, columns), small
         self._both_ways: tuple[Tensor, Tensor] | None = None
         self._sum = scipy.sparse.csr_matrix(self._shape, dtype=np.float32)
-        self._kept: tuple[npt.NDArray[np.float16], npt.NDArray[np.int32], npt.NDArray[np.int32]] | None = None
+        self._kept: tuple[npt.NDArray[np.float16], npt.NDArray[np.integer[Any]], npt.NDArray[np.int32]] | None = None
+        self._column = np.dtype(np.uint16 if small and columns <= 1 << 16 else np.int32)
         self._colours: Floats = np.zeros((rows, 3), dtype=np.float32)
         self._kept_colours = Halves(torch.zeros(0))
 
@@ -78,7 +81,7 @@ class ColouredRows:
     def bytes(self) -> int:
         """Memory when it is finished: a share and its column an entry, a beginning and a colour a row; a share and its
         row an entry and a beginning a column as well, where it is kept both ways."""
-        small = 6 * self.entries + (4 + 6) * self._shape[0]
+        small = (2 + self._column.itemsize) * self.entries + (4 + 6) * self._shape[0]
         return small if self._small else small + 10 * self.entries + 4 * self._shape[1]
 
     def add(self, rows: Ints, columns: Ints, shares: Floats, weights: Floats) -> None:
@@ -106,7 +109,7 @@ class ColouredRows:
         factors = np.where(sums > 0.0, 1.0 / np.maximum(sums, 1e-30), 0.0)
         shares = self._sum.data * np.repeat(factors, np.diff(self._sum.indptr))
         if self._small:
-            self._kept = shares.astype(np.float16), self._sum.indices, self._sum.indptr
+            self._kept = shares.astype(np.float16), self._sum.indices.astype(self._column), self._sum.indptr
         else:
             rows = scipy.sparse.csr_matrix((shares, self._sum.indices, self._sum.indptr), self._shape)
             self._both_ways = _by_rows(rows), _by_rows(rows.T.tocsr())
@@ -138,7 +141,7 @@ class ColouredRows:
     def _shares(self) -> scipy.sparse.csr_matrix:
         assert self._kept is not None, "finish it first"
         shares, columns, begin = self._kept
-        return scipy.sparse.csr_matrix((shares.astype(np.float32), columns, begin), self._shape)
+        return scipy.sparse.csr_matrix((shares.astype(np.float32), columns.astype(np.int32), begin), self._shape)
 
 
 class TextureTransport:
