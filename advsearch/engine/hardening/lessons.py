@@ -136,7 +136,7 @@ def lessons(problem: Problem, views: int, tries: int, seed: int, *, shared: bool
         for number in range(views):
             own = seeds.stream(seed, "lesson", number)
             whole = problem.whole(problem.domain.start, own)
-            numbers = whole[problem.domain.dim :]
+            numbers = whole[problem.domain.dim :].clone()  # and not all that it is a part of
             if linear:
                 made = LinearRenderer(problem.renderer, whole, own, spp=MATRIX_SPP, quick=True)
                 plain = made(whole)

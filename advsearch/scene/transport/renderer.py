@@ -146,8 +146,10 @@ class LinearRenderer(PredictingRenderer):
             self._base = Halves(base)
 
     def let_go(self, space: InputSpace) -> None:
-        """Let go of the scene, which only tracing takes; the pictures stay, and `space` is the same without a scene."""
-        vars(self).pop("scene")
+        """Let go of the scene and the denoiser, which only tracing takes; the pictures stay, and `space` is the same
+        without a scene."""
+        for name in ("scene", "_denoise"):
+            vars(self).pop(name)
         self.space = space
 
     @property
