@@ -58,7 +58,7 @@ class Denoiser:
         gain = _gain(radiance.detach())
         for buffer, image in ((color, radiance.detach() * gain), (guide, albedo), (direction, normal)):
             buffer.copy_(image.detach())
-        quality = mitsuba_oidn.Quality.Fast if quick else mitsuba_oidn.Quality.Default
+        quality = mitsuba_oidn.Quality.Fast if quick else mitsuba_oidn.Quality.High
         mitsuba_oidn.denoise(color, guide, direction, hdr=True, quality=quality, input_scale=1.0, output=output)
         return (output / gain).to(radiance.device)
 

@@ -55,6 +55,14 @@ def test_the_brightness_is_what_the_denoiser_finds_itself() -> None:
     assert not torch.allclose(apart, own, rtol=1e-4, atol=1e-5), "else the brightness decides nothing here"
 
 
+def test_the_quick_one_is_another_and_takes_the_noise_out_too() -> None:
+    mitsuba()
+    picture, flat, denoiser = noisy(5), torch.full((*SIZE, 3), 0.5), Denoiser(SIZE)
+    full, quick = (denoiser(picture, flat, flat, quick=one) for one in (False, True))
+    assert not torch.equal(full, quick)
+    assert (quick - full).abs().mean() < 0.2 * (picture - full).abs().mean()
+
+
 def test_black_squares_do_not_count() -> None:
     picture = torch.zeros(32, 48, 3)
     assert _gain(picture) == 1.0
