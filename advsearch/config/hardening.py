@@ -16,6 +16,9 @@ FURTHER_SCENES = 6
 """Scenes that come with each one of the training, of which nothing is drawn but one view: what is learned is lost on
 other scenes where there are few, and so is clean accuracy."""
 
+TEXTURE_LOOKS = 3
+"""How often an epoch looks at a view with a texture: it is another one each time, while what was rendered stays."""
+
 QUICK: dict[str, int] = {"rounds": 1, "scenes": 14, "views": 2, "epochs": 6, "measured": 14, "steps": 20}
 """What `quick` takes where nothing else was said: minutes instead of an hour."""
 
@@ -88,7 +91,7 @@ class HardenConfig(AttackConfig):
     epochs: int = setting(
         3,
         "training",
-        "how often a round looks at each view; three times as often where a texture is searched",
+        f"how often a round looks at each view; {TEXTURE_LOOKS} times as often where a texture is searched",
         ge=1,
         le=10_000,
     )

@@ -39,7 +39,7 @@ class ImageFormation:
             nothing (Reinhard, Stark, Shirley and Ferwerda 2002, Photographic tone reproduction for digital images,
             equation 3); or "linear", neither clipped nor encoded, for checks of derivatives: the mean of a noisy
             picture after a curve is not the curve of the mean.
-        quick: whether the denoiser is the one that takes half of the time and leaves a little more error.
+        quick: whether the denoiser takes some 0.6 of its time and leaves a little more error.
     """
 
     denoiser: str = "oidn"

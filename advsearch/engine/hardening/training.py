@@ -17,6 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from advsearch.config.hardening import TEXTURE_LOOKS
 from advsearch.engine.hardening.augmentation import Augmentation
 from advsearch.engine.hardening.lessons import TOGETHER, Lesson, RenderedLesson, TextureLesson, harder, surprise
 from advsearch.models import Model
@@ -28,9 +29,6 @@ AUGMENTATION = Augmentation(smallest_crop=0.75, largest_crop=1.15, turn=15.0, cu
 WEIGHT_DECAY = 0.02
 LARGEST_GRADIENT_NORM = 2.0
 WARM_UP = 0.1
-OFTEN = 3
-"""How often an epoch looks at a lesson that a matrix of light transport says the pictures of: each time it has another
-texture, while what was rendered stays as it is."""
 KEEP = 1.0
 """Weight of the given model's answers to plain pictures, beside that of the right ones."""
 AVERAGE = 0.98
@@ -92,7 +90,7 @@ class Course:
             optimiser: torch.optim.Optimizer = torch.optim.AdamW(parameters, lr=self.rate, weight_decay=WEIGHT_DECAY)
         else:
             optimiser = self.optimiser(parameters)
-        steps, done = self.steps(chosen), 0
+        steps, done, looks = self.steps(chosen), 0, _looks(chosen)
         highest = [float(group["lr"]) for group in optimiser.param_groups]
         rates = torch.optim.lr_scheduler.OneCycleLR(
             optimiser, highest, total_steps=steps + 1, pct_start=WARM_UP, cycle_momentum=False
@@ -100,7 +98,7 @@ class Course:
         average = [one.detach().clone() for one in parameters]
         rng = np.random.default_rng([self.seed, number])
         for _ in range(self.epochs):
-            order = rng.permutation(_looks(chosen))
+            order = rng.permutation(looks)
             for begin in range(0, len(order), BATCH):
                 batch = [chosen[place] for place in order[begin : begin + BATCH]]
                 self._step(batch, optimiser, int(rng.integers(2**62)))
@@ -164,7 +162,9 @@ class Course:
 
 def _looks(chosen: Sequence[Lesson]) -> list[int]:
     """Places of lessons, as often as an epoch looks at each."""
-    return [place for place, one in enumerate(chosen) for _ in range(OFTEN if isinstance(one, TextureLesson) else 1)]
+    return [
+        place for place, one in enumerate(chosen) for _ in range(TEXTURE_LOOKS if isinstance(one, TextureLesson) else 1)
+    ]
 
 
 def score(model: Model, held_back: Sequence[Lesson]) -> Score:

@@ -43,7 +43,7 @@ class Denoiser:
             radiance: (H, W, 3) float32 linear radiance, at least 0.
             albedo: (H, W, 3) float32 reflectance of the first hit in [0, 1].
             normal: (H, W, 3) float32 shading normal of the first hit in [-1, 1].
-            quick: take half of the time, by a smaller network.
+            quick: take some 0.6 of the time, and leave a little more error.
 
         Raises:
             EnvironmentSetupError: the package is not installed.
