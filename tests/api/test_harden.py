@@ -156,19 +156,24 @@ def test_a_round_ends_with_the_part_of_the_way_that_is_best(
     student = Trainable(net, load())
     given = {name: one.clone() for name, one in net.state_dict().items()}
 
+    judged_at = list[float]()
+
     def judged(model: Model, held_back: Any) -> Score:
         part = float(net.weight.detach()[0, 0] - given["weight"][0, 0])
+        judged_at.append(part)
         return Score(1.0 - 0.1 * part, 0.5 + 0.2 * part)
 
     monkeypatch.setattr("advsearch.engine.hardening.rounds.score", judged)
     with RunDirectory.create_for(config) as run:
         work = work_of(config, run, Course(student, load(), 0.1, 1, 0))
         work.rounds._keep(0, [], Score(1.0, 0.5), 0, 0.0)
-        for loss, expected in ((0.05, 0.4), (0.2, 1.0), (0.001, 0.25)):
+        for loss, expected, looked_at in ((0.05, 0.4, 6), (0.2, 1.0, 2), (0.001, 0.25, 6)):
+            judged_at.clear()
             net.load_state_dict({name: one + 1.0 for name, one in given.items()})
             work.rounds.clean_loss = loss
             found, part = work.rounds._mixed([])
             assert part == expected and found.robust == pytest.approx(0.5 + 0.2 * part)
+            assert len(judged_at) == looked_at, "less than the best part is looked at once"
             torch.testing.assert_close(net.bias.detach(), given["bias"] + part)
     shutil.rmtree(run.path)
 
