@@ -91,7 +91,7 @@ class TrainingRounds:
         write_archive(folder / FOLDER, folder / ARCHIVE)
 
     def _train(self, count: int) -> None:
-        student, pool = self.course.student, list[Lesson]()
+        student, pool, begun = self.course.student, list[Lesson](), 0
         held_back = self.draw("drawing scenes to choose weights by", VALIDATION, range(self.judged), VALIDATION_VIEWS)
         if not self.done:
             self._keep(0, [], score(student.model, held_back), 0, 0.0)
@@ -104,9 +104,10 @@ class TrainingRounds:
             student.net.load_state_dict(self._weights(number - 1))
             self.progress.stage(f"round {number}: training", self.course.steps(pool))
             with threads.all_for_torch():
-                harder(pool, student.model, FIRST_STEPS)
+                harder(pool[begun:], student.model, FIRST_STEPS)  # the others are as hard as their training left them
                 self.course.round(number, pool, lambda: self.progress.advance(1))
                 found, part = self._mixed(held_back)
+            begun = len(pool)
             self._keep(number, new, found, len(pool), part)
 
     def _mixed(self, held_back: Sequence[Lesson]) -> tuple[Score, float]:
