@@ -73,6 +73,9 @@ def main() -> int:
             renew(name, run)
         begun, cpu = (run / CONFIG).is_file(), time.process_time()
         result = real(name, args.data, run) if args.data else bundled(name, run)
+        if result.goes_on:
+            print(name, "was interrupted, and is not kept", file=sys.stderr)
+            return 1
         keep(name, result, "data" if args.data else "", None if begun else time.process_time() - cpu)
         print(name, result.seconds["total"], file=sys.stderr)
     return 0
