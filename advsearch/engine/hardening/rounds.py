@@ -125,18 +125,15 @@ class TrainingRounds:
                      for name, one in learned.items()}  # fmt: skip
             student.net.load_state_dict(mixed)
 
-        found, best = dict[float, Score](), None
+        found = dict[float, Score]()
         for part in PARTS:
             take(part)
-            found[part] = here = score(student.model, held_back)
-            if not self._allowed(here.clean):
-                continue
-            if best is not None and here.robust < found[best].robust:
+            found[part] = score(student.model, held_back)
+            robust = [one.robust for one in found.values() if self._allowed(one.clean)]
+            if robust and robust[-1] < max(robust):
                 break
-            if best is None or here.robust > found[best].robust:
-                best = part
-        if best is None:
-            best = max(PARTS, key=lambda part: found[part].clean)
+        allowed = [part for part, one in found.items() if self._allowed(one.clean)]
+        best = max(allowed, key=lambda part: found[part].robust, default=max(found, key=lambda part: found[part].clean))
         take(best)
         return found[best], best
 
