@@ -110,10 +110,9 @@ def real(name: str, data: Path, run: Path) -> RecipeResult:
     several = name == "backgrounds"
     objects = list(LABELS)[: 1 if name in ONE_OBJECT else None if name in ALL_OBJECTS else 2]
     environments = sorted(str(one) for one in (data / "environments").glob("*.hdr"))
-    models = [
-        "mobilenet_v2_imagenet.pt2",
-        *(["mobilenet_edgetpu_075_imagenet_224.pt2"] if "corruptions" in name else []),
-    ]
+    models = ["mobilenet_v2_imagenet.pt2", "mobilenet_edgetpu_075_imagenet_224.pt2"]
+    if name != "common-corruptions":
+        models = models[1:] if name == "physical" else models[:1]
     return (
         done(run)
         or gone_on(run)

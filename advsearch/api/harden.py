@@ -197,6 +197,7 @@ class Hardening:
     def carry_out(self, executor: Executor) -> None:
         """Measure, train, and measure again; the executor does what there is to do with scenes."""
         self._executor, sides = executor, self.splits
+        self.progress.stage("checking that training and measurement share nothing")
         check_disjoint(sides[HELD_OUT], [sides[name] for name in (TRAINING, FURTHER, VALIDATION)], self._counts)
         gc.freeze()  # as of `scenes_of`
         try:

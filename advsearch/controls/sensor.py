@@ -11,7 +11,8 @@ Katkovnik and Egiazarian 2008, Practical Poissonian-Gaussian noise modeling and 
 section II). The pattern is Bayer's (1976, US patent 3971065); interpolation is bilinear. Chromatic aberration as a
 difference of magnification: Kang 2007, Automatic removal of chromatic aberration from a single image, section 2.
 
-It happens to the finished picture, and nothing is rendered anew.
+It happens to the finished picture, and nothing is rendered anew. Searched by default is what cameras do at their worst:
+noise with a tenth of white's light, a white balance half a stop off, a file of quality 40.
 """
 
 from __future__ import annotations
@@ -36,16 +37,17 @@ _DARK = 1e-6
 """Keeps the slope of a square root finite in black."""
 
 
-def _number(name: str, unit: str, low: float, high: float, description: str, **more: object) -> Parameter:
+def _number(
+    name: str, unit: str, ends: tuple[float, float], search: tuple[float, float], description: str, **more: object
+) -> Parameter:
     return Parameter(
         name,
         (),
         unit,
-        low,
-        high,
+        *ends,
         0.0,
         description,
-        **{"search": (low, high), "estimators": ("image",), **more},  # type: ignore[arg-type]
+        **{"search": search, "estimators": ("image",), **more},  # type: ignore[arg-type]
     )
 
 
@@ -55,14 +57,37 @@ class SensorControl(NumberControl):
     kind: ClassVar[str] = "sensor"
     summary: ClassVar[str] = "What a camera adds: noise, mosaic, white balance, chromatic aberration, JPEG."
     parameters: ClassVar[tuple[Parameter, ...]] = (
-        _number("aberration", "1", -0.02, 0.02, "How much larger the red picture is than the green one; blue smaller."),
-        _number("shot", "1", 0.0, 0.5, "Standard deviation of the noise in white that grows with the root of light."),
-        _number("read", "1", 0.0, 0.2, "Standard deviation of the noise that is there in the dark."),
-        _number("mosaic", "1", 0.0, 1.0, "Share of the picture that goes through a Bayer mosaic; 1 is a real camera."),
-        _number("red", "stops", -1.0, 1.0, "White balance: red is this much brighter."),
-        _number("blue", "stops", -1.0, 1.0, "White balance: blue is this much brighter."),
         _number(
-            "compression", "1", 0.0, 95.0, "0 is no file; above, a JPEG file of quality 100 less this.", estimators=()
+            "aberration",
+            "1",
+            (-0.02, 0.02),
+            (-0.005, 0.005),
+            "How much larger the red picture is than the green one; blue smaller.",
+        ),
+        _number(
+            "shot",
+            "1",
+            (0.0, 0.5),
+            (0.0, 0.1),
+            "Standard deviation of the noise in white that grows with the root of light.",
+        ),
+        _number("read", "1", (0.0, 0.2), (0.0, 0.02), "Standard deviation of the noise that is there in the dark."),
+        _number(
+            "mosaic",
+            "1",
+            (0.0, 1.0),
+            (0.0, 1.0),
+            "Share of the picture that goes through a Bayer mosaic; 1 is a real camera.",
+        ),
+        _number("red", "stops", (-1.0, 1.0), (-0.5, 0.5), "White balance: red is this much brighter."),
+        _number("blue", "stops", (-1.0, 1.0), (-0.5, 0.5), "White balance: blue is this much brighter."),
+        _number(
+            "compression",
+            "1",
+            (0.0, 95.0),
+            (0.0, 60.0),
+            "0 is no file; above, a JPEG file of quality 100 less this.",
+            estimators=(),
         ),
     )
     choices: ClassVar[tuple[Choice, ...]] = (

@@ -68,8 +68,8 @@ class TrainingRounds:
 
     @property
     def judged(self) -> int:
-        """Scenes by which weights are chosen, for each control: half as many as a round adds."""
-        return -(-self.each // 2)
+        """Scenes by which weights are chosen, for each control: a third as many as a round adds."""
+        return -(-self.each // 3)
 
     @property
     def best(self) -> int:
