@@ -12,7 +12,7 @@ section II). The pattern is Bayer's (1976, US patent 3971065); interpolation is 
 difference of magnification: Kang 2007, Automatic removal of chromatic aberration from a single image, section 2.
 
 It happens to the finished picture, and nothing is rendered anew. Searched by default is what cameras do at their worst:
-noise with a tenth of white's light, a white balance half a stop off, a file of quality 40.
+noise of a tenth of white, a white balance half a stop off, a file of quality 40.
 """
 
 from __future__ import annotations
@@ -37,17 +37,16 @@ _DARK = 1e-6
 """Keeps the slope of a square root finite in black."""
 
 
-def _number(
-    name: str, unit: str, ends: tuple[float, float], search: tuple[float, float], description: str, **more: object
-) -> Parameter:
+def _number(name: str, unit: str, low: float, high: float, description: str, **more: object) -> Parameter:
     return Parameter(
         name,
         (),
         unit,
-        *ends,
+        low,
+        high,
         0.0,
         description,
-        **{"search": search, "estimators": ("image",), **more},  # type: ignore[arg-type]
+        **{"search": (low, high), "estimators": ("image",), **more},  # type: ignore[arg-type]
     )
 
 
@@ -60,33 +59,32 @@ class SensorControl(NumberControl):
         _number(
             "aberration",
             "1",
-            (-0.02, 0.02),
-            (-0.005, 0.005),
+            -0.02,
+            0.02,
             "How much larger the red picture is than the green one; blue smaller.",
+            search=(-0.005, 0.005),
         ),
         _number(
             "shot",
             "1",
-            (0.0, 0.5),
-            (0.0, 0.1),
+            0.0,
+            0.5,
             "Standard deviation of the noise in white that grows with the root of light.",
+            search=(0.0, 0.1),
         ),
-        _number("read", "1", (0.0, 0.2), (0.0, 0.02), "Standard deviation of the noise that is there in the dark."),
         _number(
-            "mosaic",
-            "1",
-            (0.0, 1.0),
-            (0.0, 1.0),
-            "Share of the picture that goes through a Bayer mosaic; 1 is a real camera.",
+            "read", "1", 0.0, 0.2, "Standard deviation of the noise that is there in the dark.", search=(0.0, 0.02)
         ),
-        _number("red", "stops", (-1.0, 1.0), (-0.5, 0.5), "White balance: red is this much brighter."),
-        _number("blue", "stops", (-1.0, 1.0), (-0.5, 0.5), "White balance: blue is this much brighter."),
+        _number("mosaic", "1", 0.0, 1.0, "Share of the picture that goes through a Bayer mosaic; 1 is a real camera."),
+        _number("red", "stops", -1.0, 1.0, "White balance: red is this much brighter.", search=(-0.5, 0.5)),
+        _number("blue", "stops", -1.0, 1.0, "White balance: blue is this much brighter.", search=(-0.5, 0.5)),
         _number(
             "compression",
             "1",
-            (0.0, 95.0),
-            (0.0, 60.0),
+            0.0,
+            95.0,
             "0 is no file; above, a JPEG file of quality 100 less this.",
+            search=(0.0, 60.0),
             estimators=(),
         ),
     )

@@ -12,7 +12,6 @@ from importlib import resources
 from pathlib import Path
 
 import torch
-import torch.nn.functional as F
 from safetensors import SafetensorError
 from safetensors import torch as safetensors
 from torch import Tensor, nn
@@ -85,15 +84,8 @@ class _Convolution(nn.Module):
         self.normalise: nn.BatchNorm2d | nn.Identity = nn.BatchNorm2d(outputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        one, norm = self.convolve, self.normalise
-        if self.training or isinstance(norm, nn.Identity):
-            result: Tensor = norm(one(x))
-            return result
-        # with the statistics fixed both are one convolution; a tenth of a step of a training
-        assert norm.running_mean is not None and norm.running_var is not None
-        gain = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
-        weight, bias = one.weight * gain.view(-1, 1, 1, 1), norm.bias - norm.running_mean * gain
-        return F.conv2d(x, weight, bias, one.stride, one.padding)
+        result: Tensor = self.normalise(self.convolve(x))
+        return result
 
     def fold(self) -> None:
         """Merge the normalisation into the convolution (inference only)."""
