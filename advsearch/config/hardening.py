@@ -16,7 +16,7 @@ FURTHER_SCENES = 6
 """Scenes that come with each one of the training, of which nothing is drawn but one view: what is learned is lost on
 other scenes where there are few, and so is clean accuracy."""
 
-TEXTURE_LOOKS = 2
+TEXTURE_LOOKS = 3
 """How often an epoch looks at a view with a texture: it is another one each time, while what was rendered stays."""
 
 QUICK: dict[str, int] = {"rounds": 1, "scenes": 14, "views": 2, "epochs": 6, "measured": 14, "steps": 20}
@@ -89,13 +89,13 @@ class HardenConfig(AttackConfig):
     )
     views: int = setting(2, "training", "views of each scene, unless it is rendered", ge=1, le=1000)
     epochs: int = setting(
-        4,
+        3,
         "training",
         f"how often a round looks at each view; {TEXTURE_LOOKS} times as often where a texture is searched",
         ge=1,
         le=10_000,
     )
-    rate: float = setting(2e-3, "training", "the highest learning rate", gt=0.0, le=1.0)
+    rate: float = setting(1e-3, "training", "the highest learning rate", gt=0.0, le=1.0)
     clean_loss: float = setting(
         0.02, "training", "clean accuracy that may be lost; weights that lose more are not kept", ge=0.0, le=1.0
     )

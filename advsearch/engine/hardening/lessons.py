@@ -92,15 +92,27 @@ class RenderedLesson(Lesson):
 
     Attributes:
         pictures: (N, H, W, 3) uint8, as an 8-bit file has them, at random configurations; there are many.
+        losses: (N,) of each, when a model last looked at it; infinite of those that none has.
     """
 
     pictures: Tensor
+    losses: Tensor
+    _chosen: int = 0
 
     @classmethod
     def of(cls, right: tuple[int, ...], plain: Tensor, pictures: Tensor) -> RenderedLesson:
         """Return a lesson of pictures (N, H, W, 3) in [0, 1], of which the first counts as the worst so far."""
         levels = levels_of(pictures)
-        return cls(right, plain, levels[0] / 255.0, levels)
+        return cls(right, plain, levels[0] / 255.0, levels, torch.full((len(levels),), torch.inf))
+
+    def choose(self) -> None:
+        """Let the picture whose loss was highest be the worst."""
+        self._chosen = int(self.losses.argmax())
+        self.worst = self.pictures[self._chosen] / 255.0
+
+    def learned(self, loss: float) -> None:
+        """Take down what the worst picture's loss is now."""
+        self.losses[self._chosen] = loss
 
 
 def plain_lessons(problem: Problem, views: int, seed: int) -> list[Lesson]:
@@ -187,37 +199,45 @@ def unchanged(images: Tensor) -> Tensor:
     return images
 
 
-def harder(
-    chosen: Sequence[Lesson], model: Model, steps: int = 1, change: Callable[[Tensor], Tensor] = unchanged
-) -> None:
-    """Make the worst pictures of lessons worse for a model: further steps of their textures, or another choice among
-    what was rendered.
+def harder(chosen: Sequence[Lesson], model: Model, steps: int = 1) -> None:
+    """Make the worst pictures of lessons worse for a model: further steps of their textures, or the choice among all
+    that was rendered.
 
     Args:
         chosen: lessons.
         model: that gets them wrong.
         steps: of each texture.
-        change: what happens to as many pictures (N, H, W, 3) as there are lessons before the model sees them.
     """
     for begin in range(0, len(chosen), TOGETHER):
         part = chosen[begin : begin + TOGETHER]
-        _ascend([one for one in part if isinstance(one, TextureLesson)], model, steps, change)
-        _choose([one for one in part if isinstance(one, RenderedLesson)], model)
+        ascend(part, model, steps)
+        _look([one for one in part if isinstance(one, RenderedLesson)], model)
 
 
 @torch.no_grad()
-def _choose(chosen: Sequence[RenderedLesson], model: Model) -> None:
-    """Choose the worst picture of each."""
+def _look(chosen: Sequence[RenderedLesson], model: Model) -> None:
+    """Have a model look at all pictures of lessons, and choose the worst of each."""
     if not chosen:
         return
     pictures = torch.cat([one.pictures for one in chosen]) / 255.0
     loss = surprise(model(pictures), [one.right for one in chosen for _ in one.pictures])
     for one, own in zip(chosen, loss.split([len(one.pictures) for one in chosen]), strict=True):
-        one.worst = one.pictures[int(own.argmax())] / 255.0
+        one.losses = own.clone()
+        one.choose()
 
 
-def _ascend(chosen: Sequence[TextureLesson], model: Model, steps: int, change: Callable[[Tensor], Tensor]) -> None:
-    """Steps uphill of textures; views that share one add up."""
+def ascend(
+    some: Sequence[Lesson], model: Model, steps: int = 1, change: Callable[[Tensor], Tensor] = unchanged
+) -> None:
+    """Steps uphill of the textures of lessons; views that share one add up.
+
+    Args:
+        some: lessons; those without a texture stay as they are.
+        model: that gets them wrong.
+        steps: of each texture.
+        change: what happens to as many pictures (N, H, W, 3) as there are textured views before the model sees them.
+    """
+    chosen = [one for one in some if isinstance(one, TextureLesson)]
     if not chosen:
         return
     textures = list(dict.fromkeys(one.texture for one in chosen))

@@ -30,7 +30,7 @@ ROUNDS = "rounds"
 """The note under which the store keeps the scores."""
 FIRST_STEPS = 4
 """Steps of each texture before a training."""
-VALIDATION_VIEWS = 2
+VALIDATION_VIEWS, JUDGED = 2, 168
 PARTS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
 """Of the way from the weights that were given to the trained ones, which are judged."""
 
@@ -68,8 +68,8 @@ class TrainingRounds:
 
     @property
     def judged(self) -> int:
-        """Scenes by which weights are chosen, for each control: a third as many as a round adds."""
-        return -(-self.each // 3)
+        """Scenes by which weights are chosen, for each control: a third as many as a round adds, up to `JUDGED`."""
+        return min(-(-self.each // 3), JUDGED)
 
     @property
     def best(self) -> int:

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from advsearch.config.hardening import TEXTURE_LOOKS
 from advsearch.engine.hardening.augmentation import Augmentation
-from advsearch.engine.hardening.lessons import TOGETHER, Lesson, RenderedLesson, TextureLesson, harder, surprise
+from advsearch.engine.hardening.lessons import TOGETHER, Lesson, RenderedLesson, TextureLesson, ascend, harder, surprise
 from advsearch.models import Model
 from advsearch.models.trainable import Trainable
 
@@ -31,6 +31,8 @@ LARGEST_GRADIENT_NORM = 2.0
 WARM_UP = 0.1
 KEEP = 1.0
 """Weight of the given model's answers to plain pictures, beside that of the right ones."""
+MIXED_STEPS, MIXING = 0.5, 0.4
+"""Share of the steps that mix pictures, and both parameters of the beta distribution that the parts come from."""
 AVERAGE = 0.98
 """Weight of the past in the average of the weights, per step."""
 HELD_BACK_STEPS = 8
@@ -122,17 +124,15 @@ class Course:
             generator = torch.Generator().manual_seed(seed)
             return AUGMENTATION(images.permute(0, 3, 1, 2), generator).permute(0, 2, 3, 1)
 
-        harder(batch, self.student.model, change=change)
+        ascend(batch, self.student.model, change=change)
+        for one in batch:
+            if isinstance(one, RenderedLesson):
+                one.choose()
         searched = [one for one in batch if isinstance(one, (TextureLesson, RenderedLesson))]
-        plain = change(torch.stack([one.plain for one in batch]))
-        images = [plain]
+        images = change(torch.stack([one.plain for one in batch]))
         if searched:
-            images.append(change(torch.stack([one.worst for one in searched])))
-        logits = self.student.logits(torch.cat(images))
-        found = surprise(logits, [one.right for one in [*batch, *searched]])
-        loss = found[: len(batch)].mean() + KEEP * self._forgotten(plain, logits[: len(batch)], batch)
-        if searched:
-            loss = loss + found[len(batch) :].mean()
+            images = torch.cat([images, change(torch.stack([one.worst for one in searched]))])
+        loss = self._loss(images, [*batch, *searched], len(batch), np.random.default_rng(seed))
         if self.beside is not None:
             shown, labels = self._next()
             truth = [(int(label),) for label in labels]
@@ -142,14 +142,44 @@ class Course:
         nn.utils.clip_grad_norm_(self.student.parameters(), LARGEST_GRADIENT_NORM)
         optimiser.step()
 
-    def _forgotten(self, plain: Tensor, logits: Tensor, batch: Sequence[Lesson]) -> Tensor:
+    def _loss(self, images: Tensor, taught: Sequence[Lesson], plain: int, rng: np.random.Generator) -> Tensor:
+        """What is descended, of pictures (N, H, W, 3) of as many lessons: so many plain ones, then the worst ones.
+
+        In some steps all that was rendered is mixed with each other (mixup, Zhang et al. 2018, arXiv 1710.09412), as no
+        more pictures of it will come; a texture is another one each time.
+        """
+        right = [one.right for one in taught]
+        mixed = [place for place, one in enumerate(taught) if isinstance(one, RenderedLesson)]
+        if rng.random() >= MIXED_STEPS:
+            mixed = []
+        others, share = rng.permutation(mixed).astype(int).tolist(), float(rng.beta(MIXING, MIXING))
+        if mixed:
+            images[mixed] = torch.lerp(images[mixed], images[others], min(share, 1.0 - share))
+        logits = self.student.logits(images)
+        found = surprise(logits, right)
+        if mixed:
+            of_others = surprise(logits[mixed], [right[place] for place in others])
+            found[mixed] = torch.lerp(found[mixed], of_others, min(share, 1.0 - share))
+        loss = found[:plain].mean()
+        unmixed = sorted({*range(plain)} - {*mixed})
+        if unmixed:
+            kept = self._forgotten(images[unmixed], logits[unmixed], [right[place] for place in unmixed])
+            loss = loss + KEEP * kept / plain
+        if len(taught) > plain:
+            loss = loss + found[plain:].mean()
+        for one, now in zip(taught[plain:], found[plain:].tolist(), strict=True):
+            if isinstance(one, RenderedLesson) and not mixed:
+                one.learned(now)
+        return loss
+
+    def _forgotten(self, plain: Tensor, logits: Tensor, right: Sequence[tuple[int, ...]]) -> Tensor:
         """The Kullback-Leibler divergence of what the given model says of plain pictures (N, H, W, 3), where it is
-        right, to what logits (N, C) say; a mean over all."""
+        right, to what logits (N, C) say; a sum over all."""
         with torch.no_grad():
             wanted = self.given(plain)
-        right = [said in one.right for said, one in zip(wanted.argmax(dim=1).tolist(), batch, strict=True)]
-        target = F.log_softmax(wanted[right], dim=1)
-        return F.kl_div(F.log_softmax(logits[right], dim=1), target, reduction="sum", log_target=True) / len(batch)
+        known = [said in own for said, own in zip(wanted.argmax(dim=1).tolist(), right, strict=True)]
+        target = F.log_softmax(wanted[known], dim=1)
+        return F.kl_div(F.log_softmax(logits[known], dim=1), target, reduction="sum", log_target=True)
 
     def _next(self) -> tuple[Tensor, Tensor]:
         assert self.beside is not None
