@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from advsearch import seeds
 from advsearch.api.attack import LOADING, executor_for
 from advsearch.api.harden_scenes import (
+    CLEAN_SCENES,
     CLEAN_VIEWS,
     ROBUST,
     TIMES,
@@ -57,9 +58,6 @@ if TYPE_CHECKING:
 
 MEASURED, MEANS = "measured", "means"
 """Notes under which the store keeps what is done."""
-
-CLEAN_SCENES = 4
-"""Held-out scenes whose plain pictures are looked at, for each one that is attacked."""
 
 
 @asks(HardenConfig, HardenKeywords)
@@ -197,8 +195,7 @@ class Hardening:
     def carry_out(self, executor: Executor) -> None:
         """Measure, train, and measure again; the executor does what there is to do with scenes."""
         self._executor, sides = executor, self.splits
-        self.progress.stage("checking that training and measurement share nothing")
-        check_disjoint(sides[HELD_OUT], [sides[name] for name in (TRAINING, FURTHER, VALIDATION)], self._counts)
+        check_disjoint(sides[HELD_OUT], [sides[name] for name in (TRAINING, FURTHER, VALIDATION)])
         gc.freeze()  # as of `scenes_of`
         try:
             with self._timed("measurement"):

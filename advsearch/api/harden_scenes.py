@@ -18,7 +18,15 @@ from advsearch.cluster.executor import Call
 from advsearch.config import AttackConfig, HardenConfig
 from advsearch.config.hardening import ALL
 from advsearch.engine.hardening.lessons import Lesson, has_matrix, lessons, plain_lessons
-from advsearch.engine.hardening.split import FURTHER, HELD_OUT, TRAINING, VALIDATION, Split
+from advsearch.engine.hardening.split import (
+    FURTHER,
+    HELD_OUT,
+    TRAINING,
+    VALIDATION,
+    Split,
+    check_unmeasured,
+    fingerprint,
+)
 from advsearch.engine.loading import Scene
 from advsearch.engine.naming import load_models, scene_settings
 from advsearch.engine.problem import Problem
@@ -45,7 +53,8 @@ OVER: dict[str, dict[str, object]] = {
 TRIES, TRIES_TO_CHOOSE = 3, 6
 """Random configurations of a view that is rendered, of which the worst counts: in the training, and where weights are
 chosen by it. New scenes teach more than further configurations."""
-CLEAN_VIEWS = 2
+CLEAN_SCENES, CLEAN_VIEWS = 4, 2
+"""Held-out scenes whose plain pictures are looked at, for each one that is attacked, and the views of each."""
 CLEAN_SPP = 16
 
 STRONGER = {"name": "portfolio", "policies": [{"name": "restarts", "policy": "pgd"}, "cmaes", "random"]}
@@ -176,6 +185,12 @@ class SceneWork:
         side = self.splits[TRAINING]
         return tuple(one for one in self.config.controls if has_matrix(self._problem(side, 0, (one,))[0]))
 
+    @cached_property
+    def _measured(self) -> frozenset[str]:
+        """Fingerprints of the objects of all held-out scenes."""
+        held, count = self.splits[HELD_OUT], CLEAN_SCENES * self.config.measured
+        return frozenset(fingerprint(held.scene(number)[1].description.object) for number in range(count))
+
     def _draw(self, one: Drawing) -> list[Lesson]:
         problem, seed = self._problem(self.splits[one.side], one.number, one.controls)
         tries = TRIES_TO_CHOOSE if one.side == VALIDATION else TRIES
@@ -208,6 +223,8 @@ class SceneWork:
     def _problem(self, side: Split, number: int, controls: Sequence[str]) -> tuple[Problem, int]:
         """What a scene is searched as, and the root of the draws of its lessons."""
         name, scene = side.scene(number, self._set)
+        if side.name != HELD_OUT:
+            check_unmeasured(scene.description.object, self._measured)
         kinds = {control.partition(":")[0].partition(".")[0] for control in controls}
         over = {other: given for other, given in OVER.items() if other not in kinds}
         problem = problem_of(self._of(controls, name, over=over), scene, self.model, differentiated=False)

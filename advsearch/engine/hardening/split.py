@@ -7,7 +7,7 @@ file is one object, and its split has to be said.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -84,15 +84,10 @@ class Split:
         """What a scene is drawn from, its object first."""
         return np.random.default_rng([seeds.stream(self.seed, f"{self.name} scene", number)])
 
-    def assets(self, count: int) -> Iterator[ObjectAsset]:
-        """Yield the objects of the first `count` scenes; what a file holds comes once."""
-        files = set[str]()
-        for number in range(count):
-            name = self.objects[number % len(self.objects)]
-            if name in OBJECTS:
-                yield OBJECTS[name].generate(self._draws(number))
-            elif name not in files:
-                files.add(name)
+    def files(self) -> Iterator[ObjectAsset]:
+        """Yield what is in each file."""
+        for number, name in enumerate(self.objects):
+            if name not in OBJECTS:
                 yield self.scene(number)[1].description.object
 
 
@@ -104,14 +99,14 @@ def fingerprint(asset: ObjectAsset) -> str:
     return found.hexdigest()
 
 
-def check_disjoint(held: Split, taught: Sequence[Split], counts: Mapping[str, int]) -> None:
-    """Refuse to measure what is trained on: an object with the geometry and texture of one of the training, or one of
-    its environments.
+def check_disjoint(held: Split, taught: Sequence[Split]) -> None:
+    """Refuse to measure what is trained on: one of the training's environments, or one of its files.
+
+    Instances that are drawn are checked when they are, by `check_unmeasured`: to make all of them takes minutes.
 
     Args:
         held: what is measured.
         taught: what weights are fitted to and chosen by.
-        counts: scenes of each, by its name.
 
     Raises:
         InputError: they share something; it is named.
@@ -119,7 +114,17 @@ def check_disjoint(held: Split, taught: Sequence[Split], counts: Mapping[str, in
     both = sorted({name for split in taught for name in split.environments} & set(held.environments))
     if both:
         raise InputError(f"held_out_environment: {', '.join(both)} is an environment of the training too; name others")
-    seen = {fingerprint(asset) for split in taught for asset in split.assets(counts[split.name])}
-    for asset in held.assets(counts[held.name]):
-        if fingerprint(asset) in seen:
-            raise InputError(f"held_out: {asset.name} is an object of the training too; name others")
+    measured = {fingerprint(asset) for asset in held.files()}
+    for split in taught:
+        for asset in split.files():
+            check_unmeasured(asset, measured)
+
+
+def check_unmeasured(asset: ObjectAsset, measured: Set[str]) -> None:
+    """Refuse to train on an object whose fingerprint is among those of what is measured.
+
+    Raises:
+        InputError: it is; it is named.
+    """
+    if fingerprint(asset) in measured:
+        raise InputError(f"held_out: {asset.name} is an object of the training too; name others")
