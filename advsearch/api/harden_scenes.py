@@ -188,8 +188,8 @@ class SceneWork:
     @cached_property
     def _measured(self) -> frozenset[str]:
         """Fingerprints of the objects of all held-out scenes."""
-        held, count = self.splits[HELD_OUT], CLEAN_SCENES * self.config.measured
-        return frozenset(fingerprint(held.scene(number)[1].description.object) for number in range(count))
+        count = CLEAN_SCENES * self.config.measured
+        return frozenset(fingerprint(asset) for asset in self.splits[HELD_OUT].assets(count))
 
     def _draw(self, one: Drawing) -> list[Lesson]:
         problem, seed = self._problem(self.splits[one.side], one.number, one.controls)

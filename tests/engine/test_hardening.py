@@ -103,10 +103,17 @@ def test_scenes_repeat_and_splits_share_nothing(tmp_path: Path) -> None:
     check_disjoint(held, [training])
     again = Split(TRAINING, held.objects, ("noon",), 2)
     own, other = (one.scene(0)[1].description.object for one in (held, again))
+    assert (
+        fingerprint(next(again.assets(1)))
+        == fingerprint(other)
+        != fingerprint(own)
+        == fingerprint(next(held.assets(1)))
+    )
     check_unmeasured(other, {fingerprint(own)})  # seeds of splits differ by name
     with pytest.raises(InputError, match="held_out: ball is an object of the training too"):
         check_unmeasured(own, {fingerprint(own)})
     files = [Split(name, (str(file),), (lit,), 1) for name, lit in ((HELD_OUT, "gallery"), (TRAINING, "noon"))]
+    assert len(list(files[0].assets(5))) == 1
     with pytest.raises(InputError, match="held_out: tennis-ball is an object of the training too"):
         check_disjoint(files[0], files[1:])
     with pytest.raises(InputError, match="held_out_environment: noon is an environment of the training too"):

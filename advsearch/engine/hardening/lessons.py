@@ -97,7 +97,6 @@ class RenderedLesson(Lesson):
 
     pictures: Tensor
     losses: Tensor
-    _chosen: int = 0
 
     @classmethod
     def of(cls, right: tuple[int, ...], plain: Tensor, pictures: Tensor) -> RenderedLesson:
@@ -107,12 +106,11 @@ class RenderedLesson(Lesson):
 
     def choose(self) -> None:
         """Let the picture whose loss was highest be the worst."""
-        self._chosen = int(self.losses.argmax())
-        self.worst = self.pictures[self._chosen] / 255.0
+        self.worst = self.pictures[int(self.losses.argmax())] / 255.0
 
     def learned(self, loss: float) -> None:
-        """Take down what the worst picture's loss is now."""
-        self.losses[self._chosen] = loss
+        """Take down what the loss of the picture that was chosen is now."""
+        self.losses[int(self.losses.argmax())] = loss
 
 
 def plain_lessons(problem: Problem, views: int, seed: int) -> list[Lesson]:

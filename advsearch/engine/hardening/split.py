@@ -84,10 +84,15 @@ class Split:
         """What a scene is drawn from, its object first."""
         return np.random.default_rng([seeds.stream(self.seed, f"{self.name} scene", number)])
 
-    def files(self) -> Iterator[ObjectAsset]:
-        """Yield what is in each file."""
-        for number, name in enumerate(self.objects):
-            if name not in OBJECTS:
+    def assets(self, count: int) -> Iterator[ObjectAsset]:
+        """Yield the objects of the first `count` scenes; what a file holds comes once."""
+        files = set[str]()
+        for number in range(count):
+            name = self.objects[number % len(self.objects)]
+            if name in OBJECTS:
+                yield OBJECTS[name].generate(self._draws(number))
+            elif name not in files:
+                files.add(name)
                 yield self.scene(number)[1].description.object
 
 
@@ -102,7 +107,8 @@ def fingerprint(asset: ObjectAsset) -> str:
 def check_disjoint(held: Split, taught: Sequence[Split]) -> None:
     """Refuse to measure what is trained on: one of the training's environments, or one of its files.
 
-    Instances that are drawn are checked when they are, by `check_unmeasured`: to make all of them takes minutes.
+    Of each bundled object the first instance is looked at; all others are checked when they are drawn, by
+    `check_unmeasured`: to make them takes minutes.
 
     Args:
         held: what is measured.
@@ -114,9 +120,9 @@ def check_disjoint(held: Split, taught: Sequence[Split]) -> None:
     both = sorted({name for split in taught for name in split.environments} & set(held.environments))
     if both:
         raise InputError(f"held_out_environment: {', '.join(both)} is an environment of the training too; name others")
-    measured = {fingerprint(asset) for asset in held.files()}
+    measured = {fingerprint(asset) for asset in held.assets(len(held.objects))}
     for split in taught:
-        for asset in split.files():
+        for asset in split.assets(len(split.objects)):
             check_unmeasured(asset, measured)
 
 

@@ -152,14 +152,15 @@ class Course:
         mixed = [place for place, one in enumerate(taught) if isinstance(one, RenderedLesson)]
         if rng.random() >= MIXED_STEPS:
             mixed = []
-        others, share = rng.permutation(mixed).astype(int).tolist(), float(rng.beta(MIXING, MIXING))
+        others, drawn = rng.permutation(mixed).astype(int).tolist(), float(rng.beta(MIXING, MIXING))
+        share = min(drawn, 1.0 - drawn)
         if mixed:
-            images[mixed] = torch.lerp(images[mixed], images[others], min(share, 1.0 - share))
+            images[mixed] = torch.lerp(images[mixed], images[others], share)
         logits = self.student.logits(images)
         found = surprise(logits, right)
         if mixed:
             of_others = surprise(logits[mixed], [right[place] for place in others])
-            found[mixed] = torch.lerp(found[mixed], of_others, min(share, 1.0 - share))
+            found[mixed] = torch.lerp(found[mixed], of_others, share)
         loss = found[:plain].mean()
         unmixed = sorted({*range(plain)} - {*mixed})
         if unmixed:
