@@ -36,6 +36,7 @@ from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.trainable import trainable
 from advsearch.runs.results.base import INTERRUPTED
+from advsearch.scene.formation import levels_of
 from advsearch.scene.library import list_environments
 from advsearch.scene.settings import Given
 from advsearch.settings import split_names
@@ -216,8 +217,7 @@ class SceneWork:
         right, found = tuple(int(index) for index in problem.truth()), list[Lesson]()
         for view in range(CLEAN_VIEWS):
             seed = seeds.stream(side.seed, "plain", one.number * CLEAN_VIEWS + view)
-            picture = problem.picture(problem.domain.start, seed, CLEAN_SPP)
-            found.append(Lesson(right, picture, picture))
+            found.append(Lesson(right, levels_of(problem.picture(problem.domain.start, seed, CLEAN_SPP))))
         return found
 
     def _problem(self, side: Split, number: int, controls: Sequence[str]) -> tuple[Problem, int]:

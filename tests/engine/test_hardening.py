@@ -28,7 +28,7 @@ from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model, reference
 from advsearch.models.trainable import Trainable, trainable
-from advsearch.scene.formation import to_8_bit
+from advsearch.scene.formation import levels_of, to_8_bit
 from advsearch.scene.library import load_environment
 
 LABELS = [f"class {number}" for number in range(14)]
@@ -201,7 +201,6 @@ def test_a_step_takes_the_picture_whose_loss_was_highest_when_a_model_last_looke
     lesson = RenderedLesson.of((1,), pictures[0], pictures)
     lesson.losses = torch.tensor([0.2, 1.0, 0.5])
     for after, expected in ((0.1, 1), (0.3, 2), (0.0, 2), (0.05, 0)):
-        lesson.choose()
         assert torch.equal(lesson.worst, pictures[expected])
         lesson.learned(after)
     assert lesson.losses.tolist() == pytest.approx([0.05, 0.1, 0.0])
@@ -215,7 +214,7 @@ def test_a_round_teaches_plain_and_worst_pictures() -> None:
     course.round(1, lessons, lambda: ticks.append(1))
     after = score(made.model, lessons)
     assert len(ticks) == course.steps(lessons) == 12
-    more = [Lesson((5,), coloured(0, 0.4, 1), coloured(0, 0.4, 1))] * 24  # nothing makes them harder
+    more = [Lesson((5,), levels_of(coloured(0, 0.4, 1)))] * 24  # nothing makes them harder
     assert score(made.model, [*lessons, *more]) == Score(after.clean / 2, after.robust)
     assert before.robust < 0.6 and after.clean >= 0.9 and after.robust >= 0.9
 

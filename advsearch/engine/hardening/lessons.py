@@ -38,17 +38,25 @@ TOGETHER = 32
 
 @dataclass(eq=False)
 class Lesson:
-    """One scene under conditions that were drawn for it.
+    """One scene under conditions that were drawn for it. Pictures are kept as an 8-bit file has them: there are many.
 
     Attributes:
         right: indices of the right classes.
-        plain: (H, W, 3) its picture as it is, sRGB in [0, 1].
-        worst: (H, W, 3) the worst picture that is known.
+        levels: (H, W, 3) uint8, its picture as it is.
     """
 
     right: tuple[int, ...]
-    plain: Tensor
-    worst: Tensor
+    levels: Tensor
+
+    @property
+    def plain(self) -> Tensor:
+        """(H, W, 3) its picture as it is, sRGB in [0, 1]."""
+        return self.levels / 255.0
+
+    @property
+    def worst(self) -> Tensor:
+        """(H, W, 3) the worst picture that is known."""
+        return self.plain
 
 
 @dataclass(eq=False)
@@ -85,13 +93,19 @@ class TextureLesson(Lesson):
         inputs = self.space.inputs(u)
         return self.linear.shown({name: inputs[name] for name in self.linear.there}, torch.cat([u, self.numbers]))
 
+    @property
+    def worst(self) -> Tensor:
+        """(H, W, 3) the picture of the adversarial texture as it is now."""
+        with torch.no_grad():
+            return to_8_bit(self.picture(self.texture.u))
+
 
 @dataclass(eq=False)
 class RenderedLesson(Lesson):
     """A lesson whose pictures were rendered.
 
     Attributes:
-        pictures: (N, H, W, 3) uint8, as an 8-bit file has them, at random configurations; there are many.
+        pictures: (N, H, W, 3) uint8, at random configurations.
         losses: (N,) of each, when a model last looked at it; infinite of those that none has.
     """
 
@@ -100,16 +114,16 @@ class RenderedLesson(Lesson):
 
     @classmethod
     def of(cls, right: tuple[int, ...], plain: Tensor, pictures: Tensor) -> RenderedLesson:
-        """Return a lesson of pictures (N, H, W, 3) in [0, 1], of which the first counts as the worst so far."""
-        levels = levels_of(pictures)
-        return cls(right, plain, levels[0] / 255.0, levels, torch.full((len(levels),), torch.inf))
+        """Return a lesson of a picture (H, W, 3) and some (N, H, W, 3) in [0, 1], the first the worst so far."""
+        return cls(right, levels_of(plain), levels_of(pictures), torch.full((len(pictures),), torch.inf))
 
-    def choose(self) -> None:
-        """Let the picture whose loss was highest be the worst."""
-        self.worst = self.pictures[int(self.losses.argmax())] / 255.0
+    @property
+    def worst(self) -> Tensor:
+        """(H, W, 3) the picture whose loss was highest."""
+        return self.pictures[int(self.losses.argmax())] / 255.0
 
     def learned(self, loss: float) -> None:
-        """Take down what the loss of the picture that was chosen is now."""
+        """Take down what the loss of the worst picture is now."""
         self.losses[int(self.losses.argmax())] = loss
 
 
@@ -120,7 +134,7 @@ def plain_lessons(problem: Problem, views: int, seed: int) -> list[Lesson]:
     quickly = problem.renderer.like(quick=True)
     with torch.no_grad(), quickly.scene.shorter(DEPTH):
         pictures = [quickly(problem.whole(problem.domain.start, one), seed=one, spp=SPP) for one in drawn]
-    return [Lesson(right, picture, picture) for picture in pictures]
+    return [Lesson(right, levels_of(picture)) for picture in pictures]
 
 
 def has_matrix(problem: Problem) -> bool:
@@ -152,7 +166,8 @@ def lessons(problem: Problem, views: int, tries: int, seed: int, *, shared: bool
                 plain = made(whole)
                 texture = common if shared else _begun(problem, own)
                 made.let_go(whole_space)
-                found.append(TextureLesson(right, plain, plain, space, problem.domain, made, numbers, texture))
+                levels = levels_of(plain)
+                found.append(TextureLesson(right, levels, space, problem.domain, made, numbers, texture))
             else:
                 drawn = tried(problem.domain, torch.Generator().manual_seed(own), tries)
                 shown = [quickly(torch.cat([u, numbers]), seed=own, spp=SPP) for u in drawn]
@@ -198,8 +213,8 @@ def unchanged(images: Tensor) -> Tensor:
 
 
 def harder(chosen: Sequence[Lesson], model: Model, steps: int = 1) -> None:
-    """Make the worst pictures of lessons worse for a model: further steps of their textures, or the choice among all
-    that was rendered.
+    """Make the worst pictures of lessons worse for a model: further steps of their textures, and a look at all that was
+    rendered.
 
     Args:
         chosen: lessons.
@@ -214,14 +229,13 @@ def harder(chosen: Sequence[Lesson], model: Model, steps: int = 1) -> None:
 
 @torch.no_grad()
 def _look(chosen: Sequence[RenderedLesson], model: Model) -> None:
-    """Have a model look at all pictures of lessons, and choose the worst of each."""
+    """Have a model look at all pictures of lessons, so that the worst of each is known."""
     if not chosen:
         return
     pictures = torch.cat([one.pictures for one in chosen]) / 255.0
     loss = surprise(model(pictures), [one.right for one in chosen for _ in one.pictures])
     for one, own in zip(chosen, loss.split([len(one.pictures) for one in chosen]), strict=True):
         one.losses = own.clone()
-        one.choose()
 
 
 def ascend(
@@ -248,6 +262,3 @@ def ascend(
         for texture, slope in zip(textures, slopes, strict=True):
             domain = domains[texture]
             texture.u = domain.project(texture.u + STEP * domain.steepest(texture.u, slope))
-    with torch.no_grad():
-        for one in chosen:
-            one.worst = to_8_bit(one.picture(one.texture.u))

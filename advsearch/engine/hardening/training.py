@@ -125,9 +125,6 @@ class Course:
             return AUGMENTATION(images.permute(0, 3, 1, 2), generator).permute(0, 2, 3, 1)
 
         ascend(batch, self.student.model, change=change)
-        for one in batch:
-            if isinstance(one, RenderedLesson):
-                one.choose()
         searched = [one for one in batch if isinstance(one, (TextureLesson, RenderedLesson))]
         images = change(torch.stack([one.plain for one in batch]))
         if searched:
