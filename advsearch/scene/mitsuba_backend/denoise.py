@@ -7,6 +7,9 @@ differences of pictures include it exactly.
 
 from __future__ import annotations
 
+import threading
+from functools import lru_cache
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -26,15 +29,12 @@ LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
 class Denoiser:
     """The denoiser for pictures of one size.
 
-    It works in buffers of its own: the filter is set up anew, for longer than it takes to run, whenever it is given
-    other memory.
-
     Args:
         resolution: (height, width) in pixels.
     """
 
     def __init__(self, resolution: tuple[int, int]) -> None:
-        self._buffers = [torch.zeros(*resolution, 3) for _ in range(4)]
+        self._resolution = resolution
 
     def __call__(self, radiance: Tensor, albedo: Tensor, normal: Tensor, *, quick: bool = False) -> Tensor:
         """Return the denoised linear radiance.
@@ -54,13 +54,20 @@ class Denoiser:
             raise EnvironmentSetupError(
                 f"the denoiser cannot be loaded ({error}): pip install mitsuba-oidn, or use `denoise=none`"
             ) from error
-        color, guide, direction, output = self._buffers
+        color, guide, direction, output = _buffers(self._resolution, threading.get_ident())
         gain = _gain(radiance.detach())
         for buffer, image in ((color, radiance.detach() * gain), (guide, albedo), (direction, normal)):
             buffer.copy_(image.detach())
         quality = mitsuba_oidn.Quality.Fast if quick else mitsuba_oidn.Quality.High
         mitsuba_oidn.denoise(color, guide, direction, hdr=True, quality=quality, input_scale=1.0, output=output)
         return (output / gain).to(radiance.device)
+
+
+@lru_cache(maxsize=8)
+def _buffers(resolution: tuple[int, int], thread: int) -> list[Tensor]:
+    """Return what all denoisers of a size and a thread work in: the filter is set up anew, for longer than it takes to
+    run, whenever it is given other memory, as of every new scene."""
+    return [torch.zeros(*resolution, 3) for _ in range(4)]
 
 
 def _gain(radiance: Tensor) -> float:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch import threads
-from advsearch.scene.mitsuba_backend.denoise import KEY, Denoiser, _gain
+from advsearch.scene.mitsuba_backend.denoise import KEY, Denoiser, _buffers, _gain
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 
 SIZE = (72, 88)
@@ -61,6 +61,16 @@ def test_the_quick_one_is_another_and_takes_the_noise_out_too() -> None:
     full, quick = (denoiser(picture, flat, flat, quick=one) for one in (False, True))
     assert not torch.equal(full, quick)
     assert (quick - full).abs().mean() < 0.2 * (picture - full).abs().mean()
+
+
+def test_denoisers_of_a_size_work_in_the_same_memory_and_spoil_nothing() -> None:
+    mitsuba()
+    flat = torch.full((*SIZE, 3), 0.5)
+    first = Denoiser(SIZE)(noisy(1), flat, flat)
+    kept, second = first.clone(), Denoiser(SIZE)(noisy(2), flat, flat)
+    assert torch.equal(first, kept) and not torch.equal(first, second)
+    own, other = _buffers(SIZE, 1), _buffers(SIZE, 2)
+    assert own is _buffers(SIZE, 1) and own[0].data_ptr() != other[0].data_ptr()
 
 
 def test_black_squares_do_not_count() -> None:
