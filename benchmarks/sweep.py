@@ -41,7 +41,7 @@ from advsearch.progress import NullProgress  # noqa: E402
 from advsearch.runs.directory import RunDirectory  # noqa: E402
 from advsearch.scene.formation import ImageFormation  # noqa: E402
 from advsearch.scene.leaving_out import EVERYTHING  # noqa: E402
-from advsearch.scene.mitsuba_backend.denoise import Denoiser  # noqa: E402
+from advsearch.scene.mitsuba_backend.denoise import denoise  # noqa: E402
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene  # noqa: E402
 from advsearch.tasks import Classification  # noqa: E402
 
@@ -207,7 +207,6 @@ class Bare:
         self.description = framed(job.places[0].scene.description, self.size)
         self.formation = ImageFormation(resolution=self.size, gain=self.description.gain)
         self.scene = MitsubaScene(self.space.scene or self.description, self.size, leave_out=EVERYTHING - {"tracing"})
-        self.denoise = Denoiser(self.size)
 
     def turn(self, count: int) -> float:
         """Render and classify so many pictures; return the seconds."""
@@ -224,7 +223,7 @@ class Bare:
     def picture(self, inputs, seed: int, spp: int) -> Tensor:  # type: ignore[no-untyped-def]
         radiance = self.scene.radiance(inputs, seed, spp)
         albedo, normal = self.scene.guides(inputs, seed, spp)
-        return self.formation.display(self.denoise(radiance[..., :3].contiguous(), albedo, normal))
+        return self.formation.display(denoise(radiance[..., :3].contiguous(), albedo, normal))
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ def picture(
     """Render an object on a brown ground plane; (size, size, 3) display-referred sRGB. Angles in degrees."""
     import torch
 
-    from advsearch.scene.mitsuba_backend.denoise import Denoiser
+    from advsearch.scene.mitsuba_backend.denoise import denoise
     from advsearch.scene.mitsuba_backend.meshes import mitsuba_mesh, principled
     from advsearch.scene.mitsuba_backend.variant import mitsuba
 
@@ -78,8 +78,7 @@ def picture(
         }
     )
     layers = torch.from_numpy(np.array(mi.render(scene, spp=spp, seed=1), dtype=np.float32))
-    height, width = layers.shape[:2]
-    radiance = Denoiser((height, width))(layers[..., :3], layers[..., -6:-3].clamp(0.0, 1.0), layers[..., -3:])
+    radiance = denoise(layers[..., :3], layers[..., -6:-3].clamp(0.0, 1.0), layers[..., -3:])
     return linear_to_srgb(radiance.numpy())
 
 

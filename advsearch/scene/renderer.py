@@ -28,7 +28,7 @@ from advsearch.scene.gradients.differences import central, one_sided, random_dir
 from advsearch.scene.gradients.group import Group
 from advsearch.scene.gradients.motion import Motion, steps_for
 from advsearch.scene.gradients.plan import BY_ADJOINT, BY_DIFFERENCES, TURN_STEP, first_plan
-from advsearch.scene.mitsuba_backend.denoise import Denoiser
+from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.scene import MitsubaScene
 from advsearch.scene.surfaces import Surfaces
 
@@ -91,7 +91,6 @@ class Renderer:
         self.space = space
         self.formation = formation
         self.root_seed = root_seed
-        self._denoise = Denoiser(formation.resolution)
         self._source: Source | None = None
         self.renders = 0
         self.gradients = 0
@@ -259,7 +258,7 @@ class Renderer:
         rendered = self._finite(self.scene.radiance(inputs, noise, spp, hide=hide))
         if self.formation.denoiser == "oidn":
             albedo, normal = self.scene.guides(inputs, seeds.stream(self.root_seed, "guides", seed), spp)
-            clean = self._denoise(rendered[..., :3].contiguous(), albedo, normal, quick=self.formation.quick)
+            clean = denoise(rendered[..., :3].contiguous(), albedo, normal, quick=self.formation.quick)
             rendered = torch.cat([clean, rendered[..., 3:]], dim=-1) if hide else clean
         self.renders += 1
         return rendered

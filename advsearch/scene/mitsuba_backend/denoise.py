@@ -26,47 +26,37 @@ LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
 """Of red, green and blue (ITU-R BT.709); likewise."""
 
 
-class Denoiser:
-    """The denoiser for pictures of one size.
+def denoise(radiance: Tensor, albedo: Tensor, normal: Tensor, *, quick: bool = False) -> Tensor:
+    """Return the denoised linear radiance.
 
     Args:
-        resolution: (height, width) in pixels.
+        radiance: (H, W, 3) float32 linear radiance, at least 0.
+        albedo: (H, W, 3) float32 reflectance of the first hit in [0, 1].
+        normal: (H, W, 3) float32 shading normal of the first hit in [-1, 1].
+        quick: take some 0.6 of the time, and leave a little more error.
+
+    Raises:
+        EnvironmentSetupError: the package is not installed.
     """
-
-    def __init__(self, resolution: tuple[int, int]) -> None:
-        self._resolution = resolution
-
-    def __call__(self, radiance: Tensor, albedo: Tensor, normal: Tensor, *, quick: bool = False) -> Tensor:
-        """Return the denoised linear radiance.
-
-        Args:
-            radiance: (H, W, 3) float32 linear radiance, at least 0.
-            albedo: (H, W, 3) float32 reflectance of the first hit in [0, 1].
-            normal: (H, W, 3) float32 shading normal of the first hit in [-1, 1].
-            quick: take some 0.6 of the time, and leave a little more error.
-
-        Raises:
-            EnvironmentSetupError: the package is not installed.
-        """
-        try:
-            import mitsuba_oidn
-        except ImportError as error:
-            raise EnvironmentSetupError(
-                f"the denoiser cannot be loaded ({error}): pip install mitsuba-oidn, or use `denoise=none`"
-            ) from error
-        color, guide, direction, output = _buffers(self._resolution, threading.get_ident())
-        gain = _gain(radiance.detach())
-        for buffer, image in ((color, radiance.detach() * gain), (guide, albedo), (direction, normal)):
-            buffer.copy_(image.detach())
-        quality = mitsuba_oidn.Quality.Fast if quick else mitsuba_oidn.Quality.High
-        mitsuba_oidn.denoise(color, guide, direction, hdr=True, quality=quality, input_scale=1.0, output=output)
-        return (output / gain).to(radiance.device)
+    try:
+        import mitsuba_oidn
+    except ImportError as error:
+        raise EnvironmentSetupError(
+            f"the denoiser cannot be loaded ({error}): pip install mitsuba-oidn, or use `denoise=none`"
+        ) from error
+    color, guide, direction, output = _buffers((radiance.shape[0], radiance.shape[1]), threading.get_ident())
+    gain = _gain(radiance.detach())
+    for buffer, image in ((color, radiance.detach() * gain), (guide, albedo), (direction, normal)):
+        buffer.copy_(image.detach())
+    quality = mitsuba_oidn.Quality.Fast if quick else mitsuba_oidn.Quality.High
+    mitsuba_oidn.denoise(color, guide, direction, hdr=True, quality=quality, input_scale=1.0, output=output)
+    return (output / gain).to(radiance.device)
 
 
 @lru_cache(maxsize=8)
 def _buffers(resolution: tuple[int, int], thread: int) -> list[Tensor]:
-    """Return what all denoisers of a size and a thread work in: the filter is set up anew, for longer than it takes to
-    run, whenever it is given other memory, as of every new scene."""
+    """Return what pictures of a size are denoised in, in a thread: the filter is set up anew, for longer than it takes
+    to run, whenever it is given other memory."""
     return [torch.zeros(*resolution, 3) for _ in range(4)]
 
 

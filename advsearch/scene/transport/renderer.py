@@ -15,6 +15,7 @@ from advsearch import seeds
 from advsearch.files import scaled
 from advsearch.scene.assembly import ON_PICTURE
 from advsearch.scene.gradients.group import Group
+from advsearch.scene.mitsuba_backend.denoise import denoise
 from advsearch.scene.mitsuba_backend.transport import Paths, mean_of
 from advsearch.scene.renderer import InputSpace, Renderer
 from advsearch.scene.transport.matrix import Halves, TextureTransport
@@ -146,10 +147,8 @@ class LinearRenderer(PredictingRenderer):
             self._base = Halves(base)
 
     def let_go(self, space: InputSpace) -> None:
-        """Let go of the scene and the denoiser, which only tracing takes; the pictures stay, and `space` is the same
-        without a scene."""
-        for name in ("scene", "_denoise"):
-            vars(self).pop(name)
+        """Let go of the scene, which only tracing takes; the pictures stay, and `space` is the same without a scene."""
+        del self.scene
         self.space = space
 
     @property
@@ -194,12 +193,12 @@ class LinearRenderer(PredictingRenderer):
         radiance = self._finite(seen.radiance - seen.background if self._hide else seen.radiance)
         clean = radiance
         if self.formation.denoiser == "oidn":
-            clean = self._denoise(radiance, seen.albedo.clamp(0.0, 1.0), seen.normal)
+            clean = denoise(radiance, seen.albedo.clamp(0.0, 1.0), seen.normal)
         ratio = (clean / radiance.clamp_min(1e-12)).clamp(1.0 / MOST, MOST)
         even = (seen.albedo.sum(dim=-1, keepdim=True) > 0.0).to(torch.float32).expand(-1, -1, 3).contiguous()
 
         def smooth(picture: Tensor) -> Tensor:
-            return picture * ratio if quick else self._denoise(picture.contiguous(), even, seen.normal)
+            return picture * ratio if quick else denoise(picture.contiguous(), even, seen.normal)
 
         for transport in self.transports.values():
             transport.finish(smooth if self.formation.denoiser == "oidn" else None)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from advsearch import threads
-from advsearch.scene.mitsuba_backend.denoise import KEY, Denoiser, _buffers, _gain
+from advsearch.scene.mitsuba_backend.denoise import KEY, _buffers, _gain, denoise
 from advsearch.scene.mitsuba_backend.variant import mitsuba
 
 SIZE = (72, 88)
@@ -37,10 +37,10 @@ def test_the_same_bytes_at_any_number_of_threads() -> None:
     mitsuba()
     flat = torch.full((*SIZE, 3), 0.5)
     pictures = [noisy(seed) for seed in range(4)]
-    denoiser, found = Denoiser(SIZE), []
+    found = []
     for count in (1, 2, 3):
         with on(count):
-            found.append(torch.stack([denoiser(one, flat, flat) for one in pictures]))
+            found.append(torch.stack([denoise(one, flat, flat) for one in pictures]))
     assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
 
 
@@ -50,24 +50,24 @@ def test_the_brightness_is_what_the_denoiser_finds_itself() -> None:
 
     picture, flat = noisy(5), torch.full((*SIZE, 3), 0.5)
     own = mitsuba_oidn.denoise(picture, flat, flat, hdr=True)
-    assert torch.allclose(Denoiser(SIZE)(picture, flat, flat), own, rtol=1e-4, atol=1e-5)
+    assert torch.allclose(denoise(picture, flat, flat), own, rtol=1e-4, atol=1e-5)
     apart = mitsuba_oidn.denoise(picture, flat, flat, hdr=True, input_scale=1.1 * _gain(picture))
     assert not torch.allclose(apart, own, rtol=1e-4, atol=1e-5), "else the brightness decides nothing here"
 
 
 def test_the_quick_one_is_another_and_takes_the_noise_out_too() -> None:
     mitsuba()
-    picture, flat, denoiser = noisy(5), torch.full((*SIZE, 3), 0.5), Denoiser(SIZE)
-    full, quick = (denoiser(picture, flat, flat, quick=one) for one in (False, True))
+    picture, flat = noisy(5), torch.full((*SIZE, 3), 0.5)
+    full, quick = (denoise(picture, flat, flat, quick=one) for one in (False, True))
     assert not torch.equal(full, quick)
     assert (quick - full).abs().mean() < 0.2 * (picture - full).abs().mean()
 
 
-def test_denoisers_of_a_size_work_in_the_same_memory_and_spoil_nothing() -> None:
+def test_pictures_of_a_size_are_denoised_in_the_same_memory_and_spoil_nothing() -> None:
     mitsuba()
     flat = torch.full((*SIZE, 3), 0.5)
-    first = Denoiser(SIZE)(noisy(1), flat, flat)
-    kept, second = first.clone(), Denoiser(SIZE)(noisy(2), flat, flat)
+    first = denoise(noisy(1), flat, flat)
+    kept, second = first.clone(), denoise(noisy(2), flat, flat)
     assert torch.equal(first, kept) and not torch.equal(first, second)
     own, other = _buffers(SIZE, 1), _buffers(SIZE, 2)
     assert own is _buffers(SIZE, 1) and own[0].data_ptr() != other[0].data_ptr()
