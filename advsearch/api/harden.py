@@ -118,7 +118,8 @@ def _carry_out(
     (loaded, *_), warnings = load_models([model], task, labels=config.labels, used_threads=config.used_threads)
     student = trainable(loaded, config.layers)
     splits = splits_of(config, loaded)
-    course = Course(student, loaded, config.rate, config.epochs, seeds.stream(config.seed, "order"), optimiser, beside)
+    order = seeds.stream(config.seed, "order")
+    course = Course(student, loaded, config.rate, config.epochs, order, config.texture_looks, optimiser, beside)
     with RunDirectory.of(config, resumed) as run:
         _same_means(run, {"optimiser": optimiser is not None, "beside": beside is not None}, resumed)
         work = Hardening(run, course, SceneWork(config, loaded, splits), progress)

@@ -16,8 +16,9 @@ FURTHER_SCENES = 6
 """Scenes that come with each one of the training, of which nothing is drawn but one view: what is learned is lost on
 other scenes where there are few, and so is clean accuracy."""
 
-TEXTURE_LOOKS = 3
-"""How often an epoch looks at a view with a texture: it is another one each time, while what was rendered stays."""
+TEXTURE_LOOKS = 6
+"""How often an epoch looks at a scene with a texture, over its views: it is another one each time, while what was
+rendered stays."""
 
 QUICK: dict[str, int] = {"rounds": 1, "scenes": 14, "views": 2, "epochs": 6, "measured": 14, "steps": 20}
 """What `quick` takes where nothing else was said: minutes instead of an hour."""
@@ -91,7 +92,8 @@ class HardenConfig(AttackConfig):
     epochs: int = setting(
         3,
         "training",
-        f"how often a round looks at each view; {TEXTURE_LOOKS} times as often where a texture is searched",
+        "how often a round looks at each view; where a texture is searched, as many times as often as makes "
+        f"{TEXTURE_LOOKS} for a scene, at most, over its views",
         ge=1,
         le=10_000,
     )
@@ -112,6 +114,11 @@ class HardenConfig(AttackConfig):
     def _quickly(cls, data: Any) -> Any:
         """Let `quick` say what is not said otherwise."""
         return {**QUICK, **data} if data.get("quick") is True else data
+
+    @property
+    def texture_looks(self) -> int:
+        """How often an epoch looks at each view with a texture."""
+        return max(1, TEXTURE_LOOKS // self.views)
 
     @property
     def title(self) -> tuple[str, ...]:

@@ -65,7 +65,7 @@ def frozen(module: nn.Module, name: str) -> nn.Module:
     """
     if not isinstance(module, (torch.fx.GraphModule, torch.jit.ScriptModule)):
         try:
-            module = _sharing_copy(module)
+            module = sharing_copy(module)
         except (
             TypeError,
             AttributeError,
@@ -88,8 +88,9 @@ def frozen(module: nn.Module, name: str) -> nn.Module:
     return module
 
 
-def _sharing_copy(module: nn.Module) -> nn.Module:
-    memo: dict[int, Any] = {id(p): nn.Parameter(p.detach(), requires_grad=False) for p in module.parameters()}
+def sharing_copy(module: nn.Module) -> nn.Module:
+    """Return a copy that has the same weights, but gradients of its own."""
+    memo: dict[int, Any] = {id(p): nn.Parameter(p.detach(), p.requires_grad) for p in module.parameters()}
     memo.update({id(buffer): buffer for buffer in module.buffers()})
     return copy.deepcopy(module, memo)
 

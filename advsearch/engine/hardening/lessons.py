@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 import torch.nn.functional as F
@@ -223,7 +224,7 @@ def harder(chosen: Sequence[Lesson], model: Model, steps: int = 1) -> None:
     """
     for begin in range(0, len(chosen), TOGETHER):
         part = chosen[begin : begin + TOGETHER]
-        ascend(part, model, steps)
+        ascend(part, partial(slopes, model=model), steps)
         _look([one for one in part if isinstance(one, RenderedLesson)], model)
 
 
@@ -239,26 +240,40 @@ def _look(chosen: Sequence[RenderedLesson], model: Model) -> None:
 
 
 def ascend(
-    some: Sequence[Lesson], model: Model, steps: int = 1, change: Callable[[Tensor], Tensor] = unchanged
+    some: Sequence[Lesson], slopes_of: Callable[[Sequence[TextureLesson]], Sequence[Tensor]], steps: int = 1
 ) -> None:
     """Steps uphill of the textures of lessons; views that share one add up.
 
     Args:
         some: lessons; those without a texture stay as they are.
-        model: that gets them wrong.
+        slopes_of: from lessons to what `slopes` says of them.
         steps: of each texture.
-        change: what happens to as many pictures (N, H, W, 3) as there are textured views before the model sees them.
     """
     chosen = [one for one in some if isinstance(one, TextureLesson)]
     if not chosen:
         return
-    textures = list(dict.fromkeys(one.texture for one in chosen))
+    domains = {one.texture: one.domain for one in chosen}
     for _ in range(steps):
-        leaves = {texture: texture.u.clone().requires_grad_() for texture in textures}
-        pictures = torch.stack([one.picture(leaves[one.texture]) for one in chosen])
-        loss = surprise(model(change(pictures)), [one.right for one in chosen]).sum()
-        slopes = torch.autograd.grad(loss, list(leaves.values()))
-        domains = {one.texture: one.domain for one in chosen}
-        for texture, slope in zip(textures, slopes, strict=True):
+        total = dict[Disguise, Tensor]()
+        for one, slope in zip(chosen, slopes_of(chosen), strict=True):
+            total[one.texture] = total[one.texture] + slope if one.texture in total else slope
+        for texture, slope in total.items():
             domain = domains[texture]
             texture.u = domain.project(texture.u + STEP * domain.steepest(texture.u, slope))
+
+
+def slopes(
+    chosen: Sequence[TextureLesson],
+    model: Callable[[Tensor], Tensor],
+    change: Callable[[Tensor], Tensor] = unchanged,
+) -> Sequence[Tensor]:
+    """Return the derivative (d,) of the loss of each lesson with respect to its texture.
+
+    Args:
+        chosen: lessons.
+        model: that gets them wrong.
+        change: what happens to the pictures (N, H, W, 3) before the model sees them.
+    """
+    leaves = [one.texture.u.clone().requires_grad_() for one in chosen]
+    pictures = torch.stack([one.picture(u) for one, u in zip(chosen, leaves, strict=True)])
+    return torch.autograd.grad(surprise(model(change(pictures)), [one.right for one in chosen]).sum(), leaves)

@@ -1,0 +1,146 @@
+"""The gradient of a batch of lessons: plain pictures and the worst ones, which are made worse first, count alike.
+
+A network that answers plain pictures as it did before has lost nothing (learning without forgetting: Li and Hoiem 2016,
+arXiv 1606.09282): where the given model is right, its answers count beside the right ones.
+
+Threads share a batch, a few lessons at a time, each with a copy of the network: what they do is the same whatever their
+number is.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
+from typing import TypeVar
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from advsearch.engine.hardening.augmentation import Augmentation
+from advsearch.engine.hardening.lessons import Lesson, RenderedLesson, TextureLesson, ascend, slopes, surprise
+from advsearch.models import Model
+from advsearch.models.trainable import Trainable
+
+PART = 6
+"""Lessons that one thread works at."""
+AUGMENTATION = Augmentation(smallest_crop=0.75, largest_crop=1.15, turn=15.0, cutout=0.0)
+"""What happens to pictures while they are trained on; the search for worse ones sees the same."""
+KEEP = 1.0
+"""Weight of the given model's answers to plain pictures, beside that of the right ones."""
+MIXED, MIXING = 0.5, 0.4
+"""Share of the parts that mix pictures, and both parameters of the beta distribution that their weights come from."""
+
+AnyLesson = TypeVar("AnyLesson", bound=Lesson)
+
+
+class Gradients:
+    """Takes gradients for a network that is trained.
+
+    Args:
+        student: the network; its parameters collect the gradients.
+        given: the model as it was given; its answers to plain pictures are kept.
+        pool: threads that have one of torch's each.
+    """
+
+    def __init__(self, student: Trainable, given: Model, pool: Executor) -> None:
+        self._student, self._given, self._pool = student, given, pool
+        self._twins: list[Trainable] = []
+
+    def take(self, batch: Sequence[Lesson], beside: tuple[Tensor, Tensor] | None, seed: int) -> None:
+        """Make the worst pictures of lessons worse, and leave the gradient of their loss with the parameters.
+
+        Args:
+            batch: lessons.
+            beside: further images (N, H, W, 3) and class indices (N,), which count too.
+            seed: of what is random.
+        """
+        ascend(batch, lambda chosen: self._slopes(chosen, seed))
+        plain, worst = 1.0 / len(batch), 1.0 / max(1, len(_searched(batch)))
+
+        def descend(number: int, twin: Trainable, part: Sequence[Lesson]) -> list[Tensor | None]:
+            loss = self._loss(twin, part, plain, worst, seed + number)
+            return list(torch.autograd.grad(loss, twin.parameters(), allow_unused=True))
+
+        def descend_beside(images: Tensor, labels: Tensor) -> list[Tensor | None]:
+            loss = surprise(self._student.logits(images), [(int(label),) for label in labels]).mean()
+            return list(torch.autograd.grad(loss, self._student.parameters(), allow_unused=True))
+
+        others = [] if beside is None else [self._pool.submit(descend_beside, *beside)]
+        found = [*self._each(descend, batch), *(one.result() for one in others)]
+        for parameter, *own in zip(self._student.parameters(), *found, strict=True):
+            some = [one for one in own if one is not None]
+            parameter.grad = torch.stack(some).sum(dim=0) if some else None
+
+    def _each(
+        self, do: Callable[[int, Trainable, Sequence[AnyLesson]], list[Tensor | None]], chosen: Sequence[AnyLesson]
+    ) -> list[list[Tensor | None]]:
+        """Have something done with each part of some lessons, with its number and a copy of the network."""
+        parts = [chosen[begin : begin + PART] for begin in range(0, len(chosen), PART)]
+        while len(self._twins) < len(parts):
+            self._twins.append(self._student.twin())
+        return list(self._pool.map(do, itertools.count(), self._twins, parts))
+
+    def _slopes(self, chosen: Sequence[TextureLesson], seed: int) -> list[Tensor]:
+        """What `slopes` says."""
+
+        def climb(number: int, twin: Trainable, part: Sequence[TextureLesson]) -> list[Tensor | None]:
+            return list(slopes(part, twin.quickly, lambda images: _changed(images, seed + number)))
+
+        return [one for some in self._each(climb, chosen) for one in some if one is not None]
+
+    def _loss(self, student: Trainable, part: Sequence[Lesson], plain: float, worst: float, seed: int) -> Tensor:
+        """What is descended, of a part of a batch: so much of each plain picture, and so much of each worst one.
+
+        At times all that was rendered is mixed with each other (mixup, Zhang et al. 2018, arXiv 1710.09412), as no more
+        pictures of it will come; a texture is another one each time.
+        """
+        searched, rng = _searched(part), np.random.default_rng(seed)
+        images = _changed(torch.stack([one.plain for one in part]), seed)
+        if searched:
+            images = torch.cat([images, _changed(torch.stack([one.worst for one in searched]), seed)])
+        taught = [*part, *searched]
+        right = [one.right for one in taught]
+        mixed = [place for place, one in enumerate(taught) if isinstance(one, RenderedLesson)]
+        if rng.random() >= MIXED:
+            mixed = []
+        others, drawn = rng.permutation(mixed).astype(int).tolist(), float(rng.beta(MIXING, MIXING))
+        share = min(drawn, 1.0 - drawn)
+        if mixed:
+            images[mixed] = torch.lerp(images[mixed], images[others], share)
+        logits = student.logits(images)
+        found = surprise(logits, right)
+        if mixed:
+            of_others = surprise(logits[mixed], [right[place] for place in others])
+            found[mixed] = torch.lerp(found[mixed], of_others, share)
+        unmixed = sorted({*range(len(part))} - {*mixed})
+        loss = plain * found[: len(part)].sum() + worst * found[len(part) :].sum()
+        if unmixed:
+            kept = self._forgotten(images[unmixed], logits[unmixed], [right[place] for place in unmixed])
+            loss = loss + plain * KEEP * kept
+        for one, now in zip(searched, found[len(part) :].tolist(), strict=True):
+            if isinstance(one, RenderedLesson) and not mixed:
+                one.learned(now)
+        return loss
+
+    def _forgotten(self, plain: Tensor, logits: Tensor, right: Sequence[tuple[int, ...]]) -> Tensor:
+        """The Kullback-Leibler divergence of what the given model says of plain pictures (N, H, W, 3), where it is
+        right, to what logits (N, C) say; a sum over all."""
+        with torch.no_grad():
+            wanted = self._given(plain)
+        known = [said in own for said, own in zip(wanted.argmax(dim=1).tolist(), right, strict=True)]
+        target = F.log_softmax(wanted[known], dim=1)
+        return F.kl_div(F.log_softmax(logits[known], dim=1), target, reduction="sum", log_target=True)
+
+
+def _searched(some: Sequence[Lesson]) -> list[TextureLesson | RenderedLesson]:
+    """Those that have a worst picture."""
+    return [one for one in some if isinstance(one, (TextureLesson, RenderedLesson))]
+
+
+def _changed(images: Tensor, seed: int) -> Tensor:
+    """Change pictures (N, H, W, 3) by chance; the same way whenever there are as many of them."""
+    generator = torch.Generator().manual_seed(seed)
+    return AUGMENTATION(images.permute(0, 3, 1, 2), generator).permute(0, 2, 3, 1)
