@@ -52,8 +52,8 @@ class Trainable:
     def _mixed_precision(self) -> torch.autocast:
         """Convolutions and products of matrices in bfloat16, on a processor that has instructions for it.
 
-        Several threads at one of them wait for each other busily: where others want the cores too it takes ten times as
-        long as on one thread.
+        Several threads at one of them wait for each other busily: where others want the cores too it takes five
+        times as long as in float32.
         """
         found: Mapping[str, object] = getattr(torch.cpu, "get_capabilities", dict)()  # torch 2.8 says nothing
         bfloat16 = self.model.device.type == "cpu" and bool(found.get("avx512_bf16"))

@@ -20,7 +20,15 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from advsearch.engine.hardening.augmentation import Augmentation
-from advsearch.engine.hardening.lessons import Lesson, RenderedLesson, TextureLesson, ascend, slopes, surprise
+from advsearch.engine.hardening.lessons import (
+    Lesson,
+    RenderedLesson,
+    TextureLesson,
+    ascend,
+    slopes,
+    surprise,
+    with_worst,
+)
 from advsearch.models import Model
 from advsearch.models.trainable import Trainable
 
@@ -34,6 +42,7 @@ MIXED, MIXING = 0.5, 0.4
 """Share of the parts that mix pictures, and both parameters of the beta distribution that their weights come from."""
 
 AnyLesson = TypeVar("AnyLesson", bound=Lesson)
+Found = TypeVar("Found")
 
 
 class Gradients:
@@ -58,7 +67,7 @@ class Gradients:
             seed: of what is random.
         """
         ascend(batch, lambda chosen: self._slopes(chosen, seed))
-        plain, worst = 1.0 / len(batch), 1.0 / max(1, len(_searched(batch)))
+        plain, worst = 1.0 / len(batch), 1.0 / max(1, len(with_worst(batch)))
 
         def descend(number: int, twin: Trainable, part: Sequence[Lesson]) -> list[Tensor | None]:
             loss = self._loss(twin, part, plain, worst, seed + number)
@@ -75,8 +84,8 @@ class Gradients:
             parameter.grad = torch.stack(some).sum(dim=0) if some else None
 
     def _each(
-        self, do: Callable[[int, Trainable, Sequence[AnyLesson]], list[Tensor | None]], chosen: Sequence[AnyLesson]
-    ) -> list[list[Tensor | None]]:
+        self, do: Callable[[int, Trainable, Sequence[AnyLesson]], Found], chosen: Sequence[AnyLesson]
+    ) -> list[Found]:
         """Have something done with each part of some lessons, with its number and a copy of the network."""
         parts = [chosen[begin : begin + PART] for begin in range(0, len(chosen), PART)]
         while len(self._twins) < len(parts):
@@ -86,10 +95,10 @@ class Gradients:
     def _slopes(self, chosen: Sequence[TextureLesson], seed: int) -> list[Tensor]:
         """What `slopes` says."""
 
-        def climb(number: int, twin: Trainable, part: Sequence[TextureLesson]) -> list[Tensor | None]:
-            return list(slopes(part, twin.quickly, lambda images: _changed(images, seed + number)))
+        def climb(number: int, twin: Trainable, part: Sequence[TextureLesson]) -> Sequence[Tensor]:
+            return slopes(part, twin.quickly, lambda images: _changed(images, seed + number))
 
-        return [one for some in self._each(climb, chosen) for one in some if one is not None]
+        return [one for some in self._each(climb, chosen) for one in some]
 
     def _loss(self, student: Trainable, part: Sequence[Lesson], plain: float, worst: float, seed: int) -> Tensor:
         """What is descended, of a part of a batch: so much of each plain picture, and so much of each worst one.
@@ -97,7 +106,7 @@ class Gradients:
         At times all that was rendered is mixed with each other (mixup, Zhang et al. 2018, arXiv 1710.09412), as no more
         pictures of it will come; a texture is another one each time.
         """
-        searched, rng = _searched(part), np.random.default_rng(seed)
+        searched, rng = with_worst(part), np.random.default_rng(seed)
         images = _changed(torch.stack([one.plain for one in part]), seed)
         if searched:
             images = torch.cat([images, _changed(torch.stack([one.worst for one in searched]), seed)])
@@ -133,11 +142,6 @@ class Gradients:
         known = [said in own for said, own in zip(wanted.argmax(dim=1).tolist(), right, strict=True)]
         target = F.log_softmax(wanted[known], dim=1)
         return F.kl_div(F.log_softmax(logits[known], dim=1), target, reduction="sum", log_target=True)
-
-
-def _searched(some: Sequence[Lesson]) -> list[TextureLesson | RenderedLesson]:
-    """Those that have a worst picture."""
-    return [one for one in some if isinstance(one, (TextureLesson, RenderedLesson))]
 
 
 def _changed(images: Tensor, seed: int) -> Tensor:

@@ -208,6 +208,11 @@ def surprise(logits: Tensor, right: Sequence[tuple[int, ...]]) -> Tensor:
     return torch.stack([-row[list(of)].logsumexp(dim=0) for row, of in zip(found, right, strict=True)])
 
 
+def with_worst(some: Sequence[Lesson]) -> list[TextureLesson | RenderedLesson]:
+    """Those lessons that something makes harder."""
+    return [one for one in some if isinstance(one, (TextureLesson, RenderedLesson))]
+
+
 def unchanged(images: Tensor) -> Tensor:
     """Return images as they are."""
     return images

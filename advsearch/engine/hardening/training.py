@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from advsearch import threads
 from advsearch.engine.hardening.gradients import Gradients
-from advsearch.engine.hardening.lessons import TOGETHER, Lesson, RenderedLesson, TextureLesson, harder
+from advsearch.engine.hardening.lessons import TOGETHER, Lesson, TextureLesson, harder, with_worst
 from advsearch.models import Model
 from advsearch.models.trainable import Trainable
 
@@ -136,8 +136,7 @@ def score(model: Model, held_back: Sequence[Lesson]) -> Score:
         if isinstance(one, TextureLesson):
             one.texture = copy.copy(one.texture)
     harder(own, model, HELD_BACK_STEPS)
-    searched = [one for one in own if isinstance(one, (TextureLesson, RenderedLesson))]
-    return Score(right_share(model, own, "plain"), right_share(model, searched, "worst"))
+    return Score(right_share(model, own, "plain"), right_share(model, with_worst(own), "worst"))
 
 
 def right_share(model: Model, chosen: Sequence[Lesson], which: str) -> float:
