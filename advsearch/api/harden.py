@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from advsearch import seeds
 from advsearch.api.attack import LOADING, executor_for
 from advsearch.api.harden_scenes import (
@@ -58,6 +60,8 @@ if TYPE_CHECKING:
 
 MEASURED, MEANS = "measured", "means"
 """Notes under which the store keeps what is done."""
+SHARED, MOVED = 0.25, 0.5
+"""Shares of the scenes with a texture in which all views have the same, and in which rendered controls vary too."""
 
 
 @asks(HardenConfig, HardenKeywords)
@@ -244,16 +248,17 @@ class Hardening:
     def _drawn(self, title: str, split: str, places: Sequence[int], views: int) -> list[Lesson]:
         """Lessons of scenes: for each control whose pictures a matrix says, and for all others together.
 
-        In every fourth scene of the training all views share a texture, and further scenes come on top: of what is
-        rendered new scenes teach more than further views.
+        In the training a fourth of the scenes have one texture for all views, in half of them the controls that are
+        rendered vary by chance, and further scenes come on top: of what is rendered new scenes teach more than further
+        views.
         """
         controls, linear = tuple(self.config.controls), self.scenes.linear
         rendered, training = tuple(one for one in controls if one not in linear), split == TRAINING
-        wanted = [
-            Drawing(split, number, (one,), views, 1, training and number % 4 == 3)
-            for one in linear
-            for number in places
-        ]
+        wanted = list[Drawing]()
+        for one in linear:
+            for number in places:
+                shared, moved = self._chance(one, number) if training else (False, False)
+                wanted.append(Drawing(split, number, (one,), views, 1, shared, self.scenes.beside if moved else ()))
         more = [FURTHER_SCENES * place + one for place in places for one in range(FURTHER_SCENES)] if training else []
         if rendered:
             wanted += [Drawing(split, number, rendered, 1 if training else views, 0) for number in places]
@@ -263,6 +268,12 @@ class Hardening:
         self.progress.stage(title, len(wanted))
         found = dict(self._each(wanted))
         return [one for place in range(len(wanted)) for one in found[place]]
+
+    def _chance(self, control: str, number: int) -> tuple[bool, bool]:
+        """Whether all views of a scene have one texture, and whether other controls vary beside it. Not by turns, as
+        the objects take turns."""
+        shared, moved = np.random.default_rng(seeds.stream(self.config.seed, f"views of {control}", number)).random(2)
+        return bool(shared < SHARED), bool(moved < MOVED)
 
     # ---- measurement ------------------------------------------------------------------------------------------------
 

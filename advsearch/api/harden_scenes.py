@@ -51,9 +51,8 @@ OVER: dict[str, dict[str, object]] = {
 }
 """What varies by chance from view to view, unless it is searched."""
 
-TRIES, TRIES_TO_CHOOSE = 3, 6
-"""Random configurations of a view that is rendered, of which the worst counts: in the training, and where weights are
-chosen by it. New scenes teach more than further configurations."""
+TRIES_TO_CHOOSE = 6
+"""Random configurations of a view that is rendered to choose weights by, of which the worst counts."""
 CLEAN_SCENES, CLEAN_VIEWS = 4, 2
 """Held-out scenes whose plain pictures are looked at, for each one that is attacked, and the views of each."""
 CLEAN_SPP = 16
@@ -74,6 +73,7 @@ class Drawing:
         views: that are made harder.
         plain: views of the scene as it is.
         shared: whether all views share one adversarial texture.
+        beside: controls that vary by chance from view to view.
     """
 
     side: str
@@ -82,6 +82,7 @@ class Drawing:
     views: int
     plain: int
     shared: bool = False
+    beside: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -187,15 +188,28 @@ class SceneWork:
         return tuple(one for one in self.config.controls if has_matrix(self._problem(side, 0, (one,))[0]))
 
     @cached_property
+    def beside(self) -> tuple[str, ...]:
+        """The controls that are rendered which can vary by chance beside a matrix."""
+        return tuple(one for one in self.config.controls if one not in self.linear and self._can_vary(one))
+
+    def _can_vary(self, control: str) -> bool:
+        if not self.linear:
+            return False
+        try:
+            return has_matrix(self._problem(self.splits[TRAINING], 0, self.linear[:1], (control,))[0])
+        except InputError:
+            return False
+
+    @cached_property
     def _measured(self) -> frozenset[str]:
         """Fingerprints of the objects of all held-out scenes."""
         count = CLEAN_SCENES * self.config.measured
         return frozenset(fingerprint(asset) for asset in self.splits[HELD_OUT].assets(count))
 
     def _draw(self, one: Drawing) -> list[Lesson]:
-        problem, seed = self._problem(self.splits[one.side], one.number, one.controls)
-        tries = TRIES_TO_CHOOSE if one.side == VALIDATION else TRIES
-        found = lessons(problem, one.views, tries, seed, shared=one.shared) if one.views else []
+        problem, seed = self._problem(self.splits[one.side], one.number, one.controls, one.beside)
+        tries = TRIES_TO_CHOOSE if one.side == VALIDATION else None
+        found = lessons(problem, one.views, seed, tries=tries, shared=one.shared) if one.views else []
         return found + plain_lessons(problem, one.plain, seed)
 
     def _attack(self, one: Attacking) -> str:
@@ -220,13 +234,16 @@ class SceneWork:
             found.append(Lesson(right, levels_of(problem.picture(problem.domain.start, seed, CLEAN_SPP))))
         return found
 
-    def _problem(self, side: Split, number: int, controls: Sequence[str]) -> tuple[Problem, int]:
-        """What a scene is searched as, and the root of the draws of its lessons."""
+    def _problem(
+        self, side: Split, number: int, controls: Sequence[str], beside: Sequence[str] = ()
+    ) -> tuple[Problem, int]:
+        """What a scene is searched as, with controls that vary by chance beside, and the root of its lessons' draws."""
         name, scene = side.scene(number, self._set)
         if side.name != HELD_OUT:
             check_unmeasured(scene.description.object, self._measured)
-        kinds = {control.partition(":")[0].partition(".")[0] for control in controls}
+        kinds = {control.partition(":")[0].partition(".")[0] for control in (*controls, *beside)}
         over = {other: given for other, given in OVER.items() if other not in kinds}
+        over |= {control: self.config.controls[control] for control in beside}
         problem = problem_of(self._of(controls, name, over=over), scene, self.model, differentiated=False)
         return problem, seeds.stream(side.seed, "views", number)
 

@@ -14,7 +14,7 @@ import advsearch
 from advsearch.api import harden as hardening
 from advsearch.api import harden_scenes
 from advsearch.api.attack import executor_for
-from advsearch.api.harden_scenes import SceneWork
+from advsearch.api.harden_scenes import Drawing, SceneWork
 from advsearch.cli.harden import answer
 from advsearch.cli.main import main
 from advsearch.config import AttackConfig, HardenConfig
@@ -107,15 +107,32 @@ def test_what_is_rendered_is_searched_together_and_in_further_scenes_too(attacks
     assert [type(one) for one in held_back] == [TextureLesson] * 2 + [Lesson] + [RenderedLesson] * 2
     assert [type(one) for one in found] == [TextureLesson, Lesson, RenderedLesson, RenderedLesson]
     tries = [len(one.pictures) for one in [*found, *held_back] if isinstance(one, RenderedLesson)]
-    assert tries == [harden_scenes.TRIES] * 2 + [harden_scenes.TRIES_TO_CHOOSE] * 2
+    assert tries == [1] * 2 + [harden_scenes.TRIES_TO_CHOOSE] * 2
+    shutil.rmtree(run.path)
+
+
+def test_in_half_of_the_scenes_with_a_texture_what_is_rendered_varies_too(attacks: list[tuple[str, int]]) -> None:
+    config = HardenConfig(**{**SMALL, "controls": "texture,pose,haze", "labels": "labels.json"})
+    with RunDirectory.create_for(config) as run:
+        course = Course(Trainable(torch.nn.Linear(2, 3), load()), load(), 0.1, 1, 0)
+        work = work_of(config, run, course)
+        assert work.scenes.beside == ("pose",)  # no matrix says what haze does
+        drawn = [work._chance("texture", number) for number in range(400)]
+        for share, which in ((hardening.SHARED, 0), (hardening.MOVED, 1)):
+            for part in (drawn[::2], drawn[1::2]):  # objects take turns, and each has as many
+                assert abs(sum(one[which] for one in part) / 200 - share) < 0.08
+        seen = work.scenes([Drawing(TRAINING, 0, ("texture",), 1, 0, beside=beside) for beside in ((), ("pose",))])
+        one, other = (some[0] for some in seen)
+        assert isinstance(one, TextureLesson) and isinstance(other, TextureLesson)
+        assert len(other.numbers) == len(one.numbers) + 6 and not torch.equal(one.plain, other.plain)
     shutil.rmtree(run.path)
 
 
 def test_workers_do_what_this_process_does(attacks: list[tuple[str, int]]) -> None:
     config = HardenConfig(**{**SMALL, "model": "reference", "controls": "texture,pose", "epsilon": {"texture": 0.03}})
     wanted: list[harden_scenes.Wanted] = [
-        harden_scenes.Drawing(TRAINING, 1, ("texture",), 1, 1),
-        harden_scenes.Drawing(TRAINING, 0, ("pose",), 1, 0),
+        Drawing(TRAINING, 1, ("texture",), 1, 1),
+        Drawing(TRAINING, 0, ("pose",), 1, 0),
         harden_scenes.Looking(0),
     ]
     here = SceneWork(config, load(), harden_scenes.splits_of(config, load()))(wanted)
@@ -136,7 +153,9 @@ def test_the_weights_that_are_kept_are_within_the_clean_loss(attacks: list[tuple
     config = HardenConfig(**SMALL, labels="labels.json")
     rows = [(0.9, 0.2), (0.89, 0.5), (0.87, 0.8), (0.885, 0.5)]
     with RunDirectory.create_for(config) as run:
-        noted = [{"lessons": 1, "part": 1.0, "clean": clean, "robust": robust, "kept": False} for clean, robust in rows]
+        noted = [
+            {"lessons": 1, "parts": [1.0], "clean": clean, "robust": robust, "kept": False} for clean, robust in rows
+        ]
         run.store.set_note(ROUNDS, json.dumps(noted))
         course: Any = None
         work = work_of(config, run, course)
@@ -166,15 +185,19 @@ def test_a_round_ends_with_the_part_of_the_way_that_is_best(
     monkeypatch.setattr("advsearch.engine.hardening.rounds.score", judged)
     with RunDirectory.create_for(config) as run:
         work = work_of(config, run, Course(student, load(), 0.1, 1, 0))
-        work.rounds._keep(0, [], Score(1.0, 0.5), 0, 0.0)
+        work.rounds._keep(0, [], Score(1.0, 0.5), 0, ())
         for loss, expected, looked_at in ((0.05, 0.4, 6), (0.2, 1.0, 2), (0.001, 0.25, 6)):
             judged_at.clear()
-            net.load_state_dict({name: one + 1.0 for name, one in given.items()})
+            learned = {name: one + 1.0 for name, one in given.items()}
             work.rounds.clean_loss = loss
-            found, part = work.rounds._mixed([])
+            found, (part,) = work.rounds._mixed([], given, [learned])
             assert part == expected and found.robust == pytest.approx(0.5 + 0.2 * part)
             assert len(judged_at) == looked_at, "less than the best part is looked at once"
             torch.testing.assert_close(net.bias.detach(), given["bias"] + part)
+        work.rounds.clean_loss = 0.13  # of two ways, the sum of the parts is what was judged
+        ways = [{name: one + way for name, one in given.items()} for way in (1.0, 0.5)]
+        found, both = work.rounds._mixed([], given, ways)
+        assert both == (0.85, 0.85) and found.robust == pytest.approx(0.5 + 0.2 * 1.275)
     shutil.rmtree(run.path)
 
 

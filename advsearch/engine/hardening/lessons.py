@@ -4,7 +4,9 @@ Where light arrives linearly (textures, patches), a lesson holds a matrix of lig
 picture of any texture and its derivative without rendering: its adversarial texture is searched further each time that
 the lesson comes up (warm starts: Zheng et al. 2020, arXiv 1912.11969). A texture that several views share is one of
 expectation over transformation (EOT, Athalye et al. 2018). Everything else is rendered at random configurations, half
-of them with numbers at the ends of their ranges; of these the one that is worst for the model as it is counts.
+of them with numbers at the ends of their ranges. To train on, a scene is rendered twice, as new scenes teach more than
+further configurations of one; to choose weights by, it is rendered more often, and the configuration that is worst for
+the model as it is counts.
 """
 
 from __future__ import annotations
@@ -43,7 +45,7 @@ class Lesson:
 
     Attributes:
         right: indices of the right classes.
-        levels: (H, W, 3) uint8, its picture as it is.
+        levels: (H, W, 3) uint8, its picture as it is; of a scene that is rendered twice, that with one control moved.
     """
 
     right: tuple[int, ...]
@@ -51,7 +53,7 @@ class Lesson:
 
     @property
     def plain(self) -> Tensor:
-        """(H, W, 3) its picture as it is, sRGB in [0, 1]."""
+        """(H, W, 3) the picture of `levels`, sRGB in [0, 1]."""
         return self.levels / 255.0
 
     @property
@@ -143,14 +145,15 @@ def has_matrix(problem: Problem) -> bool:
     return why_not(problem.renderer, [one.name for one in problem.space.controls[problem.searched :]]) is None
 
 
-def lessons(problem: Problem, views: int, tries: int, seed: int, *, shared: bool = False) -> list[Lesson]:
+def lessons(problem: Problem, views: int, seed: int, *, tries: int | None = None, shared: bool = False) -> list[Lesson]:
     """Draw lessons from one scene whose view and light vary by chance.
 
     Args:
         problem: with the searched controls, and conditions.
         views: how many; each has conditions of its own.
-        tries: configurations of each, where no matrix says its pictures; see `tried`.
         seed: root of the draws.
+        tries: configurations that are rendered beside each view as it is, where no matrix says the pictures; see
+            `tried`. None for two renders of a view: one of the controls moved, and all of them.
         shared: let all views have one adversarial texture.
     """
     linear, quickly, found = has_matrix(problem), problem.renderer.like(quick=True), list[Lesson]()
@@ -170,9 +173,13 @@ def lessons(problem: Problem, views: int, tries: int, seed: int, *, shared: bool
                 levels = levels_of(plain)
                 found.append(TextureLesson(right, levels, space, problem.domain, made, numbers, texture))
             else:
-                drawn = tried(problem.domain, torch.Generator().manual_seed(own), tries)
-                shown = [quickly(torch.cat([u, numbers]), seed=own, spp=SPP) for u in drawn]
-                plain = quickly(whole, seed=own, spp=SPP)
+                generator = torch.Generator().manual_seed(own)
+                if tries is None:
+                    *alone, together = tried(problem.domain, generator, 1 + len(problem.searched_space.controls))
+                    wanted = [alone[torch.randint(len(alone), (), generator=generator)], together]
+                else:
+                    wanted = [problem.domain.start, *tried(problem.domain, generator, tries)]
+                plain, *shown = (quickly(torch.cat([u, numbers]), seed=own, spp=SPP) for u in wanted)
                 found.append(RenderedLesson.of(right, plain, torch.stack(shown)))
     return found
 
