@@ -17,10 +17,21 @@ import torch
 from small_models import Colours
 from torch import Tensor, nn
 
+from advsearch import threads
 from advsearch.api.attack import problem_of
 from advsearch.attacks import Block, Domain
 from advsearch.config import AttackConfig, HardenConfig
-from advsearch.engine.hardening.lessons import Lesson, RenderedLesson, TextureLesson, harder, lessons, surprise, tried
+from advsearch.engine.hardening.gradients import Gradients
+from advsearch.engine.hardening.lessons import (
+    Disguise,
+    Lesson,
+    RenderedLesson,
+    TextureLesson,
+    harder,
+    lessons,
+    surprise,
+    tried,
+)
 from advsearch.engine.hardening.pictures import save_pictures, write_archive
 from advsearch.engine.hardening.rounds import mixed
 from advsearch.engine.hardening.split import HELD_OUT, TRAINING, Split, check_disjoint, check_unmeasured, fingerprint
@@ -297,6 +308,45 @@ def test_a_round_comes_to_the_same_whatever_the_number_of_threads() -> None:
             torch.set_num_threads(before)
         found.append([one.detach() for one in made.parameters()])
     assert all(torch.equal(one, other) for one, other in zip(*found, strict=True))
+
+
+class Tinted(TextureLesson):
+    """A picture whose texture is its tint."""
+
+    def picture(self, u: Tensor) -> Tensor:
+        return (self.plain + 0.2 * (u - 0.5)).clamp(0.0, 1.0)
+
+
+def tinted(number: int) -> TextureLesson:
+    nothing: Any = None
+    domain, levels = Domain(torch.full((3,), 0.5), (Block(3),)), levels_of(coloured(number % 3, 0.3, number))
+    return Tinted((number % 3,), levels, nothing, domain, nothing, nothing, Disguise(torch.full((3,), 0.5)))
+
+
+def test_worst_textures_are_trained_on_as_their_search_saw_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An adversarial texture is adversarial for the crop, turn and colours that it was searched under."""
+    seen = list[tuple[list[int], int, bool]]()
+    textured, rendered = [tinted(number) for number in range(9)], pupils()[:15]
+    batch = [one for pair in zip(rendered, [*textured, *rendered[9:]], strict=False) for one in pair][:24]
+
+    def changed(images: Tensor, seed: int) -> Tensor:
+        owners = [
+            number
+            for image in images.detach()
+            for number, one in enumerate(textured)
+            if torch.equal(image, one.picture(one.texture.u).detach() if images.requires_grad else one.worst)
+        ]
+        if len(owners) == len(images):
+            seen.append((owners, seed, images.requires_grad))
+        return images
+
+    monkeypatch.setattr("advsearch.engine.hardening.gradients._changed", changed)
+    made = student()
+    with threads.one_each_for_torch() as pool:
+        Gradients(made, student().model, pool).take(batch, None, 7)
+    searched = sorted(one[:2] for one in seen if one[2])
+    trained = sorted(one[:2] for one in seen if not one[2])
+    assert sum(len(owners) for owners, _ in searched) == 9 and searched == trained
 
 
 def test_a_round_takes_the_users_optimiser_and_their_batches() -> None:

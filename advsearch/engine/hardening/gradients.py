@@ -66,6 +66,7 @@ class Gradients:
             beside: further images (N, H, W, 3) and class indices (N,), which count too.
             seed: of what is random.
         """
+        batch = sorted(batch, key=lambda one: not isinstance(one, TextureLesson))  # parts are those of `_slopes`
         ascend(batch, lambda chosen: self._slopes(chosen, seed))
         plain, worst = 1.0 / len(batch), 1.0 / max(1, len(with_worst(batch)))
 
@@ -103,13 +104,14 @@ class Gradients:
     def _loss(self, student: Trainable, part: Sequence[Lesson], plain: float, worst: float, seed: int) -> Tensor:
         """What is descended, of a part of a batch: so much of each plain picture, and so much of each worst one.
 
-        At times all that was rendered is mixed with each other (mixup, Zhang et al. 2018, arXiv 1710.09412), as no more
+        Worst textures are changed as the search for them saw them: seen otherwise, they are no longer the worst. At
+        times all that was rendered is mixed with each other (mixup, Zhang et al. 2018, arXiv 1710.09412), as no more
         pictures of it will come; a texture is another one each time.
         """
         searched, rng = with_worst(part), np.random.default_rng(seed)
-        images = _changed(torch.stack([one.plain for one in part]), seed)
-        if searched:
-            images = torch.cat([images, _changed(torch.stack([one.worst for one in searched]), seed)])
+        textured = [one.worst for one in searched if isinstance(one, TextureLesson)]
+        shown = [[one.plain for one in part], textured, [one.worst for one in searched[len(textured) :]]]
+        images = torch.cat([_changed(torch.stack(some), seed) for some in shown if some])
         taught = [*part, *searched]
         right = [one.right for one in taught]
         mixed = [place for place, one in enumerate(taught) if isinstance(one, RenderedLesson)]
