@@ -13,7 +13,7 @@ from advsearch.runs.results.harden import HardenResult
 from advsearch.viewer.document import data_url, document, scrolled
 from advsearch.viewer.study_page import again, facts_table, heading, table
 
-ROUND_HEADS = ("round", "views trained on", "parts of the way", "plain pictures right", "worst pictures right", "kept")
+ROUND_HEADS = ("round", "views trained on", "part of the way", "plain pictures right", "worst pictures right", "kept")
 SPLIT_HEADS = ("side", "objects", "environments", "scenes", "views")
 
 
@@ -32,7 +32,7 @@ def harden_page(run: Path, result: HardenResult) -> str:
         [
             str(number),
             str(one.lessons),
-            " and ".join(map(percent, one.parts)) or percent(0.0),
+            percent(one.part),
             percent(one.clean),
             percent(one.robust),
             "yes" if one.kept else "",
@@ -40,9 +40,8 @@ def harden_page(run: Path, result: HardenResult) -> str:
         for number, one in enumerate(result.rounds)
     ]
     trained = (
-        "Round 0 is the model as it was. Weights are part of the way from those to the trained ones; textures and "
-        "what is rendered were learned apart, and their parts are added. Judged on scenes in the training's "
-        "environments on which it was not trained."
+        "Round 0 is the model as it was. Weights are part of the way from those to the trained ones. Judged on "
+        "scenes in the training's environments on which it was not trained."
     )
     split = [
         [name, ", ".join(one.objects), ", ".join(one.environments), str(one.scenes), str(one.views)]

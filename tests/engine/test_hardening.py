@@ -33,9 +33,8 @@ from advsearch.engine.hardening.lessons import (
     tried,
 )
 from advsearch.engine.hardening.pictures import save_pictures, write_archive
-from advsearch.engine.hardening.rounds import mixed
 from advsearch.engine.hardening.split import HELD_OUT, TRAINING, Split, check_disjoint, check_unmeasured, fingerprint
-from advsearch.engine.hardening.training import Course, Score, by_kind, score
+from advsearch.engine.hardening.training import Course, Score, score
 from advsearch.engine.hardening.variation import white_light_changed
 from advsearch.engine.loading import load_scene
 from advsearch.errors import InputError, ModelError
@@ -265,35 +264,6 @@ def test_a_round_teaches_plain_and_worst_pictures() -> None:
     more = [Lesson((5,), levels_of(coloured(0, 0.4, 1)))] * 24  # nothing makes them harder
     assert score(made.model, [*lessons, *more]) == Score(after.clean / 2, after.robust)
     assert before.robust < 0.6 and after.clean >= 0.9 and after.robust >= 0.9
-
-
-def test_each_kind_of_lessons_is_learned_with_the_plain_pictures_of_the_other() -> None:
-    levels = torch.zeros((16, 16, 3), dtype=torch.uint8)
-    nothing: Any = None
-    plain, (rendered, *_) = Lesson((0,), levels), pupils()
-    texture = TextureLesson((1,), levels, nothing, nothing, nothing, nothing, nothing)
-    for chosen in ([plain], [plain, rendered], [texture, plain]):
-        (kind,) = by_kind(chosen)
-        assert [type(one) for one in kind] == [type(one) for one in chosen] and kind[-1].levels is chosen[-1].levels
-    of_textures, of_rendered = by_kind([texture, plain, rendered])
-    assert of_textures[0] is texture and [type(one) for one in of_textures[1:]] == [Lesson, Lesson]
-    assert of_rendered[2] is rendered and [type(one) for one in of_rendered[:2]] == [Lesson, Lesson]
-    assert [one.right for one in of_rendered] == [(1,), (0,), rendered.right]
-    assert torch.equal(of_textures[2].plain, rendered.plain)
-
-
-def test_what_was_learned_apart_is_added() -> None:
-    given, first = ({"w": torch.tensor([one]), "n": torch.tensor(2)} for one in (0.0, 1.0))
-    learned = [{"w": torch.tensor([one]), "n": torch.tensor(2)} for one in (3.0, 2.0)]
-    for some, parts, expected in (
-        (learned[:1], (1.0,), 3.0),
-        (learned[:1], (0.5,), 1.5),  # half of the way back to what was given, whatever the round began with
-        (learned, (1.0, 1.0), 4.0),
-        (learned, (1.0, 0.5), 3.5),
-        (learned, (0.5, 0.5), 2.0),
-    ):
-        found = mixed(given, first, some, parts)
-        assert found["w"].item() == pytest.approx(expected) and found["n"].item() == 2
 
 
 def test_a_round_comes_to_the_same_whatever_the_number_of_threads() -> None:

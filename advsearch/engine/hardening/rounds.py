@@ -3,9 +3,6 @@
 What a round learned costs clean accuracy; part of the way from the weights that were given to the trained ones costs
 less of it than of what was learned (Wortsman et al. 2022, arXiv 2109.01903), so that each round ends with the part that
 is best, and the next one begins there.
-
-Textures and what is rendered are learned by a copy of the network each, whose ways are added (task arithmetic: Ilharco
-et al. 2023, arXiv 2212.04089): learned at once, one takes half of what the other teaches.
 """
 
 from __future__ import annotations
@@ -21,7 +18,7 @@ from advsearch import threads
 from advsearch.engine.hardening.lessons import Lesson, harder
 from advsearch.engine.hardening.pictures import ARCHIVE, FOLDER, save_pictures, write_archive
 from advsearch.engine.hardening.split import TRAINING, VALIDATION
-from advsearch.engine.hardening.training import Course, Score, by_kind, score
+from advsearch.engine.hardening.training import Course, Score, score
 from advsearch.progress import Progress
 from advsearch.report.phrases import percent
 from advsearch.runs.directory import ARTIFACTS, RunDirectory
@@ -34,11 +31,8 @@ ROUNDS = "rounds"
 FIRST_STEPS = 4
 """Steps of each texture before a training."""
 VALIDATION_VIEWS, JUDGED = 2, 168
-PARTS = ((1.0,), (0.85,), (0.7,), (0.55,), (0.4,), (0.25,))
-PARTS_OF_TWO = ((0.7, 0.7), (1.0, 0.7), (0.7, 1.0), (0.85, 0.85), (0.5, 0.5), (0.25, 0.25))
-"""Of the ways from the weights that were given to those that each kind of lessons taught, which are judged."""
-
-Weights = dict[str, torch.Tensor]
+PARTS = (1.0, 0.85, 0.7, 0.55, 0.4, 0.25)
+"""Of the way from the weights that were given to the trained ones, which are judged."""
 
 Draw = Callable[[str, str, Sequence[int], int], list[Lesson]]
 """From what to tell the progress, the name of a split, numbers of its scenes and the views of each to lessons."""
@@ -100,63 +94,55 @@ class TrainingRounds:
         student, pool, begun = self.course.student, list[Lesson](), 0
         held_back = self.draw("drawing scenes to choose weights by", VALIDATION, range(self.judged), VALIDATION_VIEWS)
         if not self.done:
-            self._keep(0, [], score(student.model, held_back), 0, ())
+            self._keep(0, [], score(student.model, held_back), 0, 0.0)
         for number in range(1, count + 1):
             places = range((number - 1) * self.each, number * self.each)
             new = self.draw(f"round {number}: drawing scenes", TRAINING, places, self.views)
             pool += new
             if number < len(self.done):
                 continue  # done before this run was stopped
-            first, learned, kinds = self._weights(number - 1), list[Weights](), by_kind(pool)
-            student.net.load_state_dict(first)
-            self.progress.stage(f"round {number}: training", sum(map(self.course.steps, kinds)))
+            student.net.load_state_dict(self._weights(number - 1))
+            self.progress.stage(f"round {number}: training", self.course.steps(pool))
             with threads.all_for_torch():
                 harder(pool[begun:], student.model, FIRST_STEPS)  # the others are as hard as their training left them
-                for place, kind in enumerate(kinds):
-                    student.net.load_state_dict(first)
-                    self.course.round(number * len(kinds) + place, kind, lambda: self.progress.advance(1))
-                    learned.append({name: one.clone() for name, one in student.net.state_dict().items()})
-                found, parts = self._mixed(held_back, first, learned)
+                self.course.round(number, pool, lambda: self.progress.advance(1))
+                found, part = self._mixed(held_back)
             begun = len(pool)
-            self._keep(number, new, found, len(pool), parts)
+            self._keep(number, new, found, len(pool), part)
 
-    def _mixed(
-        self, held_back: Sequence[Lesson], first: Weights, learned: Sequence[Weights]
-    ) -> tuple[Score, tuple[float, ...]]:
-        """Leave the student with the best parts of the ways from the weights that were given; return score and parts.
+    def _mixed(self, held_back: Sequence[Lesson]) -> tuple[Score, float]:
+        """Leave the student with the best part of the way from the weights that were given; return its score and it.
 
         The best one is right most often on the worst pictures among those that lose no more on plain ones than they
-        may; where all lose more, it is the one that loses least. Less of one way learned less: once that shows, the
+        may; where all lose more, it is the one that loses least. Less of the way learned less: once that shows, the
         smaller parts are not looked at, as each costs a search of its own.
-
-        Args:
-            held_back: lessons to judge by.
-            first: what the round began with.
-            learned: what each kind of lessons taught.
         """
-        student, given, alone = self.course.student, self._weights(0), len(learned) == 1
+        student, given = self.course.student, self._weights(0)
+        learned = {name: one.clone() for name, one in student.net.state_dict().items()}
 
-        def take(parts: tuple[float, ...]) -> None:
-            student.net.load_state_dict(mixed(given, first, learned, parts))
+        def take(part: float) -> None:
+            mixed = {name: torch.lerp(given[name], one, part) if one.is_floating_point() else one
+                     for name, one in learned.items()}  # fmt: skip
+            student.net.load_state_dict(mixed)
 
-        found = dict[tuple[float, ...], Score]()
-        for parts in PARTS if alone else PARTS_OF_TWO:
-            take(parts)
-            found[parts] = score(student.model, held_back)
+        found = dict[float, Score]()
+        for part in PARTS:
+            take(part)
+            found[part] = score(student.model, held_back)
             robust = [one.robust for one in found.values() if self._allowed(one.clean)]
-            if alone and robust and robust[-1] < max(robust):
+            if robust and robust[-1] < max(robust):
                 break
-        allowed = [parts for parts, one in found.items() if self._allowed(one.clean)]
-        best = max(allowed, key=lambda one: found[one].robust, default=max(found, key=lambda one: found[one].clean))
+        allowed = [part for part, one in found.items() if self._allowed(one.clean)]
+        best = max(allowed, key=lambda part: found[part].robust, default=max(found, key=lambda part: found[part].clean))
         take(best)
         return found[best], best
 
-    def _keep(self, number: int, new: Sequence[Lesson], found: Score, trained: int, parts: Sequence[float]) -> None:
+    def _keep(self, number: int, new: Sequence[Lesson], found: Score, trained: int, part: float) -> None:
         """Keep weights, what they came to, and the round's pictures."""
         model = self.course.student.model
         self._save(_file(number))
         save_pictures(self.run.path / ARTIFACTS / FOLDER, number, new, model.labels)
-        done = TrainingRound(lessons=trained, parts=[*parts], clean=found.clean, robust=found.robust, kept=False)
+        done = TrainingRound(lessons=trained, part=part, clean=found.clean, robust=found.robust, kept=False)
         self.done.append(done)
         self.run.store.set_note(ROUNDS, json.dumps([one.model_dump() for one in self.done]))
         clean, worst = percent(found.clean), percent(found.robust)
@@ -166,26 +152,9 @@ class TrainingRounds:
         state = {key: one.contiguous() for key, one in self.course.student.net.state_dict().items()}
         write_bytes(self.run.path / ARTIFACTS / name, safetensors.save(state))
 
-    def _weights(self, number: int) -> Weights:
+    def _weights(self, number: int) -> dict[str, torch.Tensor]:
         return safetensors.load((self.run.path / ARTIFACTS / _file(number)).read_bytes())
 
 
 def _file(number: int) -> str:
     return f"round-{number:03d}.safetensors"
-
-
-def mixed(given: Weights, first: Weights, learned: Sequence[Weights], parts: Sequence[float]) -> Weights:
-    """Return weights parts of the ways from those that were given to those that were learned, added.
-
-    Args:
-        given: of the model as it was.
-        first: where all that was learned began; as much of the way there counts once, as the largest part says.
-        learned: weights.
-        parts: of each, in 0 to 1.
-    """
-    found = dict(given)
-    for name, one in given.items():
-        if one.is_floating_point():
-            ways = [part * (own[name] - first[name]) for part, own in zip(parts, learned, strict=True)]
-            found[name] = torch.lerp(one, first[name], max(parts)) + sum(ways)
-    return found

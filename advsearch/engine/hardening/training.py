@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from advsearch import threads
 from advsearch.engine.hardening.gradients import Gradients
-from advsearch.engine.hardening.lessons import TOGETHER, Lesson, RenderedLesson, TextureLesson, harder, with_worst
+from advsearch.engine.hardening.lessons import TOGETHER, Lesson, TextureLesson, harder, with_worst
 from advsearch.models import Model
 from advsearch.models.trainable import Trainable
 
@@ -127,20 +127,6 @@ class Course:
             self._further = iter(self.beside)
             found = next(self._further)
         return found
-
-
-def by_kind(chosen: Sequence[Lesson]) -> list[list[Lesson]]:
-    """Lessons that a matrix says, and lessons that are rendered, each with the plain pictures of all others.
-
-    What makes a network robust to one kind takes half of what it learns from the other, where it learns both at once.
-    """
-    kinds: list[type[Lesson]] = [
-        kind for kind in (TextureLesson, RenderedLesson) if any(isinstance(one, kind) for one in chosen)
-    ]
-    return [
-        [one if isinstance(one, kind) else Lesson(one.right, one.levels) for one in chosen]
-        for kind in kinds or [Lesson]
-    ]
 
 
 def score(model: Model, held_back: Sequence[Lesson]) -> Score:

@@ -32,10 +32,7 @@ class TrainingRound(Fields):
     """One round of search and training, judged on scenes of the training's environments that it was not trained on."""
 
     lessons: int = Field(description="views that it was trained on")
-    parts: list[float] = Field(
-        description="of the ways from the weights that were given to those that each kind of lessons taught, textures "
-        "first, in 0 to 1"
-    )
+    part: float = Field(description="of the way from the weights that were given to the trained ones, in 0 to 1")
     clean: float = Field(description="share of plain pictures that are right")
     robust: float = Field(description="share of the worst pictures, searched for against these weights")
     kept: bool = Field(description="whether its weights are the answer")
