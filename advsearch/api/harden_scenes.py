@@ -189,14 +189,13 @@ class SceneWork:
 
     @cached_property
     def beside(self) -> tuple[str, ...]:
-        """The controls that are rendered which can vary by chance beside a matrix."""
+        """The controls that are rendered which can vary by chance beside every matrix."""
         return tuple(one for one in self.config.controls if one not in self.linear and self._can_vary(one))
 
     def _can_vary(self, control: str) -> bool:
-        if not self.linear:
-            return False
+        side = self.splits[TRAINING]
         try:
-            return has_matrix(self._problem(self.splits[TRAINING], 0, self.linear[:1], (control,))[0])
+            return all(has_matrix(self._problem(side, 0, (one,), (control,))[0]) for one in self.linear)
         except InputError:
             return False
 

@@ -102,7 +102,7 @@ class Gradients:
         return [one for some in self._each(climb, chosen) for one in some]
 
     def _loss(self, student: Trainable, part: Sequence[Lesson], plain: float, worst: float, seed: int) -> Tensor:
-        """What is descended, of a part of a batch: so much of each plain picture, and so much of each worst one.
+        """What is descended, of a part of a batch, textures first: so much of each plain picture and each worst one.
 
         Worst textures are changed as the search for them saw them: seen otherwise, they are no longer the worst. At
         times all that was rendered is mixed with each other (mixup, Zhang et al. 2018, arXiv 1710.09412), as no more
@@ -131,9 +131,6 @@ class Gradients:
         if unmixed:
             kept = self._forgotten(images[unmixed], logits[unmixed], [right[place] for place in unmixed])
             loss = loss + plain * KEEP * kept
-        for one, now in zip(searched, found[len(part) :].tolist(), strict=True):
-            if isinstance(one, RenderedLesson) and not mixed:
-                one.learned(now)
         return loss
 
     def _forgotten(self, plain: Tensor, logits: Tensor, right: Sequence[tuple[int, ...]]) -> Tensor:

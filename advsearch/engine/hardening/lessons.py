@@ -125,10 +125,6 @@ class RenderedLesson(Lesson):
         """(H, W, 3) the picture whose loss was highest."""
         return self.pictures[int(self.losses.argmax())] / 255.0
 
-    def learned(self, loss: float) -> None:
-        """Take down what the loss of the worst picture is now."""
-        self.losses[int(self.losses.argmax())] = loss
-
 
 def plain_lessons(problem: Problem, views: int, seed: int) -> list[Lesson]:
     """Draw views of one scene as it is: lessons that nothing makes harder. Arguments as for `lessons`."""
@@ -226,8 +222,8 @@ def unchanged(images: Tensor) -> Tensor:
 
 
 def harder(chosen: Sequence[Lesson], model: Model, steps: int = 1) -> None:
-    """Make the worst pictures of lessons worse for a model: further steps of their textures, and a look at all that was
-    rendered.
+    """Make the worst pictures of lessons worse for a model: further steps of their textures, and a look at what was
+    rendered in several configurations.
 
     Args:
         chosen: lessons.
@@ -237,7 +233,7 @@ def harder(chosen: Sequence[Lesson], model: Model, steps: int = 1) -> None:
     for begin in range(0, len(chosen), TOGETHER):
         part = chosen[begin : begin + TOGETHER]
         ascend(part, partial(slopes, model=model), steps)
-        _look([one for one in part if isinstance(one, RenderedLesson)], model)
+        _look([one for one in part if isinstance(one, RenderedLesson) and len(one.pictures) > 1], model)
 
 
 @torch.no_grad()
