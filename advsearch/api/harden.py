@@ -32,7 +32,7 @@ from advsearch.api.keywords import HardenKeywords, asks, configured
 from advsearch.attacks import clopper_pearson
 from advsearch.cluster.executor import Executor, InProcess
 from advsearch.config import HardenConfig
-from advsearch.config.hardening import FURTHER_SCENES
+from advsearch.config.hardening import PLAIN_SCENES, RENDERED_SCENES
 from advsearch.engine.hardening.lessons import Lesson
 from advsearch.engine.hardening.pictures import FOLDER
 from advsearch.engine.hardening.rounds import VALIDATION_VIEWS, WEIGHTS, TrainingRounds
@@ -227,7 +227,7 @@ class Hardening:
         """Scenes of each split, by its name; of those that are held out a part is attacked."""
         config = self.config
         held, searched = CLEAN_SCENES * config.measured, config.scenes * config.rounds
-        counts = {TRAINING: searched, FURTHER: FURTHER_SCENES * searched}
+        counts = {TRAINING: searched, FURTHER: self._further * searched}
         return {**counts, VALIDATION: self.rounds.judged, HELD_OUT: held}
 
     def _each(self, wanted: Sequence[Wanted]) -> Iterator[tuple[int, Any]]:
@@ -243,6 +243,16 @@ class Hardening:
             self.progress.advance(1, **({} if facts is None else facts.told))
             yield done.numbers.start, done.value[0]
 
+    @property
+    def _rendered(self) -> tuple[str, ...]:
+        """The controls whose pictures no matrix says."""
+        return tuple(one for one in self.config.controls if one not in self.scenes.linear)
+
+    @property
+    def _further(self) -> int:
+        """Scenes that come with each one of the training."""
+        return RENDERED_SCENES if self._rendered else PLAIN_SCENES
+
     # ---- lessons ----------------------------------------------------------------------------------------------------
 
     def _drawn(self, title: str, split: str, places: Sequence[int], views: int) -> list[Lesson]:
@@ -250,21 +260,20 @@ class Hardening:
 
         In the training a fourth of the scenes have one texture for all views, in half of them the controls that are
         rendered vary by chance, and further scenes come on top: of what is rendered new scenes teach more than further
-        views.
+        views. Of what is rendered one in so many scenes is drawn as it is, too: there the given model's answers count.
         """
-        controls, linear = tuple(self.config.controls), self.scenes.linear
-        rendered, training = tuple(one for one in controls if one not in linear), split == TRAINING
+        linear, rendered, training = self.scenes.linear, self._rendered, split == TRAINING
         wanted = list[Drawing]()
         for one in linear:
             for number in places:
                 shared, moved = self._chance(one, number) if training else (False, False)
                 wanted.append(Drawing(split, number, (one,), views, 1, shared, self.scenes.beside if moved else ()))
-        more = [FURTHER_SCENES * place + one for place in places for one in range(FURTHER_SCENES)] if training else []
+        more = [self._further * place + one for place in places for one in range(self._further)] if training else []
         if rendered:
-            wanted += [Drawing(split, number, rendered, 1 if training else views, 0) for number in places]
+            wanted += [Drawing(split, number, rendered, *((1, 1) if training else (views, 0))) for number in places]
             wanted += [Drawing(FURTHER, number, rendered, 1, 0) for number in more]
         else:
-            wanted += [Drawing(FURTHER, number, controls[:1], 0, 1) for number in more]
+            wanted += [Drawing(FURTHER, number, linear[:1], 0, 1) for number in more]
         self.progress.stage(title, len(wanted))
         found = dict(self._each(wanted))
         return [one for place in range(len(wanted)) for one in found[place]]

@@ -12,9 +12,10 @@ from advsearch.settings import setting, setting_as_in
 ALL = "all"
 """The objects of a command that takes all bundled ones."""
 
-FURTHER_SCENES = 6
-"""Scenes that come with each one of the training, of which nothing is drawn but one view: what is learned is lost on
-other scenes where there are few, and so is clean accuracy."""
+PLAIN_SCENES, RENDERED_SCENES = 6, 15
+"""Scenes that come with each one of the training, of which nothing is drawn but one view: plain ones, where nothing is
+rendered, or such as are rendered. What is learned is lost on other scenes where there are few, and so is clean
+accuracy."""
 
 TEXTURE_LOOKS = 6
 """How often an epoch looks at a scene with a texture, over its views: it is another one each time, while what was
@@ -84,7 +85,7 @@ class HardenConfig(AttackConfig):
     scenes: int = setting(
         336,
         "training",
-        f"new scenes a round for each control; of what is rendered {FURTHER_SCENES + 1} times as many",
+        f"new scenes a round for each control; of what is rendered {RENDERED_SCENES + 1} times as many",
         ge=1,
         le=100_000,
     )

@@ -21,7 +21,7 @@ from advsearch.config import AttackConfig, HardenConfig
 from advsearch.config.hardening import QUICK
 from advsearch.engine.hardening.lessons import Lesson, RenderedLesson, TextureLesson
 from advsearch.engine.hardening.rounds import ROUNDS
-from advsearch.engine.hardening.split import TRAINING, VALIDATION
+from advsearch.engine.hardening.split import FURTHER, TRAINING, VALIDATION
 from advsearch.engine.hardening.training import Course, Score
 from advsearch.engine.loading import Scene
 from advsearch.errors import InputError
@@ -51,7 +51,8 @@ def attacks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[tuple[str, 
 
     monkeypatch.setattr(harden_scenes, "attacked", attacked)
     monkeypatch.setattr(hardening, "CLEAN_SCENES", 1)
-    monkeypatch.setattr(hardening, "FURTHER_SCENES", 1)
+    monkeypatch.setattr(hardening, "PLAIN_SCENES", 1)
+    monkeypatch.setattr(hardening, "RENDERED_SCENES", 2)
     return done
 
 
@@ -104,10 +105,12 @@ def test_what_is_rendered_is_searched_together_and_in_further_scenes_too(attacks
         work = work_of(config, run, course)
         found = work._drawn("scenes", TRAINING, range(1), 1)
         held_back = work._drawn("scenes", VALIDATION, range(1), 2)
+        assert work._counts[FURTHER] == 2 * work._counts[TRAINING]
     assert [type(one) for one in held_back] == [TextureLesson] * 2 + [Lesson] + [RenderedLesson] * 2
-    assert [type(one) for one in found] == [TextureLesson, Lesson, RenderedLesson, RenderedLesson]
+    rendered = [RenderedLesson, Lesson, RenderedLesson, RenderedLesson]  # one scene as it is, too
+    assert [type(one) for one in found] == [TextureLesson, Lesson, *rendered]
     tries = [len(one.pictures) for one in [*found, *held_back] if isinstance(one, RenderedLesson)]
-    assert tries == [1] * 2 + [harden_scenes.TRIES_TO_CHOOSE] * 2
+    assert tries == [1] * 3 + [harden_scenes.TRIES_TO_CHOOSE] * 2
     shutil.rmtree(run.path)
 
 

@@ -9,7 +9,7 @@ import tarfile
 import weakref
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -263,6 +263,22 @@ def test_a_round_teaches_plain_and_worst_pictures() -> None:
     more = [Lesson((5,), levels_of(coloured(0, 0.4, 1)))] * 24  # nothing makes them harder
     assert score(made.model, [*lessons, *more]) == Score(after.clean / 2, after.robust)
     assert before.robust < 0.6 and after.clean >= 0.9 and after.robust >= 0.9
+
+
+def test_the_given_model_is_asked_about_scenes_as_they_are_alone() -> None:
+    """Where something moved it is right without being sure, and its doubts would be learned."""
+    asked = list[Tensor]()
+
+    def given(images: Tensor) -> Tensor:
+        asked.append(images)
+        return student().model(images)
+
+    plain = [Lesson((n,), levels_of(coloured(n, 0.4, n))) for n in range(3)]
+    with threads.one_each_for_torch() as pool:
+        for batch, count in (([*pupils(), *plain], 3), (pupils(), 0)):
+            Gradients(student(), cast(Any, given), pool).take(batch, None, 0)
+            assert sum(len(one) for one in asked) == count
+            asked.clear()
 
 
 def test_a_round_comes_to_the_same_whatever_the_number_of_threads() -> None:

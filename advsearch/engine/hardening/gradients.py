@@ -106,7 +106,8 @@ class Gradients:
 
         Worst textures are changed as the search for them saw them: seen otherwise, they are no longer the worst. At
         times all that was rendered is mixed with each other (mixup, Zhang et al. 2018, arXiv 1710.09412), as no more
-        pictures of it will come; a texture is another one each time.
+        pictures of it will come; a texture is another one each time. The given model's answers count of scenes as they
+        are alone: where something moved, it is right without being sure.
         """
         searched, rng = with_worst(part), np.random.default_rng(seed)
         textured = [one.worst for one in searched if isinstance(one, TextureLesson)]
@@ -126,10 +127,10 @@ class Gradients:
         if mixed:
             of_others = surprise(logits[mixed], [right[place] for place in others])
             found[mixed] = torch.lerp(found[mixed], of_others, share)
-        unmixed = sorted({*range(len(part))} - {*mixed})
+        as_given = [place for place, one in enumerate(part) if not isinstance(one, RenderedLesson)]
         loss = plain * found[: len(part)].sum() + worst * found[len(part) :].sum()
-        if unmixed:
-            kept = self._forgotten(images[unmixed], logits[unmixed], [right[place] for place in unmixed])
+        if as_given:
+            kept = self._forgotten(images[as_given], logits[as_given], [right[place] for place in as_given])
             loss = loss + plain * KEEP * kept
         return loss
 
