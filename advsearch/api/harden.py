@@ -223,6 +223,11 @@ class Hardening:
             self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - begun
 
     @property
+    def _further(self) -> int:
+        """Scenes that come with each one of the training."""
+        return RENDERED_SCENES if self.scenes.rendered else PLAIN_SCENES
+
+    @property
     def _counts(self) -> dict[str, int]:
         """Scenes of each split, by its name; of those that are held out a part is attacked."""
         config = self.config
@@ -243,16 +248,6 @@ class Hardening:
             self.progress.advance(1, **({} if facts is None else facts.told))
             yield done.numbers.start, done.value[0]
 
-    @property
-    def _rendered(self) -> tuple[str, ...]:
-        """The controls whose pictures no matrix says."""
-        return tuple(one for one in self.config.controls if one not in self.scenes.linear)
-
-    @property
-    def _further(self) -> int:
-        """Scenes that come with each one of the training."""
-        return RENDERED_SCENES if self._rendered else PLAIN_SCENES
-
     # ---- lessons ----------------------------------------------------------------------------------------------------
 
     def _drawn(self, title: str, split: str, places: Sequence[int], views: int) -> list[Lesson]:
@@ -262,7 +257,7 @@ class Hardening:
         rendered vary by chance, and further scenes come on top: of what is rendered new scenes teach more than further
         views. Of what is rendered one in so many scenes is drawn as it is, too: there the given model's answers count.
         """
-        linear, rendered, training = self.scenes.linear, self._rendered, split == TRAINING
+        linear, rendered, training = self.scenes.linear, self.scenes.rendered, split == TRAINING
         wanted = list[Drawing]()
         for one in linear:
             for number in places:
@@ -270,7 +265,8 @@ class Hardening:
                 wanted.append(Drawing(split, number, (one,), views, 1, shared, self.scenes.beside if moved else ()))
         more = [self._further * place + one for place in places for one in range(self._further)] if training else []
         if rendered:
-            wanted += [Drawing(split, number, rendered, *((1, 1) if training else (views, 0))) for number in places]
+            harder, plain = (1, 1) if training else (views, 0)
+            wanted += [Drawing(split, number, rendered, harder, plain) for number in places]
             wanted += [Drawing(FURTHER, number, rendered, 1, 0) for number in more]
         else:
             wanted += [Drawing(FURTHER, number, linear[:1], 0, 1) for number in more]

@@ -188,9 +188,14 @@ class SceneWork:
         return tuple(one for one in self.config.controls if has_matrix(self._problem(side, 0, (one,))[0]))
 
     @cached_property
+    def rendered(self) -> tuple[str, ...]:
+        """The controls whose pictures no matrix says."""
+        return tuple(one for one in self.config.controls if one not in self.linear)
+
+    @cached_property
     def beside(self) -> tuple[str, ...]:
         """The controls that are rendered which can vary by chance beside every matrix."""
-        return tuple(one for one in self.config.controls if one not in self.linear and self._can_vary(one))
+        return tuple(one for one in self.rendered if self._can_vary(one))
 
     def _can_vary(self, control: str) -> bool:
         side = self.splits[TRAINING]
