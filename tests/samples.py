@@ -140,7 +140,10 @@ HARDEN: dict[str, Any] = {
     **RUN, "run": "runs/harden-texture-001", "controls": ["texture", "pose"], "objects": ["mug", "bowl"],
     "model": "reference", "task": "classification", "before": SHARE, "after": SHARE, "clean_before": SHARE,
     "clean_after": SHARE,
-    "table": [{"control": name, "before": SHARE, "after": SHARE, "stronger": SHARE} for name in ("texture", "pose")],
+    "table": [
+        {"control": name, "before": SHARE, "stronger_before": SHARE, "after": SHARE, "stronger": SHARE}
+        for name in ("texture", "pose")
+    ],
     "search": "auto, 16 steps", "stronger_search": "portfolio, 48 steps",
     "split": {"training": SIDE, "validation": SIDE, "held out": SIDE},
     "rounds": [

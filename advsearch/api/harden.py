@@ -204,12 +204,14 @@ class Hardening:
         gc.freeze()  # as of `scenes_of`
         try:
             with self._timed("measurement"):
-                self._measure("before", "attacking the model as it is", 1)
+                self._measure("before", "attacking the model as it is")
+                self._measure("stronger before", "attacking it with a stronger search", known="before")
             with self._timed("training"):
                 self.rounds.carry_out(self.config.rounds)
             with self._timed("measurement"):
-                self._measure("after", "attacking the hardened model", 1)
-                self._measure("stronger", "attacking it with a stronger search", TIMES)
+                weights = (self.run.path / ARTIFACTS / WEIGHTS).read_bytes()
+                self._measure("after", "attacking the hardened model", weights)
+                self._measure("stronger", "attacking it with a stronger search", weights, known="after")
                 self._look()
         finally:
             gc.unfreeze()
@@ -282,14 +284,15 @@ class Hardening:
 
     # ---- measurement ------------------------------------------------------------------------------------------------
 
-    def _measure(self, which: str, title: str, times: int) -> None:
-        """Attack every held-out scene over each control; what is known is not attacked again, and what was found is not
-        sought any harder."""
+    def _measure(self, which: str, title: str, weights: bytes | None = None, *, known: str | None = None) -> None:
+        """Attack the model, as it was given or with other weights, on every held-out scene over each control; what is
+        measured is not attacked again. With the name of what is `known` of the usual search: by the stronger one, and
+        what that had found is not sought any harder."""
         config, wanted = self.config, list[Attacking]()
-        weights = None if which == "before" else (self.run.path / ARTIFACTS / WEIGHTS).read_bytes()
+        times = 1 if known is None else TIMES
         for number in range(config.measured):
             for control in config.controls:
-                if times > 1 and self.measured[f"after {control} {number}"] != ROBUST:
+                if known is not None and self.measured[f"{known} {control} {number}"] != ROBUST:
                     self._note(which, control, number, "found before")
                 elif f"{which} {control} {number}" not in self.measured:
                     wanted.append(Attacking(control, number, times, weights))
@@ -328,10 +331,10 @@ class Hardening:
         config, done = self.config, ending == "done"
         table = []
         for control in config.controls:
-            shares = [self._robust(which, [control]) for which in ("before", "after", "stronger")]
+            shares = [self._robust(which, [control]) for which in ("before", "stronger before", "after", "stronger")]
             if all(one is not None for one in shares):
-                before, after, stronger = shares
-                table.append(HardenedControl(control=control, before=before, after=after, stronger=stronger))
+                of_each = dict(zip(("before", "stronger_before", "after", "stronger"), shares, strict=True))
+                table.append(HardenedControl(control=control, **of_each))
         if done and self.rounds.best == 0:
             warnings = [*warnings, "No round kept the clean accuracy, so the weights are the model's own."]
         rounds = [

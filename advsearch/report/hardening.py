@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from advsearch.report import wording
-from advsearch.report.drawing import BLUE, GREY, RED, Figures, drawn
+from advsearch.report.drawing import BLUE, RED, Figures, drawn
 from advsearch.report.phrases import percent
 from advsearch.runs.results.harden import HardenResult, Share
 
-HEADS = ("on held-out scenes", "before", "95 % interval", "after", "95 % interval", "stronger search", "95 % interval")
+HEADS = ("on held-out scenes", "before", "95 % interval", "after", "95 % interval")
 """Of the columns."""
 
-LINES = (("before", RED), ("after", BLUE), ("after, stronger search", GREY))
+LINES = (("before", RED), ("after", BLUE))
 """Names and colours of the figure."""
 
 
@@ -28,44 +28,46 @@ def hardened_text(result: HardenResult) -> str:
 
 
 def hardened_rows(result: HardenResult) -> list[list[str]]:
-    """Return a row for each control, one for all of them where there are several, and one for plain pictures."""
-    rows = [[f"robust to {row.control}", *_cells(row.before, row.after, row.stronger)] for row in result.table]
-    if len(rows) > 1:
-        rows.append(["robust to each", *_cells(result.before, result.after, None)])
+    """Return two rows for each control, one of each search; one for all of them where there are several; and one for
+    plain pictures."""
+    return [[name, *_cells(before), *_cells(after)] for name, before, after in _shares(result)]
+
+
+def _shares(result: HardenResult) -> list[tuple[str, Share | None, Share | None]]:
+    """What was measured, before and after."""
+    found = list[tuple[str, Share | None, Share | None]]()
+    for row in result.table:
+        found.append((f"robust to {row.control}", row.before, row.after))
+        found.append((f"robust to {row.control}, stronger search", row.stronger_before, row.stronger))
+    if len(result.table) > 1:
+        found.append(("robust to each", result.before, result.after))
     if result.clean_after is not None:
-        rows.append(["plain pictures right", *_cells(result.clean_before, result.clean_after, None)])
-    return rows
+        found.append(("plain pictures right", result.clean_before, result.clean_after))
+    return found
 
 
 def hardened_figure(result: HardenResult) -> Figures:
-    """Draw each share before, after and against the stronger search with its interval; nothing where none is known."""
-    shares: list[tuple[str, tuple[Share, ...]]]
-    shares = [(f"robust to {row.control}", (row.before, row.after, row.stronger)) for row in result.table]
-    if result.clean_before is not None and result.clean_after is not None:
-        shares.append(("plain pictures", (result.clean_before, result.clean_after)))
+    """Draw each share before and after with its interval; nothing where none is known."""
+    shares = _shares(result)
     if not shares:
         return {}
 
     def draw(figure: Any) -> None:
         axes = figure.subplots()
-        for place, (_, of_each) in enumerate(shares):
-            for number, share in enumerate(of_each):
-                label, color = LINES[number]
-                up = place + 0.22 * (number - 1)
-                axes.plot(share.interval, [up, up], color=color, alpha=0.35, linewidth=5)
-                axes.plot(share.accuracy, up, "o", color=color, ms=4, label=label if place == 0 else None)
-        axes.set_yticks(range(len(shares)), [name for name, _ in shares])
+        for place, (_, *of_each) in enumerate(shares):
+            for (label, color), share, up in zip(LINES, of_each, (place - 0.14, place + 0.14), strict=True):
+                if share is not None:
+                    axes.plot(share.interval, [up, up], color=color, alpha=0.35, linewidth=5)
+                    axes.plot(share.accuracy, up, "o", color=color, ms=4, label=label if place == 0 else None)
+        axes.set_yticks(range(len(shares)), [name for name, *_ in shares])
         axes.invert_yaxis()
         axes.set(xlabel="share that is right, with 95 % interval", xlim=(-0.03, 1.03))
         axes.set_title(f"Held-out scenes: {wording.short_name(result.model)}")
         axes.grid(True, axis="x")
-        figure.legend(loc="outside lower center", ncols=3)
+        figure.legend(loc="outside lower center", ncols=len(LINES))
 
-    return drawn(draw, (6.4, 1.4 + 0.6 * len(shares)))
+    return drawn(draw, (6.4, 1.4 + 0.45 * len(shares)))
 
 
-def _cells(*shares: Share | None) -> list[str]:
-    found = []
-    for one in shares:
-        found += ["", ""] if one is None else [percent(one.accuracy), wording.interval_text(one.interval)]
-    return found
+def _cells(share: Share | None) -> tuple[str, str]:
+    return ("", "") if share is None else (percent(share.accuracy), wording.interval_text(share.interval))

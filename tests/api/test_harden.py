@@ -70,12 +70,15 @@ def test_a_run_trains_measures_and_goes_on(attacks: list[tuple[str, int]], monke
     monkeypatch.setattr(Course, "round", stopped)
     first = hardening.harden_from_config(config)
     assert (first.ending, len(first.rounds), first.after, first.hardened) == ("interrupted", 2, None, None)
-    assert attacks == [("ball", 40), ("book", 40)]
+    both = [("ball", 40), ("book", 40), ("ball", 120)]  # what was found is not sought any harder
+    assert attacks == both
     monkeypatch.setattr(Course, "round", taught)
     with pytest.raises(InputError, match="cannot go on: it began without `beside`, which only Python gives"):
         advsearch.harden(SMALL["model"], beside=[], resume=True, **given)
     result = advsearch.harden(SMALL["model"], resume=True, **given)
-    assert attacks[2:] == [("ball", 40), ("book", 40), ("ball", 120)]  # what was found is not sought any harder
+    assert attacks[3:] == both
+    (row,) = result.table
+    assert row.stronger_before is not None and (row.stronger_before.right, row.stronger.right) == (1, 1)
     assert result.rounds[:2] == [one.model_copy(update={"kept": result.rounds[k].kept}) for k, one in
                                  enumerate(first.rounds)]  # fmt: skip
     assert [one.lessons for one in result.rounds] == [0, 3, 6] and sum(one.kept for one in result.rounds) == 1

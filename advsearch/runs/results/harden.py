@@ -24,6 +24,9 @@ class HardenedControl(Fields):
 
     control: str
     before: Share
+    stronger_before: Share | None = Field(
+        default=None, description="before, against the search `stronger_search`; absent from runs of older versions"
+    )
     after: Share
     stronger: Share = Field(description="after, against the search `stronger_search`")
 
