@@ -60,6 +60,8 @@ if TYPE_CHECKING:
 
 MEASURED, MEANS = "measured", "means"
 """Notes under which the store keeps what is done."""
+MEASUREMENTS = ("before", "stronger_before", "after", "stronger")
+"""What is measured over each control, by its name in the table."""
 SHARED, MOVED = 0.25, 0.5
 """Shares of the scenes with a texture in which all views have the same, and in which rendered controls vary too."""
 
@@ -205,7 +207,7 @@ class Hardening:
         try:
             with self._timed("measurement"):
                 self._measure("before", "attacking the model as it is")
-                self._measure("stronger before", "attacking it with a stronger search", known="before")
+                self._measure("stronger_before", "attacking it with a stronger search", known="before")
             with self._timed("training"):
                 self.rounds.carry_out(self.config.rounds)
             with self._timed("measurement"):
@@ -292,9 +294,11 @@ class Hardening:
         times = 1 if known is None else TIMES
         for number in range(config.measured):
             for control in config.controls:
+                if f"{which} {control} {number}" in self.measured:
+                    continue
                 if known is not None and self.measured[f"{known} {control} {number}"] != ROBUST:
                     self._note(which, control, number, "found before")
-                elif f"{which} {control} {number}" not in self.measured:
+                else:
                     wanted.append(Attacking(control, number, times, weights))
         self.progress.stage(title, len(wanted), hint="`measured` and `steps` shorten it")
         for place, ending in self._each(wanted):
@@ -331,10 +335,9 @@ class Hardening:
         config, done = self.config, ending == "done"
         table = []
         for control in config.controls:
-            shares = [self._robust(which, [control]) for which in ("before", "stronger before", "after", "stronger")]
-            if all(one is not None for one in shares):
-                of_each = dict(zip(("before", "stronger_before", "after", "stronger"), shares, strict=True))
-                table.append(HardenedControl(control=control, **of_each))
+            shares = {which: self._robust(which, [control]) for which in MEASUREMENTS}
+            if all(one is not None for one in shares.values()):
+                table.append(HardenedControl(control=control, **shares))
         if done and self.rounds.best == 0:
             warnings = [*warnings, "No round kept the clean accuracy, so the weights are the model's own."]
         rounds = [
