@@ -14,6 +14,7 @@ from advsearch.report.wording import count
 from advsearch.runs.results.attack import VerifiedRate
 from advsearch.runs.store import Row
 from advsearch.tasks import Answer, Judgement
+from advsearch.tasks.base import NOT_A_NUMBER
 
 LOST = "(no answer)"
 """The answer to a picture that nobody could make; what the row keeps beside it says why."""
@@ -72,7 +73,7 @@ def _said(judgement: Judgement) -> dict[str, Any]:
     return {
         "correct": judgement.right,
         "margin": _number(judgement.margin),
-        "label": answer.label,
+        "label": None if judgement.not_a_number else answer.label,
         "label_index": answer.index,
         "probability": answer.probability,
         "payload": judgement.payload,
@@ -84,11 +85,16 @@ def _number(value: float) -> float | None:
 
 
 def judgement_of(row: Row) -> Judgement:
-    """Return what was said of a trial from its row; in an old row, only the score says whether it was right."""
+    """Return what was said of a trial from its row: nothing where it has no label, for the answer was not a number.
+
+    In an old row, only the score says whether it was right.
+    """
     score = math.nan if row.objective is None else row.objective
     margin = math.nan if row.margin is None else row.margin
     right = score <= 0.0 if row.correct is None else row.correct
-    return Judgement(score, margin, right, Answer(row.label or "", row.label_index, row.probability), row.payload)
+    return Judgement(
+        score, margin, right, Answer(row.label or NOT_A_NUMBER, row.label_index, row.probability), row.payload
+    )
 
 
 def verified_rate(rate: Trials, trials: Sequence[Judgement]) -> VerifiedRate:
