@@ -19,6 +19,7 @@ from advsearch.described import Value
 from advsearch.engine.loading import Controls, Scene, as_controls, framed, load_scene, make_renderer
 from advsearch.errors import InputError
 from advsearch.models import Model, load_model
+from advsearch.models.switches import plainly
 from advsearch.progress import NullProgress, Progress
 from advsearch.report.contact_sheet import contact_sheet
 from advsearch.report.marks import marked
@@ -177,6 +178,7 @@ class Rendering:
         )
 
 
+@plainly()
 def render(
     scene: Scene | str | Path,
     model: Model | nn.Module | str | Path = "reference",

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from advsearch.described import NOT_A_NUMBER
+
 CLASSIFICATION, DETECTION, SEGMENTATION = "classification", "detection", "segmentation"
 """Tasks whose answers have words of their own; others are quoted."""
 
@@ -32,8 +34,6 @@ _UNITS = {
 }
 
 _NONE, _ELSEWHERE = "no ", " elsewhere"
-NOT_A_NUMBER = "not a number"
-"""What an answer with NaN or infinity in it is called: the model has said nothing."""
 
 
 class Said(Protocol):

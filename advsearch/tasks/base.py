@@ -16,6 +16,7 @@ from typing import Any, ClassVar, TypeVar
 import torch
 from torch import Tensor
 
+from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
@@ -43,10 +44,6 @@ class Answer:
     label: str
     index: int | None = None
     probability: float | None = None
-
-
-NOT_A_NUMBER = "not a number"
-"""The label of an answer that has NaN or infinity in it: the model has said nothing."""
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
-from advsearch.tasks.base import NOT_A_NUMBER, Answer, Facts, Judgement
+from advsearch.tasks.base import Answer, Facts, Judgement
 from advsearch.tasks.classes import ClassTask, Labels
 
 

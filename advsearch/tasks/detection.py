@@ -17,11 +17,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.files import JsonValue
 from advsearch.models import Model
 from advsearch.options import FROM_RUN
-from advsearch.tasks.base import NOT_A_NUMBER, Answer, Facts, Judgement, Mark
+from advsearch.tasks.base import Answer, Facts, Judgement, Mark
 from advsearch.tasks.box_readings import UNITS, Reading, strongest_boxes, unit_in
 from advsearch.tasks.boxes import FORMS, overlap, share_inside, strongest
 from advsearch.tasks.classes import NO, ClassTask, Labels

@@ -11,8 +11,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
-from advsearch.tasks.base import NOT_A_NUMBER, Answer, Facts, Judgement, Mark
+from advsearch.tasks.base import Answer, Facts, Judgement, Mark
 from advsearch.tasks.classes import NO, ClassTask, Labels
 from advsearch.tasks.classification import members, target_lead, wrong_lead
 

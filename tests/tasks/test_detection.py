@@ -11,10 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.attacks.objectives import check_objective, get_objective
+from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError, ModelError
 from advsearch.models import load_model
 from advsearch.tasks import Answer, Detection, Facts, Judgement, Sight
-from advsearch.tasks.base import NOT_A_NUMBER
 from advsearch.tasks.boxes import corners, overlap, share_inside, strongest
 from advsearch.tasks.detection import GOALS, Place, log_odds
 from advsearch.tasks.detector_answers import detections_in

@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError
 from advsearch.models import load_model
 from advsearch.tasks import Answer, Detection
-from advsearch.tasks.base import NOT_A_NUMBER
 from advsearch.tasks.detection import Place
 from advsearch.tasks.detector_answers import Detections, detections_in, settled
 

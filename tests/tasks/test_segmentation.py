@@ -11,10 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.attacks.objectives import get_objective
+from advsearch.described import NOT_A_NUMBER
 from advsearch.errors import InputError, ModelError
 from advsearch.models import ModelWarning, load_model
 from advsearch.tasks import Answer, Facts, Segmentation, Sight
-from advsearch.tasks.base import NOT_A_NUMBER
 from advsearch.tasks.segmentation import Region
 
 NAMES = ("background", "bottle", "chair")
