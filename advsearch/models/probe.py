@@ -92,14 +92,14 @@ def probe(model: Model, labels: tuple[str, ...] | None, labels_source: str) -> M
             f"model {model.name} answers with {kind}. Their logarithm is used, so that margins are log-odds, "
             "but gradients vanish where a probability rounds to 0 or 1: remove the final softmax if you can"
         )
-    elif logits and (odd := _odd_scores(rows)):
-        _warn(f"model {model.name} answers with {odd}. {ODD_ADVICE}")
     if not logits and _pixel_probabilities(model, noise):
         _warn(
             f"model {model.name} answers with probabilities for each pixel: margins are differences of these and no "
             "log-odds, and gradients vanish where one rounds to 0 or 1: remove the final softmax if you can"
         )
     repeatable = _same(model, rows[:1], again)
+    if repeatable and logits and not probabilities and (odd := _odd_scores(model, rows)):
+        _warn(f"model {model.name} answers with {odd}. {ODD_ADVICE}")
     if not repeatable:
         _warn(f"model {model.name} answers the same image differently each time: results hold for single draws only")
     return dataclasses.replace(
@@ -183,10 +183,17 @@ def _probabilities(rows: Tensor, tolerance: float = PROBABILITY_TOLERANCE) -> bo
     return bool((rows >= 0).all()) and bool(((sums - 1).abs() < tolerance).all())
 
 
-def _odd_scores(rows: Tensor) -> str:
-    """What rows of scores (N, classes) are that are neither logits nor probabilities; empty of others."""
+def _odd_scores(model: Model, rows: Tensor) -> str:
+    """What rows of scores (N, classes) are that are neither logits nor probabilities; empty of others.
+
+    A black picture tells a sigmoid from means of the picture, which are 0 there.
+    """
     least = float(rows.min())
-    if least >= 0.0 and float(rows.max()) <= 1.0 and bool(rows.any()):
+    if least >= 0.0 and float(rows.max()) <= 1.0:
+        with torch.no_grad():
+            black = _run(model, torch.zeros(1, *model.input_size, 3))
+        rows = torch.cat([rows, black])
+    if 0.0 <= float(rows.min()) and float(rows.max()) <= 1.0 and bool(rows.any(dim=1).all()):
         return "scores in [0, 1] that do not sum to 1, as after a sigmoid for each class"
     if least >= 0.0 and bool(((torch.exp(-rows).sum(dim=1) - 1.0).abs() < PROBABILITY_TOLERANCE).all()):
         return "costs, of which the least is meant: minus the logarithm of probabilities"

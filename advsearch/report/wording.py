@@ -62,7 +62,7 @@ def remarks(summary: AttackSummary) -> list[str]:
     missed = control.trials - control.correct if control else 0
     if control and missed and summary.ending != "already wrong" and not summary.minimises:
         apart = " They do not count." if summary.over else ""
-        nothing = f"; the answer is not a number in {control.not_a_number} of them" if control.not_a_number else ""
+        nothing = f"; in {control.not_a_number} the answer is not a number" if control.not_a_number else ""
         said.append(f"The clean scene itself fails {missed} of its {control.trials} trials{nothing}.{apart}")
     if summary.answer_from == "random" and own:
         said.append(
@@ -127,11 +127,11 @@ def interval_text(interval: Interval | None) -> str:
 
 def rate_text(rated: VerifiedRate) -> str:
     """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``; and how many answers are not numbers."""
-    nothing = f"its answer is not a number in {rated.not_a_number} of them" if rated.not_a_number else ""
+    nothing = f"in {rated.not_a_number} its answer is not a number" if rated.not_a_number else ""
     if nothing and not rated.successes:
         return f"none of {rated.trials} fresh renders: {nothing}"
     rate = f"{rated.successes} of {rated.trials} fresh renders (95 % interval {interval_text(rated.interval)})"
-    return f"{rate}; {nothing}" if nothing else rate
+    return f"{rate}, and {nothing}" if nothing else rate
 
 
 def no_numbers(count: int) -> str:
