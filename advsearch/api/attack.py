@@ -339,13 +339,14 @@ def _task(job: _Job, *, shows: bool = True) -> tuple[Task, Callable[[Described, 
     task = task_for(asked, model).on(model, target=config.target, minimise=config.minimise)
     facts = partial(facts_of, job.scene, config.object, config.label)
     pictures = PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed)
-    together = isinstance(task, Together)
+    alone = zip(task.tasks, task.models, strict=True) if isinstance(task, Together) else [(task, model)]
     tasks = list[Task]()
-    for one, network in zip(task.tasks, task.models, strict=True) if together else [(task, model)]:
+    for one, network in alone:
         check_truth(one, network, job.scene, facts(dict), pictures)
         tasks.append(shown(one, network, [job.scene], config.label, pictures) if shows else one)
         job.loaded[1].extend(remark for remark in tasks[-1].remarks if remark not in job.loaded[1])
-    return replace(task, tasks=tuple(tasks)) if together else tasks[0], facts, pictures
+    task = replace(task, tasks=tuple(tasks)) if isinstance(task, Together) else tasks[0]
+    return task, facts, pictures
 
 
 def _space(job: _Job, description: SceneDescription) -> Space:

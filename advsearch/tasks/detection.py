@@ -313,7 +313,7 @@ class Detection(ClassTask):
 
     def _read(self, output: Sequence[Detections]) -> list[Detections]:
         """What the model answered, with boxes as shares of the picture; what names no thing has a score of 0."""
-        found, reading = [], self._reading
+        found, reading = list[Detections](), self._reading
         nothing = torch.tensor(self.nothing, dtype=torch.long)
         for one in self._settled(output):
             boxes, scores = reading.fractions(one["boxes"]), one["scores"]
