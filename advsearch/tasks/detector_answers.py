@@ -257,7 +257,12 @@ def settled(one: Detections, order: str = "") -> Detections:
 
 def ask_order() -> str:
     """What to say where scores and classes cannot be told apart."""
-    return f"say `order`: '{ORDERS[0]}' or '{ORDERS[1]}'"
+    return f"say {' or '.join(as_option(f'order: {order}') for order in ORDERS)}"
+
+
+def as_option(options: str) -> str:
+    """Return what says options of detection, as messages name settings."""
+    return f"`task='detection={{{options}}}'`"
 
 
 def order_in(found: Sequence[Detections], classes: int | None = None) -> str:
