@@ -262,7 +262,7 @@ def test_long_paths_are_short_names_that_tell_everything_apart(browser: Browser,
 def test_the_boxes_of_a_detector_lie_on_its_pictures(browser: Browser, tmp_path: Path) -> None:
     found = [{"box": [1.0, 1.0, 5.0, 6.0], "label": "bowl", "score": 0.9}]
     found += [{"box": [4.0, 4.5, 12.0, 12.0], "label": "mug", "score": 0.4}]
-    payload = {"box": [4, 4, 12, 12], "found": found}
+    payload: Any = {"box": [4, 4, 12, 12], "found": found}
     run = make_sweep(tmp_path / "boxes", keep="all", payload=payload, label="no mug", task="detection")
     with opened(browser, (run / "report.html").as_uri()) as page:
         page.wait_for_selector(".card svg")
