@@ -12,7 +12,7 @@ import logging
 import re
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,44 +20,20 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.importing import gltf, gltf_notes
+from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.importing.checks import check_faces, checked
 from advsearch.scene.importing.files import damaged, shown, text_of
-from advsearch.scene.importing.gltf_entries import Header
+from advsearch.scene.importing.gltf_parts import read_gltf
 from advsearch.scene.importing.images import without_pillows_limit
+from advsearch.scene.importing.imported_part import ImportedPart, placed
 from advsearch.scene.importing.pictures import Pictures
-from advsearch.scene.importing.references import GLOW, Named, References
+from advsearch.scene.importing.references import Named, References
 from advsearch.scene.importing.surfaces import UNNAMED, ImportedSurface, SurfaceReader
 
 Array = npt.NDArray[np.float64]
 
 GLTF = (".glb", ".gltf", ".blend")
 """Endings of glTF files, which have conventions of their own: y up, linear colours; and of what is read as glTF."""
-
-
-@dataclass(frozen=True, eq=False)
-class ImportedPart:
-    """One piece of a mesh file, with the transform of its place in the file applied.
-
-    Attributes:
-        vertices: (V, 3) float64 positions in the file's axes and units; may hold NaN.
-        faces: (F, 3) int64 vertex indices, F > 0.
-        normals: (V, 3) float64 of the file, not necessarily unit length or finite; None when the file gives none.
-        uvs: (V, 2) float64 of the file, v = 0 at the bottom row; None when the file gives none.
-        colors: (F, 3, 3) float64 display-referred sRGB of each corner, which multiply the base colour in linear light;
-            None when the file gives none.
-        surface: the part's material.
-        node: number of its node in a glTF file; -1 in others.
-    """
-
-    vertices: Array
-    faces: npt.NDArray[np.int64]
-    normals: Array | None
-    uvs: Array | None
-    colors: Array | None
-    surface: ImportedSurface
-    node: int = -1
 
 
 @contextlib.contextmanager
@@ -91,55 +67,39 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     """
     import trimesh  # takes half a second, and bundled objects do without
 
+    if path.suffix.lower() in GLTF:
+        return read_gltf(path, data)
     references = References(path)
-    header = gltf.read_header(path, data) if path.suffix.lower() in GLTF else None
-    readable = checked(path, data) if header is None else gltf.rewritten(path, data, header)
-    found = _parse(path, readable, references)
+    found = _parse(path, checked(path, data), references)
     meshes = [one for one in found if isinstance(one[0], trimesh.Trimesh) and len(one[0].faces)]
-    if any(np.shape(mesh.vertices)[1:] != (3,) for mesh, _, _ in meshes):
+    if any(np.shape(mesh.vertices)[1:] != (3,) for mesh, _ in meshes):
         raise damaged(path, "vertices with 3 coordinates", "another number")
-    if any(mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices) for mesh, _, _ in meshes):
+    if any(mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices) for mesh, _ in meshes):
         raise damaged(path, "faces of its own vertices", "a face that refers to a vertex that is not there")
-    check_faces(path, sum(len(mesh.faces) for mesh, _, _ in meshes))
+    check_faces(path, sum(len(mesh.faces) for mesh, _ in meshes))
     if not meshes:
         got = "points or lines only" if found else "none"
         raise FileFormatError(f"{path}: expected a mesh with faces, got {got}; export triangles")
-    notes = _file_notes(path, data, header, references)
+    notes = _file_notes(path, data, references)
     if len(meshes) < len(found):
         notes.append(f"{path.name}: {len(found) - len(meshes)} parts without faces (points, lines) are left out")
-    named = _named_textures(path, data, header, references)
-    materials = len(references.materials) if header is None else len(header.materials)
-    pictures = Pictures(materials, references.get, references.refused)
-    reader = SurfaceReader(path.name, named, pictures, header)
-    parts, edges = [], set[str]()
-    for mesh, matrix, node in meshes:
-        part = _part(mesh, reader.surface(mesh.visual), linear=path.suffix.lower() in GLTF)
+    named = _named_textures(path, data, references)
+    pictures = Pictures(len(references.materials), references.get, references.refused)
+    reader = SurfaceReader(path.name, named, pictures)
+    parts = []
+    for mesh, matrix in meshes:
+        part = _part(mesh, reader.surface(mesh.visual))
         if _has_face_uvs(path, data):  # trimesh has shuffled the vertices, but not what belongs to them
             part = replace(part, normals=None, colors=None)
-        parts.append(replace(_placed(part, matrix), node=node))
-        if header is not None and _leaves_its_textures(mesh, part, header):
-            edges.add(path.name + gltf_notes.EDGES)
-    return parts, [*notes, *edges, *reader.notes]
+        parts.append(placed(part, matrix))
+    return parts, [*notes, *reader.notes, *(f"{path.name}: {note}" for note in pictures.notes)]
 
 
-BEYOND = 0.01
-"""How far texture coordinates may lie outside of a texture before it matters how that goes on."""
-
-
-def _leaves_its_textures(mesh: Any, part: ImportedPart, header: Header) -> bool:
-    """Whether a part looks its textures up beyond their edges, where these are not to repeat."""
-    entry = gltf.entry_of(header, getattr(getattr(mesh.visual, "material", None), "name", None))
-    if part.uvs is None or entry is None or gltf_notes.repeats(header, entry):
-        return False
-    used = part.uvs[part.faces]
-    return not (used.min() >= -BEYOND and used.max() <= 1.0 + BEYOND)
-
-
-def _parse(path: Path, data: bytes, references: References) -> list[tuple[Any, Array, int]]:
-    """Run trimesh's parser; return what it found with transforms (4, 4) and nodes, always in the same order."""
+def _parse(path: Path, data: bytes, references: References) -> list[tuple[Any, Array]]:
+    """Run trimesh's parser; return what it found with transforms (4, 4), always in the same order."""
     import trimesh
 
-    kind = path.suffix.lower().lstrip(".").replace("blend", "glb")
+    kind = path.suffix.lower().lstrip(".")
     options: dict[str, bool] = {"process": False}
     if kind == "ply":  # with fix_texture, vertices are shuffled and their normals are not
         options["fix_texture"] = _has_face_uvs(path, data)
@@ -148,10 +108,9 @@ def _parse(path: Path, data: bytes, references: References) -> list[tuple[Any, A
         found = []
         for node in scene.graph.nodes_geometry:
             matrix, name = scene.graph.get(node)
-            number = re.match(rf"{gltf.NODE}(\d+)", str(node))
-            found.append((str(name), np.asarray(matrix, dtype=np.float64), int(number[1]) if number else -1))
-        found.sort(key=lambda item: (item[0], item[1].tobytes(), item[2]))  # the names of nodes can be random
-        return [(scene.geometry[name], matrix, number) for name, matrix, number in found]
+            found.append((str(name), np.asarray(matrix, dtype=np.float64)))
+        found.sort(key=lambda item: (item[0], item[1].tobytes()))  # the names of nodes can be random
+        return [(scene.geometry[name], matrix) for name, matrix in found]
     except MemoryError:
         raise
     except Exception as error:
@@ -170,7 +129,7 @@ def _has_face_uvs(path: Path, data: bytes) -> bool:
     return path.suffix.lower() == ".ply" and b"texcoord" in data.split(b"end_header")[0]
 
 
-def _file_notes(path: Path, data: bytes, header: Header | None, references: References) -> list[str]:
+def _file_notes(path: Path, data: bytes, references: References) -> list[str]:
     """Return the warnings about material files, and about features of the file that are not carried over."""
     notes = []
     for name, reason in references.refused.items():
@@ -184,35 +143,24 @@ def _file_notes(path: Path, data: bytes, header: Header | None, references: Refe
             notes.append(
                 f"{path.name} uses the material {shown(name)}, which its .mtl file lacks; neutral grey is used instead"
             )
-    notes += [path.name + what for what in gltf_notes.left_out(header)] if header else []
-    for what, count in gltf.unread(header).items() if header else ():
-        if count:
-            verb = "is" if what == GLOW else "are"
-            notes.append(f"{path.name}: {what} of {count} material{'s' if count > 1 else ''} {verb} left out")
     return notes
 
 
-def _named_textures(path: Path, data: bytes, header: Header | None, references: References) -> Named:
+def _named_textures(path: Path, data: bytes, references: References) -> Named:
     """Return, for each material that names a base colour texture, the file that names it and the texture's name."""
     if path.suffix.lower() == ".ply":
         found = re.search(r"^comment TextureFile\s+(.*?)\s*$", text_of(data.split(b"end_header")[0]), re.MULTILINE)
         return {UNNAMED: (path.name, found[1])} if found else {}
-    if header is None:
-        return references.named
-    images = {
-        f"{gltf.MATERIAL}{index}": gltf.image_name(header, material.base_color)
-        for index, material in enumerate(header.materials)
-    }
-    return {name: (path.name, image) for name, image in images.items() if image}
+    return references.named
 
 
-def _part(mesh: Any, surface: ImportedSurface, *, linear: bool) -> ImportedPart:
-    """Return what the file says about a parsed mesh; `linear` tells how its vertex colours are encoded."""
+def _part(mesh: Any, surface: ImportedSurface) -> ImportedPart:
+    """Return what the file says about a parsed mesh."""
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     normals = mesh._cache.cache.get("vertex_normals")  # the public property would make normals up
     uvs = getattr(mesh.visual, "uv", None)
     plain = surface.color is None and surface.texture is None
-    colors = _corner_colors(mesh, faces, plain=plain, linear=linear)
+    colors = _corner_colors(mesh, faces, plain=plain)
     if plain and colors is not None:  # they are the base colour then, and not its factor
         surface = replace(surface, color=np.ones(3, np.float32))
     return ImportedPart(
@@ -225,50 +173,26 @@ def _part(mesh: Any, surface: ImportedSurface, *, linear: bool) -> ImportedPart:
     )
 
 
-def _placed(part: ImportedPart, matrix: Array) -> ImportedPart:
-    """Return a part moved to its place in the file by an affine transform (4, 4)."""
-    if np.array_equal(matrix, np.eye(4)):
-        return part
-    turn, normals = matrix[:3, :3], part.normals
-    with np.errstate(all="ignore"):
-        vertices = part.vertices @ turn.T + matrix[:3, 3]
-        if normals is not None:  # a normal turns with the cofactors of the matrix
-            normals = normals @ np.cross(turn[[1, 2, 0]], turn[[2, 0, 1]]).T
-    if not np.linalg.det(turn) < 0.0:
-        return replace(part, vertices=vertices, normals=normals)
-    colors = None if part.colors is None else part.colors[:, ::-1]  # a mirror turns faces over, and cofactors normals
-    return replace(
-        part,
-        vertices=vertices,
-        faces=part.faces[:, ::-1],
-        normals=None if normals is None else -normals,
-        colors=colors,
-    )
-
-
-def _corner_colors(mesh: Any, faces: npt.NDArray[np.int64], *, plain: bool, linear: bool) -> Array | None:
+def _corner_colors(mesh: Any, faces: npt.NDArray[np.int64], *, plain: bool) -> Array | None:
     """Return the colours that the file gives to vertices or faces.
 
     Args:
         mesh: as trimesh parsed it.
         faces: (F, 3) its faces.
-        plain: whether it has no material; beside one, only the colours of glTF count.
-        linear: whether the colours are linear, as in glTF, or display-referred.
+        plain: whether it has no material; beside one, they do not count.
 
     Returns:
-        (F, 3, 3) float64 display-referred, or None.
+        (F, 3, 3) float64 linear, or None; in the file they are display-referred.
     """
     visual, at = mesh.visual, faces
     if visual.kind == "vertex":
         given = visual.vertex_colors
     elif visual.kind == "face":
         given, at = visual.face_colors, np.repeat(np.arange(len(faces))[:, None], 3, axis=1)
-    elif visual.kind == "texture" and "color" in visual.vertex_attributes:
-        given = visual.vertex_attributes["color"]
     else:
         given = mesh.vertex_attributes.get("color") if plain else None
     if np.ndim(given) != 2 or len(given) <= int(at.max()) or given.shape[1] < 3:
         return None
     scale = 1.0 if given.dtype.kind == "f" else float(np.iinfo(given.dtype).max)
     colors = np.clip(np.nan_to_num(given[:, :3].astype(np.float32) / np.float32(scale)), 0.0, 1.0)
-    return np.asarray((linear_to_srgb(colors) if linear else colors)[at], dtype=np.float64)
+    return np.asarray(srgb_to_linear(colors)[at], dtype=np.float64)

@@ -20,9 +20,6 @@ Named = dict[str | None, tuple[str, str]]
 
 MISSING = "is missing"
 OUTSIDE = "is outside its folder and is not read"
-NORMAL_MAPS = "the normal maps with texture coordinates of their own"
-GLOW = "the emission with texture coordinates of its own"
-"""What a material may have that is not read."""
 
 _NO_SUCH_NAME = (errno.ENOENT, errno.ENOTDIR, errno.ENAMETOOLONG, errno.EINVAL)
 
