@@ -100,7 +100,7 @@ class Buffers:
         rows = self._array(places.bufferView, places.byteOffset, (count, 1), kind)[:, 0]
         if rows.max() >= one.count:
             raise damaged(self._path, f"sparse values at places under {one.count:,}", f"{int(rows.max()):,}")
-        values = values.copy()
+        values = np.array(values)
         values[rows] = self._array(given.bufferView, given.byteOffset, (count, one.width), values.dtype)
         return values
 

@@ -196,7 +196,7 @@ class GltfSurfaces:
             if wraps[0] == MIRRORED and out:
                 pictures = [np.concatenate([one, np.flip(one, side)], axis=side) for one in pictures]
                 scale[axis], changed = 0.5, True
-            elif wraps[0] == CLAMPED and (out or _differ_at_edges(pictures, side)):
+            elif wraps[0] in (CLAMPED, MIRRORED) and (out or _differ_at_edges(pictures, side)):
                 unit_size = int(np.gcd.reduce(sizes))  # pads are whole texels of each
                 before, after = (max(0, int(np.ceil(beyond * unit_size))) + 1 for beyond in (-low, high - 1.0))
                 total = unit_size + before + after
