@@ -248,8 +248,9 @@ def test_sparse_accessors_are_read(based: bool, tmp_path: Path) -> None:
     file.primitive(attributes={"POSITION": place})
     (part,), notes = parts_of(file, tmp_path)
     assert notes == [] and np.array_equal(part.vertices, SQUARE)
-    file.header["accessors"][place]["count"] = 3
-    with pytest.raises(FileFormatError, match="expected sparse values at places under 3, got 3"):
+    elsewhere = file.view(np.array([1, 2, 9], "<u2").tobytes())
+    file.header["accessors"][place]["sparse"]["indices"]["bufferView"] = elsewhere
+    with pytest.raises(FileFormatError, match="expected sparse values at places under 4, got 9"):
         parts_of(file, tmp_path)
 
 

@@ -34,6 +34,7 @@ class Buffers:
     def __init__(self, path: Path, header: Header, chunk: bytes | None, references: References) -> None:
         self._path, self._header, self._chunk, self._references = path, header, chunk, references
         self._read: dict[int, bytes] = {}
+        self._put_in: dict[int, npt.NDArray[Any]] = {}
 
     def uri(self, uri: str) -> bytes:
         """Return what a URI holds, or the file in the folder that it names.
@@ -86,6 +87,8 @@ class Buffers:
         Raises:
             FileFormatError: they reach beyond their view.
         """
+        if index in self._put_in:
+            return self._put_in[index]
         one = self._header.accessors[index]
         values = np.zeros((one.count, one.width), _TYPES[one.componentType])
         if one.bufferView is not None and one.count:
@@ -102,6 +105,7 @@ class Buffers:
             raise damaged(self._path, f"sparse values at places under {one.count:,}", f"{int(rows.max()):,}")
         values = np.array(values)
         values[rows] = self._array(given.bufferView, given.byteOffset, (count, one.width), values.dtype)
+        self._put_in[index] = values
         return values
 
     def _array(
@@ -114,10 +118,10 @@ class Buffers:
         found: npt.NDArray[Any] = np.ndarray(shape, kind, data, offset, (step, kind.itemsize))
         return found
 
-    def numbers(self, index: int) -> Array:
-        """Return the values (count, width) of an accessor, normalised integers as the numbers that they stand for."""
-        values, one = self.values(index), self._header.accessors[index]
+    def numbers(self, index: int, rows: npt.NDArray[np.int64]) -> Array:
+        """Return rows (N,) of an accessor as (N, width), normalised integers as the numbers that they stand for."""
+        values = self.values(index)[rows]
         numbers: Array = values.astype(np.float64)
-        if not one.normalized or values.dtype.kind == "f":
+        if not self._header.accessors[index].normalized or values.dtype.kind == "f":
             return numbers
         return np.asarray(numbers / np.iinfo(values.dtype).max).clip(-1.0)

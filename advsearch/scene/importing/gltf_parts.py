@@ -101,24 +101,25 @@ def _piece(path: Path, header: Header, buffers: Buffers, primitive: Primitive) -
     held = primitive.attributes
     if primitive.mode < TRIANGLES or "POSITION" not in held:
         return None
-    vertices = buffers.numbers(held["POSITION"])
+    count = header.accessors[held["POSITION"]].count
     if primitive.indices is None:
-        order = np.arange(len(vertices))
+        order = np.arange(count)
     else:
         order = buffers.values(primitive.indices)[:, 0].astype(np.int64)
-    if len(order) and order.max() >= len(vertices):
+    if len(order) and order.max() >= count:
         raise damaged(path, "faces of its own vertices", "a face that refers to a vertex that is not there")
-    faces = _triangles(order, primitive.mode)
+    used, corners = np.unique(_triangles(order, primitive.mode), return_inverse=True)  # others may share the vertices
+    faces, vertices = corners.reshape(-1, 3).astype(np.int64), buffers.numbers(held["POSITION"], used)
     material = MaterialEntry() if primitive.material is None else header.materials[primitive.material]
     uvs = colors = None
     see_through = False
     if material.attribute in held:
-        uvs = _moved(buffers.numbers(held[material.attribute]), material.layout)
+        uvs = _moved(buffers.numbers(held[material.attribute], used), material.layout)
     if "COLOR_0" in held:
-        given = np.clip(np.nan_to_num(buffers.numbers(held["COLOR_0"])), 0.0, 1.0)
+        given = np.clip(np.nan_to_num(buffers.numbers(held["COLOR_0"], used)), 0.0, 1.0)
         colors = given[:, :3][faces]
         see_through = material.alphaMode in CUT_OUTS and given.shape[1] == 4 and bool((given[:, 3] < 1.0).any())
-    normals = buffers.numbers(held["NORMAL"]) if "NORMAL" in held else None
+    normals = buffers.numbers(held["NORMAL"], used) if "NORMAL" in held else None
     part = ImportedPart(vertices, faces, normals, uvs, colors, ImportedSurface(), flat=True)
     return _Piece(part, primitive.material, see_through)
 

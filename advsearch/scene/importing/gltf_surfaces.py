@@ -23,7 +23,7 @@ from advsearch.scene.importing.gltf_entries import (
     Sampler,
     TextureUse,
 )
-from advsearch.scene.importing.images import FORMATS, TEXTURE_LIMIT
+from advsearch.scene.importing.images import FORMATS
 from advsearch.scene.importing.normal_maps import normal_map
 from advsearch.scene.importing.pictures import Kind, Pictures
 from advsearch.scene.importing.references import References
@@ -36,12 +36,8 @@ Fit = Callable[[Array], Array]
 
 BEYOND = 1e-4
 """How far texture coordinates may lie outside of a texture before it matters how that goes on."""
-SHARP = 512
-"""Texels a side to which textures of sharp texels are enlarged, so that filtering does not show."""
 SMALL = 256
 """Texels a side up to which half a texel at an edge is seen."""
-WIDEST = 2 * TEXTURE_LIMIT
-"""Texels a side of a texture with what lies beyond its edges."""
 
 EDGES = " has textures that do not repeat beyond their edges; where they differ, or reach far, they do here"
 BLURRED = " has textures with sharp texels (filter NEAREST); those above {most} texels a side are filtered"
@@ -64,7 +60,7 @@ class GltfSurfaces:
     buffers: Buffers
     references: References
     notes: list[str] = field(default_factory=list)
-    _opened: dict[int, Image.Image | None] = field(default_factory=dict)
+    _opened: dict[tuple[str | None, int | None], Image.Image | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._pictures = Pictures(len(self.header.materials), self.references.get, self.references.refused)
@@ -78,8 +74,8 @@ class GltfSurfaces:
         """
         material = MaterialEntry() if number is None else self.header.materials[number]
         given = material.surface
-        scaled = np.array([1.0] * 4 if given.baseColorFactor is None else given.baseColorFactor, np.float32)
-        factor, alpha = np.clip(scaled[:3], 0.0, 1.0), material.alphaMode in CUT_OUTS
+        scaled = np.array([1.0] * 4 if given.baseColorFactor is None else given.baseColorFactor, np.float32).clip(0, 1)
+        factor, alpha = scaled[:3], material.alphaMode in CUT_OUTS
         color = linear_to_srgb(factor)
         textured = given.baseColorTexture is not None and bool((color > 0.999).all())
         instead = "neutral grey" if textured else f"its base colour ({', '.join(f'{c:.2f}' for c in color)})"
@@ -149,16 +145,17 @@ class GltfSurfaces:
         ]
         if self._sampler(use).magFilter != NEAREST or min(found.shape[:2]) == max(found.shape[:2]) == 1:
             return found
-        times = SHARP // max(found.shape[:2])
+        sharp = self._pictures.side // 2  # so many that filtering does not show
+        times = sharp // max(found.shape[:2])
         if times < 2:
-            self._note(BLURRED.format(most=SHARP // 2))
+            self._note(BLURRED.format(most=sharp // 2))
             return found
         return found.repeat(times, axis=0).repeat(times, axis=1)
 
     def _image(self, number: int) -> Image.Image | None:
         """Open a picture of the file; None where it cannot be had."""
-        if number not in self._opened:
-            entry, opened = self.header.images[number], None
+        entry, opened = self.header.images[number], None
+        if (entry.uri, entry.bufferView) not in self._opened:
             try:
                 if entry.uri is not None:
                     data = self.buffers.uri(entry.uri)
@@ -167,8 +164,8 @@ class GltfSurfaces:
                 opened = Image.open(io.BytesIO(data), formats=FORMATS)
             except (OSError, ValueError, SyntaxError):
                 pass
-            self._opened[number] = opened
-        return self._opened[number]
+            self._opened[entry.uri, entry.bufferView] = opened
+        return self._opened[entry.uri, entry.bufferView]
 
     def _sampler(self, use: TextureUse) -> Sampler:
         number = self.header.textures[use.index].sampler
@@ -200,7 +197,7 @@ class GltfSurfaces:
                 unit_size = int(np.gcd.reduce(sizes))  # pads are whole texels of each
                 before, after = (max(0, int(np.ceil(beyond * unit_size))) + 1 for beyond in (-low, high - 1.0))
                 total = unit_size + before + after
-                if total * (max(sizes) // unit_size) > WIDEST:
+                if total * (max(sizes) // unit_size) > 2 * self._pictures.side:
                     self._note(EDGES)
                     continue
                 pictures = [

@@ -38,10 +38,10 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
       object is scaled to a largest extent of 1 and set on z = 0.
     - Faces without area are removed, the winding is made consistent, closed shells that are inside out are turned over.
     - Normals are the file's; where it has none, or they contradict the faces, they are computed: smooth, with creases
-      where faces meet at more than 40 degrees.
+      where faces meet at more than 40 degrees; flat in glTF.
     - UVs are the file's, moved into [0, 1] where that takes little. Where it has none, where they repeat a texture or
       are squashed, and where there are several materials, xatlas makes new ones and the colours are baked into a map.
-    - Base colour: the material's texture (averaged down to at most 1024 texels on its long side; alpha
+    - Base colour: the material's texture (averaged down to at most 1024 texels on its long side, with a warning; alpha
       is opacity where a glTF material says so),
       otherwise the material's colour, otherwise vertex or face colours, otherwise grey of display-referred 0.5. A glTF
       texture is multiplied by its linear factor. The ``Kd`` of an .mtl is taken as display-referred, and ignored beside
@@ -50,7 +50,7 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
     - Emission is that of glTF, and of an .mtl ``Ke`` and ``map_Ke``: linear radiance on the front of the faces.
     - The normal map of glTF, and of an .mtl ``norm``, ``map_Bump`` or ``bump`` that holds normals; where textures are
       baked, it is turned to the new texture coordinates.
-    - Roughness and metallic are those of glTF where given, their mean over several materials, and else `Material`'s.
+    - Roughness and metallic are those of glTF, their mean over several materials, and in other formats `Material`'s.
 
     The same file gives the same bytes every time.
 

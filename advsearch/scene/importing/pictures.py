@@ -47,6 +47,14 @@ class Pictures:
     _opened: list[Image.Image] = field(default_factory=list)
     _pixels: dict[bool, int] = field(default_factory=lambda: {False: 0, True: 0})
 
+    @property
+    def side(self) -> int:
+        """The longest side of the textures of so many materials; all together they take a bounded memory."""
+        side = TEXTURE_LIMIT
+        while side > 64 and self.materials * side * side > MOST_TEXTURES * TEXTURE_LIMIT * TEXTURE_LIMIT:
+            side //= 2
+        return side
+
     def decoded(self, image: Image.Image | None, kind: Kind = "colours", name: str = "") -> Floats | str | None:
         """Return a picture's values, why there are none, or None; a picture without format is trimesh's invention.
 
@@ -83,7 +91,7 @@ class Pictures:
             check_pixels("", width, height)
             if pixels > most:
                 raise files.too_large("", f"pictures of at most {most:,} pixels", f"{pixels:,} in all")
-            texture = display_image(image, _side(self.materials), "", alpha=kind == "colours and alpha", raw=raw)
+            texture = display_image(image, self.side, "", alpha=kind == "colours and alpha", raw=raw)
         except FileFormatError as error:
             return f"is not read ({str(error).removeprefix(': ')})"
         except (OSError, ValueError, SyntaxError, EOFError):
@@ -95,11 +103,3 @@ class Pictures:
             note = f"{called} of {width:,} x {height:,} texels is averaged down to {columns:,} x {rows:,}"
             self.notes += [] if note in self.notes else [note]
         return texture
-
-
-def _side(materials: int) -> int:
-    """Return the longest side of the textures of so many materials; all together they take a bounded memory."""
-    side = TEXTURE_LIMIT
-    while side > 64 and materials * side * side > MOST_TEXTURES * TEXTURE_LIMIT * TEXTURE_LIMIT:
-        side //= 2
-    return side
