@@ -17,7 +17,8 @@ from advsearch.scene.importing import gltf, gltf_notes
 from advsearch.scene.importing.blender import read_mesh_bytes
 from advsearch.scene.importing.files import safe_name
 from advsearch.scene.importing.geometry import Soup, assemble, join, repaired
-from advsearch.scene.importing.parts import GLTF, ImportedPart, read_parts
+from advsearch.scene.importing.imported_part import ImportedPart
+from advsearch.scene.importing.parts import GLTF, read_parts
 from advsearch.scene.importing.surfaces import ImportedSurface
 from advsearch.scene.importing.texture import textured
 from advsearch.scene.importing.upright import guess_up

@@ -12,7 +12,7 @@ import logging
 import re
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +20,18 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import FileFormatError
-from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.importing import gltf, gltf_notes
-from advsearch.scene.importing.checks import check_faces, checked
-from advsearch.scene.importing.files import damaged, shown, text_of
+from advsearch.scene.importing.checks import check_faces
+from advsearch.scene.importing.files import damaged, shown
 from advsearch.scene.importing.gltf_entries import Header
 from advsearch.scene.importing.images import without_pillows_limit
+from advsearch.scene.importing.imported_part import ImportedPart, placed
 from advsearch.scene.importing.pictures import Pictures
-from advsearch.scene.importing.references import GLOW, Named, References
-from advsearch.scene.importing.surfaces import UNNAMED, ImportedSurface, SurfaceReader
+from advsearch.scene.importing.ply import read_ply
+from advsearch.scene.importing.references import GLOW, References
+from advsearch.scene.importing.stl import read_stl
+from advsearch.scene.importing.surfaces import ImportedSurface, Named, SurfaceReader
+from advsearch.scene.importing.wavefront import read_obj
 
 Array = npt.NDArray[np.float64]
 
@@ -36,28 +39,8 @@ GLTF = (".glb", ".gltf", ".blend")
 """Endings of glTF files, which have conventions of their own: y up, linear colours; and of what is read as glTF."""
 
 
-@dataclass(frozen=True, eq=False)
-class ImportedPart:
-    """One piece of a mesh file, with the transform of its place in the file applied.
-
-    Attributes:
-        vertices: (V, 3) float64 positions in the file's axes and units; may hold NaN.
-        faces: (F, 3) int64 vertex indices, F > 0.
-        normals: (V, 3) float64 of the file, not necessarily unit length or finite; None when the file gives none.
-        uvs: (V, 2) float64 of the file, v = 0 at the bottom row; None when the file gives none.
-        colors: (F, 3, 3) float64 display-referred sRGB of each corner, which multiply the base colour in linear light;
-            None when the file gives none.
-        surface: the part's material.
-        node: number of its node in a glTF file; -1 in others.
-    """
-
-    vertices: Array
-    faces: npt.NDArray[np.int64]
-    normals: Array | None
-    uvs: Array | None
-    colors: Array | None
-    surface: ImportedSurface
-    node: int = -1
+READERS = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl}
+"""Readers of the other formats, by their endings."""
 
 
 @contextlib.contextmanager
@@ -89,12 +72,13 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     Raises:
         FileFormatError: the file is damaged, not a mesh, refers to missing geometry, or has no faces.
     """
+    if path.suffix.lower() in READERS:
+        return READERS[path.suffix.lower()](path, data)
     import trimesh  # takes half a second, and bundled objects do without
 
     references = References(path)
-    header = gltf.read_header(path, data) if path.suffix.lower() in GLTF else None
-    readable = checked(path, data) if header is None else gltf.rewritten(path, data, header)
-    found = _parse(path, readable, references)
+    header = gltf.read_header(path, data)
+    found = _parse(path, gltf.rewritten(path, data, header), references)
     meshes = [one for one in found if isinstance(one[0], trimesh.Trimesh) and len(one[0].faces)]
     if any(np.shape(mesh.vertices)[1:] != (3,) for mesh, _, _ in meshes):
         raise damaged(path, "vertices with 3 coordinates", "another number")
@@ -104,20 +88,16 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     if not meshes:
         got = "points or lines only" if found else "none"
         raise FileFormatError(f"{path}: expected a mesh with faces, got {got}; export triangles")
-    notes = _file_notes(path, data, header, references)
+    notes = _file_notes(path, header)
     if len(meshes) < len(found):
         notes.append(f"{path.name}: {len(found) - len(meshes)} parts without faces (points, lines) are left out")
-    named = _named_textures(path, data, header, references)
-    materials = len(references.materials) if header is None else len(header.materials)
-    pictures = Pictures(materials, references.get, references.refused)
-    reader = SurfaceReader(path.name, named, pictures, header)
+    pictures = Pictures(len(header.materials), references.get, references.refused)
+    reader = SurfaceReader(path.name, _named_textures(path, header), pictures, header)
     parts, edges = [], set[str]()
     for mesh, matrix, node in meshes:
-        part = _part(mesh, reader.surface(mesh.visual), linear=path.suffix.lower() in GLTF)
-        if _has_face_uvs(path, data):  # trimesh has shuffled the vertices, but not what belongs to them
-            part = replace(part, normals=None, colors=None)
-        parts.append(replace(_placed(part, matrix), node=node))
-        if header is not None and _leaves_its_textures(mesh, part, header):
+        part = placed(_part(mesh, reader.surface(mesh.visual)), matrix)
+        parts.append(replace(part, node=node))
+        if _leaves_its_textures(mesh, part, header):
             edges.add(path.name + gltf_notes.EDGES)
     return parts, [*notes, *edges, *reader.notes]
 
@@ -140,11 +120,8 @@ def _parse(path: Path, data: bytes, references: References) -> list[tuple[Any, A
     import trimesh
 
     kind = path.suffix.lower().lstrip(".").replace("blend", "glb")
-    options: dict[str, bool] = {"process": False}
-    if kind == "ply":  # with fix_texture, vertices are shuffled and their normals are not
-        options["fix_texture"] = _has_face_uvs(path, data)
     try:
-        scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=references, **options)
+        scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=references, process=False)
         found = []
         for node in scene.graph.nodes_geometry:
             matrix, name = scene.graph.get(node)
@@ -165,40 +142,18 @@ def _parse(path: Path, data: bytes, references: References) -> list[tuple[Any, A
         raise FileFormatError(message) from error
 
 
-def _has_face_uvs(path: Path, data: bytes) -> bool:
-    """Tell whether a PLY file keeps texture coordinates with its faces, not with its vertices."""
-    return path.suffix.lower() == ".ply" and b"texcoord" in data.split(b"end_header")[0]
-
-
-def _file_notes(path: Path, data: bytes, header: Header | None, references: References) -> list[str]:
-    """Return the warnings about material files, and about features of the file that are not carried over."""
-    notes = []
-    for name, reason in references.refused.items():
-        if name.lower().endswith(".mtl"):
-            notes.append(
-                f"{path.name} names the material file {shown(name)}, which {reason}; neutral grey is used instead"
-            )
-    if path.suffix.lower() == ".obj" and references.materials:
-        used = set(re.findall(r"^\s*usemtl\s+(.*?)\s*$", text_of(data), re.MULTILINE))
-        for name in sorted(used - references.materials):
-            notes.append(
-                f"{path.name} uses the material {shown(name)}, which its .mtl file lacks; neutral grey is used instead"
-            )
-    notes += [path.name + what for what in gltf_notes.left_out(header)] if header else []
-    for what, count in gltf.unread(header).items() if header else ():
+def _file_notes(path: Path, header: Header) -> list[str]:
+    """Return the warnings about features of the file that are not carried over."""
+    notes = [path.name + what for what in gltf_notes.left_out(header)]
+    for what, count in gltf.unread(header).items():
         if count:
             verb = "is" if what == GLOW else "are"
             notes.append(f"{path.name}: {what} of {count} material{'s' if count > 1 else ''} {verb} left out")
     return notes
 
 
-def _named_textures(path: Path, data: bytes, header: Header | None, references: References) -> Named:
+def _named_textures(path: Path, header: Header) -> Named:
     """Return, for each material that names a base colour texture, the file that names it and the texture's name."""
-    if path.suffix.lower() == ".ply":
-        found = re.search(r"^comment TextureFile\s+(.*?)\s*$", text_of(data.split(b"end_header")[0]), re.MULTILINE)
-        return {UNNAMED: (path.name, found[1])} if found else {}
-    if header is None:
-        return references.named
     images = {
         f"{gltf.MATERIAL}{index}": gltf.image_name(header, material.base_color)
         for index, material in enumerate(header.materials)
@@ -206,13 +161,13 @@ def _named_textures(path: Path, data: bytes, header: Header | None, references: 
     return {name: (path.name, image) for name, image in images.items() if image}
 
 
-def _part(mesh: Any, surface: ImportedSurface, *, linear: bool) -> ImportedPart:
-    """Return what the file says about a parsed mesh; `linear` tells how its vertex colours are encoded."""
+def _part(mesh: Any, surface: ImportedSurface) -> ImportedPart:
+    """Return what the file says about a parsed mesh."""
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     normals = mesh._cache.cache.get("vertex_normals")  # the public property would make normals up
     uvs = getattr(mesh.visual, "uv", None)
     plain = surface.color is None and surface.texture is None
-    colors = _corner_colors(mesh, faces, plain=plain, linear=linear)
+    colors = _corner_colors(mesh, faces, plain=plain)
     if plain and colors is not None:  # they are the base colour then, and not its factor
         surface = replace(surface, color=np.ones(3, np.float32))
     return ImportedPart(
@@ -225,38 +180,16 @@ def _part(mesh: Any, surface: ImportedSurface, *, linear: bool) -> ImportedPart:
     )
 
 
-def _placed(part: ImportedPart, matrix: Array) -> ImportedPart:
-    """Return a part moved to its place in the file by an affine transform (4, 4)."""
-    if np.array_equal(matrix, np.eye(4)):
-        return part
-    turn, normals = matrix[:3, :3], part.normals
-    with np.errstate(all="ignore"):
-        vertices = part.vertices @ turn.T + matrix[:3, 3]
-        if normals is not None:  # a normal turns with the cofactors of the matrix
-            normals = normals @ np.cross(turn[[1, 2, 0]], turn[[2, 0, 1]]).T
-    if not np.linalg.det(turn) < 0.0:
-        return replace(part, vertices=vertices, normals=normals)
-    colors = None if part.colors is None else part.colors[:, ::-1]  # a mirror turns faces over, and cofactors normals
-    return replace(
-        part,
-        vertices=vertices,
-        faces=part.faces[:, ::-1],
-        normals=None if normals is None else -normals,
-        colors=colors,
-    )
-
-
-def _corner_colors(mesh: Any, faces: npt.NDArray[np.int64], *, plain: bool, linear: bool) -> Array | None:
+def _corner_colors(mesh: Any, faces: npt.NDArray[np.int64], *, plain: bool) -> Array | None:
     """Return the colours that the file gives to vertices or faces.
 
     Args:
         mesh: as trimesh parsed it.
         faces: (F, 3) its faces.
         plain: whether it has no material; beside one, only the colours of glTF count.
-        linear: whether the colours are linear, as in glTF, or display-referred.
 
     Returns:
-        (F, 3, 3) float64 display-referred, or None.
+        (F, 3, 3) float64 linear, or None.
     """
     visual, at = mesh.visual, faces
     if visual.kind == "vertex":
@@ -271,4 +204,4 @@ def _corner_colors(mesh: Any, faces: npt.NDArray[np.int64], *, plain: bool, line
         return None
     scale = 1.0 if given.dtype.kind == "f" else float(np.iinfo(given.dtype).max)
     colors = np.clip(np.nan_to_num(given[:, :3].astype(np.float32) / np.float32(scale)), 0.0, 1.0)
-    return np.asarray((linear_to_srgb(colors) if linear else colors)[at], dtype=np.float64)
+    return np.asarray(colors[at], dtype=np.float64)

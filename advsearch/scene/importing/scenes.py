@@ -24,8 +24,9 @@ from advsearch.scene.importing.blender import read_mesh_bytes
 from advsearch.scene.importing.files import safe_name, shown
 from advsearch.scene.importing.geometry import FLAT
 from advsearch.scene.importing.gltf_entries import CameraEntry, Header, Light, Node
+from advsearch.scene.importing.imported_part import ImportedPart
 from advsearch.scene.importing.objects import object_of
-from advsearch.scene.importing.parts import GLTF, ImportedPart, read_parts
+from advsearch.scene.importing.parts import GLTF, read_parts
 from advsearch.scene.parts import PlacedCamera, PointLamp, ScenePart, SpotLamp, mesh_part
 
 Doubles = npt.NDArray[np.float64]

@@ -13,21 +13,19 @@ from advsearch.scene.color import linear_to_srgb, srgb_to_linear
 from advsearch.scene.importing import gltf
 from advsearch.scene.importing.files import shown
 from advsearch.scene.importing.gltf_entries import CUT_OUTS, CUTOFF, Header, MaterialEntry, NormalUse
-from advsearch.scene.importing.material_lines import color_of, last_number, radiance_of, scale_and_name
-from advsearch.scene.importing.normal_maps import holds_normals, normal_map
+from advsearch.scene.importing.normal_maps import normal_map
 from advsearch.scene.importing.pictures import Pictures
-from advsearch.scene.importing.references import Named
 
 if TYPE_CHECKING:
-    from trimesh.visual.material import PBRMaterial, SimpleMaterial
+    from trimesh.visual.material import PBRMaterial
 
 Floats = npt.NDArray[np.float32]
 
 NEUTRAL = 0.5
 """Display-referred grey of an object without material."""
 
-UNNAMED = "material_0"
-"""The name that trimesh gives to a material that the file does not name."""
+Named = dict[str | None, tuple[str, str]]
+"""For each material that names a texture: the file that names it, and the texture's name."""
 
 
 BRIGHTEST = 1e5
@@ -96,58 +94,11 @@ class SurfaceReader:
         return self._known[id(material)]
 
     def _read(self, material: Any) -> ImportedSurface:
-        from trimesh.visual.material import PBRMaterial, SimpleMaterial
+        from trimesh.visual.material import PBRMaterial
 
         if isinstance(material, PBRMaterial):
             return self._gltf(material)
-        if isinstance(material, SimpleMaterial):
-            # The Kd of a textured material is an exporter's default more often than a tint: the texture stands alone.
-            color = color_of(material.kwargs.get("kd"))
-            texture = self._texture(material, material.image, color)
-            found = ImportedSurface(_unless_white(color, material, self.named), texture)
-            found = replace(self._see_through(material, found), normal_map=self._bumps(material))
-            return replace(found, emission=self._glow(material))
         return ImportedSurface()
-
-    def _see_through(self, material: SimpleMaterial, surface: ImportedSurface) -> ImportedSurface:
-        """Give a surface the opacity that a material file says by ``d``, a number, and ``map_d``, a picture: its alpha,
-        or its grey where it has none."""
-        factor, map = last_number(material.kwargs.get("d"), 1.0), self._opacity(material)
-        if map is None and factor == 1.0:
-            return surface
-        share, color, texture = np.array([factor], np.float32), surface.color, surface.texture
-        if map is not None:
-            plain = np.full(3, NEUTRAL, np.float32) if color is None else color
-            texture = np.broadcast_to(plain, (*map.shape, 3)) if texture is None else texture
-            size = (texture.shape[1], texture.shape[0])
-            fitted = np.asarray(Image.fromarray(map).resize(size, Image.Resampling.BILINEAR))
-            texture = np.concatenate([texture, fitted[:, :, None]], axis=2)
-        return replace(surface, color=_with_opacity(color, share, None), texture=_with_opacity(texture, share, None))
-
-    def _opacity(self, material: SimpleMaterial) -> Floats | None:
-        """The (H, W) opacity in [0, 1] that a material's ``map_d`` holds; warn where it cannot be had."""
-        name = " ".join(material.kwargs.get("map_d") or [])
-        if not name:
-            return None
-        found = self.pictures.of_file(name, "colours and alpha")
-        if isinstance(found, np.ndarray):
-            return found[:, :, 3] if found[:, :, 3].min() < 1.0 else found[:, :, :3].mean(axis=2)
-        self._note(f"{self.source}: the opacity {shown(name)} {found}; it is opaque instead")
-        return None
-
-    def _bumps(self, material: SimpleMaterial) -> Floats | None:
-        """The normal map of a material file: ``norm``, or ``map_Bump`` or ``bump`` where these hold normals."""
-        for key in ("norm", "map_bump", "bump"):
-            scale, name = scale_and_name(material.kwargs.get(key) or [])
-            if not name:
-                continue
-            picture = self.pictures.of_file(name, "numbers")
-            if isinstance(picture, np.ndarray):
-                if key == "norm" or holds_normals(picture):
-                    return normal_map(picture, scale)
-                picture = "holds heights, and no normals"
-            self._without_normals(name, picture)
-        return None
 
     def _without_normals(self, name: str, why: str) -> None:
         self._note(f"{self.source}: the normal map {shown(name)} {why}; it is left out")
@@ -174,7 +125,7 @@ class SurfaceReader:
         if alpha:
             under = material.alphaCutoff
             cutoff = None if material.alphaMode == "BLEND" else CUTOFF if under is None else under
-            kept, texture = _with_opacity(color, scaled[3:], cutoff), _with_opacity(texture, scaled[3:], cutoff)
+            kept, texture = with_opacity(color, scaled[3:], cutoff), with_opacity(texture, scaled[3:], cutoff)
         found = ImportedSurface(kept, texture, _unit(roughness), _unit(metallic))
         entry = None if self.header is None else gltf.entry_of(self.header, material.name)
         if self.header is None or entry is None:
@@ -208,29 +159,12 @@ class SurfaceReader:
         self._without_emission(name, self.pictures.why(name, found))
         return None
 
-    def _glow(self, material: SimpleMaterial) -> Floats | None:
-        """The radiance that a material file says by ``Ke`` and ``map_Ke``; where it has both, their product."""
-        words, name = material.kwargs.get("ke") or [], " ".join(material.kwargs.get("map_ke") or [])
-        factor = radiance_of(words)
-        if factor is None:
-            self._note(f"{self.source}: the emission {shown(' '.join(words))} is no colour; it is left out")
-            return None
-        if not name:
-            return self._radiance(factor)
-        found = self.pictures.of_file(name, "colours")
-        if isinstance(found, np.ndarray):
-            return self._radiance(factor if factor.any() else np.ones(3), found)
-        self._without_emission(name, found)
-        return None
-
     def _radiance(self, factor: npt.NDArray[np.float64], picture: Floats | None = None) -> Floats | None:
         """Return a factor (3,) times the linear values of a picture (H, W, 3); None where it is dark."""
-        if factor.max() > BRIGHTEST:
-            self._note(f"{self.source}: emission brighter than {BRIGHTEST:g} is cut to that")
-            factor = np.minimum(factor, BRIGHTEST)
-        linear = np.ones((1, 1, 3), np.float32) if picture is None else srgb_to_linear(picture)
-        found = (linear * factor).astype(np.float32)
-        return found if found.any() else None
+        found, cut = limited_radiance(factor, picture)
+        if cut is not None:
+            self._note(f"{self.source}: {cut}")
+        return found
 
     def _without_emission(self, name: str, why: str) -> None:
         self._note(f"{self.source}: the texture {shown(name)} of the emission {why}; it is left out")
@@ -256,7 +190,18 @@ class SurfaceReader:
             self.notes.append(message)
 
 
-def _with_opacity(color: Floats | None, factor: Floats, cutoff: float | None) -> Floats | None:
+def limited_radiance(
+    factor: npt.NDArray[np.float64], picture: Floats | None = None
+) -> tuple[Floats | None, str | None]:
+    """Return a factor (3,) times the linear values of a picture (H, W, 3), as in `ImportedSurface`, and a warning where
+    that is cut to `BRIGHTEST`."""
+    cut = f"emission brighter than {BRIGHTEST:g} is cut to that" if factor.max() > BRIGHTEST else None
+    linear = np.ones((1, 1, 3), np.float32) if picture is None else srgb_to_linear(picture)
+    found = (linear * np.minimum(factor, BRIGHTEST)).astype(np.float32)
+    return (found if found.any() else None), cut
+
+
+def with_opacity(color: Floats | None, factor: Floats, cutoff: float | None) -> Floats | None:
     """Return a base colour (..., 3 or 4) with its opacity, or as (..., 3) where it is opaque.
 
     Args:

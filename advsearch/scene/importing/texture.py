@@ -133,9 +133,9 @@ def _plain(surface: ImportedSurface) -> Floats:
 
 
 def _tinted(color: npt.NDArray[np.floating], factor: npt.NDArray[np.floating]) -> Floats:
-    """Multiply display-referred colours (..., 3 or 4) by factors (..., 3) in linear light; opacity stays."""
+    """Multiply display-referred colours (..., 3 or 4) by linear factors (..., 3); opacity stays."""
     color = np.asarray(color, np.float32)
-    product = srgb_to_linear(color[..., :3]) * srgb_to_linear(np.asarray(factor, np.float32))
+    product = srgb_to_linear(color[..., :3]) * factor
     return np.concatenate([linear_to_srgb(product.astype(np.float32)), color[..., 3:]], axis=-1)
 
 
