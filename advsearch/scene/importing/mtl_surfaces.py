@@ -147,17 +147,15 @@ class MtlReader:
         """Put what is not read into the inventory; what is there by default, and changes nothing, is not in it."""
         said = {key: without_comment(rest) for key, rest in material.statements.items()}
         zero = {key for key, rest in said.items() if not any(numbers_of(rest) or [1.0])}
+        base = map_of(said.get("map_kd", ""))
         for key, rest in said.items():
-            values = numbers_of(rest) or []
+            use = map_of(rest)
+            quiet = key in READ or key in QUIET or key in zero or (key == "pcr" and "pc" in zero)
+            quiet |= key == "tf" and len(set(rest.split())) == 1
+            quiet |= key == "map_ka" and use is not None and base is not None and use.name == base.name
             if key == "illum" and rest not in ("", "0", "1", "2"):
                 self.inventory.has("illumination model", rest)
-            elif key in READ or key in QUIET or key in zero or (key == "pcr" and "pc" in zero):
-                continue
-            elif (key == "tf" and len(set(values)) == 1) or (
-                key == "map_ka" and map_of(rest) == map_of(said.get("map_kd", ""))
-            ):
-                continue
-            else:
+            elif not quiet:
                 self.inventory.has(STATEMENT, material.spelled[key])
 
     def _use(self, material: MtlMaterial, key: str) -> MapUse | None:

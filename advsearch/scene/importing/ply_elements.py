@@ -131,9 +131,8 @@ class _Words:
         return self.values.item(place)
 
     def odd(self) -> str | None:
-        """The word that ended the numbers, if it was one."""
-        words = self.data.split(None, self.end + 1)
-        return text_of(words[self.end]) if len(words) > self.end else None
+        """The first word that is no number, if there is one."""
+        return next((text_of(word) for word in self.data.split() if not _is_number(word)), None)
 
 
 class _Bytes:
@@ -157,6 +156,14 @@ class _Bytes:
 
     def odd(self) -> str | None:
         return None
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _fill(path: Path, element: Element, cells: _Words | _Bytes, at: int) -> int:

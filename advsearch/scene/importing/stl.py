@@ -22,7 +22,8 @@ Attributes = npt.NDArray[np.uint16]
 
 _FACET = np.dtype([("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("attribute", "<u2")])
 _VERTEX = re.compile(rb"\bvertex\s+(\S+)\s+(\S+)\s+(\S+)", re.IGNORECASE)
-_WORDS = frozenset("solid facet outer vertex endloop endfacet endsolid end".split())
+_NAMED = re.compile(rb"^[ \t]*(?:end[ \t]?)?solid\b(?:(?!facet\s+normal)[^\n])*", re.IGNORECASE | re.MULTILINE)
+_WORDS = frozenset("facet outer vertex endloop endfacet end".split())
 _OWN = 0x8000
 
 
@@ -66,6 +67,7 @@ def _of_text(path: Path, data: bytes, inventory: Inventory) -> Array:
     """Return the corners (3 F, 3) of the facets of an ASCII file."""
     if not re.search(rb"\bend\s?solid", data, re.IGNORECASE):
         raise damaged(path, "an ASCII STL file that ends in 'endsolid'", "one that is cut short")
+    data = _NAMED.sub(b"", data.replace(b"\r", b"\n"))
     found = _VERTEX.findall(data)
     check_faces(path, len(found) // 3)
     if len(found) % 3 or len(found) != 3 * len(re.findall(rb"\bouter\s+loop\b", data, re.IGNORECASE)):
