@@ -106,6 +106,17 @@ def test_values_and_channels_of_maps(tmp_path: Path) -> None:
     np.testing.assert_allclose(part.surface.texture[seen][:, :3], (0.25 + 0.5 * pixels)[seen], atol=1e-6)
 
 
+def test_an_alpha_that_nothing_makes_an_opacity_is_said(tmp_path: Path) -> None:
+    picture(tmp_path, "leaf.png", np.full((4, 4, 4), 128))
+    part, notes = material(tmp_path, "map_Kd leaf.png")
+    assert part.surface.texture is not None and part.surface.texture.shape == (4, 4, 3)
+    assert notes == ["the alpha of 'leaf.png' is left out: no map_d makes it an opacity"]
+    part, notes = material(tmp_path, "map_Kd leaf.png", "map_d leaf.png")
+    assert (
+        notes == [] and part.surface.texture is not None and part.surface.texture[0, 0, 3] == pytest.approx(128 / 255)
+    )
+
+
 def test_clamped_textures_are_said_where_they_would_repeat(tmp_path: Path) -> None:
     picture(tmp_path, "wood.png")
     assert material(tmp_path, "map_Kd -clamp on wood.png")[1] == []

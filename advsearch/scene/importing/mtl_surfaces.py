@@ -200,9 +200,11 @@ class MtlReader:
         tint. Warn where it cannot be had."""
         if use is None:
             return None
-        found = self._picture(use, "colours")
+        found = self._picture(use, "colours and alpha")
         if isinstance(found, np.ndarray):
-            return found
+            if found[:, :, 3].min() < 1.0 and "map_d" not in material.statements:
+                self.note(f"{self.source}: the alpha of {shown(use.name)} is left out: no map_d makes it an opacity")
+            return np.ascontiguousarray(found[:, :, :3])
         plain = color is None or bool((color > 0.999).all())
         instead = (
             "neutral grey" if color is None or plain else f"its base colour ({', '.join(f'{c:.2f}' for c in color)})"

@@ -1,7 +1,8 @@
 """Mesh files as a list of parts: one piece of geometry with one surface each, in the file's own coordinates.
 
-trimesh does the parsing. What it invents where a file is silent (a grey texture, a default colour, normals made on
-demand) is told apart from what the file says here and in `surfaces`.
+trimesh parses glTF. What it invents where a file is silent (a grey texture, a default colour, normals made on demand)
+is told apart from what the file says here and in `surfaces`. The other formats have readers of our own (`READERS`):
+those that there are drop without a word what they do not know.
 """
 
 from __future__ import annotations

@@ -120,8 +120,8 @@ class _Said:
 def _statements(lines: Lines, inventory: Inventory) -> _Said:
     """Read the statements that are no numbers; what nothing becomes of is put into the inventory."""
     said = _Said([], [], [])
-    for row, key, rest in lines.others():
-        plain = without_comment(rest).lower()
+    for row, word, rest in lines.others():
+        key, plain = word.lower(), without_comment(rest).lower()
         if key == "mtllib":
             said.libraries.append(rest)
         elif key == "usemtl":
@@ -133,7 +133,7 @@ def _statements(lines: Lines, inventory: Inventory) -> _Said:
         elif key in FREE_FORM:
             inventory.has("curves and curved surfaces, statement", key)
         elif key not in GROUPING and plain not in ("off", "0"):
-            inventory.has("statement", key)
+            inventory.has("statement", word)
     return said
 
 
