@@ -27,7 +27,7 @@ from advsearch.scene.importing.images import FORMATS
 from advsearch.scene.importing.normal_maps import normal_map
 from advsearch.scene.importing.pictures import Kind, Pictures
 from advsearch.scene.importing.references import References
-from advsearch.scene.importing.surfaces import ImportedSurface, radiance, unit, with_opacity
+from advsearch.scene.importing.surfaces import ImportedSurface, limited_radiance, unit, with_opacity
 
 Array = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.float32]
@@ -119,7 +119,7 @@ class GltfSurfaces:
             picture = self._picture(material.emissiveTexture, "colours", words)
             if picture is None:
                 return None
-        found, note = radiance(factor, picture)
+        found, note = limited_radiance(factor, picture)
         self._note(f": {note}" if note else "")
         return found
 

@@ -41,16 +41,17 @@ def import_object(path: str | PathLike[str], *, up: Literal["y", "z"] | None = N
       where faces meet at more than 40 degrees; flat in glTF.
     - UVs are the file's, moved into [0, 1] where that takes little. Where it has none, where they repeat a texture or
       are squashed, and where there are several materials, xatlas makes new ones and the colours are baked into a map.
-    - Base colour: the material's texture (averaged down to at most 1024 texels on its long side, with a warning; alpha
-      is opacity where a glTF material says so),
-      otherwise the material's colour, otherwise vertex or face colours, otherwise grey of display-referred 0.5. A glTF
-      texture is multiplied by its linear factor. The ``Kd`` of an .mtl is taken as display-referred, and ignored beside
-      a ``map_Kd``. Where a texture is missing, the colour takes its place, or grey if that is plain white, with a
-      warning.
+    - Base colour: the material's texture (averaged down to at most 1024 texels on its long side, with a warning;
+      alpha is opacity where a glTF material says so), otherwise its colour, otherwise vertex or face colours, otherwise
+      grey of display-referred 0.5. A glTF texture is multiplied by its linear factor. The ``Kd`` of an .mtl
+      is taken as display-referred, multiplied by the colours of vertices, and ignored beside a ``map_Kd``. Where a
+      texture is missing, the colour takes its place, or grey if that is plain white, with a warning.
     - Emission is that of glTF, and of an .mtl ``Ke`` and ``map_Ke``: linear radiance on the front of the faces.
     - The normal map of glTF, and of an .mtl ``norm``, ``map_Bump`` or ``bump`` that holds normals; where textures are
       baked, it is turned to the new texture coordinates.
-    - Roughness and metallic are those of glTF, their mean over several materials, and in other formats `Material`'s.
+    - Roughness and metallic are those of glTF, and of an .mtl ``Pr`` and ``Pm`` where given, their mean over several
+      materials, and else `Material`'s.
+    - What else a file has is named in the warnings.
 
     The same file gives the same bytes every time.
 

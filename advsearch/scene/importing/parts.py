@@ -1,57 +1,32 @@
 """Mesh files as a list of parts: one piece of geometry with one surface each, in the file's own coordinates.
 
-trimesh does the parsing. What it invents where a file is silent (a grey texture, a default colour, normals made on
-demand) is told apart from what the file says here and in `surfaces`.
+The formats have readers of our own: those that there are drop without a word what they do not know.
 """
 
 from __future__ import annotations
 
-import contextlib
-import io
-import logging
-import re
 import warnings
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from advsearch.errors import FileFormatError
-from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing.checks import check_faces, checked
-from advsearch.scene.importing.files import damaged, shown, text_of
 from advsearch.scene.importing.gltf_parts import read_gltf
 from advsearch.scene.importing.images import without_pillows_limit
-from advsearch.scene.importing.imported_part import ImportedPart, placed
-from advsearch.scene.importing.pictures import Pictures
-from advsearch.scene.importing.references import Named, References
-from advsearch.scene.importing.surfaces import UNNAMED, ImportedSurface, SurfaceReader
-
-Array = npt.NDArray[np.float64]
+from advsearch.scene.importing.imported_part import ImportedPart
+from advsearch.scene.importing.ply import read_ply
+from advsearch.scene.importing.stl import read_stl
+from advsearch.scene.importing.wavefront import read_obj
 
 GLTF = (".glb", ".gltf", ".blend")
 """Endings of glTF files, which have conventions of their own: y up, linear colours; and of what is read as glTF."""
 
+Reader = Callable[[Path, bytes], tuple[list[ImportedPart], list[str]]]
 
-@contextlib.contextmanager
-def _silent() -> Iterator[None]:
-    """Keep trimesh's log messages, some with tracebacks, and numpy's warnings about damaged files to ourselves."""
-    logger, handler = logging.getLogger("trimesh"), logging.NullHandler()
-    propagate, logger.propagate = logger.propagate, False
-    logger.addHandler(handler)  # without any, Python would print them
-    try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"), without_pillows_limit():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.removeHandler(handler)
-        logger.propagate = propagate
+READERS: dict[str, Reader] = {".obj": read_obj, ".ply": read_ply, ".stl": read_stl, **dict.fromkeys(GLTF, read_gltf)}
+"""Readers by the endings of files."""
 
 
-@_silent()
 def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     """Parse a mesh file.
 
@@ -65,134 +40,6 @@ def read_parts(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
     Raises:
         FileFormatError: the file is damaged, not a mesh, refers to missing geometry, or has no faces.
     """
-    import trimesh  # takes half a second, and bundled objects do without
-
-    if path.suffix.lower() in GLTF:
-        return read_gltf(path, data)
-    references = References(path)
-    found = _parse(path, checked(path, data), references)
-    meshes = [one for one in found if isinstance(one[0], trimesh.Trimesh) and len(one[0].faces)]
-    if any(np.shape(mesh.vertices)[1:] != (3,) for mesh, _ in meshes):
-        raise damaged(path, "vertices with 3 coordinates", "another number")
-    if any(mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices) for mesh, _ in meshes):
-        raise damaged(path, "faces of its own vertices", "a face that refers to a vertex that is not there")
-    check_faces(path, sum(len(mesh.faces) for mesh, _ in meshes))
-    if not meshes:
-        got = "points or lines only" if found else "none"
-        raise FileFormatError(f"{path}: expected a mesh with faces, got {got}; export triangles")
-    notes = _file_notes(path, data, references)
-    if len(meshes) < len(found):
-        notes.append(f"{path.name}: {len(found) - len(meshes)} parts without faces (points, lines) are left out")
-    named = _named_textures(path, data, references)
-    pictures = Pictures(len(references.materials), references.get, references.refused)
-    reader = SurfaceReader(path.name, named, pictures)
-    parts = []
-    for mesh, matrix in meshes:
-        part = _part(mesh, reader.surface(mesh.visual))
-        if _has_face_uvs(path, data):  # trimesh has shuffled the vertices, but not what belongs to them
-            part = replace(part, normals=None, colors=None)
-        parts.append(placed(part, matrix))
-    return parts, [*notes, *reader.notes, *(f"{path.name}: {note}" for note in pictures.notes)]
-
-
-def _parse(path: Path, data: bytes, references: References) -> list[tuple[Any, Array]]:
-    """Run trimesh's parser; return what it found with transforms (4, 4), always in the same order."""
-    import trimesh
-
-    kind = path.suffix.lower().lstrip(".")
-    options: dict[str, bool] = {"process": False}
-    if kind == "ply":  # with fix_texture, vertices are shuffled and their normals are not
-        options["fix_texture"] = _has_face_uvs(path, data)
-    try:
-        scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, resolver=references, **options)
-        found = []
-        for node in scene.graph.nodes_geometry:
-            matrix, name = scene.graph.get(node)
-            found.append((str(name), np.asarray(matrix, dtype=np.float64)))
-        found.sort(key=lambda item: (item[0], item[1].tobytes()))  # the names of nodes can be random
-        return [(scene.geometry[name], matrix) for name, matrix in found]
-    except MemoryError:
-        raise
-    except Exception as error:
-        if references.refused:
-            name, reason = next(iter(references.refused.items()))
-            message = f"{path}: needs {shown(name)}, which {reason}; put that file beside it"
-        else:
-            words = "".join(c if c.isprintable() else " " for c in str(error)).split()
-            reason = " ".join(words)[:120] or type(error).__name__
-            message = f"{path}: is not readable {kind.upper()} ({reason}); it is damaged or cut short, export it again"
-        raise FileFormatError(message) from error
-
-
-def _has_face_uvs(path: Path, data: bytes) -> bool:
-    """Tell whether a PLY file keeps texture coordinates with its faces, not with its vertices."""
-    return path.suffix.lower() == ".ply" and b"texcoord" in data.split(b"end_header")[0]
-
-
-def _file_notes(path: Path, data: bytes, references: References) -> list[str]:
-    """Return the warnings about material files, and about features of the file that are not carried over."""
-    notes = []
-    for name, reason in references.refused.items():
-        if name.lower().endswith(".mtl"):
-            notes.append(
-                f"{path.name} names the material file {shown(name)}, which {reason}; neutral grey is used instead"
-            )
-    if path.suffix.lower() == ".obj" and references.materials:
-        used = set(re.findall(r"^\s*usemtl\s+(.*?)\s*$", text_of(data), re.MULTILINE))
-        for name in sorted(used - references.materials):
-            notes.append(
-                f"{path.name} uses the material {shown(name)}, which its .mtl file lacks; neutral grey is used instead"
-            )
-    return notes
-
-
-def _named_textures(path: Path, data: bytes, references: References) -> Named:
-    """Return, for each material that names a base colour texture, the file that names it and the texture's name."""
-    if path.suffix.lower() == ".ply":
-        found = re.search(r"^comment TextureFile\s+(.*?)\s*$", text_of(data.split(b"end_header")[0]), re.MULTILINE)
-        return {UNNAMED: (path.name, found[1])} if found else {}
-    return references.named
-
-
-def _part(mesh: Any, surface: ImportedSurface) -> ImportedPart:
-    """Return what the file says about a parsed mesh."""
-    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-    normals = mesh._cache.cache.get("vertex_normals")  # the public property would make normals up
-    uvs = getattr(mesh.visual, "uv", None)
-    plain = surface.color is None and surface.texture is None
-    colors = _corner_colors(mesh, faces, plain=plain)
-    if plain and colors is not None:  # they are the base colour then, and not its factor
-        surface = replace(surface, color=np.ones(3, np.float32))
-    return ImportedPart(
-        vertices=vertices,
-        faces=faces,
-        normals=None if normals is None else np.asarray(normals, dtype=np.float64),
-        uvs=np.asarray(uvs, dtype=np.float64) if uvs is not None and uvs.shape == (len(vertices), 2) else None,
-        colors=colors,
-        surface=surface,
-    )
-
-
-def _corner_colors(mesh: Any, faces: npt.NDArray[np.int64], *, plain: bool) -> Array | None:
-    """Return the colours that the file gives to vertices or faces.
-
-    Args:
-        mesh: as trimesh parsed it.
-        faces: (F, 3) its faces.
-        plain: whether it has no material; beside one, they do not count.
-
-    Returns:
-        (F, 3, 3) float64 linear, or None; in the file they are display-referred.
-    """
-    visual, at = mesh.visual, faces
-    if visual.kind == "vertex":
-        given = visual.vertex_colors
-    elif visual.kind == "face":
-        given, at = visual.face_colors, np.repeat(np.arange(len(faces))[:, None], 3, axis=1)
-    else:
-        given = mesh.vertex_attributes.get("color") if plain else None
-    if np.ndim(given) != 2 or len(given) <= int(at.max()) or given.shape[1] < 3:
-        return None
-    scale = 1.0 if given.dtype.kind == "f" else float(np.iinfo(given.dtype).max)
-    colors = np.clip(np.nan_to_num(given[:, :3].astype(np.float32) / np.float32(scale)), 0.0, 1.0)
-    return np.asarray(srgb_to_linear(colors)[at], dtype=np.float64)
+    with warnings.catch_warnings(), np.errstate(all="ignore"), without_pillows_limit():
+        warnings.simplefilter("ignore")
+        return READERS[path.suffix.lower()](path, data)

@@ -56,14 +56,14 @@ class Pictures:
         return side
 
     def decoded(self, image: Image.Image | None, kind: Kind = "colours", name: str = "") -> Floats | str | None:
-        """Return a picture's values, why there are none, or None; a picture without format is trimesh's invention.
+        """Return a picture's values, why there are none, or None where there is no picture.
 
         Args:
             image: as it was opened.
             kind: what it holds. Values are as in `display_image`.
             name: what the file calls it, for notes.
         """
-        if image is None or image.format is None:
+        if image is None:
             return None
         if (id(image), kind) not in self._known:
             self._known[id(image), kind] = self._pixels_of(image, kind, name)

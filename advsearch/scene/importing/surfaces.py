@@ -2,31 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 from scipy.ndimage import distance_transform_edt
 
 from advsearch.scene.color import srgb_to_linear
-from advsearch.scene.importing.files import shown
-from advsearch.scene.importing.material_lines import color_of, last_number, radiance_of, scale_and_name
-from advsearch.scene.importing.normal_maps import holds_normals, normal_map
-from advsearch.scene.importing.pictures import Pictures
-from advsearch.scene.importing.references import Named
-
-if TYPE_CHECKING:
-    from trimesh.visual.material import SimpleMaterial
 
 Floats = npt.NDArray[np.float32]
 
 NEUTRAL = 0.5
 """Display-referred grey of an object without material."""
-
-UNNAMED = "material_0"
-"""The name that trimesh gives to a material that the file does not name."""
 
 
 BRIGHTEST = 1e5
@@ -68,136 +55,15 @@ class ImportedSurface:
         return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
 
 
-@dataclass
-class SurfaceReader:
-    """Turns the materials of one file, as trimesh parsed them, into surfaces; each material once.
-
-    Attributes:
-        source: the file's name, for warnings.
-        named: for each material that names a texture: the file that names it, and the texture's name.
-        pictures: decodes those that it names.
-        notes: the warnings so far.
-    """
-
-    source: str
-    named: Named
-    pictures: Pictures
-    notes: list[str] = field(default_factory=list)
-    _known: dict[int, ImportedSurface] = field(default_factory=dict)
-
-    def surface(self, visual: Any) -> ImportedSurface:
-        """Return the surface of a parsed mesh's visual; an empty one where the file gives no material."""
-        material = getattr(visual, "material", None)
-        if id(material) not in self._known:
-            self._known[id(material)] = self._read(material)
-        return self._known[id(material)]
-
-    def _read(self, material: Any) -> ImportedSurface:
-        from trimesh.visual.material import SimpleMaterial
-
-        if isinstance(material, SimpleMaterial):
-            # The Kd of a textured material is an exporter's default more often than a tint: the texture stands alone.
-            color = color_of(material.kwargs.get("kd"))
-            texture = self._texture(material, material.image, color)
-            found = ImportedSurface(_unless_white(color, material, self.named), texture)
-            found = replace(self._see_through(material, found), normal_map=self._bumps(material))
-            return replace(found, emission=self._glow(material))
-        return ImportedSurface()
-
-    def _see_through(self, material: SimpleMaterial, surface: ImportedSurface) -> ImportedSurface:
-        """Give a surface the opacity that a material file says by ``d``, a number, and ``map_d``, a picture: its alpha,
-        or its grey where it has none."""
-        factor, map = last_number(material.kwargs.get("d"), 1.0), self._opacity(material)
-        if map is None and factor == 1.0:
-            return surface
-        share, color, texture = np.array([factor], np.float32), surface.color, surface.texture
-        if map is not None:
-            plain = np.full(3, NEUTRAL, np.float32) if color is None else color
-            texture = np.broadcast_to(plain, (*map.shape, 3)) if texture is None else texture
-            size = (texture.shape[1], texture.shape[0])
-            fitted = np.asarray(Image.fromarray(map).resize(size, Image.Resampling.BILINEAR))
-            texture = np.concatenate([texture, fitted[:, :, None]], axis=2)
-        return replace(surface, color=with_opacity(color, share, None), texture=with_opacity(texture, share, None))
-
-    def _opacity(self, material: SimpleMaterial) -> Floats | None:
-        """The (H, W) opacity in [0, 1] that a material's ``map_d`` holds; warn where it cannot be had."""
-        name = " ".join(material.kwargs.get("map_d") or [])
-        if not name:
-            return None
-        found = self.pictures.of_file(name, "colours and alpha")
-        if isinstance(found, np.ndarray):
-            return found[:, :, 3] if found[:, :, 3].min() < 1.0 else found[:, :, :3].mean(axis=2)
-        self._note(f"{self.source}: the opacity {shown(name)} {found}; it is opaque instead")
-        return None
-
-    def _bumps(self, material: SimpleMaterial) -> Floats | None:
-        """The normal map of a material file: ``norm``, or ``map_Bump`` or ``bump`` where these hold normals."""
-        for key in ("norm", "map_bump", "bump"):
-            scale, name = scale_and_name(material.kwargs.get(key) or [])
-            if not name:
-                continue
-            picture = self.pictures.of_file(name, "numbers")
-            if isinstance(picture, np.ndarray):
-                if key == "norm" or holds_normals(picture):
-                    return normal_map(picture, scale)
-                picture = "holds heights, and no normals"
-            self._without_normals(name, picture)
-        return None
-
-    def _without_normals(self, name: str, why: str) -> None:
-        self._note(f"{self.source}: the normal map {shown(name)} {why}; it is left out")
-
-    def _glow(self, material: SimpleMaterial) -> Floats | None:
-        """The radiance that a material file says by ``Ke`` and ``map_Ke``; where it has both, their product."""
-        words, name = material.kwargs.get("ke") or [], " ".join(material.kwargs.get("map_ke") or [])
-        factor = radiance_of(words)
-        if factor is None:
-            self._note(f"{self.source}: the emission {shown(' '.join(words))} is no colour; it is left out")
-            return None
-        if not name:
-            return self._radiance(factor)
-        found = self.pictures.of_file(name, "colours")
-        if isinstance(found, np.ndarray):
-            return self._radiance(factor if factor.any() else np.ones(3), found)
-        self._without_emission(name, found)
-        return None
-
-    def _radiance(self, factor: npt.NDArray[np.float64], picture: Floats | None = None) -> Floats | None:
-        found, note = radiance(factor, picture)
-        if note:
-            self._note(f"{self.source}: {note}")
-        return found
-
-    def _without_emission(self, name: str, why: str) -> None:
-        self._note(f"{self.source}: the texture {shown(name)} of the emission {why}; it is left out")
-
-    def _texture(self, material: Any, image: Image.Image | None, color: Floats | None) -> Floats | None:
-        """Return the base colour texture; where the material names one that cannot be had, warn."""
-        file, name = self.named.get(material.name, ("", ""))
-        texture = self.pictures.decoded(image, "colours", name)
-        if isinstance(texture, np.ndarray):
-            return texture
-        if name:
-            why = self.pictures.why(name, texture)
-            kept = _unless_white(color, material, self.named)
-            instead = "neutral grey" if kept is None else f"its base colour ({', '.join(f'{c:.2f}' for c in kept)})"
-            where = "" if file == self.source else f"{self.source}: "
-            self._note(f"{where}{file} names the texture {shown(name)}, which {why}; {instead} is used instead")
-        return None
-
-    def _note(self, message: str) -> None:
-        if message not in self.notes:
-            self.notes.append(message)
-
-
-def radiance(factor: npt.NDArray[np.float64], picture: Floats | None = None) -> tuple[Floats | None, str]:
-    """Return a factor (3,) times the linear values of a picture (H, W, 3), None where it is dark; and what to say."""
-    note = ""
-    if factor.max() > BRIGHTEST:
-        factor, note = np.minimum(factor, BRIGHTEST), f"emission brighter than {BRIGHTEST:g} is cut to that"
+def limited_radiance(
+    factor: npt.NDArray[np.float64], picture: Floats | None = None
+) -> tuple[Floats | None, str | None]:
+    """Return a factor (3,) times the linear values of a picture (H, W, 3), as in `ImportedSurface`, and a warning where
+    that is cut to `BRIGHTEST`."""
+    cut = f"emission brighter than {BRIGHTEST:g} is cut to that" if factor.max() > BRIGHTEST else None
     linear = np.ones((1, 1, 3), np.float32) if picture is None else srgb_to_linear(picture)
-    found = (linear * factor).astype(np.float32)
-    return (found if found.any() else None), note
+    found = (linear * np.minimum(factor, BRIGHTEST)).astype(np.float32)
+    return (found if found.any() else None), cut
 
 
 def with_opacity(color: Floats | None, factor: Floats, cutoff: float | None) -> Floats | None:
@@ -222,13 +88,6 @@ def with_opacity(color: Floats | None, factor: Floats, cutoff: float | None) -> 
     if color.ndim == 3 and not unseen.all():  # lest the colour of what is cut out bleeds over its edges
         plain = plain[tuple(distance_transform_edt(unseen, return_distances=False, return_indices=True))]
     return np.concatenate([plain, opacity], axis=-1)
-
-
-def _unless_white(color: Floats | None, material: Any, named: Named) -> Floats | None:
-    """Return a base colour, or None for the plain white of a textured material: that only leaves its texture alone."""
-    if color is not None and material.name in named and (color > 0.999).all():
-        return None
-    return color
 
 
 def unit(value: float | None) -> float | None:
