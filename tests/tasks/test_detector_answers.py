@@ -117,7 +117,7 @@ def test_one_class_is_all_zeros_and_still_no_score(form: str) -> None:
 def test_what_the_numbers_leave_open_is_asked_for() -> None:
     network = Shaped(rows, classes=(1, 0), scores=(1.0, 1.0))
     with pytest.raises(
-        InputError, match="which of a box's two numbers is its score does not show; say `task='detection={order: boxes"
+        InputError, match=r"which of a box's two numbers is its score does not show; say `task='detection="
     ):
         on(network)
     task, output = on(network, order="boxes scores labels")
