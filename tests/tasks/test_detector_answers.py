@@ -159,6 +159,7 @@ def three() -> Rows:
     ("answer", "text"),
     [
         (lambda b, s, c: (b, s, s), "expected for each box a score in"),
+        (lambda b, s, c: None, "expected boxes"),
         (lambda b, s, c: (b, c.long(), c.long()), "expected boxes"),
         (lambda b, s, c: {"boxes": b, "labels": c + 0.5, "scores": s}, "classes that are whole numbers"),
         (lambda b, s, c: torch.cat([b, s[..., None]], dim=-1), "expected boxes"),
