@@ -1260,6 +1260,10 @@ def _morphed(header: dict[str, Any]) -> None:
             ],
         ),
         (_elsewhere, [": 1 further scene: left out", ": 2 nodes with a mesh outside of its scene: left out"]),
+        (
+            lambda header: header["materials"][0].update(alphaMode="mask"),
+            [": 1 material with an alphaMode that glTF does not have: opaque"],
+        ),
         (_occluded, [": 1 occlusion map: left out"]),
         (_morphed, [": 1 mesh with morph targets, which are left out"]),
         (
