@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Literal
@@ -19,7 +20,7 @@ from advsearch.scene.importing.files import safe_name
 from advsearch.scene.importing.geometry import Soup, assemble, join, repaired
 from advsearch.scene.importing.parts import GLTF, ImportedPart, read_parts
 from advsearch.scene.importing.surfaces import ImportedSurface
-from advsearch.scene.importing.texture import textured
+from advsearch.scene.importing.texture import by_material, textured
 from advsearch.scene.importing.upright import guess_up
 
 Floats = npt.NDArray[np.float32]
@@ -94,7 +95,7 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     material, blends = _material(soup, surfaces)
     return ObjectAsset(
         name=name,
-        mesh=_mesh(soup, file),
+        mesh=_mesh(soup, surfaces, file),
         base_color=np.ascontiguousarray(maps.color[:, :, :3]),
         material=material,
         source=str(file),
@@ -106,9 +107,12 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     )
 
 
-def _mesh(soup: Soup, file: Path) -> Mesh:
+def _mesh(soup: Soup, surfaces: list[ImportedSurface], file: Path) -> Mesh:
+    names, number = by_material(soup, surfaces)
+    faces = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number, minlength=len(names)))[:-1])
+    materials = {name: group for name, group in zip(names, faces, strict=True) if name and len(group)}
     try:
-        return normalised(assemble(soup))
+        return replace(normalised(assemble(soup)), materials=materials)
     except InputError as error:  # which knows of no file
         raise InputError(f"{file}: {error}") from None
 

@@ -47,6 +47,7 @@ class ImportedSurface:
         normal_map: (H, W, 3) float32 of `advsearch.scene.importing.normal_maps`, row 0 on top; or None.
         emission: (H, W, 3) float32 linear radiance, row 0 on top; (1, 1, 3) where it is the same everywhere, None where
             there is none.
+        name: of the material in the file; empty where it has none.
     """
 
     color: Floats | None = None
@@ -55,6 +56,7 @@ class ImportedSurface:
     metallic: float | None = None
     normal_map: Floats | None = None
     emission: Floats | None = None
+    name: str = ""
 
     @property
     def pictures(self) -> tuple[Floats, ...]:
@@ -92,8 +94,15 @@ class SurfaceReader:
         """Return the surface of a parsed mesh's visual; an empty one where the file gives no material."""
         material = getattr(visual, "material", None)
         if id(material) not in self._known:
-            self._known[id(material)] = self._read(material)
+            self._known[id(material)] = replace(self._read(material), name=self._name(material))
         return self._known[id(material)]
+
+    def _name(self, material: Any) -> str:
+        name = getattr(material, "name", None)
+        if self.header is None:
+            return "" if name in (None, UNNAMED) else str(name)
+        entry = gltf.entry_of(self.header, name)
+        return "" if entry is None else entry.name or str(name)
 
     def _read(self, material: Any) -> ImportedSurface:
         from trimesh.visual.material import PBRMaterial, SimpleMaterial

@@ -23,8 +23,6 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
     lit = {} if varying else lighting(renderer).groups
     if renderer.scene.volumetric and not all(group.name in lit for group in searched):
         return "there is haze"
-    if renderer.scene.made[0].cut_out:
-        return "there are cut-outs"
     if renderer.formation.denoiser != "oidn":
         return "noise is part of the picture without the denoiser"
     for group in searched:
