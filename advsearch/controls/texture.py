@@ -166,7 +166,14 @@ class TextureControl(Control):
             object.__setattr__(self, "materials", list(dict.fromkeys(names)))
 
     def mesh_in(self, scene: SceneDescription) -> MeshPart:
-        return scene.meshes[OBJECT] if self._named_material(scene) else super().mesh_in(scene)
+        if self._named_material(scene):
+            return scene.meshes[OBJECT]
+        try:
+            return super().mesh_in(scene)
+        except UnknownNameError:
+            materials, hint = scene.object.mesh.materials, f"It stands in `controls` {self.name}."
+            kind = "mesh of the scene" + (" or material of the object" if materials else "")
+            raise UnknownNameError(kind, self.mesh, [*scene.meshes, *materials], hint) from None
 
     def materials_in(self, scene: SceneDescription) -> Sequence[str] | None:
         """Return the materials that it paints in a scene; None for all of the mesh."""

@@ -162,5 +162,6 @@ def _material(soup: Soup, surfaces: list[ImportedSurface]) -> tuple[Material, li
     )
     same = bool((values[area > 0] == values[area > 0][0]).all())
     roughness, metallic = values[area > 0][0] if same else (values * area[:, None]).sum(axis=0) / area.sum()
-    notes = [] if same else ["the roughness and metallic of its materials are replaced by their means"]
+    means = f"{roughness:.2g} and {metallic:.2g}"
+    notes = [] if same else [f"the roughness and metallic of its materials are replaced by their means ({means})"]
     return Material(roughness=float(roughness), metallic=float(metallic)), notes

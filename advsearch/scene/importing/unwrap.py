@@ -53,7 +53,9 @@ def unwrapped(soup: Soup, apart: Ints | None = None) -> Soup:
     for number, group in enumerate(groups):
         _, corners, uvs = atlas[number]
         result[group] = np.asarray(uvs, dtype=np.float64)[np.asarray(corners)]
-    return replace(soup, uvs=np.clip(result, 0.0, 1.0))
+    # lookups repeat at the border, where xatlas keeps nothing apart
+    margin = 0.5 * ATLAS_PADDING / ATLAS_SIZE
+    return replace(soup, uvs=margin + (1.0 - 2.0 * margin) * np.clip(result, 0.0, 1.0))
 
 
 def _side_by_side(count: int) -> Array:

@@ -10,6 +10,10 @@ from advsearch.scene.renderer import Renderer
 from advsearch.scene.transport.lights import BasisRenderer, Lights, fixed_lights, light_inputs, lighting
 from advsearch.scene.transport.renderer import SPP, LinearRenderer, PredictingRenderer, linear_inputs, passes
 
+HAZE = "there is haze"
+NOISE = "noise is part of the picture without the denoiser"
+"""Reasons that stand alone: without haze, or with the denoiser, pictures of the same space could be predicted."""
+
 
 def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
     """Why pictures of a renderer's space cannot be predicted, in words; None if they can.
@@ -21,10 +25,6 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
     plan, linear = renderer.plan, linear_inputs(renderer)
     searched = [group for group in plan.groups if group.control not in varying]
     lit = {} if varying else lighting(renderer).groups
-    if renderer.scene.volumetric and not all(group.name in lit for group in searched):
-        return "there is haze"
-    if renderer.formation.denoiser != "oidn":
-        return "noise is part of the picture without the denoiser"
     for group in searched:
         if "forced" in group.reason and group.estimator not in ("none", "image"):
             return f"the estimator of {group.name} is forced"
@@ -36,7 +36,9 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
             return f"{group.name} changes more than base colours{'' if varying else ' and light'}"
     if not any(renderer.routes.get(group.name) or lit.get(group.name) for group in searched):
         return "nothing that is searched needs a render to be differentiated"
-    return None
+    if renderer.scene.volumetric and not all(group.name in lit for group in searched):
+        return HAZE
+    return None if renderer.formation.denoiser == "oidn" else NOISE
 
 
 def predicting(
