@@ -193,8 +193,10 @@ class TextureControl(Control):
         longer = max(own.shape[:2])
         if self.resolution or names is None or longer < RESOLUTIONS[0]:
             own = resampled(own, int(self.resolution or min(max(longer, RESOLUTIONS[0]), RESOLUTIONS[1])))
-        where = None if names is None else self._texels_of(mesh, names, (own.shape[0], own.shape[1]))
-        return BoundTexture(self.name, mesh.name, own, where, self._painter(mesh.mesh, own, where))
+        if names is None:
+            return BoundTexture(self.name, mesh.name, own, self._painter(mesh.mesh, own, None))
+        where = self._texels_of(mesh, names, (own.shape[0], own.shape[1]))
+        return BoundTexture(self.name, mesh.name, own, self._painter(mesh.mesh, own, where), where, ", ".join(names))
 
     def _texels_of(self, part: MeshPart, names: Sequence[str], shape: tuple[int, int]) -> Mask:
         """Which texels (h, w) only lookups on some materials read."""
@@ -318,16 +320,20 @@ class BoundTexture(BoundControl):
         name: the instance's name.
         on: name of the mesh.
         original: (h, w, 3) float32 display-referred sRGB in [0, 1].
-        where: (h, w) bool, the texels that are painted; None for all.
-        painter: maps u to them.
+        painter: maps u to the texels that are painted.
+        where: (h, w) bool, which these are; None for all.
+        materials: whose they are, in words.
     """
 
-    def __init__(self, name: str, on: str, original: Tensor, where: Mask | None, painter: Painter) -> None:
+    def __init__(
+        self, name: str, on: str, original: Tensor, painter: Painter, where: Mask | None = None, materials: str = ""
+    ) -> None:
         self.name = name
         self._on = on
         self._original = original
         self._where = None if where is None else torch.from_numpy(where)
         self._painter = painter
+        self._materials = materials
         self.start = painter.start
         self.groups = (painter.group,)
 
@@ -343,7 +349,8 @@ class BoundTexture(BoundControl):
 
     def describe(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, Value]:
         change = self._painter.texels(u.detach()) - self._painter.texels(self.start.to(u.device))
-        return {
+        named: dict[str, Value] = {f"{self.name}.materials": {"value": self._materials, "unit": "name"}}
+        return (named if self._materials else {}) | {
             f"{self.name}.linf": {"value": float(change.abs().max()), "unit": "sRGB"},
             f"{self.name}.rms": {"value": float(change.pow(2).mean().sqrt()), "unit": "sRGB"},
         }

@@ -215,7 +215,8 @@ def test_the_ball_is_over_what_is_painted(scene: advsearch.Scene) -> None:
     assert len(space.start) == group.size < 0.05 * 3 * 512 * 512
     assert group.budget.epsilon == pytest.approx(0.1 * group.size**0.5)
     u = (space.start - 0.1).clamp(0.0, 1.0)
-    assert space.describe(u)["texture.rms"]["value"] == pytest.approx(0.1)
+    told = space.describe(u)
+    assert told["texture.rms"]["value"] == pytest.approx(0.1) and told["texture.materials"]["value"] == "plate"
 
 
 @pytest.mark.parametrize("name", ["texture:Body-Paint", "texture:roof"])
@@ -355,7 +356,7 @@ HAZY = {"density": 0.05, "red": 0.9, "green": 0.9, "blue": 0.9}
 @pytest.mark.parametrize(
     ("controls", "options", "told"),
     [
-        ({"texture": {}, "haze": HAZY}, {}, "than predicting it: there is haze; leave the haze out."),
+        ({"texture": {}, "haze": HAZY}, {}, "as predicting it: there is haze; leave the haze out."),
         ({"texture": {}}, {"denoise": "none"}, "without the denoiser; `denoise=oidn` takes the noise out"),
         ({"texture": {}, "pose": {}, "haze": HAZY}, {"denoise": "none"}, ""),
     ],
