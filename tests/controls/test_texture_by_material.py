@@ -350,7 +350,7 @@ def test_print_terms_count_what_is_painted() -> None:
     assert float(variation(torch.cat([colors, torch.ones(4, 5, 1)], dim=-1))) == float(variation(colors))
 
 
-HAZY = {"density": 0.05, "red": 0.9, "green": 0.9, "blue": 0.9}
+HAZY = {"density": [0.0, 0.05]}
 
 
 @pytest.mark.parametrize(

@@ -95,6 +95,8 @@ def by_material(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[list[s
 
 def _overlap(uvs: Array, material: Ints) -> bool:
     """Whether places of different materials (F,) lie at the same texture coordinates (F, 3, 2)."""
+    if material.min() == material.max():
+        return False
     side = BAKED_SIZE
     face, row, column, _ = pixels_in(uvs * side - 0.5, (side, side), tolerance=-1e-6)
     least, most = np.full(side * side, len(uvs)), np.full(side * side, -1)

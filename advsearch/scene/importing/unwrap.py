@@ -35,7 +35,7 @@ def unwrapped(soup: Soup, apart: Ints | None = None) -> Soup:
     """
     patch = _patches(soup)
     if apart is not None:
-        patch = np.unique(np.stack([patch, apart]), axis=1, return_inverse=True)[1].reshape(-1)
+        patch = np.unique(patch * (int(apart.max()) + 1) + apart, return_inverse=True)[1].reshape(-1)
     if int(patch.max()) >= _MOST_PATCHES:
         return replace(soup, uvs=_side_by_side(len(soup.faces)))
     groups = np.split(np.argsort(patch, kind="stable"), np.cumsum(np.bincount(patch))[:-1])

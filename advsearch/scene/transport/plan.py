@@ -28,7 +28,7 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
     for group in searched:
         if "forced" in group.reason and group.estimator not in ("none", "image"):
             return f"the estimator of {group.name} is forced"
-        if group.estimator == "image" or group.name in lit:
+        if group.estimator == "image" or group.name in lit or _of_haze(renderer, group.name):
             continue
         if renderer.routes.get(group.name, frozenset()) & light_inputs(renderer) and fixed_lights(renderer):
             return f"{group.name} changes light, and the scene has other lights of its own"
@@ -39,6 +39,13 @@ def why_not(renderer: Renderer, varying: Collection[str] = ()) -> str | None:
     if renderer.scene.volumetric and not all(group.name in lit for group in searched):
         return HAZE
     return None if renderer.formation.denoiser == "oidn" else NOISE
+
+
+def _of_haze(renderer: Renderer, group: str) -> bool:
+    """Whether a group of coordinates changes haze alone."""
+    hazes = tuple(f"{part.name}." for part in renderer.scene.made[0].parts if part.volumetric)
+    inputs = renderer.routes.get(group, frozenset())
+    return bool(inputs) and all(name.startswith(hazes) for name in inputs)
 
 
 def predicting(
