@@ -182,7 +182,7 @@ def test_the_texels_that_lookups_read_are_all_there(seed: int) -> None:
 def test_import_lists_materials_and_says_what_is_slow(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["import", str(file)]) == 0
     said = capsys.readouterr().out
-    assert "materials (--control 'texture={materials: [NAME]}'): Body Paint, glass, plate, roof, tyres\n" in said
+    assert "materials (--control 'texture={materials: [NAME]}'): Body Paint, roof, glass, tyres, plate\n" in said
     assert "slow: for what it lets light through, controls that move outlines" in said
     assert main(["import", str(file), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
