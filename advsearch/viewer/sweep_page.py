@@ -235,7 +235,9 @@ def _worst_text(summary: SweepSummary) -> str:
         return ""
     where = ", ".join(f"{name} {wording.number_text(one.value)}" for name, one in worst.values.items())
     told, rate = f"{where}: the model answers {worst.claimed.label}", worst.verified
-    return f"{told}; wrong in {rate.successes} of {rate.trials} fresh renders." if rate else f"{told}."
+    if rate is None:
+        return f"{told}."
+    return f"{told}; {wording.tally('wrong', rate.successes, rate.trials, rate.not_a_number)} fresh renders."
 
 
 def _figure(file: Path, caption: str, *, wide: bool = False) -> Html | None:
