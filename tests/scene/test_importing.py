@@ -685,7 +685,7 @@ def test_several_roughnesses_are_replaced_by_their_mean(tmp_path: Path) -> None:
         scene.add_geometry(box, transform=trimesh.transformations.translation_matrix([3.0 * k, 0.0, 0.0]))
     asset = import_object(exported(tmp_path, "boxes.glb", scene))
     assert asset.material.roughness == pytest.approx(0.2 * 0.2 + 0.8 * 0.7)
-    told = "the roughness and metallic of its materials are replaced by their means (0.6 and 0)"
+    told = "the roughness and metallic of its materials are replaced by their means (0.6 and 1)"
     assert asset.warnings == (f"boxes.glb: {told}",)
     assert asset.base_color == pytest.approx(np.broadcast_to([1.0, 0.0, 0.0], (8, 8, 3)))
 
