@@ -162,7 +162,10 @@ class TextureControl(Control):
         names = [self.materials] if isinstance(self.materials, str) else self.materials
         if names is not None:
             if not (isinstance(names, Sequence) and names and all(isinstance(one, str) for one in names)):
-                raise InputError(f"{self.name}.materials: expected names of materials, got {self.materials!r}")
+                raise InputError(
+                    f"{self.name}.materials: expected names of materials, got {self.materials!r}; put quotes around a "
+                    "name that reads as a number"
+                )
             object.__setattr__(self, "materials", list(dict.fromkeys(names)))
 
     def mesh_in(self, scene: SceneDescription) -> MeshPart:

@@ -147,6 +147,49 @@ def test_materials_of_one_colour_are_told_apart_too(tmp_path: Path) -> None:
     assert [texels_of_faces(mesh, faces, (256, 256))[1] for faces in mesh.materials.values()] == [1.0, 1.0]
 
 
+def two_quads(folder: Path, ending: str) -> Path:
+    """Two quads of two materials: OBJ without its .mtl file, PLY with two textures, glTF with one name."""
+    file, corners = folder / f"two{ending}", [(x, y, z) for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    if ending == ".obj":
+        lines = [f"v {x} {y} {z}" for x, y, z in corners]
+        file.write_text("\n".join([*lines, "usemtl one", "f 1 2 3 4", "usemtl other # back", "f 5 6 7 8"]) + "\n")
+    elif ending == ".ply":
+        Image.new("RGB", (4, 4), (255, 0, 0)).save(folder / "one.png")
+        Image.new("RGB", (4, 4), (0, 0, 255)).save(folder / "other.png")
+        head = ["ply", "format ascii 1.0", "comment TextureFile one.png", "comment TextureFile other.png"]
+        head += ["element vertex 8", *(f"property float {axis}" for axis in "xyz"), "element face 2"]
+        head += [
+            "property list uchar int vertex_indices",
+            "property list uchar float texcoord",
+            "property int texnumber",
+        ]
+        faces = [f"4 {4 * n} {4 * n + 1} {4 * n + 2} {4 * n + 3} 8 0 0 1 0 1 1 0 1 {n}" for n in (0, 1)]
+        file.write_text("\n".join([*head, "end_header", *(f"{x} {y} {z}" for x, y, z in corners), *faces]) + "\n")
+    else:
+        scene = trimesh.Scene()
+        for number, name in enumerate(("one", None)):
+            mesh = trimesh.Trimesh(corners[4 * number : 4 * number + 4], [[0, 1, 2], [0, 2, 3]], process=False)
+            material = PBRMaterial(name=name, baseColorFactor=[1.0, 0.5 * number, 0.0, 1.0])
+            mesh.visual = TextureVisuals(uv=np.zeros((4, 2)), material=material)
+            scene.add_geometry(mesh)
+        scene.export(file)
+    return file
+
+
+@pytest.mark.parametrize(
+    ("ending", "names"), [(".obj", {"one", "other"}), (".ply", {"one.png", "other.png"}), (".glb", {"one", None})]
+)
+def test_names_are_those_of_the_file(ending: str, names: set[str], tmp_path: Path) -> None:
+    """In PLY those of textures; a material of glTF without a name has its number for one."""
+    found = import_object(two_quads(tmp_path, ending)).mesh.materials
+    assert [len(faces) for faces in found.values()] == [2, 2]
+    if None in names:
+        unnamed = set(found) - {"one"}
+        assert len(unnamed) == 1 and unnamed.pop().startswith("material")
+    else:
+        assert set(found) == names
+
+
 def test_a_baked_texture_says_how_much_finer_its_pictures_were(tmp_path: Path) -> None:
     names, size = ("a", "b", "c", "d"), 1024
     Image.new("RGB", (size, size), (10, 20, 30)).save(tmp_path / "p.png")
