@@ -132,7 +132,8 @@ class BoundControl(ABC):
 
     def printed(self, u: Tensor) -> Tensor | None:
         """Return the searched colours that a printer would print, (h, w, 3) display-referred sRGB in [0, 1], as a
-        differentiable function of u; None without."""
+        differentiable function of u; where only some are searched (h, w, 4), with 1 for these and 0 for others; None
+        without."""
         return None
 
     def files(self, u: Tensor, so_far: Mapping[str, Tensor] = NOTHING) -> dict[str, bytes]:

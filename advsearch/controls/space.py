@@ -158,5 +158,6 @@ def _with_inputs(control: BoundControl, u: Tensor, so_far: Mapping[str, Tensor])
     own = control.inputs(u, so_far)
     for name in own:
         if name in so_far and name not in control.refines:
-            raise InputError(f"controls: two controls set {name}; leave one of them out")
+            hint = "; one `texture` takes several materials" if name.endswith(".base_color") else ""
+            raise InputError(f"controls: two controls set {name}; leave one of them out{hint}")
     return {**so_far, **own}

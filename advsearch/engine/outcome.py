@@ -23,6 +23,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.rows import control_group, lost_remarks, mean_number, verified_rate
 from advsearch.engine.searches import UNPRINTED
+from advsearch.engine.transport import remark
 from advsearch.errors import InputError
 from advsearch.report.drawing import new_axes
 from advsearch.report.notebook import attack_html, side_by_side
@@ -457,7 +458,7 @@ def _verified(verification: Verification | None) -> VerifiedRate | None:
 
 def _remarks(findings: Findings, problem: Problem, recorder: Recorder) -> list[str]:
     """What a reader has to know beside the numbers."""
-    remarks = []
+    remarks = [told] if (told := remark(findings.rendered_because)) else []
     count = findings.sample_count
     if count is not None and count.table and not count.converged:
         remarks.append(

@@ -25,12 +25,14 @@ class Mesh:
         faces: (F, 3) uint32 vertex indices, counter-clockwise seen from outside.
         normals: (V, 3) float32 unit shading normals, pointing outwards.
         uvs: (V, 2) float32 in [0, 1]; v = 0 is the BOTTOM row of the texture image (the OBJ convention).
+        materials: the faces (N,) int64 of each material that its file names, by that name; each face is in one at most.
     """
 
     vertices: Floats
     faces: npt.NDArray[np.uint32]
     normals: Floats
     uvs: Floats
+    materials: Mapping[str, npt.NDArray[np.int64]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         count = len(self.vertices)
