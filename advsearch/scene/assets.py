@@ -24,13 +24,17 @@ class Mesh:
         vertices: (V, 3) float32 positions, z up, in the author's units.
         faces: (F, 3) uint32 vertex indices, counter-clockwise seen from outside.
         normals: (V, 3) float32 unit shading normals, pointing outwards.
-        uvs: (V, 2) float32 in [0, 1]; v = 0 is the BOTTOM row of the texture image (the OBJ convention).
+        uvs: (V, 2) float32; v = 0 is the BOTTOM row of the texture image (the OBJ convention). In [0, 1], but for
+            meshes of Mitsuba scenes, whose textures may go on beyond their edges.
+        attributes: of meshes of Mitsuba scenes, further numbers, (V, n) or (F, n) float32, by Mitsuba's names, which
+            begin with "vertex_" or "face_".
     """
 
     vertices: Floats
     faces: npt.NDArray[np.uint32]
     normals: Floats
     uvs: Floats
+    attributes: Mapping[str, Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         count = len(self.vertices)

@@ -20,7 +20,7 @@ from advsearch.scene.assets import Floats, Material, Mesh, ObjectAsset
 Doubles = npt.NDArray[np.float64]
 Triple = tuple[float, float, float]
 BASE_COLOR = "base color"
-"""Stands for the texture in a surface in Mitsuba's words."""
+"""The type that stands for the texture in a surface in Mitsuba's words."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,7 +79,7 @@ def test_the_object_stands_and_the_rest_is_kept(box: Path) -> None:
     assert isinstance(floor, PluginPart)
     matrix = np.asarray(floor.plugin["to_world"])
     np.testing.assert_allclose((matrix @ (0, 0, 0, 1))[2], 0.0, atol=1e-6)  # the box stands on the floor
-    assert found.object.surface == {"type": "diffuse", "reflectance": "base color"}
+    assert found.object.surface == {"type": "diffuse", "reflectance": {"type": "base color"}}
 
 
 @pytest.mark.parametrize("typed", ["large-box", "LargeBox", "large_box"])

@@ -118,7 +118,7 @@ class MitsubaScene:
         self._integrators: dict[tuple[str, int], Any] = {}
         parts = [one for part in translated for one in part.inputs]
         declared = [*camera_inputs(resolution), ENVIRONMENT_INPUT, GROUND_INPUT, *parts]
-        self.declared = {one.name: (key, one) for one in declared if (key := key_of(self.parameters, one.key))}
+        self.declared = {one.name: (key, one) for one in declared if (key := key_of(self.parameters, one))}
         self.names = frozenset(self.declared)
         self.interior = frozenset(name for name, (_, one) in self.declared.items() if one.interior)
         self._shapes = frozenset(

@@ -15,11 +15,16 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import InputError, UnknownNameError
+from advsearch.scene.assets import Floats, Mesh, ObjectAsset, UpAxis, normalised
 from advsearch.scene.importing.files import safe_name
-from advsearch.scene.importing.objects import object_of
+from advsearch.scene.importing.geometry import assemble, join
+from advsearch.scene.importing.parts import ImportedPart
 from advsearch.scene.importing.scenes import TAKEN, ImportedScene, clean
+from advsearch.scene.importing.surfaces import ImportedSurface
+from advsearch.scene.importing.texture import textured
 from advsearch.scene.mitsuba_backend.files.haze import haze_in
-from advsearch.scene.mitsuba_backend.files.shapes import MESHES, mesh_of, surface_of
+from advsearch.scene.mitsuba_backend.files.shapes import MESHES, ShapeMesh, mesh_of
+from advsearch.scene.mitsuba_backend.files.surfaces import ShapeSurface, surface_of
 from advsearch.scene.mitsuba_backend.files.trusted import trusted
 from advsearch.scene.mitsuba_backend.files.xml import read_scene
 from advsearch.scene.mitsuba_backend.plugins import plain
@@ -161,19 +166,21 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     if len(named) > MOST_PARTS:
         raise InputError(f"{where}: expected at most {MOST_PARTS} plugins at the top, got {len(named)}; join meshes")
     shape = named[wanted]
-    bsdf = _bsdf(shape, named)
-    color, surface = surface_of(bsdf)
-    frame = _Frame(shape, wanted, z_up=_is_z_up(named))
+    surface, found = surface_of(_bsdf(shape, named)), mesh_of(shape, wanted)
+    frame = _Frame(found.mesh, wanted, z_up=_is_z_up(named))
     haze, used = haze_in(named, frame.matrix) or (None, frozenset[str]())
-    notes = [f"{where}: {one}" for one in _left_out(tree, shape, hazy=haze is not None)]
-    part = replace(mesh_of(shape, wanted, painted=color.texture is not None), surface=color)
-    turned = replace(
-        part,
-        vertices=part.vertices @ frame.turn.T,
-        normals=None if part.normals is None else part.normals @ frame.turn.T,
-    )
+    notes = [f"{where}: {one}" for one in (*_left_out(tree, shape, hazy=haze is not None), *surface.notes)]
     source = scene if isinstance(scene, Path) else Path("scene.xml")
-    made = object_of([turned], notes, source, f"{safe_name(source)}-{clean(wanted)}", "z")
+    mesh, base_color = _painted(frame.turned(found), surface, str(shape["type"]), where)
+    made = ObjectAsset(
+        name=f"{safe_name(source)}-{clean(wanted)}",
+        mesh=normalised(mesh),
+        base_color=base_color,
+        source=str(source),
+        warnings=tuple(notes),
+        up=UpAxis("z"),
+        surface=surface.plugin,
+    )
     around: list[ScenePart] = [] if haze is None else [haze]
     cameras: dict[str, PlacedCamera] = {}
     for name, one in named.items():
@@ -187,7 +194,26 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
         kept = _renamed(frame.moved(one))
         holds = MediumPart if any(inner.get("type") in MEDIA for inner in _all(kept)) else PluginPart
         around.append(holds(free, kept, _shines(kept)))
-    return ImportedScene(replace(made, surface=surface), tuple(around), cameras)
+    return ImportedScene(made, tuple(around), cameras)
+
+
+def _painted(found: ShapeMesh, surface: ShapeSurface, kind: str, where: str) -> tuple[Mesh, Floats]:
+    """Return a shape's mesh with texture coordinates for its base colour, and that.
+
+    Where anything is looked up by the mesh's own, or by its attributes, they stay. A shape of one colour gets new ones
+    where its own do not tell its places apart, as on a cube.
+    """
+    mesh = found.mesh
+    if surface.picture or surface.bound:
+        down = mesh.uvs * (1.0, -1.0) + (0.0, 1.0)
+        down = down @ surface.to_uv[:2, :2].T + surface.to_uv[:2, 2]
+        return replace(mesh, uvs=(down * (1.0, -1.0) + (0.0, 1.0)).astype(np.float32)), surface.base_color
+    own = found.uv and kind not in ("cube", "sphere", "cylinder", "disk")
+    vertices, normals, uvs = (one.astype(np.float64) for one in (mesh.vertices, mesh.normals, mesh.uvs))
+    color = ImportedSurface(color=surface.base_color[0, 0])
+    part = ImportedPart(vertices, mesh.faces.astype(np.int64), normals, uvs if own else None, None, color)
+    soup, maps, _ = textured(join([part], where, y_up=False), [color])
+    return assemble(soup), maps.color
 
 
 def _plugins(tree: Mapping[str, object]) -> Iterator[tuple[str, Mapping[str, object]]]:
@@ -261,10 +287,9 @@ def _is_z_up(named: Mapping[str, Mapping[str, object]]) -> bool:
 class _Frame:
     """From the scene's coordinates to the object's: z up, standing on z = 0, a largest extent of 1."""
 
-    def __init__(self, shape: Mapping[str, object], name: str, *, z_up: bool) -> None:
+    def __init__(self, mesh: Mesh, name: str, *, z_up: bool) -> None:
         turn = np.eye(4) if z_up else Y_TO_Z
-        part = mesh_of(shape, name)
-        places = part.vertices[part.faces].reshape(-1, 3) @ turn[:3, :3].T
+        places = mesh.vertices.astype(np.float64) @ turn[:3, :3].T
         low, high = places.min(axis=0), places.max(axis=0)
         self.turn = turn[:3, :3]
         self.size = float((high - low).max())
@@ -273,6 +298,12 @@ class _Frame:
         move = np.eye(4)
         move[:3, 3] = (-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2])
         self.matrix = np.diag([1.0 / self.size] * 3 + [1.0]) @ move @ turn
+
+    def turned(self, found: ShapeMesh) -> ShapeMesh:
+        """Return a mesh with z up."""
+        turn = self.turn.astype(np.float32)
+        mesh = replace(found.mesh, vertices=found.mesh.vertices @ turn.T, normals=found.mesh.normals @ turn.T)
+        return replace(found, mesh=mesh)
 
     def moved(self, plugin: Mapping[str, object]) -> Plugin:
         """Return a plugin at the top of a scene in its place."""
