@@ -15,6 +15,9 @@ from advsearch.errors import InputError
 
 Floats = npt.NDArray[np.float32]
 
+SLACK = 1e-3
+"""How far texture coordinates of a texture that does not repeat may lie beyond its edges."""
+
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
@@ -35,6 +38,11 @@ class Mesh:
     normals: Floats
     uvs: Floats
     attributes: Mapping[str, Floats] = field(default_factory=dict)
+
+    @property
+    def repeats(self) -> bool:
+        """Whether its texture coordinates leave [0, 1], where a texture goes on beyond its edges."""
+        return not (self.uvs.min() >= -SLACK and self.uvs.max() <= 1.0 + SLACK)
 
     def __post_init__(self) -> None:
         count = len(self.vertices)

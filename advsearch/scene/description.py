@@ -20,7 +20,7 @@ from advsearch.scene import environments, library, settings
 from advsearch.scene.assets import EnvironmentAsset, Material, ObjectAsset
 from advsearch.scene.importing.objects import import_object
 from advsearch.scene.importing.scenes import MITSUBA_FILE, ImportedScene, import_scene, split_node
-from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part
+from advsearch.scene.parts import Lamp, MeshPart, PlacedCamera, PluginPart, ScenePart, mesh_part, plugins_in
 from advsearch.scene.photograph import Photograph, photograph_of
 
 Doubles = npt.NDArray[np.float64]
@@ -131,12 +131,18 @@ class SceneDescription:
     @property
     def cut_out(self) -> bool:
         """Whether a mesh has cut-outs."""
-        return any(one.opacity is not None for one in self.meshes.values())
+        return any(one.opacity is not None for one in self.meshes.values()) or self._has("mask")
 
     @property
     def normal_mapped(self) -> bool:
         """Whether a mesh has a normal map."""
-        return any(one.normal_map is not None for one in self.meshes.values())
+        return any(one.normal_map is not None for one in self.meshes.values()) or self._has("normalmap", "bumpmap")
+
+    def _has(self, *kinds: str) -> bool:
+        """Whether a surface in Mitsuba's words has a plugin of these."""
+        surfaces = [one.surface for one in self.meshes.values() if one.surface is not None]
+        plugins = [part.plugin for part in self.parts if isinstance(part, PluginPart)]
+        return any(one.get("type") in kinds for plugin in (*surfaces, *plugins) for one in plugins_in(plugin))
 
     @property
     def emits(self) -> bool:

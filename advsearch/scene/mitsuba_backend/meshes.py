@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor
 
 from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.color import srgb_to_linear
@@ -113,6 +115,26 @@ def base_texture(base_color: Floats, options: Mapping[str, object]) -> Plugin:
     """A base colour (h, w, 3), display-referred, as a texture of linear reflectance that is looked up as `options`
     say."""
     return {**_texture(srgb_to_linear(base_color)), **loadable(options)}
+
+
+def repeating(uv: Tensor, options: Mapping[str, object], size: tuple[int, int]) -> Tensor:
+    """Return where a texture that repeats and is interpolated shows what one with these options does.
+
+    Args:
+        uv: (n, 2) float32 texture coordinates, as Mitsuba has them.
+        options: as of `base_texture`.
+        size: height and width of the texture in texels.
+    """
+    if "to_uv" in options:
+        matrix = torch.as_tensor(np.asarray(options["to_uv"]), dtype=uv.dtype)
+        uv = uv @ matrix[:2, :2].T + matrix[:2, -1]
+    texels = torch.tensor((size[1], size[0]), dtype=uv.dtype)
+    wrap = options.get("wrap_mode", "repeat")
+    if wrap == "mirror":
+        uv = 1.0 - (uv % 2.0 - 1.0).abs()
+    if wrap != "repeat":
+        uv = torch.minimum(torch.maximum(uv, 0.5 / texels), 1.0 - 0.5 / texels)
+    return (torch.floor(uv * texels) + 0.5) / texels if options.get("filter_type") == "nearest" else uv
 
 
 def mitsuba_mesh(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -21,13 +22,14 @@ from advsearch.scene.leaving_out import EVERYTHING
 from advsearch.scene.mitsuba_backend.dictionary import GROUND_INPUT, camera_inputs, scene_dict
 from advsearch.scene.mitsuba_backend.first_hit import first_hits
 from advsearch.scene.mitsuba_backend.inputs import SceneInput, as_is, as_torch, contiguous, key_of, plain_number
-from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, sampling_weights, textured_emission
+from advsearch.scene.mitsuba_backend.meshes import NORMALS, POSITIONS, repeating, sampling_weights, textured_emission
 from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, leave_dark_lamps_out, mesh_translation, translation
 from advsearch.scene.mitsuba_backend.population import media_in, population
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER, next_count
 from advsearch.scene.mitsuba_backend.transport import Paths, collect
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
-from advsearch.scene.parts import PluginPart
+from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
+from advsearch.scene.parts import PluginPart, plugins_in
 from advsearch.scene.surfaces import Surfaces
 
 MAX_DEPTH = 6
@@ -305,7 +307,13 @@ class MitsubaScene:
         noise = mi.load_dict({"type": self.sampler, "sample_count": spp})
         noise.set_samples_per_wavefront(spp)
         noise.seed(dr.opaque(mi.UInt32, seed), self.resolution[0] * self.resolution[1] * spp)
-        return collect(self._scene, self.parameters, key, noise, self.resolution, depth=self._depth, spp=spp)
+        found = collect(self._scene, self.parameters, key, noise, self.resolution, depth=self._depth, spp=spp)
+        surface = self.made[0].meshes[name.partition(".")[0]].surface
+        if surface is None:
+            return found
+        options = next(one for one in plugins_in(surface) if one["type"] == BASE_COLOR_PLACE)
+        size = tuple(self.parameters[key].shape[:2])
+        return replace(found, vertices=[replace(one, uv=repeating(one.uv, options, size)) for one in found.vertices])
 
     # ---- inside -----------------------------------------------------------------------------------------------------
 
@@ -323,6 +331,11 @@ class MitsubaScene:
         mi = mitsuba()
 
         unknown = [name for name in inputs if name not in self.declared]
+        if any(name.endswith(".base_color") for name in unknown):
+            raise InputError(
+                f"{unknown[0]}: the surface is one of Mitsuba's own without a base colour that can be searched; leave "
+                "out what changes it, such as texture, material or patch, or search mitsuba:KEY=[low, high]"
+            )
         if unknown:
             raise InputError(f"the scene has no input {', '.join(unknown)}; it has {', '.join(sorted(self.declared))}")
         if self._every:

@@ -29,7 +29,7 @@ from advsearch.scene.mitsuba_backend.files.trusted import trusted
 from advsearch.scene.mitsuba_backend.files.xml import read_scene
 from advsearch.scene.mitsuba_backend.plugins import plain
 from advsearch.scene.mitsuba_backend.variant import Plugin
-from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart
+from advsearch.scene.parts import MediumPart, PlacedCamera, PluginPart, ScenePart, plugins_in
 
 Doubles = npt.NDArray[np.float64]
 
@@ -126,7 +126,7 @@ def _free(name: str) -> str:
 
 
 def _shines(plugin: Mapping[str, object]) -> bool:
-    return any(inner.get("type") in LIGHTS for inner in _all(plugin))
+    return any(inner.get("type") in LIGHTS for inner in plugins_in(plugin))
 
 
 def _meant(wanted: str, ids: Sequence[str]) -> str:
@@ -192,7 +192,7 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
                 cameras[free] = _camera(one, frame)
             continue
         kept = _renamed(frame.moved(one))
-        holds = MediumPart if any(inner.get("type") in MEDIA for inner in _all(kept)) else PluginPart
+        holds = MediumPart if any(inner.get("type") in MEDIA for inner in plugins_in(kept)) else PluginPart
         around.append(holds(free, kept, _shines(kept)))
     return ImportedScene(made, tuple(around), cameras)
 
@@ -219,14 +219,6 @@ def _painted(found: ShapeMesh, surface: ShapeSurface, kind: str, where: str) -> 
 def _plugins(tree: Mapping[str, object]) -> Iterator[tuple[str, Mapping[str, object]]]:
     """The plugins at the top of a scene, by name."""
     return ((name, one) for name, one in tree.items() if isinstance(one, Mapping) and "type" in one)
-
-
-def _all(plugin: Mapping[str, object]) -> Iterator[Mapping[str, object]]:
-    """A plugin and all within it."""
-    yield plugin
-    for inner in plugin.values():
-        if isinstance(inner, Mapping):
-            yield from _all(inner)
 
 
 def _renamed(plugin: Mapping[str, object]) -> Plugin:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from advsearch.scene.assets import Floats
 from advsearch.scene.color import linear_to_srgb
 from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
-from advsearch.scene.parts import BASE_COLOR
+from advsearch.scene.parts import BASE_COLOR, plugins_in
 
 Doubles = npt.NDArray[np.float64]
 
@@ -93,7 +93,7 @@ def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
     if not (color.linear.min() >= 0.0 and color.linear.max() <= 1.0 + 1e-4):
         notes.append("its base colour is cut to reflectances from 0 to 1")
     picture = color.linear.shape[:2] != (PLAIN_SIZE, PLAIN_SIZE) or bool(np.ptp(color.linear, axis=(0, 1)).any())
-    bound = any(one["type"] in BOUND or ANISOTROPIC & set(one) for one in _all(surface))
+    bound = any(one["type"] in BOUND or ANISOTROPIC & set(one) for one in plugins_in(surface))
     to_uv = np.eye(3) if color.to_uv is None else uv_matrix(color.to_uv)
     if not _folds(surface, to_uv):
         surface, to_uv = _with_transform(surface, to_uv, BASE_COLOR), np.eye(3)
@@ -103,18 +103,10 @@ def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
     return ShapeSurface(surface, base_color, picture, to_uv, bound, tuple(notes))
 
 
-def _all(plugin: Mapping[str, object]) -> Iterator[Mapping[str, object]]:
-    """A plugin and all within it."""
-    yield plugin
-    for inner in plugin.values():
-        if isinstance(inner, Mapping):
-            yield from _all(inner)
-
-
 def _unusual(surface: Mapping[str, object]) -> Iterator[str]:
     """Clauses about textures that controls do not reach."""
-    if not any(one["type"] == BASE_COLOR for one in _all(surface)):
-        kinds = sorted({str(one["type"]) for one in _all(surface)} & {"mesh_attribute", "volume"})
+    if not any(one["type"] == BASE_COLOR for one in plugins_in(surface)):
+        kinds = sorted({str(one["type"]) for one in plugins_in(surface)} & {"mesh_attribute", "volume"})
         why = f"its colour is a {kinds[0]}" if kinds else f"a {surface['type']} has none"
         yield f"it has no base colour that can be searched ({why}): not for texture, patch and material"
 
@@ -123,7 +115,7 @@ def _folds(surface: Mapping[str, object], to_uv: Doubles) -> bool:
     """Whether the mesh's texture coordinates can be transformed: it can be undone, and the tangents along u stay."""
     if not abs(np.linalg.det(to_uv)) > 1e-12:
         return False
-    tangents = any(one["type"] in ("normalmap", "hair") or ANISOTROPIC & set(one) for one in _all(surface))
+    tangents = any(one["type"] in ("normalmap", "hair") or ANISOTROPIC & set(one) for one in plugins_in(surface))
     return not tangents or (to_uv[1, 0] == 0.0 and to_uv[0, 0] > 0.0)
 
 
