@@ -65,18 +65,24 @@ DIAGONAL = math.hypot(36.0, 24.0)
 """Of the film of which Mitsuba's `focal_length` speaks, millimetres."""
 
 
-def read_tree(scene: Path | Mapping[str, object]) -> Plugin:
-    """Return a scene file's dictionary, or a caller's own, with arrays for transforms.
+def read_tree(scene: Path | Mapping[str, object]) -> tuple[Plugin, list[str]]:
+    """Return a scene file's dictionary, or a caller's own, with arrays for transforms; and warnings about its pictures.
 
     Raises:
         FileFormatError: as for `read_scene` and `trusted`.
         InputError: no scene.
     """
+    notes: list[str] = []
     if isinstance(scene, Path):
-        return trusted(scene, read_scene(scene))
+        return trusted(scene, read_scene(scene), notes), notes
     if scene.get("type") != "scene":
         raise InputError(f"scene: expected a dictionary of type 'scene', got {scene.get('type')!r}")
-    return plain(scene)
+    notes += [
+        f"scene: {name} is left out: expected a plugin's dictionary, got {type(one).__name__}"
+        for name, one in scene.items()
+        if name != "type" and not isinstance(one, Mapping)
+    ]
+    return plain(scene), notes
 
 
 def shape_ids(tree: Mapping[str, object]) -> list[str]:
@@ -107,7 +113,7 @@ def contents(path: Path) -> PluginContents:
     Raises:
         FileFormatError: as for `read_tree`.
     """
-    named = dict(_plugins(read_tree(path)))
+    named = dict(_plugins(read_tree(path)[0]))
     kinds = {name: str(one["type"]) for name, one in named.items()}
     objects = tuple(name for name, kind in kinds.items() if kind in MESHES and named[name].get("bsdf") != NOTHING)
     cameras = tuple(name for name, kind in kinds.items() if kind in CAMERAS)
@@ -156,7 +162,7 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
         FileFormatError: as for `read_tree`.
         InputError: the shape is no mesh and cannot be made one, or the scene is too large.
     """
-    tree = read_tree(scene)
+    tree, notes = read_tree(scene)
     where = scene.name if isinstance(scene, Path) else "scene"
     ids = shape_ids(tree)
     wanted = _meant(wanted, ids)
@@ -169,7 +175,7 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     surface, found = surface_of(_bsdf(shape, named)), mesh_of(shape, wanted)
     frame = _Frame(found.mesh, wanted, z_up=_is_z_up(named))
     haze, used = haze_in(named, frame.matrix) or (None, frozenset[str]())
-    notes = [f"{where}: {one}" for one in (*_left_out(tree, shape, hazy=haze is not None), *surface.notes)]
+    notes += [f"{where}: {one}" for one in (*_left_out(tree, shape, hazy=haze is not None), *surface.notes)]
     source = scene if isinstance(scene, Path) else Path("scene.xml")
     mesh, base_color = _painted(frame.turned(found), surface, str(shape["type"]), where)
     made = ObjectAsset(
@@ -232,7 +238,13 @@ def _renamed(plugin: Mapping[str, object]) -> Plugin:
 def _bsdf(shape: Mapping[str, object], named: Mapping[str, Mapping[str, object]]) -> Mapping[str, object]:
     """The surface of a shape with what it refers to in its place; Mitsuba's default where it has none."""
 
+    count = 0
+
     def whole(plugin: Mapping[str, object], depth: int) -> Mapping[str, object]:
+        nonlocal count
+        count += 1
+        if count > MOST_PARTS:
+            raise InputError(f"object: expected a surface of at most {MOST_PARTS} plugins, got more; make it simpler")
         if plugin["type"] == "ref":
             name = str(plugin["id"])
             if name not in named or depth > len(named):
