@@ -34,6 +34,8 @@ FRAME_FILL = 0.86
 """Share of the picture's half-width that the object's outline may reach when the distance is worked out."""
 ORBIT_CAMERA = "orbit"
 """The camera that the settings `camera.*` describe: on a sphere around the object, looking at it."""
+ENVIRONMENTS = ("constant", "envmap", "sunsky", "timed_sunsky")
+"""Mitsuba's lights from everywhere, of which a scene can have one."""
 NO_MAP = "none"
 """What the environment of a scene without a map is called."""
 TABLE_SETTINGS = ("ground.size", *(f"ground.{channel}" for channel in settings.CHANNELS))
@@ -188,6 +190,7 @@ class SceneDescription:
             InputError: the scene has none.
         """
         if self.environment is None:
+            check_one_environment(self.parts, who)
             raise InputError(f"{who}: the scene has no environment map; give it one, or leave {who} out")
         return self.environment
 
@@ -285,6 +288,8 @@ def describe(
     shining = (isinstance(part, Lamp) or (isinstance(part, PluginPart) and part.shines) for part in around.surroundings)
     lit_by = environment_spec or (NO_MAP if any(shining) else DEFAULT_ENVIRONMENT)
     check_ground(given or {}, lit_by)
+    if lit_by != NO_MAP:
+        check_one_environment(around.surroundings, f"`environment={_spec(lit_by)}`")
     if (node is not None or mitsuba) and not {"ground.size", "ground.kind"} & set(given or {}):
         values = {**values, "ground.size": 0.0}
     asked = () if environment_spec is None else (ENVIRONMENT,)
@@ -316,6 +321,24 @@ def check_meshes(scene: SceneDescription, names: Iterable[str]) -> None:
         mesh = settings.mesh_of(name)
         if mesh is not None and mesh not in scene.around:
             raise UnknownNameError("mesh around the object", mesh, scene.around, f"It stands in `set` {name}.")
+
+
+def check_one_environment(parts: Iterable[ScenePart], who: str) -> None:
+    """Refuse an environment, or what needs one that is a map of ours, beside one that a Mitsuba scene has of its own.
+
+    Args:
+        parts: of the scene.
+        who: asks for it, as it is written.
+
+    Raises:
+        InputError: there are two.
+    """
+    own = [one for one in parts if isinstance(one, PluginPart) and one.plugin.get("type") in ENVIRONMENTS]
+    if own:
+        raise InputError(
+            f"{who}: the Mitsuba scene has an environment of its own, {own[0].name} (a {own[0].plugin['type']}), and "
+            f"there can be one only; leave {who} out, or take {own[0].name} out of the scene"
+        )
 
 
 def check_ground(given: settings.Given, lit_by: str | Path | EnvironmentAsset) -> None:
