@@ -64,6 +64,7 @@ class SceneDescription:
         cameras: those with poses of their own, by name.
         camera: name of the one in use; `ORBIT_CAMERA` for that of the settings.
         metered: exposure is metered; otherwise a radiance of 1 is the white of the picture, as Mitsuba shows it.
+        remarks: what a user should know of further files that controls have read.
     """
 
     object: ObjectAsset
@@ -80,6 +81,7 @@ class SceneDescription:
     cameras: Mapping[str, PlacedCamera] = field(default_factory=dict)
     camera: str = ORBIT_CAMERA
     metered: bool = True
+    remarks: tuple[str, ...] = ()
 
     def with_part(self, part: ScenePart) -> SceneDescription:
         """Return the scene with one more part.
@@ -174,8 +176,9 @@ class SceneDescription:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a user should know of how object and environment were read."""
-        return (*self.object.notes, *(() if self.environment is None else self.environment.warnings))
+        """What a user should know of how object and environment were read, and what controls name."""
+        lit = () if self.environment is None else self.environment.warnings
+        return tuple(dict.fromkeys((*self.object.notes, *lit, *self.remarks)))
 
     @property
     def bundled_environment(self) -> str | None:
@@ -386,7 +389,7 @@ def _spec(spec: str | Path | ObjectAsset | EnvironmentAsset) -> str:
 def _object(spec: str | Path | ObjectAsset, up: str | None) -> ObjectAsset:
     if isinstance(spec, ObjectAsset):
         return spec
-    if _is_path(spec):
+    if is_path(spec):
         return import_object(Path(spec), up="y" if up == "y" else "z" if up == "z" else None)
     if up is not None:
         raise InputError(
@@ -400,11 +403,11 @@ def _environment(spec: str | Path | EnvironmentAsset) -> EnvironmentAsset | None
         return spec
     if spec == NO_MAP:
         return None
-    if _is_path(spec):
+    if is_path(spec):
         return environments.import_environment(Path(spec))
     return library.load_environment(str(spec))
 
 
-def _is_path(spec: str | Path) -> bool:
+def is_path(spec: str | Path) -> bool:
     """A spec with a folder or a file ending is a path; a bare word is a bundled name."""
     return isinstance(spec, Path) or "/" in spec or "\\" in spec or Path(spec).suffix != ""
