@@ -111,8 +111,8 @@ class EnvironmentControl(NumberControl):
             if found and scene.photograph is None and not lit.photographed and scene.number("ground.size") > 0.0:
                 names = ", ".join(one.name for one in found.values())
                 notes.append(
-                    f"{names}: the object stands on the scene's table there, too; `set` ground.kind=photograph shows "
-                    "the floor of each picture instead"
+                    f"{names}: the object stands on the scene's table there, too; ground.kind=photograph shows the "
+                    "floor of each picture instead"
                 )
         else:
             name = str(allowed[0])

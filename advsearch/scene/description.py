@@ -289,7 +289,8 @@ def describe(
     else:
         around = ImportedScene(_object(object_spec, up)) if node is None else _scene(Path(str(file)), node, up)
     shining = (isinstance(part, Lamp) or (isinstance(part, PluginPart) and part.shines) for part in around.surroundings)
-    lit_by = environment_spec or (NO_MAP if any(shining) else DEFAULT_ENVIRONMENT)
+    alone = any(shining) or (mitsuba and around.object.emission is not None)
+    lit_by = environment_spec or (NO_MAP if alone else DEFAULT_ENVIRONMENT)
     check_ground(given or {}, lit_by)
     if lit_by != NO_MAP:
         check_one_environment(around.surroundings, f"`environment={_spec(lit_by)}`")

@@ -27,7 +27,7 @@ from advsearch.scene.mitsuba_backend.parts import IDLE_LOBES, leave_dark_lamps_o
 from advsearch.scene.mitsuba_backend.population import media_in, population
 from advsearch.scene.mitsuba_backend.samplers import SAMPLER, next_count
 from advsearch.scene.mitsuba_backend.transport import Paths, collect
-from advsearch.scene.mitsuba_backend.variant import Plugin, mitsuba
+from advsearch.scene.mitsuba_backend.variant import Plugin, fewer_warnings, mitsuba
 from advsearch.scene.parts import BASE_COLOR as BASE_COLOR_PLACE
 from advsearch.scene.parts import PluginPart, plugins_in
 from advsearch.scene.surfaces import Surfaces
@@ -245,7 +245,7 @@ class MitsubaScene:
             if self._backdrop:
                 shown = torch.cat([shown, torch.zeros_like(shown[..., :1])], dim=-1)
             arriving = mi.TensorXf(shown)
-            with _fewer_warnings():
+            with fewer_warnings():
                 self._integrator(method).render_backward(
                     self._scene, self.parameters, arriving, sensor=self._sensor, seed=seed, spp=spp
                 )
@@ -435,24 +435,12 @@ def _loaded(plugins: Plugin, description: SceneDescription) -> Any:
         InputError: Mitsuba refuses plugins of the user's.
     """
     try:
-        with _fewer_warnings():
+        with fewer_warnings():
             return mitsuba().load_dict(plugins, optimize=False)
     except RuntimeError as error:
         if not any(isinstance(part, PluginPart) for part in description.parts):
             raise
         raise InputError(f"{description.object_name}: Mitsuba refuses the scene: {error}; change it there") from error
-
-
-@contextmanager
-def _fewer_warnings() -> Iterator[None]:
-    """Keep Mitsuba from advising a film that samples beyond its border, at every call."""
-    mi = mitsuba()
-    before = mi.log_level()
-    mi.set_log_level(mi.LogLevel.Error)
-    try:
-        yield
-    finally:
-        mi.set_log_level(before)
 
 
 def _is_of_a_shape(key: str) -> bool:

@@ -16,15 +16,15 @@ import numpy.typing as npt
 
 from advsearch.errors import InputError, UnknownNameError
 from advsearch.scene.assets import Floats, Mesh, ObjectAsset, UpAxis, normalised
-from advsearch.scene.importing.files import safe_name
+from advsearch.scene.importing.files import safe_name, shown
 from advsearch.scene.importing.geometry import assemble, join
 from advsearch.scene.importing.parts import ImportedPart
 from advsearch.scene.importing.scenes import TAKEN, ImportedScene, clean
-from advsearch.scene.importing.surfaces import ImportedSurface
+from advsearch.scene.importing.surfaces import BRIGHTEST, ImportedSurface
 from advsearch.scene.importing.texture import textured
 from advsearch.scene.mitsuba_backend.files.haze import haze_in
 from advsearch.scene.mitsuba_backend.files.shapes import MESHES, ShapeMesh, mesh_of
-from advsearch.scene.mitsuba_backend.files.surfaces import ShapeSurface, surface_of
+from advsearch.scene.mitsuba_backend.files.surfaces import ShapeSurface, constant, surface_of
 from advsearch.scene.mitsuba_backend.files.trusted import trusted
 from advsearch.scene.mitsuba_backend.files.xml import read_scene
 from advsearch.scene.mitsuba_backend.plugins import plain
@@ -175,7 +175,9 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
     surface, found = surface_of(_bsdf(shape, named)), mesh_of(shape, wanted)
     frame = _Frame(found.mesh, wanted, z_up=_is_z_up(named))
     haze, used = haze_in(named, frame.matrix) or (None, frozenset[str]())
-    notes += [f"{where}: {one}" for one in (*_left_out(tree, shape, hazy=haze is not None), *surface.notes)]
+    light = _light(shape)
+    left_out = _left_out(tree, shape, hazy=haze is not None, lit=light is not None)
+    notes += [f"{where}: {one}" for one in (*left_out, *surface.notes, *_without(surface.plugin, found.mesh))]
     source = scene if isinstance(scene, Path) else Path("scene.xml")
     mesh, base_color = _painted(frame.turned(found), surface, str(shape["type"]), where)
     made = ObjectAsset(
@@ -186,6 +188,7 @@ def import_plugins(scene: Path | Mapping[str, object], wanted: str) -> ImportedS
         warnings=tuple(notes),
         up=UpAxis("z"),
         surface=surface.plugin,
+        emission=light,
     )
     around: list[ScenePart] = [] if haze is None else [haze]
     cameras: dict[str, PlacedCamera] = {}
@@ -258,8 +261,33 @@ def _bsdf(shape: Mapping[str, object], named: Mapping[str, Mapping[str, object]]
     return {"type": "diffuse"}
 
 
-def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: bool) -> Iterator[str]:
-    """Sentences about what is not as it is in the file; `hazy` where the camera's medium is the scene's haze."""
+def _light(shape: Mapping[str, object]) -> Floats | None:
+    """The radiance (1, 1, 3) of a shape that shines evenly; None of any other."""
+    for inner in shape.values():
+        if isinstance(inner, Mapping) and inner["type"] == "area" and set(inner) <= {"type", "id", "radiance"}:
+            radiance = constant(inner.get("radiance"))
+            if radiance is not None and 0.0 < radiance.max() <= BRIGHTEST and radiance.min() >= 0.0:
+                return radiance.reshape(1, 1, 3)
+    return None
+
+
+def _without(surface: Mapping[str, object], mesh: Mesh) -> Iterator[str]:
+    """Sentences about attributes that a surface shows and the mesh has not."""
+    for one in plugins_in(surface):
+        if one["type"] == "mesh_attribute" and one.get("name") not in mesh.attributes:
+            there = ", ".join(sorted(mesh.attributes)) or "none"
+            yield f"the mesh has no attribute {shown(str(one.get('name')))} (it has {there}), so that is black"
+
+
+def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: bool, lit: bool) -> Iterator[str]:
+    """Sentences about what is not as it is in the file.
+
+    Args:
+        tree: the scene.
+        shape: the object in it.
+        hazy: the camera's medium is the scene's haze.
+        lit: the object keeps its light.
+    """
     for name, one in _plugins(tree):
         kind = one["type"]
         if kind in SENSORS - CAMERAS:
@@ -268,12 +296,22 @@ def _left_out(tree: Mapping[str, object], shape: Mapping[str, object], *, hazy: 
             yield f"the sensor {name} is sharp at all distances: its lens is left out"
         elif kind in INTEGRATORS - {"path", "prb", "volpath", "prbvolpath", "volpathmis", "prb_projective"}:
             yield f"the integrator {name} is left out: a {kind}; light takes all paths of up to 6 segments"
+        elif kind in INTEGRATORS:
+            if one.get("hide_emitters"):
+                yield f"hide_emitters of the integrator {name} is left out: lights are seen"
+            depth = one.get("max_depth", -1)
+            if isinstance(depth, int) and 0 <= depth < 6:
+                yield f"the integrator's max_depth of {depth} is left out: light takes all paths of up to 6 segments"
+        if kind in SENSORS and any(
+            isinstance(film, Mapping) and any(str(key).startswith("crop") for key in film) for film in one.values()
+        ):
+            yield f"the crop of the film of {name} is left out: the whole picture is seen"
         if kind in SENSORS and "medium" in one and not hazy:
             yield f"the sensor {name} sees nothing of its medium up to the first surface"
         if kind in SENSORS and any("principal_point" in key for key in one):
             yield f"the sensor {name} looks along its middle: its principal point is left out"
     for inner in shape.values():
-        if isinstance(inner, Mapping) and inner["type"] in LIGHTS:
+        if isinstance(inner, Mapping) and inner["type"] in LIGHTS and not lit:
             yield "the object's own light is left out"
         if isinstance(inner, Mapping) and inner["type"] in MEDIA:
             yield "the medium in the object is left out"

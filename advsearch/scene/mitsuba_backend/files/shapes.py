@@ -12,7 +12,7 @@ from advsearch.errors import InputError
 from advsearch.scene.assets import Mesh
 from advsearch.scene.mitsuba_backend.meshes import FACES, NORMALS, POSITIONS, TEXCOORDS
 from advsearch.scene.mitsuba_backend.plugins import loadable
-from advsearch.scene.mitsuba_backend.variant import mitsuba
+from advsearch.scene.mitsuba_backend.variant import fewer_warnings, mitsuba
 
 Doubles = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -109,7 +109,8 @@ def _loaded(
     """
     mi = mitsuba()
     try:
-        loaded = mi.load_dict(loadable({key: value for key, value in shape.items() if key in OF_A_MESH}))
+        with fewer_warnings():
+            loaded = mi.load_dict(loadable({key: value for key, value in shape.items() if key in OF_A_MESH}))
     except RuntimeError as error:
         raise InputError(f"object {name}: Mitsuba refuses the shape: {error}; change it there") from error
     found = mi.traverse(loaded)

@@ -138,13 +138,13 @@ def uv_matrix(value: object) -> Doubles:
 
 def _color(value: object) -> _Color | None:
     """A constant, a picture or a checkerboard as a base colour."""
-    constant = _constant(value)
-    if constant is not None:
-        return _Color(np.broadcast_to(constant, (PLAIN_SIZE, PLAIN_SIZE, 3)), {})
+    plain = constant(value)
+    if plain is not None:
+        return _Color(np.broadcast_to(plain, (PLAIN_SIZE, PLAIN_SIZE, 3)), {})
     if not isinstance(value, Mapping):
         return None
     if value["type"] == "checkerboard":
-        dark, light = _constant(value.get("color0", 0.4)), _constant(value.get("color1", 0.2))
+        dark, light = constant(value.get("color0", 0.4)), constant(value.get("color1", 0.2))
         rest = set(value) - {"type", "id", "color0", "color1", "to_uv"}
         if dark is None or light is None or rest:
             return None
@@ -184,7 +184,7 @@ def _pixels(value: Mapping[str, object]) -> Floats | None:
     return np.array(found, dtype=np.float32)
 
 
-def _constant(value: object) -> Floats | None:
+def constant(value: object) -> Floats | None:
     """A colour (3,) that is the same everywhere; None of anything else."""
     if isinstance(value, Mapping):
         value = value.get("value") if value["type"] in ("rgb", "uniform", "spectrum", "srgb") else None
