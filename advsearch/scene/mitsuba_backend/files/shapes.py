@@ -9,14 +9,18 @@ import numpy as np
 import numpy.typing as npt
 
 from advsearch.errors import InputError
-from advsearch.scene.assets import Mesh
+from advsearch.scene.assets import Floats, Mesh
 from advsearch.scene.mitsuba_backend.meshes import FACES, NORMALS, POSITIONS, TEXCOORDS
 from advsearch.scene.mitsuba_backend.plugins import loadable
 from advsearch.scene.mitsuba_backend.variant import fewer_warnings, mitsuba
 
 Doubles = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Buffers = tuple[Doubles, Ints, Doubles | None, Doubles | None, dict[str, Floats]]
+"""Vertices, faces, normals and texture coordinates of a mesh, and its attributes, (V or F, n) by their names."""
 
+BARE = ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0))
+"""Texture coordinates of a face that has none, as Mitsuba takes them."""
 SECTIONS = 64
 """Sides of a round shape."""
 SOLIDS = ("rectangle", "sphere", "cylinder", "disk")
@@ -59,54 +63,47 @@ def mesh_of(shape: Mapping[str, object], name: str) -> ShapeMesh:
     kind = str(shape["type"])
     if kind not in MESHES:
         raise InputError(f"object {name}: a {kind} cannot be moved; expected a shape of {', '.join(MESHES)}")
-    matrix = np.asarray(shape.get("to_world", np.eye(4)), dtype=np.float64)
-    flip = bool(shape.get("flip_normals"))
-    if kind in SOLIDS:
-        vertices, faces, normals, uvs, own = _solid(kind, shape)
-        matrix = matrix @ own
-        vertices = vertices @ matrix[:3, :3].T + matrix[:3, 3]
-        normals = _unit(normals @ np.linalg.inv(matrix[:3, :3]))
-        given: dict[str, Doubles] = {}
-    else:
-        vertices, faces, normals, uvs, given = _loaded(shape, name)
-    if uvs is None or normals is None or shape.get("face_normals"):
-        corners = faces.reshape(-1)
-        given = {key: one[corners] if key.startswith("vertex_") else one for key, one in given.items()}
-        vertices, faces = vertices[corners], np.arange(len(corners)).reshape(-1, 3)
-        ends = vertices.reshape(-1, 3, 3)
-        flat = _unit(np.cross(ends[:, 1] - ends[:, 0], ends[:, 2] - ends[:, 0])).repeat(3, axis=0)
-        normals = flat if normals is None or shape.get("face_normals") else normals[corners]
-        bare = np.tile([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)], (len(faces), 1))
-        wanted = bare if uvs is None else uvs[corners]
-    else:
-        wanted = uvs
-    used, index = np.unique(faces, return_inverse=True)
-    faces, normals = index.reshape(-1, 3), np.nan_to_num(normals) * (-1.0 if flip else 1.0)
-    vertices, normals, wanted = vertices[used], normals[used], wanted[used] * (1.0, -1.0) + (0.0, 1.0)
-    given = {key: one[used] if key.startswith("vertex_") else one for key, one in given.items()}
-    ends = vertices[faces]
-    fronts = np.cross(ends[:, 1] - ends[:, 0], ends[:, 2] - ends[:, 0])
-    if np.einsum("fk,fck->", fronts, normals[faces]) < 0.0:  # Mitsuba shades by the normals, ours knows faces too
-        faces = faces[:, ::-1]
+    vertices, faces, normals, uvs, attributes = _solid(kind, shape) if kind in SOLIDS else _loaded(shape, name)
     if not np.isfinite(vertices).all():
         raise InputError(f"object {name}: expected finite vertices, got NaN or infinite ones; repair the mesh")
+    if uvs is None or normals is None or shape.get("face_normals"):
+        corners = faces.reshape(-1)
+        attributes = _of(corners, attributes)
+        vertices, faces = vertices[corners], np.arange(len(corners)).reshape(-1, 3)
+        flat = normals is None or bool(shape.get("face_normals"))
+        normals = _unit(_fronts(vertices, faces)).repeat(3, axis=0) if flat or normals is None else normals[corners]
+        texture = np.tile(BARE, (len(faces), 1)) if uvs is None else uvs[corners]
+    else:
+        texture = uvs
+    used, index = np.unique(faces, return_inverse=True)
+    faces = index.reshape(-1, 3)
+    vertices, texture = vertices[used], texture[used] * (1.0, -1.0) + (0.0, 1.0)
+    normals = np.nan_to_num(normals)[used] * (-1.0 if shape.get("flip_normals") else 1.0)
+    if np.einsum("fk,fck->", _fronts(vertices, faces), normals[faces]) < 0.0:
+        faces = faces[:, ::-1]  # Mitsuba shades by the normals, whichever way faces are wound
     mesh = Mesh(
         vertices.astype(np.float32),
         np.ascontiguousarray(faces, np.uint32),
         normals.astype(np.float32),
-        wanted.astype(np.float32),
-        {key: one.astype(np.float32) for key, one in given.items()},
+        texture.astype(np.float32),
+        _of(used, attributes),
     )
     return ShapeMesh(mesh, uvs is not None)
 
 
-def _loaded(
-    shape: Mapping[str, object], name: str
-) -> tuple[Doubles, Ints, Doubles | None, Doubles | None, dict[str, Doubles]]:
-    """Return vertices, faces, normals and texture coordinates of a mesh as Mitsuba reads it, and its attributes.
+def _of(vertices: Ints, attributes: Mapping[str, Floats]) -> dict[str, Floats]:
+    """The attributes of some of the vertices, in their order, and of all faces."""
+    return {key: one[vertices] if key.startswith("vertex_") else one for key, one in attributes.items()}
 
-    The last are (V or F, n) by their names, which begin with "vertex_" or "face_".
-    """
+
+def _fronts(vertices: Doubles, faces: Ints) -> Doubles:
+    """Vectors (F, 3) along the sides from which faces are wound counter-clockwise, twice as long as their areas."""
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return np.asarray(np.cross(b - a, c - a))
+
+
+def _loaded(shape: Mapping[str, object], name: str) -> Buffers:
+    """Return what Mitsuba reads of a mesh."""
     mi = mitsuba()
     try:
         with fewer_warnings():
@@ -120,11 +117,11 @@ def _loaded(
         raise InputError(f"object {name}: expected a mesh with faces, got none; export triangles")
     normals = np.array(found[NORMALS], np.float64).reshape(-1, 3) if loaded.has_vertex_normals() else None
     uvs = np.array(found[TEXCOORDS], np.float64).reshape(-1, 2) if loaded.has_vertex_texcoords() else None
-    attributes = {}
+    attributes: dict[str, Floats] = {}
     for key in found.keys():
         count = {"vertex": len(vertices), "face": len(faces)}.get(key.split("_")[0], 0)
         if count and key not in (POSITIONS, NORMALS, TEXCOORDS) and "." not in key:
-            attributes[str(key)] = np.array(found[key], np.float64).reshape(count, -1)
+            attributes[str(key)] = np.array(found[key], np.float32).reshape(count, -1)
     return vertices, faces, normals, uvs, attributes
 
 
@@ -132,9 +129,8 @@ def _unit(vectors: Doubles) -> Doubles:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30))
 
 
-def _solid(kind: str, shape: Mapping[str, object]) -> tuple[Doubles, Ints, Doubles, Doubles, Doubles]:
-    """Vertices, faces, normals and texture coordinates of a shape around the origin, and its own transform (4, 4)
-    before `to_world`."""
+def _solid(kind: str, shape: Mapping[str, object]) -> Buffers:
+    """The same of a shape of which Mitsuba has no triangles."""
     own = np.eye(4)
     round_ = np.linspace(0.0, 1.0, SECTIONS + 1)
     normals = None
@@ -156,9 +152,10 @@ def _solid(kind: str, shape: Mapping[str, object]) -> tuple[Doubles, Ints, Doubl
         uvs, faces = _grid(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
         vertices = np.column_stack([uvs * 2.0 - 1.0, np.zeros(4)])
     normals = np.tile((0.0, 0.0, 1.0), (len(vertices), 1)) if normals is None else normals
-    ends = vertices[faces]
-    faces = faces[np.linalg.norm(np.cross(ends[:, 1] - ends[:, 0], ends[:, 2] - ends[:, 0]), axis=1) > 1e-9]
-    return vertices, faces, normals, uvs, own
+    faces = faces[np.linalg.norm(_fronts(vertices, faces), axis=1) > 1e-9]
+    matrix = np.asarray(shape.get("to_world", np.eye(4)), dtype=np.float64) @ own
+    normals = _unit(normals @ np.linalg.inv(matrix[:3, :3]))
+    return vertices @ matrix[:3, :3].T + matrix[:3, 3], faces, normals, uvs, {}
 
 
 def _grid(u: Doubles, v: Doubles) -> tuple[Doubles, npt.NDArray[np.int64]]:

@@ -98,7 +98,7 @@ def surface_of(bsdf: Mapping[str, object]) -> ShapeSurface:
     if not _folds(surface, to_uv):
         surface, to_uv = _with_transform(surface, to_uv, BASE_COLOR), np.eye(3)
     elif not np.array_equal(to_uv, np.eye(3)):
-        surface = _with_transform(surface, np.linalg.inv(to_uv), *PLACED)
+        surface = _with_transform(surface, np.asarray(np.linalg.inv(to_uv), np.float64), *PLACED)
     base_color = linear_to_srgb(np.clip(color.linear, 0.0, 1.0))
     return ShapeSurface(surface, base_color, picture, to_uv, bound, tuple(notes))
 
@@ -125,8 +125,9 @@ def _with_transform(plugin: Mapping[str, object], before: Doubles, *kinds: str) 
         key: _with_transform(one, before, *kinds) if isinstance(one, Mapping) else one for key, one in plugin.items()
     }
     if found["type"] in kinds:
-        found["to_uv"] = np.eye(4)
-        found["to_uv"][np.ix_((0, 1, 3), (0, 1, 3))] = uv_matrix(plugin.get("to_uv", np.eye(3))) @ before
+        whole = np.eye(4)
+        whole[np.ix_((0, 1, 3), (0, 1, 3))] = uv_matrix(plugin.get("to_uv", np.eye(3))) @ before
+        found["to_uv"] = whole
     return found
 
 
