@@ -165,6 +165,7 @@ LAUGHS = "".join(f'<default name="v{n}" value="{f"$v{n - 1}" * 10}"/>' for n in 
             "name of",
         ),
         ('<scene version="3.0.0"><shape type="serialized"><string name="filename" value="a"/></shape></scene>', "only"),
+        ('<scene version="3.0.0"><texture type="bitmap"/></scene>', "a filename in each bitmap"),
         ('<scene version="0.5.0"/>', "version"),
         ('<scene version="3.0.0"><float name="a" value="nan"/></scene>', "finite"),
         ('<scene version="3.0.0"><float name="a" value="$b"/></scene>', "no value"),

@@ -100,6 +100,8 @@ def trusted(path: Path, scene: Mapping[str, object], notes: list[str]) -> Plugin
         if not re.fullmatch(r"\w*", str(plugin.get("material", ""))):
             raise FileFormatError(f"{path}: {shown(str(plugin['material']))} is no name of a material")
         found = {key: checked(value) if isinstance(value, Mapping) else value for key, value in plugin.items()}
+        if kind in readers and "filename" not in found:  # without one Mitsuba's bitmap ends the process
+            raise FileFormatError(f"{path}: expected a filename in each {kind}, got none; name the file")
         if "filename" in found:
             if kind not in readers:
                 named = shown(str(found["filename"]))
