@@ -110,7 +110,7 @@ def _check_values(file: Path, planes: Planes) -> None:
 
 
 def _sized(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
-    """Average a map down to at most `LARGEST`, or repeat its texels up to at least `SMALLEST`.
+    """Average a map down to at most `LARGEST`, and repeat its texels up to at least `SMALLEST`.
 
     Args:
         band: returns the map's rows from the first to before the second of its arguments, (n, W, 3) float32.
@@ -119,10 +119,12 @@ def _sized(band: Callable[[int, int], Floats], size: tuple[int, int]) -> Floats:
     height, width = size
     scale = min(1.0, LARGEST[0] / height, LARGEST[1] / width)
     if scale == 1.0:
-        return band(0, height).repeat(-(-SMALLEST[0] // height), axis=0).repeat(-(-SMALLEST[1] // width), axis=1)
-    target = max(1, round(height * scale)), max(1, round(width * scale))
-    polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * np.float32(np.pi / height)
-    angle = np.sin(polar)[:, None, None]
-    covered = area_average(angle, target[0], 1)
-    weighted = banded_average(lambda top, end: band(top, end) * angle[top:end], size, target)
-    return np.asarray(weighted / covered, dtype=np.float32)
+        found = band(0, height)
+    else:
+        target = max(1, round(height * scale)), max(1, round(width * scale))
+        polar = (np.arange(height, dtype=np.float32) + np.float32(0.5)) * np.float32(np.pi / height)
+        angle = np.sin(polar)[:, None, None]
+        covered = area_average(angle, target[0], 1)
+        found = banded_average(lambda top, end: band(top, end) * angle[top:end], size, target) / covered
+    down, across = (-(-least // extent) for least, extent in zip(SMALLEST, found.shape[:2], strict=True))
+    return np.asarray(found.repeat(down, axis=0).repeat(across, axis=1), dtype=np.float32)

@@ -240,6 +240,11 @@ def test_a_map_is_the_same_in_both_formats(tmp_path: Path) -> None:
     assert np.array_equal(one.radiance, other.radiance) and one.photographed and other.photographed
 
 
+def test_a_strip_has_rows_enough_for_a_renderer(tmp_path: Path) -> None:
+    strip = np.ones((2, 4096, 3), np.float32)
+    assert import_environment(write_exr(tmp_path / "strip.exr", {"RGB": strip})).radiance.shape == (4, 1024, 3)
+
+
 def test_other_primaries_are_said(tmp_path: Path) -> None:
     header = {"chromaticities": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)}
     OpenEXR.File(header, planes(light())).write(str(tmp_path / "aces.exr"))
