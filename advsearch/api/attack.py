@@ -429,7 +429,7 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
     stages.begin("setup", PREPARING)
     problem = _problem(job)
     own = job.scene.description
-    warnings = [*own.notes, *job.loaded[1], *sentences(problem.space.moved)]
+    warnings = [*(problem.space.scene or own).notes, *job.loaded[1], *sentences(problem.space.moved)]
     for text in warnings:
         progress.message(text)
     policy = _policy(job, problem)

@@ -26,7 +26,7 @@ from advsearch.engine.naming import (
 )
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.sweeps.answer import SweepResult
-from advsearch.engine.sweeps.axes import read_axes
+from advsearch.engine.sweeps.axes import on_grid, read_axes
 from advsearch.engine.sweeps.batch import Batches
 from advsearch.engine.sweeps.job import Job, NamedScene, check_all, check_scenes
 from advsearch.engine.sweeps.loop import carry_out
@@ -37,6 +37,7 @@ from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress
 from advsearch.runs.directory import CONFIG, RunDirectory, check_free, is_run, run_path
 from advsearch.runs.listing import finished
+from advsearch.scene.description import ENVIRONMENT
 from advsearch.scene.mitsuba_backend.samplers import next_count
 from advsearch.scene.surfaces import aovs_of
 from advsearch.settings import FILES, split_names
@@ -201,7 +202,10 @@ def _job(
     own = {place.object: place.scene.description.object.label for place in places}
     warnings += one_label_for_several(networks, config.label, own)
     for place in places:
-        warnings += place.scene.description.notes
+        described = place.scene.description
+        for control in on_grid(drawn, axes, described):
+            described = control.prepare(described) if control.kind == ENVIRONMENT else described
+        warnings += described.notes
     return Job(
         object=config.object,
         environment=config.lit_by,

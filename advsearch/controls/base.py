@@ -162,11 +162,11 @@ class Control(ABC):
 
     @classmethod
     def declared(cls, settings: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return the parameters of an instance that is given some settings: those of the class, unless the scene names
-        them.
+        """Return the parameters of an instance that is given some settings: those of the class, unless the scene or the
+        settings name them.
 
         Args:
-            settings: names of what is given.
+            settings: names of what is given, perhaps with the values.
         """
         return cls.parameters
 

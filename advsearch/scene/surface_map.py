@@ -246,8 +246,13 @@ def _face_neighbours(mesh: Mesh) -> Ints:
 
 
 def _in_texels(mesh: Mesh, shape: tuple[int, int]) -> Doubles:
-    """Texture coordinates of the faces' corners, (F, 3, 2): column and row, integers at texel centres."""
+    """Texture coordinates of the faces' corners, (F, 3, 2): column and row, integers at texel centres.
+
+    Where a texture repeats, each face is moved by whole textures, so that its middle lies in the first one.
+    """
     uvs = mesh.uvs[mesh.faces].astype(np.float64)
+    if mesh.repeats:
+        uvs -= np.floor(uvs.mean(axis=1, keepdims=True))
     return np.stack([uvs[..., 0] * shape[1] - 0.5, (1.0 - uvs[..., 1]) * shape[0] - 0.5], axis=-1)
 
 
