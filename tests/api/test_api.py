@@ -13,9 +13,11 @@ import torch
 from torch import Tensor, nn
 
 import advsearch
+from advsearch.cli.attack import answer as answer_text
 from advsearch.config import AttackConfig
 from advsearch.engine.problem import Problem
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
+from advsearch.runs.listing import listed
 from advsearch.runs.store import Row, Store
 
 SIZE = 32
@@ -287,3 +289,24 @@ def test_auto_takes_half_of_the_samples_and_looks_again_where_it_is_close(
     looks = [row for row in rows if row.step >= summary.steps]
     assert len(rows) - len(looks) == 12 and {row.spp for row in rows} == {4}
     assert 8 <= len(looks) <= 4 * (2 + 4) and len(rows) == summary.renders["search"]
+
+
+def test_an_answer_whose_check_is_interrupted_is_told_and_verified_later(
+    scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, wrong = tmp_path / "run", model(level + 0.02)
+    asked: dict[str, Any] = {**FAST, "controls": {"light": {"power": [0, 40]}}, "baseline": False, "run": run}
+
+    def stopped(*_: Any, **__: Any) -> Any:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("advsearch.engine.verifier.choose_spp", stopped)
+        first = advsearch.attack(scene, wrong, **asked)
+    said = "The answer so far is not verified: the model calls this mug a vase."
+    assert first.summary.ending == "interrupted" and first.summary.verified is None and first.search is not None
+    assert said in answer_text(first.summary) and said in (run / "report.html").read_text()
+    assert "advsearch resume" in (run / "report.html").read_text()
+    assert listed(tmp_path)[0].answer == "vase, unverified"
+    done = advsearch.attack(scene, wrong, **asked, resume=True)
+    assert done.found and torch.equal(done.u, first.u) and listed(tmp_path)[0].answer == "6/6"

@@ -388,8 +388,8 @@ class Sweep:
             remarks.append("Some values of pictures were not finite and were set to 0.")
         if checked and not checked.converged:
             remarks.append(
-                f"The worst margin still moved with the sample count at {checked.spp} samples a pixel, the most "
-                "that was tried: noise may take part in it."
+                f"It is not shown that the worst margin stands still at {checked.spp} samples a pixel, the most that a "
+                "check takes: noise may take part in it."
             )
         return remarks
 
