@@ -25,6 +25,7 @@ from advsearch.attacks import (
 )
 from advsearch.attacks.region import GrownBox
 from advsearch.attacks.sample_count import most_samples
+from advsearch.attacks.trials import paired_difference
 from advsearch.attacks.verification import EASIER, LEAST_RATE, OVER_CONDITIONS, WORST_CASE, Rule
 from advsearch.config import FEWEST_SAMPLES, FEWEST_TRIALS
 from advsearch.errors import InputError
@@ -108,6 +109,29 @@ def test_trials_have_a_rate_and_its_interval() -> None:
 
 
 # ---- sample counts
+
+
+@pytest.mark.parametrize(
+    ("counts", "low", "high"),
+    [((20, 2, 12, 16), 0.0562, 0.3292), ((36, 2, 12, 0), 0.0569, 0.3404), ((20, 12, 2, 16), -0.3292, -0.0562)],
+)
+def test_the_difference_of_pairs_is_that_of_the_paper(
+    counts: tuple[int, int, int, int], low: float, high: float
+) -> None:
+    """Newcombe's own examples for his method 10."""
+    difference, interval = paired_difference(*counts)
+    assert difference == pytest.approx((counts[2] - counts[1]) / sum(counts))
+    assert interval == pytest.approx((low, high), abs=6e-5)
+
+
+@pytest.mark.parametrize(("first", "second"), [(0.3, 0.1), (0.05, 0.05)])
+def test_the_interval_of_pairs_covers_the_difference(first: float, second: float) -> None:
+    """Of 60 pairs in which the two go together in half of all."""
+    rng, true, covered = np.random.default_rng(0), second - first, 0
+    for counts in rng.multinomial(60, [0.5, first, second, 0.5 - first - second], size=2000).tolist():
+        low, high = paired_difference(*counts)[1]
+        covered += low <= true <= high
+    assert 0.94 < covered / 2000 < 0.99
 
 
 def drifting(limit: float, bias: float, noise: float) -> Callable[[int, int], float]:

@@ -40,6 +40,7 @@ from advsearch.runs.images import write_layers
 from advsearch.runs.results.attack import DescribedValue, LinearTransport, SharedWork
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.sweep import (
+    BesideAnswer,
     SurfaceMap,
     SweepSummary,
     WorstClaim,
@@ -99,8 +100,18 @@ class Sweep:
         objects, environments = (
             list(dict.fromkeys(getattr(place, name) for place in job.places)) for name in ("object", "environment")
         )
-        self._outer = [("object", objects), ("environment", environments), ("model", [one.name for one in job.models])]
-        self._places = [(objects.index(one.object), environments.index(one.environment)) for one in job.places]
+        answers = list(dict.fromkeys(place.answer for place in job.places))
+        self._outer = [
+            ("object", objects),
+            ("environment", environments),
+            ("answer", answers),
+            ("model", [one.name for one in job.models]),
+        ]
+        self._places = [
+            (objects.index(one.object), environments.index(one.environment), answers.index(one.answer))
+            for one in job.places
+        ]
+        self._pairs = self.total // 2 if len(answers) > 1 else 0
 
     def carry_out(self, first: int | None = None) -> SweepResult:
         """Do what is left and return the answer.
@@ -227,7 +238,9 @@ class Sweep:
         named |= {"model": {"value": self.job.models[model].name, "unit": ""}, **values}
         step = number * self.models + model
         more |= {"id": step + 1, "renders": traced if self._is_first_of_size(model) else 0}
-        row = trial_row(KIND, step, self._seeds(number), self.samples, trial, named, sought=False, **more)
+        row = trial_row(
+            KIND, step, self._seeds(self.points.draw(number)), self.samples, trial, named, sought=False, **more
+        )
         return replace(row, seed=None, spp=BASIS_SPP) if predicted else row
 
     def _is_first_of_size(self, model: int) -> bool:
@@ -250,7 +263,7 @@ class Sweep:
 
     def _counted(self) -> Tally:
         """Counts of the rows that are stored already, read one after the other."""
-        tally = Tally(self._outer, self.job.axes, self._shown)
+        tally = Tally(self._outer, self.job.axes, self._shown, self._pairs)
         self._traced = self._predicted = self._lost = 0
         key, picks = (-1, -1), self.points.picks(0, 0)
         for row in self._kept if self.run is None else self.run.store.rows(KIND):
@@ -304,7 +317,7 @@ class Sweep:
         return WorstConfiguration(
             configuration=index,
             values={name: DescribedValue.of(value) for name, value in row.values.items()},
-            seed=self._seeds(picks.number),
+            seed=self._seeds(points.draw(picks.number)),
             label_set=list(task.truth_names(truth)),
             claimed=WorstClaim(**vars(seen.answer), margin=seen.margin, payload=seen.payload),
             verified=None,
@@ -352,6 +365,7 @@ class Sweep:
             answers=tally.frequent(),
             axes=tally.table(),
             cells=tally.map(),
+            beside=self._beside(tally),
             worst=worst,
             grid={axis.name: len(axis.values) for axis in job.axes},
             samples=job.samples,
@@ -377,6 +391,13 @@ class Sweep:
                 write_bytes(self.run.path / "images" / f"sweep.{suffix}", data)
             write_page(self.run.path, summary)
         return SweepResult(summary, None if self.run is None else self.run.path, tuple(self._kept))
+
+    def _beside(self, tally: Tally) -> BesideAnswer | None:
+        """The clean scene and the answer of a run, where there is one."""
+        if not self._pairs:
+            return None
+        models = [one.name for one in self.job.models]
+        return BesideAnswer(answer=self.job.places[-1].answer, pairs=tally.beside(models))
 
     def _remarks(self, tally: Tally, checked: WorstVerified | None) -> list[str]:
         """What a reader has to know beside the numbers."""
