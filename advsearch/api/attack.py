@@ -18,7 +18,7 @@ from advsearch.attacks.objectives import check_objective
 from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
 from advsearch.config import AttackConfig, PrecisionConfig, SceneConfig
-from advsearch.config.attack import OVER_PREDICTED, OVER_RENDERED, STEPS
+from advsearch.config.attack import OVER_NUMBERS, OVER_PREDICTED, OVER_RENDERED, STEPS
 from advsearch.config.scene import one_only
 from advsearch.controls import Space, make_space
 from advsearch.controls.base import Control
@@ -393,11 +393,12 @@ def _problem(job: _Job, *, differentiated: bool = True) -> Problem:
 
 def search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
     """Return the steps of a search, and how many conditions each looks at: what was asked for, or what is right for
-    one picture, or for many conditions that are predicted or rendered."""
+    one picture, or for many conditions: predicted, rendered, or rendered where only a few numbers are searched."""
     if problem.conditions is None:
         return config.steps or STEPS, 1
     predicted = reason_against(problem, config.steps or OVER_PREDICTED[0], config.specialise) is None
-    steps, draws = OVER_PREDICTED if predicted else OVER_RENDERED
+    balls = any(block.norm != "box" for block in problem.domain.blocks)
+    steps, draws = OVER_PREDICTED if predicted else OVER_RENDERED if balls else OVER_NUMBERS
     return config.steps or steps, config.draws or draws
 
 

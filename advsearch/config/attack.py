@@ -23,9 +23,9 @@ TRIALS, TRIALS_OVER = 20, 200
 STEPS = 40
 """Of a search about one picture."""
 
-OVER_PREDICTED, OVER_RENDERED = (400, 8), (150, 4)
+OVER_PREDICTED, OVER_RENDERED, OVER_NUMBERS = (400, 8), (150, 4), (STEPS, 4)
 """Steps, and conditions that each looks at, of a search for many conditions: where a bank of light transport predicts
-pictures, and where each is rendered (`benchmarks/bank.py`)."""
+pictures (`benchmarks/bank.py`), where each is rendered, and where only a few numbers are searched (a pose)."""
 
 FEWEST_TRIALS = 6
 """With fewer, nothing can be called found: `attacks.verification.Rule.fewest`, which a test holds this to."""
@@ -124,7 +124,8 @@ class AttackConfig(DerivativeConfig):
         None,
         "search",
         "steps of the search, its budget in renders",
-        otherwise=f"{STEPS}; with --over {OVER_PREDICTED[0]} where pictures are predicted, {OVER_RENDERED[0]} else",
+        otherwise=f"{STEPS}; for textures and the like with --over {OVER_PREDICTED[0]} where pictures are predicted, "
+        f"{OVER_RENDERED[0]} where they are rendered",
         ge=1,
         le=1_000_000,
     )

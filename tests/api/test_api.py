@@ -300,7 +300,7 @@ def test_auto_takes_half_of_the_samples_and_looks_again_where_it_is_close(
         ({"controls": "texture", "over": "camera"}, 400, 8),
         ({"controls": "texture", "over": "camera", "specialise": False}, 150, 4),
         ({"controls": "texture", "over": "haze"}, 150, 4),
-        ({"controls": "pose", "over": "camera"}, 150, 4),
+        ({"controls": "pose", "over": "camera"}, 40, 4),
         ({"controls": "pose", "over": "camera", "steps": 7}, 7, 4),
         ({"controls": "texture", "over": "camera", "draws": 3}, 400, 3),
     ],

@@ -1,4 +1,7 @@
-"""Counting what a sweep finds, in memory that does not grow, and its summary (docs/sweeps.md, "What it says")."""
+"""Counting what a sweep finds, and its summary (docs/sweeps.md, "What it says").
+
+The memory that this takes does not grow, but for a byte a configuration where pairs are compared.
+"""
 
 from __future__ import annotations
 
@@ -118,7 +121,6 @@ class Tally:
             picks: the pictures it belongs to.
             place: its place among them.
             trial: what was seen.
-            label: the answer.
         """
         right = trial.right
         if pairs := len(self._verdicts[0]):
