@@ -1,9 +1,10 @@
 """The loop of a sweep: have batches carried out (`batch`), store and count what comes of them, sum it up.
 
 Configurations are numbered: scenes (object, environment; beside an answer first all without it), then the grid with its
-last axis fastest, then the draws of a point of the grid, then the models. Models are shown the same pictures, so that they can be compared, and one is
-rendered once. A batch begins at a multiple of its size and is stored in one transaction, each row in the place of its
-number, so that a sweep that was stopped, or whose batches come in another order, ends bit for bit as one that was not.
+last axis fastest, then the draws of a point of the grid, then the models. Models are shown the same pictures, so that
+they can be compared, and one is rendered once. A batch begins at a multiple of its size and is stored in one
+transaction, each row in the place of its number, so that a sweep that was stopped, or whose batches come in another
+order, ends bit for bit as one that was not.
 """
 
 from __future__ import annotations
@@ -404,7 +405,7 @@ class Sweep:
         remarks = lost_remarks(self._lost)
         remarks += self._machines.remarks
         if tally.not_finite:
-            remarks.append(f"{tally.not_finite} answers of the model were not finite; they count as not right.")
+            remarks.append(f"{tally.not_finite} answers of the model are not numbers; they count as not right.")
         if self._not_finite:
             remarks.append("Some values of pictures were not finite and were set to 0.")
         if checked and not checked.converged:
