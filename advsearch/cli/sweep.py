@@ -88,7 +88,10 @@ def _tables(summary: SweepSummary) -> list[str]:
     by_axis: dict[str, list[AxisRow]] = {}
     for row in (one for one in summary.axes if one.axis != "answer"):
         by_axis.setdefault(row.axis, []).append(row)
-    return [READING, *(_table(name, rows) for name, rows in by_axis.items())] if by_axis else []
+    reading = (
+        f"Of the clean scene and the answer together: {READING[0].lower()}{READING[1:]}" if summary.beside else READING
+    )
+    return [reading, *(_table(name, rows) for name, rows in by_axis.items())] if by_axis else []
 
 
 def _table(name: str, rows: Sequence[AxisRow]) -> str:

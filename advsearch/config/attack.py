@@ -77,7 +77,7 @@ class AttackConfig(DerivativeConfig):
         ),
         Clash(
             "draws",
-            lambda one: not one.over,
+            lambda one: not one.over and one.draws != OVER_RENDERED[1],  # which run.yaml of older versions always say
             "is how many conditions of `over` a step looks at, and there are none; add `over`, or leave `draws` out",
         ),
         Clash(

@@ -12,7 +12,7 @@ from advsearch.config.attack import FEWEST_TRIALS, AttackConfig
 from advsearch.config.derivative import DerivativeConfig
 from advsearch.config.rendering import RenderConfig
 from advsearch.config.scene import ControlsByName, SceneConfig
-from advsearch.files import MESHES, JsonObject, either
+from advsearch.files import MESHES, either
 from advsearch.settings import Clash, number_or_text, setting, setting_as_in, split_names
 
 Grid = dict[str, object]
@@ -147,7 +147,7 @@ class SweepConfig(SceneConfig):
         return split_names(self.lit_by)
 
     @classmethod
-    def of_answer(cls, theirs: AttackConfig, *, varies: bool) -> JsonObject:
+    def of_answer(cls, theirs: AttackConfig, *, varies: bool) -> dict[str, Any]:
         """Return the settings that a sweep of an attack's answer takes from the attack, where it says nothing else.
 
         Args:

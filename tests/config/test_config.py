@@ -123,6 +123,11 @@ def of_command_line(line: str, config: type[Given] = AttackConfig) -> Given:  # 
     return flags.config_from(args, config)
 
 
+def test_a_run_of_an_older_version_says_its_draws_also_where_there_are_none(tmp_path: Path) -> None:
+    (tmp_path / "run.yaml").write_text("object: mug\nsteps: 40\ndraws: 4\nover: {}\n")
+    assert AttackConfig.from_yaml(tmp_path / "run.yaml").steps == 40
+
+
 @pytest.mark.parametrize("flag", ["control", "over"])
 def test_several_controls_with_settings_may_stand_in_one_flag(flag: str) -> None:
     written = 'pose, camera={azimuth: [0, 90], elevation: 20}, environment={which: [a, "b, {c"]},texture'

@@ -964,8 +964,7 @@ def test_an_answer_has_the_draws_and_the_noise_of_the_clean_scene(attacked: Path
     for one, other in zip(clean, answer, strict=True):
         drawn = {name: value for name, value in one.values.items() if name.startswith(("camera.", "corruption."))}
         assert len(drawn) > 1 and drawn == {name: other.values[name] for name in drawn}
-        assert one.values["pose.yaw"]["value"] == 0.0 and other.values["pose.yaw"]["value"] == pytest.approx(90.0)
-        assert other.values["light.power"]["value"] == pytest.approx(10.0)
+        assert not any(name.startswith(("pose", "light")) for name in (*one.values, *other.values)), "these stand still"
 
 
 class Turned(FakeRenderer):
@@ -1005,9 +1004,11 @@ def test_both_rates_stand_side_by_side_with_what_the_pairs_say(
 
 
 def test_what_is_rendered_with_an_answer_is_the_answer_really_rendered(attacked: Path) -> None:
-    grid, small = {"camera.azimuth": [20, 110]}, {"resolution": SIZE, "spp": 4, "trials": 0, "denoise": "none"}
+    grid = {"camera.azimuth": [20, 110]}
+    small: dict[str, Any] = {"resolution": SIZE, "spp": 4, "trials": 0, "denoise": "none"}
     both = advsearch.sweep(model=model(), answer_of=attacked, grid=grid, **small)
-    clean, answer = [row.margin for row in both.rows()][:2], [row.margin for row in both.rows()][2:]
+    margins = [row.margin or 0.0 for row in both.rows()]
+    clean, answer = margins[:2], margins[2:]
     turned = advsearch.load_scene("mug", settings={"pose.yaw": 90.0})
     found = advsearch.sweep(turned, model(), {**grid, "light.power": [10.0]}, **small)
     plain = advsearch.sweep("mug", model(), {**grid, "light.power": [0.0]}, **small)

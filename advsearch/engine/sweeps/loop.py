@@ -230,13 +230,15 @@ class Sweep:
         shown: tuple[bool, int] = (False, 1),
         **more: Any,
     ) -> store.Row:
-        """What is stored of a configuration; a predicted picture has no seed of its own."""
+        """What is stored of a configuration: what varies; a predicted picture has no seed of its own."""
         place, (predicted, traced) = self.job.places[number // self.per_scene], shown
         lit_by = self.points.lit_by(values)
         named = place.values
         if lit_by is not None:
             named["environment"] = {"value": lit_by, "unit": ""}
-        named |= {"model": {"value": self.job.models[model].name, "unit": ""}, **values}
+        still = {control.name for control in place.held}
+        varied = {name: value for name, value in values.items() if name.partition(".")[0] not in still}
+        named |= {"model": {"value": self.job.models[model].name, "unit": ""}, **varied}
         step = number * self.models + model
         more |= {"id": step + 1, "renders": traced if self._is_first_of_size(model) else 0}
         row = trial_row(
