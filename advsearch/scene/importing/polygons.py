@@ -121,10 +121,13 @@ def _is_ear(
 ) -> npt.NDArray[np.bool_]:
     """Tell of each polygon whether a triangle of it (a, b, c) has an area and holds no other corner that is there."""
     rows = np.arange(len(flat))
-    ends = [flat[rows, one][:, None] for one in (a, b, c)]
-    area = _doubled_areas(*ends)[:, 0]
-    inside = there.copy()
+    ends = [flat[rows, one] for one in (a, b, c)]
+    ear: npt.NDArray[np.bool_] = _doubled_areas(*ends) > least
+    x, y = flat[ear, :, 0], flat[ear, :, 1]
+    inside = there[ear]
     for one, other in zip(ends, [*ends[1:], ends[0]], strict=True):
-        inside &= (_doubled_areas(one, other, flat) >= 0.0) & (flat != one).any(axis=2)
-    ear: npt.NDArray[np.bool_] = (area > least) & ~inside.any(axis=1)
+        (x0, y0), (x1, y1) = one[ear, :, None].swapaxes(0, 1), other[ear, :, None].swapaxes(0, 1)
+        inside &= (x1 - x0) * (y - y0) >= (y1 - y0) * (x - x0)
+        inside &= (x != x0) | (y != y0)
+    ear[ear] = ~inside.any(axis=1)
     return ear
