@@ -140,6 +140,7 @@ class MtlReader:
             metallic=self._share(material, "pm", uses.get("map_pm")),
             normal_map=self._bumps(material, uses),
             emission=self._glow(material, uses.get("map_ke")),
+            name=material.name,
         )
         if first is None:
             return Painted(found)

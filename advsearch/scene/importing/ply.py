@@ -249,11 +249,11 @@ class _Reader:
             found = read[name]
             if isinstance(found, str):
                 self.note(f" names the texture {shown(name)}, which {found}; {instead} used instead")
-                surfaces.append(ImportedSurface())
+                surfaces.append(ImportedSurface(name=name))
                 continue
             if found[:, :, 3].min() < 1.0:
                 self.note(f"the alpha of {shown(name)} is left out")
-            surfaces.append(ImportedSurface(texture=np.ascontiguousarray(found[:, :, :3])))
+            surfaces.append(ImportedSurface(texture=np.ascontiguousarray(found[:, :, :3]), name=name))
         return surfaces
 
 
