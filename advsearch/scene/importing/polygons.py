@@ -88,11 +88,15 @@ def _ears(flat: Array, budget: int) -> tuple[Ints, int, int]:
     count, corners = flat.shape[:2]
     after = np.tile(np.roll(np.arange(corners), -1), (count, 1))
     before = np.tile(np.roll(np.arange(corners), 1), (count, 1))
-    there = np.ones((count, corners), dtype=np.bool_)
     triangles = np.zeros((count, corners - 2, 3), dtype=np.int64)
     cut, tip, tries = (np.zeros(count, dtype=np.int64) for _ in range(3))
     failed = np.zeros(count, dtype=np.bool_)
     size = np.abs(_doubled_areas(flat, np.roll(flat, -1, axis=1), np.zeros(2)).sum(axis=1))
+    # only a corner that is not convex can lie in an ear
+    dents = _doubled_areas(np.roll(flat, 1, axis=1), flat, np.roll(flat, -1, axis=1)) <= _FLAT * size[:, None]
+    dent = np.argsort(~dents, axis=1, kind="stable")[:, : int(dents.sum(axis=1).max())]
+    there = np.take_along_axis(dents, dent, axis=1)
+    places = np.take_along_axis(flat, dent[:, :, None], axis=1)
     busy, used = np.arange(count), 0
     while len(busy):
         b = tip[busy]
@@ -101,8 +105,9 @@ def _ears(flat: Array, budget: int) -> tuple[Ints, int, int]:
         ear = left == 3
         hopeless = tries[busy] >= left
         if used < budget:
-            used += flat[busy].size // 2
-            ear |= _is_ear(flat[busy], there[busy], a, b, c, _FLAT * size[busy])
+            used += places[busy].size // 2
+            ends = [flat[busy, one] for one in (a, b, c)]
+            ear |= _is_ear(ends, places[busy], there[busy], _FLAT * size[busy])
         else:
             hopeless[:] = True
         failed[busy] |= hopeless & ~ear
@@ -110,21 +115,20 @@ def _ears(flat: Array, budget: int) -> tuple[Ints, int, int]:
         tip[busy], tries[busy] = c, tries[busy] + 1
         rows, a, b, c = busy[ear], a[ear], b[ear], c[ear]
         triangles[rows, cut[rows]] = np.stack([a, b, c], axis=1)
-        there[rows, b], after[rows, a], before[rows, c], tries[rows] = False, c, a, 0
+        there[rows] &= dent[rows] != b[:, None]
+        after[rows, a], before[rows, c], tries[rows] = c, a, 0
         cut[rows] += 1
         busy = busy[cut[busy] < corners - 2]
     return triangles, int((failed & (size > _FLAT)).sum()), used
 
 
-def _is_ear(
-    flat: Array, there: npt.NDArray[np.bool_], a: Ints, b: Ints, c: Ints, least: Array
-) -> npt.NDArray[np.bool_]:
-    """Tell of each polygon whether a triangle of it (a, b, c) has an area and holds no other corner that is there."""
-    rows = np.arange(len(flat))
-    ends = [flat[rows, one][:, None] for one in (a, b, c)]
-    area = _doubled_areas(*ends)[:, 0]
-    inside = there.copy()
+def _is_ear(ends: list[Array], places: Array, there: npt.NDArray[np.bool_], least: Array) -> npt.NDArray[np.bool_]:
+    """Tell of triangles, three times (P, 2), whether they have an area and hold no place (P, n, 2) that is there."""
+    ear: npt.NDArray[np.bool_] = _doubled_areas(*ends) > least
+    x, y, inside = places[ear, :, 0], places[ear, :, 1], there[ear]
     for one, other in zip(ends, [*ends[1:], ends[0]], strict=True):
-        inside &= (_doubled_areas(one, other, flat) >= 0.0) & (flat != one).any(axis=2)
-    ear: npt.NDArray[np.bool_] = (area > least) & ~inside.any(axis=1)
+        (x0, y0), (x1, y1) = one[ear, :, None].swapaxes(0, 1), other[ear, :, None].swapaxes(0, 1)
+        inside &= (x1 - x0) * (y - y0) >= (y1 - y0) * (x - x0)
+        inside &= (x != x0) | (y != y0)
+    ear[ear] = ~inside.any(axis=1)
     return ear
