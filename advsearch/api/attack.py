@@ -33,10 +33,20 @@ from advsearch.engine.loading import (
     load_scene,
     make_renderer,
     named_camera,
+    only_here,
     settings_of,
 )
 from advsearch.engine.memory import Memory
-from advsearch.engine.naming import AnyModel, check_not_spread, load_models, model_name, scene_settings, several
+from advsearch.engine.naming import (
+    OF_SCENE,
+    AnyModel,
+    check_not_of_scene,
+    check_not_spread,
+    load_models,
+    model_name,
+    scene_settings,
+    several,
+)
 from advsearch.engine.objective import Wanted, objective_for, task_for
 from advsearch.engine.outcome import AttackResult, Question, summarise
 from advsearch.engine.print_terms import print_terms
@@ -78,7 +88,7 @@ def attack(
     task: AnyTask = "classification",
     controls: Controls = ("texture",),
     objective: str | Callable[..., Tensor] | None = None,
-    policy: str | Policy[Any] = "auto",
+    policy: str | Mapping[str, object] | Policy[Any] = "auto",
     over: Controls = (),
     run: str | Path | None = None,
     resume: bool = False,
@@ -100,7 +110,7 @@ def attack(
             images (N, H, W, 3), truth, or the target where there is one) that returns (N,) values, which are maximised;
             in classification the output is logits (N, C) and the truth the indices of the right answers. None takes the
             task's own.
-        policy: a name, or an instance with options of its own.
+        policy: a name, a mapping with a `name` and options, or an instance.
         over: controls that vary by chance: the answer has to hold for all of their values.
         run: folder to keep the run in; None keeps it in memory only.
         resume: go on with the run of that name, if there is one, where it was stopped; everything else has to be as it
@@ -111,8 +121,13 @@ def attack(
         InputError: anything that the caller can put right; nothing is written then.
     """
     options = {name: value for name, value in settings.items() if value is not None}
-    if callable(objective) or not all(isinstance(one, (str, Path)) for one in (scene, *several(model))):
+    named = all(isinstance(one, (str, Path)) for one in (scene, *several(model)))
+    if not named or callable(objective) or only_here(controls) or only_here(over):
         check_not_spread(options)
+    if not isinstance(policy, (str, Mapping, Policy)):
+        raise InputError(
+            f"policy: expected a name, a mapping with a `name` and options, or an instance, got {policy!r}"
+        )
     scene = _scene(scene, object, settings)
     described = {
         "object": scene.description.object_name,
@@ -124,7 +139,7 @@ def attack(
         "over": settings_of(over),
         "task": as_setting(task) if isinstance(task, Task) else task,
         "objective": getattr(objective, "__name__", "custom") if callable(objective) else objective,
-        "policy": policy if isinstance(policy, str) else policy.name,
+        "policy": as_setting(policy) if isinstance(policy, Policy) else policy,
         "set": _set_by(scene, settings.get("exposure")),
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
@@ -132,10 +147,17 @@ def attack(
         raise InputError(
             "model: expected one, got several; add `ensemble`, which attacks them together, or attack each by itself"
         )
+    if config.epsilons:
+        listed = ", ".join(f"{one:g}" for one in config.epsilons)
+        raise InputError(
+            f"epsilon: expected one, got {listed}; attack with each, or have `advsearch attack` draw the curve"
+        )
     if config.aov is not None and config.run is None:
         raise InputError("aov: expected `run` beside it, the folder that keeps the layers; name one")
     searched, drawn = _controls(config, controls, over)
-    asked, objective = _asked(config, task, objective)
+    policy = policy if isinstance(policy, Policy) else config.policy_name
+    named = config.objective if objective is None or isinstance(objective, str) else objective
+    asked, objective = _asked(config, task if isinstance(task, Task) else config.task, named)
     loaded = _model(model, config, asked)
     job = _Job(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None)
     if resume and run is not None and is_run(run_path(run)):
@@ -225,20 +247,15 @@ def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
 def _scene(scene: Scene | str | Path | Mapping[str, Any], object: str | None, settings: AttackKeywords) -> Scene:
     """The scene as it was given, or the one that a name and the settings describe."""
     if isinstance(scene, Scene):
-        clash = [name for name in ("set", "environment", "up", "camera", "exposure") if settings.get(name) is not None]
-        clash += [] if object is None else ["object"]
-        if clash:
-            raise InputError(f"{', '.join(clash)}: belongs to the scene, which is given already; give it to load_scene")
+        check_not_of_scene({**settings, "object": object})
         return scene
-    given, lit_by = scene_settings(settings.get("set"), settings.get("exposure")), settings.get("environment")
-    if not (lit_by is None or isinstance(lit_by, (str, Path))):
-        raise one_only("environment", tuple(lit_by))
-    up, camera = settings.get("up"), settings.get("camera")
+    said = SceneConfig(**{"object": "mug", **{name: one for name, one in settings.items() if name in OF_SCENE}})
+    given = scene_settings(said.set_, said.exposure)
     if object is not None:
-        return load_scene(object, lit_by, scene=scene, up=up, settings=given, camera=camera)
+        return load_scene(object, said.environment, scene=scene, up=said.up, settings=given, camera=said.camera)
     if isinstance(scene, Mapping):
         raise InputError("object: which shape of the scene is it? Give its id")
-    return load_scene(scene, lit_by, up=up, settings=given, camera=camera)
+    return load_scene(scene, said.environment, up=said.up, settings=given, camera=said.camera)
 
 
 def _set_by(scene: Scene, exposure: float | None) -> dict[str, float | str]:

@@ -26,6 +26,7 @@ from advsearch.engine.naming import load_models, scene_settings
 from advsearch.engine.rows import judged
 from advsearch.engine.sweeps.batch import Batches
 from advsearch.engine.sweeps.job import check_all
+from advsearch.engine.turn import in_turn
 from advsearch.errors import FileFormatError, InputError
 from advsearch.files import JsonObject, read_bytes
 from advsearch.models import Model
@@ -46,6 +47,7 @@ _ALIGNED = re.compile(r"rendering-([0-9]{1,12})(?:-.*)?")
 """The name of a file with a photograph that was aligned with a rendering."""
 
 
+@in_turn()
 def photo_agreement(run: str | Path) -> PhotoAgreement:
     """Return how the photographs that were taken for a run agree with its renderings (docs/viewer.md).
 

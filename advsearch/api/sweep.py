@@ -14,9 +14,10 @@ from advsearch.cluster.opening import executor_of
 from advsearch.config import SweepConfig
 from advsearch.engine.answers import one_label_for_several
 from advsearch.engine.budget import verification_ladder
-from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, named_camera, settings_of
+from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, named_camera, only_here, settings_of
 from advsearch.engine.naming import (
     AnyModel,
+    check_not_of_scene,
     check_not_spread,
     different,
     load_models,
@@ -97,6 +98,7 @@ def sweep(
     }
     loaded = tuple(_place(one) for one in scenes if isinstance(one, Scene))
     if loaded:
+        check_not_of_scene(options)
         described |= _described(loaded)
     else:
         described["object"] = ",".join(name for some in names for name in some)
@@ -108,12 +110,13 @@ def sweep(
     if config.surface and config.run is None:
         raise InputError("surface: expected `run` beside it, the folder that keeps the map; name one")
     progress = progress or NullProgress()
-    if loaded or not all(isinstance(one, (str, Path)) for one in networks):
+    if loaded or only_here(controls) or not all(isinstance(one, (str, Path)) for one in networks):
         check_not_spread(options)
     resumed = _stopped(config)
     if config.run is not None and resumed is None:
         check_free(config.run, overwrite=config.overwrite)
-    job = _job(config, loaded or _places(config), several(networks), task, controls)
+    asked = task if isinstance(task, Task) else config.task
+    job = _job(config, loaded or _places(config), several(networks), asked, controls)
     if config.run is not None:
         return _kept(config, job, progress, resumed)
     with _executor(config, progress) as executor:

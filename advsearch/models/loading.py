@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import nn
 
 from advsearch.errors import InputError, UnknownNameError, resembling
@@ -39,6 +40,8 @@ FORMS = (
 )
 
 
+@torch.inference_mode(False)
+@torch.enable_grad()
 def load_model(
     spec: str | os.PathLike[str] | nn.Module | Model,
     *,
@@ -61,7 +64,7 @@ def load_model(
         spec: ``"reference"`` (the bundled classifier), with ``"@weights.safetensors"`` if wanted; a path to a
             `torch.export` archive (.pt2) or to TorchScript; ``"package.module:callable"``, which returns an `nn.Module`
             or a `Model`, with ``"@weights.safetensors"`` if wanted; ``"torchvision:NAME@weights.safetensors"``; an
-            `nn.Module` (copied, its weights shared); a `Model`.
+            `nn.Module` (copied, its weights shared, unless they were made in `torch.inference_mode`); a `Model`.
         labels: the label names in index order, or a label file (see `read_labels`). Default "class 0", "class 1", ...
         name: what to call it in messages and results.
         input_size: (height, width) in pixels, or one number; default 224.

@@ -14,7 +14,7 @@ from advsearch.errors import AdvsearchError, InputError, UnknownNameError
 from advsearch.files import JsonObject
 from advsearch.settings.command_line import as_flags
 from advsearch.settings.declaration import Clash, settings
-from advsearch.settings.values import all_finite, is_file, is_shallow, shown, split_names
+from advsearch.settings.values import all_finite, as_python, is_file, is_shallow, shown, split_names
 from advsearch.settings.yaml_files import HEADER, SCHEMA, put, read_yaml
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class Config(BaseModel):
         if deep:
             raise _settings_error(type(self), [{"loc": (name,), "input": deep[name], "type": ""} for name in deep])
         try:
-            super().__init__(**data)
+            super().__init__(**as_python(data))
         except ValidationError as error:
             raise _settings_error(type(self), error.errors(include_url=False)) from None
 
