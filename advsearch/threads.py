@@ -104,9 +104,9 @@ def given_back() -> Iterator[None]:
         _chosen = chosen
         if "torch" in sys.modules:
             sys.modules["torch"].set_num_threads(for_torch or _default())
-        if for_drjit and drjit.thread_count() != for_drjit:
+        if drjit is not None and drjit.thread_count() != for_drjit:
             drjit.set_thread_count(for_drjit)
-        elif "drjit" in sys.modules and not for_drjit:
+        elif "drjit" in sys.modules and drjit is None:
             apply_to_drjit()
 
 

@@ -121,8 +121,8 @@ def attack(
         InputError: anything that the caller can put right; nothing is written then.
     """
     options = {name: value for name, value in settings.items() if value is not None}
-    named = all(isinstance(one, (str, Path)) for one in (scene, *several(model)))
-    if not named or callable(objective) or only_here(controls) or only_here(over):
+    loaded_already = not all(isinstance(one, (str, Path)) for one in (scene, *several(model)))
+    if loaded_already or callable(objective) or only_here(controls) or only_here(over):
         check_not_spread(options)
     if not isinstance(policy, (str, Mapping, Policy)):
         raise InputError(
