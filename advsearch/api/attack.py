@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,8 @@ from torch import Tensor
 from advsearch import seeds
 from advsearch.api.keywords import AttackKeywords, asks
 from advsearch.attacks import Policy, make_policy
-from advsearch.attacks.objectives import check_objective
+from advsearch.attacks.objectives import OBJECTIVE_KINDS, check_objective
+from advsearch.attacks.policies import POLICIES
 from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
 from advsearch.config import AttackConfig, PrecisionConfig, SceneConfig
@@ -25,6 +26,7 @@ from advsearch.controls.clean import sentences
 from advsearch.engine.ahead import Ahead, seen_by
 from advsearch.engine.answers import Described, Looked, check_truth, facts_of
 from advsearch.engine.budget import Preparation, RenderBudget, verification_ladder
+from advsearch.engine.going_on import check_made_of
 from advsearch.engine.loading import (
     Controls,
     PictureSettings,
@@ -42,6 +44,7 @@ from advsearch.engine.naming import (
     AnyModel,
     check_not_of_scene,
     check_not_spread,
+    exists_here,
     load_models,
     model_name,
     scene_settings,
@@ -61,7 +64,7 @@ from advsearch.models import Model
 from advsearch.models.ensemble import together
 from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress
-from advsearch.runs.directory import RunDirectory, check_free, is_run, run_path
+from advsearch.runs.directory import RunDirectory, begun, check_free, is_run, run_path
 from advsearch.runs.results.gap import CurveResult
 from advsearch.runs.results.matrix import MatrixResult
 from advsearch.scene.description import SceneDescription
@@ -128,6 +131,7 @@ def attack(
         raise InputError(
             f"policy: expected a name, a mapping with a `name` and options, or an instance, got {policy!r}"
         )
+    from_dictionary = isinstance(scene, Mapping)
     scene = _scene(scene, object, settings)
     described = {
         "object": scene.description.object_name,
@@ -138,11 +142,18 @@ def attack(
         "controls": settings_of(controls),
         "over": settings_of(over),
         "task": as_setting(task) if isinstance(task, Task) else task,
-        "objective": getattr(objective, "__name__", "custom") if callable(objective) else objective,
+        "objective": _own_name(objective) if callable(objective) else objective,
         "policy": as_setting(policy) if isinstance(policy, Policy) else policy,
         "set": _set_by(scene, settings.get("exposure")),
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
+    parts = [f"the model {model_name(one)}" for one in several(model) if exists_here(one)]
+    parts += ["the scene"] if from_dictionary else []
+    parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
+    parts += [f"the objective {config.objective}"] if callable(objective) else []
+    parts += [f"the policy {policy.name}"] if isinstance(policy, Policy) and not is_named(policy, _policy_of) else []
+    parts += [f"the control {name}" for name in (*only_here(controls), *only_here(over))]
+    config = config.with_only_here(parts)
     if config.is_matrix and config.ensemble is None:
         raise InputError(
             "model: expected one, got several; add `ensemble`, which attacks them together, or attack each by itself"
@@ -158,11 +169,13 @@ def attack(
     policy = policy if isinstance(policy, Policy) else config.policy_name
     named = config.objective if objective is None or isinstance(objective, str) else objective
     asked, objective = _asked(config, task if isinstance(task, Task) else config.task, named)
-    loaded = _model(model, config, asked)
-    job = _Job(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None)
-    if resume and run is not None and is_run(run_path(run)):
-        return _go_on(job, run, progress or NullProgress())
-    return _carry_out(job, progress or NullProgress())
+    stopped = run_path(run) if resume and run is not None and is_run(run_path(run)) else None
+    with begun(config) if run is not None and stopped is None else nullcontext(stopped) as folder:
+        loaded = _model(model, config, asked)
+        job = _Job(config, scene, loaded, asked, searched, drawn, objective, policy, run is not None)
+        if folder is None:
+            return _carry_out(job, progress or NullProgress())
+        return _go_on(job, folder, progress or NullProgress())
 
 
 def attack_from_config(
@@ -242,6 +255,36 @@ def attack_on(config: AttackConfig, scene: Scene, model: Model) -> AttackResult:
         InputError: as for `attack_from_config`.
     """
     return _carry_out(_given(config, scene, model), NullProgress())
+
+
+def _own_name(objective: Callable[..., Tensor]) -> str:
+    """What an objective of the caller's is called; never as one of ours."""
+    name = str(getattr(objective, "__name__", None) or type(objective).__name__)
+    return f"own {name}" if name in OBJECTIVE_KINDS else name
+
+
+def _policy_of(setting: str | Mapping[str, Any]) -> Policy[Any]:
+    config = AttackConfig(object="mug", policy=setting)
+    return make_policy(config.policy_name, **config.policy_options)
+
+
+def is_named(entry: Task | Policy[Any], make: Callable[[Any], object]) -> bool:
+    """Whether a file can name a task or a policy, with all of its options."""
+    try:
+        return bool(make(as_setting(entry)) == entry)
+    except InputError:
+        return False
+
+
+def judged_alone(config: AttackConfig) -> AttackConfig:
+    """Return what an answer of a run is judged with: what counts as success needs neither an objective nor a policy
+    that only the session had which searched with them."""
+    change: dict[str, object] = {}
+    if config.objective is not None and config.objective not in OBJECTIVE_KINDS:
+        change["objective"] = None
+    if config.policy_name not in POLICIES:
+        change["policy"] = AttackConfig.model_fields["policy"].default
+    return config.model_copy(update=change)
 
 
 def _scene(scene: Scene | str | Path | Mapping[str, Any], object: str | None, settings: AttackKeywords) -> Scene:
@@ -445,6 +488,8 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
         progress.message(text)
     policy = _policy(job, problem)
     with _directory(job, run) as kept:
+        if kept is not None:
+            check_made_of(kept, [job.loaded[0]], {"objective": job.objective if callable(job.objective) else None})
         memory = Memory(kept)
         with executor_for(job.config, "advsearch.api.attack:announced_of", progress) as executor:
             recorder = Recorder(kept, problem, memory, Ahead(executor))

@@ -15,7 +15,7 @@ from functools import wraps
 from pathlib import Path
 from typing import Any, Literal, TypedDict, TypeVar
 
-from advsearch.engine.loading import Controls, instances_in, lending, only_here, settings_of
+from advsearch.engine.loading import Controls, instances_in, lending, lent_controls, only_here, settings_of
 from advsearch.engine.naming import check_not_spread
 from advsearch.engine.turn import in_turn
 from advsearch.settings import Config, as_python, is_shallow, settings
@@ -314,4 +314,5 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
 
 def configured(config: type[Made], **given: object) -> Made:
     """Return a configuration of settings as Python has them; None is one that was not given."""
-    return config(**{name: value for name, value in given.items() if value is not None})
+    made = config(**{name: value for name, value in given.items() if value is not None})
+    return made.with_only_here([f"the control {name}" for name in only_here(lent_controls())])

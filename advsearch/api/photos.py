@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from advsearch import seeds
-from advsearch.api.attack import problem_from_config
+from advsearch.api.attack import judged_alone, problem_from_config
 from advsearch.api.replay import kept_answer
 from advsearch.api.sweep import job_of
 from advsearch.attacks import clopper_pearson
@@ -253,7 +253,7 @@ def _by_sweep(config: SweepConfig) -> Sequence[_PhotoJudge]:
 
 def _by_attack(run: Path, config: AttackConfig) -> Sequence[_PhotoJudge]:
     """Who judges by the configurations of an attack: the clean one, the answer, and those of its trials."""
-    problem, _ = problem_from_config(config)
+    problem, _ = problem_from_config(judged_alone(config))
     task = problem.task
     alone = (task.models, task.tasks) if isinstance(task, Together) else ((problem.model,), (task,))
 

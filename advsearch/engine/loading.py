@@ -273,6 +273,11 @@ def lent_control(name: str) -> Control | None:
     return _LENT.get().get(name)
 
 
+def lent_controls() -> list[Control]:
+    """Return all of them."""
+    return list(_LENT.get().values())
+
+
 @contextmanager
 def lending(controls: Controls) -> Iterator[None]:
     """Let the instances among controls be what their names stand for inside the block, where only names are told."""

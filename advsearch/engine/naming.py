@@ -81,7 +81,12 @@ def model_name(model: AnyModel) -> str:
     """Return what a model is called in settings."""
     if isinstance(model, (str, Path)):
         return str(model)
-    return str(getattr(model, "name", None) or type(model).__name__)
+    return str(getattr(model, "asked", None) or getattr(model, "name", None) or type(model).__name__)
+
+
+def exists_here(model: AnyModel) -> bool:
+    """Whether a model exists in this session only, so that no file and no command can name it."""
+    return not isinstance(model, (str, Path)) and getattr(model, "asked", None) is None
 
 
 def different(names: Sequence[str], setting: str) -> Sequence[str]:

@@ -55,7 +55,7 @@ def trial_row(
         step=number,
         seed=seed,
         spp=spp,
-        objective=_number(trial.score),
+        objective=_number(trial.objective),
         success=trial.success if sought else None,
         values=values or {},
         **{"renders": 1, **_said(trial), **more},
@@ -70,6 +70,7 @@ def judged(row: Row, judgement: Judgement) -> Row:
 def _said(judgement: Judgement) -> dict[str, Any]:
     answer = judgement.answer
     return {
+        "score": _number(judgement.score),
         "correct": judgement.right,
         "margin": _number(judgement.margin),
         "label": answer.label,
@@ -79,16 +80,16 @@ def _said(judgement: Judgement) -> dict[str, Any]:
     }
 
 
-def _number(value: float) -> float | None:
-    return None if math.isnan(value) else value
+def _number(value: float | None) -> float | None:
+    return None if value is None or math.isnan(value) else value
 
 
 def judgement_of(row: Row) -> Judgement:
     """Return what was said of a trial from its row; in an old row, only the score says whether it was right."""
-    score = math.nan if row.objective is None else row.objective
-    margin = math.nan if row.margin is None else row.margin
+    score, margin, objective = (math.nan if one is None else one for one in (row.score, row.margin, row.objective))
     right = score <= 0.0 if row.correct is None else row.correct
-    return Judgement(score, margin, right, Answer(row.label or "", row.label_index, row.probability), row.payload)
+    answer = Answer(row.label or "", row.label_index, row.probability)
+    return Judgement(score, margin, right, answer, row.payload, objective)
 
 
 def verified_rate(rate: Trials, trials: Sequence[Judgement]) -> VerifiedRate:

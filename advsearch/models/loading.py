@@ -96,10 +96,24 @@ def load_model(
         "max_batch": max_batch,
     }
     given = {key: value for key, value in options.items() if value is not None}
+    if isinstance(spec, (str, os.PathLike)) and not given and labels is None and name is None:
+        return dataclasses.replace(_loaded(spec, given, labels, name, max_batch, read), asked=os.fspath(spec))
+    return _loaded(spec, given, labels, name, max_batch, read)
+
+
+def _loaded(
+    spec: object,
+    given: Mapping[str, object],
+    labels: Any,
+    name: str | None,
+    max_batch: int | None,
+    read: Read | None,
+) -> Model:
     names, origin = _given_labels(labels)  # first, because loading a model takes seconds
     found = _find(spec)
     if isinstance(found, Model):
         found = dataclasses.replace(found, read=read or found.read)
+        found = found if names is None and name is None else dataclasses.replace(found, asked=None)
         return _relabelled(found, names, origin, name, given)
     low, high = found.batch_limits
     bare = Model(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from advsearch.report.phrases import (
     CLASSIFICATION,
+    SUCCESS_ABOVE_ZERO,
     calling,
     calls,
     margin_text,
@@ -94,6 +95,19 @@ def goal_text(summary: AttackSummary) -> str:
     if summary.target:
         return f"the model should answer {' or '.join(summary.target)}"
     return "easier to recognise" if summary.minimises else ""
+
+
+def objective_text(summary: AttackSummary) -> str:
+    """Return what came of an objective that is no margin, over the trials; empty where there is nothing to say."""
+    tried = summary.tried_objective
+    if tried is None or summary.objective in SUCCESS_ABOVE_ZERO:
+        return ""
+    parts = [
+        f"{name} {one.mean:.3g} (from {one.low:.3g} to {one.high:.3g})"
+        for name, one in (("clean", tried.clean), ("answer", tried.answer))
+        if one is not None
+    ]
+    return f"{summary.objective} in the trials: {', '.join(parts)}" if parts else ""
 
 
 def over_text(summary: AttackSummary) -> str:

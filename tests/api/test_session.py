@@ -2,22 +2,38 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from samples import SUMMARY
 from torch import Tensor, nn
 
 import advsearch
 from advsearch.api import attack as attacking
-from advsearch.config import CONFIGS
+from advsearch.cli.main import main
+from advsearch.config import CONFIGS, AttackConfig, RegionConfig, SweepConfig
 from advsearch.controls.numbers import NumberControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
+from advsearch.engine.problem import Problem
 from advsearch.errors import AdvsearchError, InputError
+from advsearch.models import ModelWarning
+from advsearch.progress import NullProgress
+from advsearch.report.wording import objective_text
+from advsearch.runs.directory import is_run
+from advsearch.runs.store import Store
 from advsearch.scene.parameters import Parameter
 from advsearch.settings import settings
 
@@ -280,3 +296,205 @@ def test_instances_and_names_go_together_in_every_question(
         advsearch.gap("mug", controls=[TextureControl(), PoseControl()], epsilon=0.1, run=tmp_path / "not")
     with pytest.raises(InputError, match="unknown control 'faded'"):
         advsearch.gap("mug", controls="faded", run=tmp_path / "not")
+
+
+# ---- a run of this session ------------------------------------------------------------------------------------------
+
+SMALL: dict[str, Any] = {**FAST, "spp": 2, "verify_spp": 2, "steps": 4}
+
+
+def brightness(factor: float) -> Callable[..., Tensor]:
+    """An objective that settings call by the same name whatever the factor is."""
+
+    def loss(logits: Tensor, images: Tensor, labels: Any) -> Tensor:
+        return factor * images.mean(dim=(1, 2, 3))
+
+    return loss
+
+
+class Loss:
+    """The same as an object, whose numbers nobody can read off it."""
+
+    __name__ = "loss"
+
+    def __init__(self, factor: float) -> None:
+        self.factor = torch.tensor(factor)
+
+    def __call__(self, logits: Tensor, images: Tensor, labels: Any) -> Tensor:
+        return self.factor * images.mean(dim=(1, 2, 3))
+
+
+def stopped(monkeypatch: pytest.MonkeyPatch, after: int = 2) -> Any:
+    """Let a search be interrupted after so many evaluations."""
+    patch, original = pytest.MonkeyPatch(), Problem.evaluator
+
+    def interrupted(self: Problem, stream: str, on_image: Any = None) -> Any:
+        evaluate, left = original(self, stream, on_image), iter(range(after))
+
+        def stops(u: Tensor, **named: Any) -> Any:
+            if next(left, None) is None:
+                raise KeyboardInterrupt
+            return evaluate(u, **named)
+
+        return stops
+
+    patch.setattr(Problem, "evaluator", interrupted)
+    return patch
+
+
+@pytest.mark.parametrize("own", [brightness, Loss])
+def test_a_run_goes_on_with_the_objective_and_the_weights_that_it_began_with(
+    own: Callable[[float], Any], scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, model = tmp_path / "run", victim(level + 0.03)
+    patch = stopped(monkeypatch)
+    assert advsearch.attack(scene, model, objective=own(1.0), run=run, **SMALL).summary.ending == "interrupted"
+    patch.undo()
+    again: dict[str, Any] = {**SMALL, "run": run, "resume": True}
+    with pytest.raises(
+        InputError, match=r"cannot go on: .*(objective is another function now|objective was .* and is)"
+    ):
+        advsearch.attack(scene, model, objective=own(-1.0), **again)
+    with pytest.raises(InputError, match="model bright has other weights now; take the one that"):
+        advsearch.attack(scene, victim(level + 0.05), objective=own(1.0), **again)
+    with pytest.raises(InputError, match=r"the same picture of the clean scene has other values now \(score was"):
+        brighter = advsearch.load_scene("mug", settings={"camera.exposure": 0.5})
+        advsearch.attack(replace(brighter, description=replace(brighter.description, given=frozenset())), model,
+                         objective=own(1.0), **again)  # fmt: skip
+    assert advsearch.attack(scene, model, objective=own(1.0), **again).summary.ending != "interrupted"
+    with Store(run / "results.sqlite", read_only=True) as store:
+        noted = store.noted("made of")
+    assert "self.factor *" in noted["objective"]["source"] or "factor *" in noted["objective"]["source"]
+    assert len(noted["model bright"]["weights"]) == 64
+
+
+def test_a_model_that_answers_at_random_goes_on(
+    scene: advsearch.Scene, level: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Random(Bright):
+        def forward(self, images: Tensor) -> Tensor:
+            return super().forward(images) + 0.2 * torch.rand(())
+
+    with pytest.warns(ModelWarning):
+        model = advsearch.load_model(Random(level + 0.03), labels=["mug", "vase"], input_size=SIDE)
+    patch = stopped(monkeypatch)
+    advsearch.attack(scene, model, run=tmp_path / "run", **SMALL)
+    patch.undo()
+    found = advsearch.attack(scene, model, run=tmp_path / "run", resume=True, **SMALL)
+    assert found.summary.ending != "interrupted"
+
+
+def test_a_sweep_goes_on_with_the_weights_that_it_began_with(scene: advsearch.Scene, tmp_path: Path) -> None:
+    class Stops(NullProgress):
+        def advance(self, n: int = 1, **info: float | str) -> None:
+            if n:
+                raise KeyboardInterrupt
+
+    asked: dict[str, Any] = {"resolution": SIDE, "spp": 1, "trials": 0, "denoise": "none", "batch": 1}
+    grid = {"pose.yaw": [0, 90, 180, 270]}
+    model = victim(0.5)
+    for ends in (Stops(), NullProgress()):
+        with suppress(KeyboardInterrupt):
+            advsearch.sweep(scene, model, grid, run=tmp_path / "run", progress=ends, **asked)
+        if isinstance(ends, Stops):
+            with pytest.raises(InputError, match="cannot go on: model bright has other weights now"):
+                advsearch.sweep(scene, victim(0.6), grid, run=tmp_path / "run", **asked)
+            with pytest.MonkeyPatch.context() as patch:  # of a network that shows none
+                patch.setattr(Bright, "state_dict", lambda self: {})
+                with pytest.raises(InputError, match=r"has other values now \(margin was"):
+                    advsearch.sweep(scene, victim(0.6), grid, run=tmp_path / "run", **asked)
+    with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:
+        assert store.count("sweep") == 4
+
+
+def test_what_exists_only_here_is_no_command(
+    scene: advsearch.Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    objective = lambda logits, images, labels: images.mean(dim=(1, 2, 3))  # noqa: E731
+    result = advsearch.attack(
+        scene, "reference", objective=objective, run=run, **{**SMALL, "steps": 1, "resolution": 128}
+    )
+    words = "No command repeats this: the objective <lambda> exists only in the Python session that asked."
+    assert result.summary.command_line == words
+    page = (run / "report.html").read_text("utf-8")
+    assert "the objective &lt;lambda&gt; exists only in" in page and f"advsearch run {run}" not in page
+    assert "# But it can't be: the objective <lambda>" in (run / "run.yaml").read_text("utf-8")
+    (run / "summary.json").unlink()
+    assert main(["resume", str(run)]) == 2
+    assert "the objective <lambda> existed only in the Python session that asked" in capsys.readouterr().err
+    run.joinpath("summary.json").write_text(json.dumps(result.summary.to_dict()), "utf-8")
+    replayed = advsearch.replay(run, ways="curve", trials=6, run=tmp_path / "again", threads=1)
+    assert {row.ending for row in replayed.table} <= {"found", "budget spent", "not verified", "already wrong"}
+    named = advsearch.attack(scene, advsearch.load_model("reference"), run=tmp_path / "named", **{**SMALL, "steps": 1})
+    assert named.summary.command_line.startswith("advsearch attack --object mug")
+    assert AttackConfig.from_yaml(tmp_path / "named" / "run.yaml").model == "reference"
+
+
+def test_an_objective_of_ones_own_stands_beside_the_score_of_every_trial(
+    scene: advsearch.Scene, level: float, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    result = advsearch.attack(scene, victim(level + 0.03), objective=brightness(1.0), run=run, average=2, **SMALL)
+    for row in result.rows():
+        assert row.score == row.margin, "of classification without a target"
+        assert row.objective is not None and 0.0 < row.objective < 1.0, row.kind
+    tried = result.summary.tried_objective
+    control = [row.objective for row in result.rows("control") if row.objective is not None]
+    assert tried is not None and tried.clean is not None and tried.answer is not None
+    assert tried.clean.mean == pytest.approx(sum(control) / 6) and tried.clean.low == min(control)
+    assert tried.answer.low <= tried.answer.mean <= tried.answer.high and tried.answer.deviation > 0.0
+    assert "loss in the trials: clean 0.4" in objective_text(result.summary)
+    assert objective_text(SUMMARY) == "", "of an older run, and of a margin"
+
+
+def test_a_run_that_is_killed_while_it_loads_goes_on(tmp_path: Path) -> None:
+    """By the command line and from Python: the folder is there before anything is loaded."""
+    from advsearch.api import carry_out
+
+    config = AttackConfig(object="mug", run=str(tmp_path / "run"), **{**SMALL, "resolution": (SIDE, SIDE)})
+    seen: list[bool] = []
+
+    def killed(*_: Any, **__: Any) -> Any:
+        seen.append(is_run(tmp_path / "run") and (tmp_path / "run" / "run.yaml").is_file())
+        raise InterruptedError
+
+    for ask in (
+        lambda: carry_out(config),
+        lambda: advsearch.attack("mug", run=tmp_path / "run", **SMALL),
+        lambda: advsearch.sweep("mug", grid={"pose.yaw": [0, 90]}, run=tmp_path / "run"),
+        lambda: carry_out(SweepConfig(object="mug", grid={"pose.yaw": [0, 90]}, run=str(tmp_path / "run"))),
+        lambda: carry_out(RegionConfig(object="mug", controls="pose", run=str(tmp_path / "run"))),
+    ):
+        with pytest.MonkeyPatch.context() as patch:
+            for module in ("attack", "sweep"):
+                patch.setattr(f"advsearch.api.{module}.load_models", killed)
+            with pytest.raises(InterruptedError):
+                ask()
+        assert seen.pop() and not (tmp_path / "run").exists(), "what was only refused leaves nothing"
+    assert not seen
+
+
+def test_a_run_that_was_killed_at_once_is_resumed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = tmp_path / "run"
+    words = ["attack", "--object", "mug", "--run", str(run), "--resolution", str(SIDE), "--steps", "1", "--spp", "1"]
+    words += ["--trials", "6", "--verify-spp", "1", "--no-baseline", "--measure", "no", "--denoise", "none"]
+    child = subprocess.Popen([sys.executable, "-m", "advsearch", *words, "--quiet"], env=dict(os.environ))
+    while not (run / "run.yaml").is_file():
+        assert child.poll() is None
+        time.sleep(0.005)
+    child.kill()
+    child.wait()
+    with Store(run / "results.sqlite", read_only=True) as store:
+        assert store.count() == 0, "it was killed before it evaluated anything"
+    assert main(["resume", str(run), "--quiet"]) == 0
+    assert "mug" in capsys.readouterr().out
+
+
+def test_a_run_is_replaced_when_something_takes_its_place(scene: advsearch.Scene, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    advsearch.attack(scene, victim(0.9), run=run, **{**SMALL, "steps": 1})
+    before = (run / "summary.json").read_bytes()
+    with pytest.raises(InputError):
+        advsearch.attack(scene, victim(0.9), label="teapot", run=run, overwrite=True, **SMALL)
+    assert (run / "summary.json").read_bytes() == before
