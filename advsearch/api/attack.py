@@ -131,7 +131,6 @@ def attack(
         raise InputError(
             f"policy: expected a name, a mapping with a `name` and options, or an instance, got {policy!r}"
         )
-    from_dictionary = isinstance(scene, Mapping)
     scene = _scene(scene, object, settings)
     described = {
         "object": scene.description.object_name,
@@ -148,7 +147,7 @@ def attack(
     }
     config = AttackConfig(**{**described, **options, "run": None if run is None else str(run)})
     parts = [f"the model {model_name(one)}" for one in several(model) if exists_here(one)]
-    parts += ["the scene"] if from_dictionary else []
+    parts += ["the scene"] if scene.only_here else []
     parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
     parts += [f"the objective {config.objective}"] if callable(objective) else []
     parts += [f"the policy {policy.name}"] if isinstance(policy, Policy) and not is_named(policy, _policy_of) else []

@@ -106,6 +106,7 @@ def sweep(
         described["object"] = ",".join(name for some in names for name in some)
     config = SweepConfig(**{**described, **options, "run": None if run is None else str(run)})
     parts = [f"the model {model_name(one)}" for one in networks if exists_here(one)]
+    parts += ["the scene"] if any(place.scene.only_here for place in loaded) else []
     parts += [f"the task {task.name}"] if isinstance(task, Task) and not is_named(task, make_task) else []
     config = config.with_only_here([*parts, *(f"the control {name}" for name in only_here(controls))])
     if config.keep_pictures != "none" and config.run is None:

@@ -47,9 +47,11 @@ class Scene:
 
     Attributes:
         description: the scene as data.
+        only_here: whether it was made of something that no file and no command can name.
     """
 
     description: SceneDescription
+    only_here: bool = False
 
     def renderer(
         self,
@@ -91,7 +93,7 @@ class Scene:
         own = self.description
         given = own.given | {ENVIRONMENT}
         check_ground(own.given_values, name)
-        return Scene(replace(own, environment=environment, environment_spec=name, given=given))
+        return Scene(replace(own, environment=environment, environment_spec=name, given=given), self.only_here)
 
     def __repr__(self) -> str:
         described = self.description
@@ -108,7 +110,7 @@ class Scene:
         own = self.description
         check_meshes(own, given)
         values = {**own.values, **{name: resolved[name] for name in given}}
-        return Scene(replace(own, values=values, given=own.given | set(given)))
+        return Scene(replace(own, values=values, given=own.given | set(given)), self.only_here)
 
 
 @dataclass(frozen=True)
@@ -165,7 +167,10 @@ def load_scene(
         described = describe(object, environment, given=settings, up=up, plugins=scene)
     else:
         described = describe(f"{scene}#{object}", environment, given=settings, up=up)
-    return Scene(described if camera is None else described.seen_by(camera))
+    only_here = isinstance(scene, Mapping) or not all(
+        one is None or isinstance(one, (str, Path)) for one in (object, environment)
+    )
+    return Scene(described if camera is None else described.seen_by(camera), only_here)
 
 
 def named_camera(description: SceneDescription) -> str | None:

@@ -86,10 +86,10 @@ def _number(value: float | None) -> float | None:
 
 def judgement_of(row: Row) -> Judgement:
     """Return what was said of a trial from its row; in an old row, only the score says whether it was right."""
-    score, margin, objective = (math.nan if one is None else one for one in (row.score, row.margin, row.objective))
+    score, margin = (math.nan if one is None else one for one in (row.score, row.margin))
     right = score <= 0.0 if row.correct is None else row.correct
     answer = Answer(row.label or "", row.label_index, row.probability)
-    return Judgement(score, margin, right, answer, row.payload, objective)
+    return Judgement(score, margin, right, answer, row.payload, row.objective)
 
 
 def verified_rate(rate: Trials, trials: Sequence[Judgement]) -> VerifiedRate:

@@ -364,15 +364,22 @@ def begun(config: Config) -> Iterator[Path | None]:
     if overwrite and place is not None and is_run(run_path(place)):
         yield None
         return
+    home = HOME if place is None else run_path(place).parent
+    above = [one for one in (home, *home.parents) if not os.path.exists(one)]
     with RunDirectory.create_for(config) as run:
         path = run.path
     try:
         yield path
     except BaseException:
-        with suppress(AdvsearchError), RunDirectory.resume(path) as run:
-            run._began = True
+        try:
+            with suppress(AdvsearchError), RunDirectory.resume(path) as run:
+                run._began = True
+                raise
             raise
-        raise
+        finally:
+            with suppress(OSError):
+                for folder in above:
+                    folder.rmdir()
 
 
 def default_name(object_name: str, controls: Iterable[str]) -> str:

@@ -426,6 +426,9 @@ def test_what_exists_only_here_is_no_command(
     run.joinpath("summary.json").write_text(json.dumps(result.summary.to_dict()), "utf-8")
     replayed = advsearch.replay(run, ways="curve", trials=6, run=tmp_path / "again", threads=1)
     assert {row.ending for row in replayed.table} <= {"found", "budget spent", "not verified", "already wrong"}
+    drawn = advsearch.load_scene(scene.description.object)
+    swept = advsearch.sweep(drawn, "reference", {"pose.yaw": [0, 90]}, resolution=SIDE, spp=1, trials=0)
+    assert swept.summary.command_line.startswith("No command repeats this: the scene exists only in")
     named = advsearch.attack(scene, advsearch.load_model("reference"), run=tmp_path / "named", **{**SMALL, "steps": 1})
     assert named.summary.command_line.startswith("advsearch attack --object mug")
     assert AttackConfig.from_yaml(tmp_path / "named" / "run.yaml").model == "reference"
@@ -452,26 +455,28 @@ def test_a_run_that_is_killed_while_it_loads_goes_on(tmp_path: Path) -> None:
     """By the command line and from Python: the folder is there before anything is loaded."""
     from advsearch.api import carry_out
 
-    config = AttackConfig(object="mug", run=str(tmp_path / "run"), **{**SMALL, "resolution": (SIDE, SIDE)})
+    run = tmp_path / "new" / "run"
+
+    config = AttackConfig(object="mug", run=str(run), **{**SMALL, "resolution": (SIDE, SIDE)})
     seen: list[bool] = []
 
     def killed(*_: Any, **__: Any) -> Any:
-        seen.append(is_run(tmp_path / "run") and (tmp_path / "run" / "run.yaml").is_file())
+        seen.append(is_run(run) and (run / "run.yaml").is_file())
         raise InterruptedError
 
     for ask in (
         lambda: carry_out(config),
-        lambda: advsearch.attack("mug", run=tmp_path / "run", **SMALL),
-        lambda: advsearch.sweep("mug", grid={"pose.yaw": [0, 90]}, run=tmp_path / "run"),
-        lambda: carry_out(SweepConfig(object="mug", grid={"pose.yaw": [0, 90]}, run=str(tmp_path / "run"))),
-        lambda: carry_out(RegionConfig(object="mug", controls="pose", run=str(tmp_path / "run"))),
+        lambda: advsearch.attack("mug", run=run, **SMALL),
+        lambda: advsearch.sweep("mug", grid={"pose.yaw": [0, 90]}, run=run),
+        lambda: carry_out(SweepConfig(object="mug", grid={"pose.yaw": [0, 90]}, run=str(run))),
+        lambda: carry_out(RegionConfig(object="mug", controls="pose", run=str(run))),
     ):
         with pytest.MonkeyPatch.context() as patch:
             for module in ("attack", "sweep"):
                 patch.setattr(f"advsearch.api.{module}.load_models", killed)
             with pytest.raises(InterruptedError):
                 ask()
-        assert seen.pop() and not (tmp_path / "run").exists(), "what was only refused leaves nothing"
+        assert seen.pop() and not run.parent.exists(), "what was only refused leaves nothing"
     assert not seen
 
 

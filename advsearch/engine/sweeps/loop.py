@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from advsearch.attacks.draws import Seeds
@@ -248,10 +249,10 @@ class Sweep:
             return
         number, model = divmod(row.step, self.models)
         batches = Batches(self.job, self.per_scene)  # another one: what is done here decides no row
-        now, again = (batches(range(number, number + 1)).judgements[model][0] for _ in range(2))
-        if same([row.margin], [finite(now.margin)]) or not same([finite(now.margin)], [finite(again.margin)]):
-            return
-        raise Memory(self.run).other_answers({"margin": (row.margin, finite(now.margin))})
+        look = partial(batches, range(number, number + 1))
+        now = finite(look().judgements[model][0].margin)
+        if not same([row.margin], [now]) and same([now], [finite(look().judgements[model][0].margin)]):
+            raise Memory(self.run).other_answers({"margin": (row.margin, now)})
 
     def _tell(self, count: int, tally: Tally) -> None:
         self._untold += count
