@@ -11,9 +11,9 @@ from types import MappingProxyType
 from typing import final
 
 from advsearch.controls import CONTROLS, Control, Space, gathered, make_control, make_space, settings_by_name
-from advsearch.engine.turn import differentiating
 from advsearch.errors import InputError
 from advsearch.models import Model
+from advsearch.models.switches import plainly
 from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
 from advsearch.scene.description import (
@@ -79,7 +79,7 @@ class Scene:
         """
         resolution = as_python(resolution)
         description = framed(self.description, resolution)
-        with differentiating():
+        with plainly():
             space = make_space(as_controls(controls), description)
             return make_renderer(description, space, resolution, denoise, seed, estimators, sampler=sampler)
 
@@ -134,6 +134,7 @@ class PictureSettings:
         return self.resolution or (model.input_size[0], model.input_size[1])
 
 
+@plainly()
 def load_scene(
     object: str | Path | ObjectAsset,
     environment: str | Path | EnvironmentAsset | None = None,

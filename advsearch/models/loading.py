@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import nn
 
 from advsearch.errors import InputError, UnknownNameError, resembling
@@ -20,6 +19,7 @@ from advsearch.models.model import Model, Read
 from advsearch.models.preprocessing import Preprocessing
 from advsearch.models.probe import probe
 from advsearch.models.source import Source, source_of
+from advsearch.models.switches import called_under, plainly, turned_by_code
 from advsearch.models.zoo import timm, torchvision, transformers
 from advsearch.registry import Registry
 
@@ -40,8 +40,7 @@ FORMS = (
 )
 
 
-@torch.inference_mode(False)
-@torch.enable_grad()
+@plainly()
 def load_model(
     spec: str | os.PathLike[str] | nn.Module | Model,
     *,
@@ -111,6 +110,9 @@ def _loaded(
 ) -> Model:
     names, origin = _given_labels(labels)  # first, because loading a model takes seconds
     found = _find(spec)
+    switches = turned_by_code()
+    if isinstance(found, Source) and isinstance(found.module, nn.Module):
+        called_under(found.module, switches)
     if isinstance(found, Model):
         found = dataclasses.replace(found, read=read or found.read)
         found = found if names is None and name is None else dataclasses.replace(found, asked=None)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from advsearch.described import NOT_A_NUMBER
+
 CLASSIFICATION, DETECTION, SEGMENTATION = "classification", "detection", "segmentation"
 """Tasks whose answers have words of their own; others are quoted."""
 
@@ -102,6 +104,8 @@ def cells(task: str, answer: Said) -> list[str]:
 def answer_text(task: str, answer: Said) -> str:
     """Return an answer on one line: ``vase, 91 %``, ``no cup found (best 0.12)``."""
     label, number = cells(task, answer)
+    if task == SEGMENTATION and number and label.startswith(_NONE):
+        return f"{label} found, accuracy over the object's pixels {percent(answer.probability)}"
     if task == SEGMENTATION and number:
         return f"accuracy over the object's pixels {percent(answer.probability)}, most often {label}"
     if task == DETECTION and number:
@@ -111,6 +115,10 @@ def answer_text(task: str, answer: Said) -> str:
 
 def calls(task: str, thing: str, label: str) -> str:
     """Return what a model does to a thing, as a clause: ``calls this mug a vase``, ``finds no cup``."""
+    if label == NOT_A_NUMBER:
+        return f"answers nothing for {thing}, for its answer is not a number"
+    if task == SEGMENTATION and label.startswith(_NONE):
+        return f"finds {label}"
     if task == CLASSIFICATION:
         return f"calls {thing} {with_article(label)}"
     if task == DETECTION:
@@ -120,6 +128,8 @@ def calls(task: str, thing: str, label: str) -> str:
 
 def calling(task: str, label: str) -> str:
     """Return the same of a thing that was named already: ``calling it a vase``, ``finding no cup``."""
+    if task == SEGMENTATION and label.startswith(_NONE):
+        return f"finding {label}"
     if task == CLASSIFICATION:
         return f"calling it {with_article(label)}"
     if task == DETECTION:

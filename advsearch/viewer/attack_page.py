@@ -23,7 +23,7 @@ from advsearch.runs.files import write_text
 from advsearch.runs.results.attack import AttackSummary, FoundValue, UsualAnswer
 from advsearch.runs.summary import attack_of
 from advsearch.viewer.document import data_script, data_url, document, scrolled
-from advsearch.viewer.study_page import facts_table, table
+from advsearch.viewer.study_page import facts_table, heading, named, table
 from advsearch.viewer.turning import object_data, object_section, read_object
 
 LARGE_PICTURE = 1_000_000
@@ -115,15 +115,8 @@ def page(data: RunData) -> str:
 
 
 def _header(summary: AttackSummary) -> Html:
-    remarks = [element("li", text) for text in wording.remarks(summary)]
-    model, environment = (wording.short_name(name) for name in (summary.model, summary.environment))
-    what = f"{wording.budget_text(summary)}; object {wording.noun(summary)}, environment {environment}, model {model}"
-    return element(
-        "header",
-        element("p", what, class_="eyebrow"),
-        element("h1", wording.verdict(summary)),
-        element("ul", *remarks, class_="remarks") if remarks else None,
-    )
+    about = named(("object", summary.object), ("environment", summary.environment), ("model", summary.model))
+    return heading(join(f"{wording.budget_text(summary)}; ", about), wording.verdict(summary), wording.remarks(summary))
 
 
 def _pictures(data: RunData) -> Html:
@@ -188,24 +181,25 @@ def _rates(summary: AttackSummary) -> Html:
     control, average, baseline = summary.clean.control, summary.average, summary.baseline
     success, rows = wording.success(summary), []
     if control:
-        rows.append(("Clean scene (control group)", "right", control.correct, control.trials, control.interval))
+        clean = control.correct, control.trials, control.interval, control.not_a_number
+        rows.append(("Clean scene (control group)", "right", *clean))
     random = f"{baseline.policy.capitalize()} search" if baseline else ""
     for name, rated in (("Adversarial", summary.verified), (random, baseline.verified if baseline else None)):
         if rated:
-            rows.append((name, success, rated.successes, rated.trials, rated.interval))
+            rows.append((name, success, rated.successes, rated.trials, rated.interval, rated.not_a_number))
     if average:
         average_case = "Average case (random configurations)"
-        rows.append((average_case, "right", average.correct, average.configurations, average.interval))
+        rows.append((average_case, "right", average.correct, average.configurations, average.interval, 0))
     lines = [
         element(
             "tr",
             element("th", name, scope="row"),
             element("td", what),
-            element("td", f"{number} of {trials}", class_="number"),
+            element("td", wording.tally("", number, trials, nothing).removeprefix(" in "), class_="number"),
             element("td", wording.interval_text(interval), class_="number"),
             element("td", _bar(number / trials, interval), class_="hide-small"),
         )
-        for name, what, number, trials, interval in rows
+        for name, what, number, trials, interval, nothing in rows
     ]
     if not lines:
         return Html("")

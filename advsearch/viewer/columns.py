@@ -17,7 +17,7 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from advsearch.described import Value
+from advsearch.described import NOT_A_NUMBER, Value
 from advsearch.files import JsonObject
 from advsearch.runs.store import NAME, Row, Store
 
@@ -30,6 +30,11 @@ UNKNOWN = 2
 """`right` of a row whose answer was not judged."""
 
 NO_PROBABILITY = 65535
+
+BOX_STEPS = 8
+"""Of a pixel, in which the corners of boxes are counted."""
+
+NO_BOX = 65535
 
 Array = npt.NDArray[Any]
 
@@ -64,6 +69,8 @@ class Columns:
         answers: what was answered.
         parameters: in the order in which rows have them.
         last: the id of the last row; 0 where there is none.
+        boxes: (n, 8) uint16, of detection: x0, y0, x1, y1 of the true box and of the one that the answer is about, in
+            `BOX_STEPS` of a pixel of the rendering; `NO_BOX` where there is none. None where no row has any.
         more: whether there are further rows behind these.
         running: whether further rows are still being made.
     """
@@ -76,6 +83,7 @@ class Columns:
     answers: tuple[str, ...]
     parameters: tuple[Column, ...]
     last: int
+    boxes: Array | None = None
     more: bool = False
     running: bool = False
 
@@ -85,7 +93,7 @@ class Columns:
         arrays = self._arrays()
         starts = np.cumsum([0, *(one.nbytes for _, one in arrays)])
         placed = [
-            {"name": name, "type": one.dtype.name, "at": int(start)}
+            {"name": name, "type": one.dtype.name, "at": int(start), "width": one.size // max(len(one), 1)}
             for (name, one), start in zip(arrays, starts[:-1], strict=True)
         ]
         parameters = [
@@ -122,6 +130,7 @@ class Columns:
             ("right", self.right),
         ]
         own += [(f"parameter {number}", one.data) for number, one in enumerate(self.parameters)]
+        own += [] if self.boxes is None else [("boxes", self.boxes)]
         return sorted(own, key=lambda one: -one[1].itemsize)
 
 
@@ -138,16 +147,19 @@ def read_columns(run: Path, after: int = 0, most: int | None = None) -> Columns:
 def columns_of(rows: Iterable[Row]) -> Columns:
     """Return rows as columns."""
     steps, margins, shares, right = array("L"), array("f"), array("H"), array("B")
-    answers, parameters, last = _Levels(), _Parameters(), 0
+    answers, parameters, last, boxes = _Levels(), _Parameters(), 0, array("H")
     for number, row in enumerate(rows):
         steps.append(row.step)
         margins.append(math.nan if row.margin is None else row.margin)
-        answers.add(row.label or "")
+        answers.add(row.label or ("" if row.correct is None else NOT_A_NUMBER))
         share = row.probability
         shares.append(NO_PROBABILITY if share is None else round(10_000 * min(max(share, 0.0), 1.0)))
         right.append(UNKNOWN if row.correct is None else int(row.correct))
         parameters.add(number, row.values)
         last = row.id or number + 1
+        if isinstance(row.payload, dict) and "box" in row.payload:
+            boxes.extend([NO_BOX] * (8 * number - len(boxes)))
+            boxes.extend(_boxes(row.payload, row.label or ""))
     return Columns(
         step=np.array(steps, np.uint32),
         margin=np.array(margins, np.float32),
@@ -157,7 +169,20 @@ def columns_of(rows: Iterable[Row]) -> Columns:
         answers=tuple(answers.names),
         parameters=parameters.columns(len(steps)),
         last=last,
+        boxes=_filled(boxes, len(steps)) if boxes else None,
     )
+
+
+def _filled(boxes: array[int], count: int) -> Array:
+    boxes.extend([NO_BOX] * (8 * count - len(boxes)))
+    return np.array(boxes, np.uint16).reshape(count, 8)
+
+
+def _boxes(payload: Mapping[str, Any], label: str) -> list[int]:
+    """The true box of a detector's answer, and the best one with the label that the answer is, or misses."""
+    said = next((one["box"] for one in payload.get("found", ()) if one["label"] == label.removeprefix("no ")), None)
+    corners = (*(payload["box"] or [None] * 4), *(said or [None] * 4))
+    return [NO_BOX if x is None else round(min(max(BOX_STEPS * x, 0), NO_BOX - 1)) for x in corners]
 
 
 class _Levels:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from advsearch.files import JsonObject
+from advsearch.files import JsonObject, JsonValue
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
 from advsearch.report.notebook import axis_cells
@@ -25,7 +25,7 @@ from advsearch.runs.results.sweep import AxisRow, SurfaceTable, SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.viewer.columns import Columns, read_columns
 from advsearch.viewer.document import data_script, data_url, document, scrolled
-from advsearch.viewer.study_page import facts_table, table
+from advsearch.viewer.study_page import beside, facts_table, named, table
 from advsearch.viewer.thumbnails import Kept, kept_pictures
 
 MOST_EMBEDDED = 3_000_000
@@ -82,16 +82,16 @@ def page(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[Swe
     summaries = [(path, summary) for path, summary in runs if summary is not None]
     title = ", ".join(path.name for path, _ in runs)
     described, data, left_out = [], [], []
-    sources = [one for one in sources if one.rows is not None]
-    for number, source in enumerate(sources):
-        described.append(_described(source, number))
+    shown = [(one, summary) for one, (_, summary) in zip(sources, runs, strict=True) if one.rows is not None]
+    for number, (source, summary) in enumerate(shown):
+        described.append(_described(source, number) | ({} if summary is None else _judged(summary)))
         if isinstance(source.rows, Columns):
             packed = base64.b64encode(gzip.compress(source.rows.packed(), 6, mtime=0)).decode()
             data.append(element("script", Html(packed), type="application/octet-stream", id=f"rows-{number}"))
             left_out.append(_left_out(described[-1], source))
     main = element(
         "main",
-        element("div", id="explorer", hidden="hidden") if sources else _too_many(runs),
+        element("div", id="explorer", hidden="hidden") if shown else _too_many(runs),
         *left_out,
         *(_still(path, summary) for path, summary in summaries),
         *(_surface(path, summary) for path, summary in summaries),
@@ -123,17 +123,23 @@ def _described(source: SweepSource, number: int) -> JsonObject:
     return {**described, "pictures": pictures}
 
 
+def _judged(summary: SweepSummary) -> JsonObject:
+    """The task, and height and width in pixels of what was judged, where that is one size: boxes are told in them."""
+    formed = summary.image_formation
+    size = None if formed is None or "," in summary.model else list[JsonValue](formed.resolution)
+    return {"task": summary.task, "size": size}
+
+
 def _header(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
     lines: list[Html] = []
     for path, summary in runs:
-        heading = "h1" if len(runs) == 1 else "h2"
+        title = "h1" if len(runs) == 1 else "h2"
         if summary is None:
-            lines += [element(heading, f"{path.name}: this sweep has not ended yet")]
+            lines += [element(title, f"{path.name}: this sweep has not ended yet")]
             continue
-        what = f"sweep {path.name}; object {summary.object}, environment {summary.environment}, model {summary.model}"
-        lines += [element("p", what, class_="eyebrow"), element(heading, verdict(summary))]
-        remarks = [element("li", text) for text in summary.warnings]
-        lines += [element("ul", *remarks, class_="remarks")] if remarks else []
+        what = named(("object", summary.object), ("environment", summary.environment), ("model", summary.model))
+        lines += [element("p", f"sweep {path.name}; ", what, class_="eyebrow"), element(title, verdict(summary))]
+        lines += [beside(summary.warnings)]
     return element("header", element("h1", "Sweeps side by side") if len(runs) > 1 else None, *lines)
 
 
@@ -229,7 +235,9 @@ def _worst_text(summary: SweepSummary) -> str:
         return ""
     where = ", ".join(f"{name} {wording.number_text(one.value)}" for name, one in worst.values.items())
     told, rate = f"{where}: the model answers {worst.claimed.label}", worst.verified
-    return f"{told}; wrong in {rate.successes} of {rate.trials} fresh renders." if rate else f"{told}."
+    if rate is None:
+        return f"{told}."
+    return f"{told}; {wording.tally('wrong', rate.successes, rate.trials, rate.not_a_number)} fresh renders."
 
 
 def _figure(file: Path, caption: str, *, wide: bool = False) -> Html | None:

@@ -42,6 +42,7 @@ class ControlGroup(Fields):
     trials: int
     rate: float
     interval: Interval
+    not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
 
 
 class CleanAnswer(CleanScene, UsualAnswer):
@@ -61,6 +62,7 @@ class VerifiedRate(Fields):
     spp: int = Field(description="samples a pixel")
     labels: dict[str, int] = Field(description="how often each wrong answer was given")
     margin: Number = Field(description="mean over the trials, in logits")
+    not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
 
 
 class ObjectiveValues(Fields):
