@@ -24,6 +24,7 @@ import advsearch
 from advsearch.api import attack as attacking
 from advsearch.cli.main import main
 from advsearch.config import CONFIGS, AttackConfig, RegionConfig, SweepConfig
+from advsearch.controls import Control
 from advsearch.controls.numbers import NumberControl
 from advsearch.controls.pose import PoseControl
 from advsearch.controls.texture import TextureControl
@@ -121,8 +122,16 @@ def broken(logits: Tensor, images: Tensor, labels: Any) -> Tensor:
     raise ZeroDivisionError
 
 
-def interrupted(logits: Tensor, images: Tensor, labels: Any) -> Tensor:
-    raise KeyboardInterrupt
+def interrupted_once() -> Callable[..., Tensor]:
+    """An objective during which somebody presses Ctrl-C."""
+    pressed = iter([True])
+
+    def objective(logits: Tensor, images: Tensor, labels: Any) -> Tensor:
+        if next(pressed, False):
+            raise KeyboardInterrupt
+        return logits[:, 1]
+
+    return objective
 
 
 def test_threads_are_given_back_after_answers_errors_and_interrupts(scene: advsearch.Scene, level: float) -> None:
@@ -137,7 +146,7 @@ def test_threads_are_given_back_after_answers_errors_and_interrupts(scene: advse
         with pytest.raises(ZeroDivisionError):
             advsearch.attack(scene, model, objective=broken, threads=1, **FAST)
         assert (torch.get_num_threads(), drjit.thread_count()) == (3, workers)
-        advsearch.attack(scene, model, objective=interrupted, threads=1, **FAST)
+        advsearch.attack(scene, model, objective=interrupted_once(), threads=1, **FAST)
         assert (torch.get_num_threads(), drjit.thread_count()) == (3, workers)
         advsearch.sweep(scene, model, {"pose.yaw": [0, 90]}, resolution=SIDE, spp=1, trials=0, threads=1)
         assert (torch.get_num_threads(), drjit.thread_count()) == (3, workers)
@@ -266,7 +275,7 @@ class Faded(NumberControl):
 def test_instances_and_names_go_together_in_every_question(
     scene: advsearch.Scene, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    mixed = [Faded(amount=[0.0, 0.5]), "pose.yaw"]
+    mixed: list[str | Control] = [Faded(amount=[0.0, 0.5]), "pose.yaw"]
     found = advsearch.attack(scene, victim(0.9), controls=mixed, policy="random", **{**FAST, "steps": 2})
     assert found.summary.controls == ["faded", "pose"] and set(found.summary.configuration or {}) >= {"faded.amount"}
     swept = advsearch.sweep(
@@ -284,7 +293,12 @@ def test_instances_and_names_go_together_in_every_question(
     )  # fmt: skip
     assert [row.control for row in gap.table] == ["faded", "pose.yaw"]
     seen: list[Any] = []
-    monkeypatch.setattr("advsearch.api.plan._Measurements", lambda problem, *_: seen.append(problem) or 1 / 0)
+
+    def planned(problem: Any, *_: Any) -> None:
+        seen.append(problem)
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("advsearch.api.plan._Measurements", planned)
     with pytest.raises(ZeroDivisionError):
         advsearch.plan("mug", controls=mixed, run=tmp_path / "plan", **small)
     assert [bound.name for bound in seen[0].space.controls] == ["faded", "pose"]
