@@ -23,6 +23,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.rows import control_group, lost_remarks, mean_number, verified_rate
 from advsearch.engine.searches import UNPRINTED
+from advsearch.engine.transport import remark
 from advsearch.errors import InputError
 from advsearch.report.drawing import new_axes
 from advsearch.report.notebook import attack_html, side_by_side
@@ -167,7 +168,8 @@ def summarise(
     search = findings.search
     start = problem.domain.start
     u = start if search is None else problem.domain.project(search.best_u)
-    spp = max(PICTURE_SPP, findings.sample_count.spp if findings.sample_count else 0)
+    verified = findings.sample_count is not None and not findings.interrupted  # whoever presses Ctrl-C is in a hurry
+    spp = max(PICTURE_SPP, findings.spp) if verified else PICTURE_SPP
     noise = seeds.stream(problem.seed, "pictures")
     stages.progress.stage("making the pictures and the report", hint=f"pictures of {spp} samples a pixel")
     with torch.no_grad():
@@ -473,12 +475,12 @@ def _verified(verification: Verification | None) -> VerifiedRate | None:
 
 def _remarks(findings: Findings, problem: Problem, recorder: Recorder) -> list[str]:
     """What a reader has to know beside the numbers."""
-    remarks = []
+    remarks = [told] if (told := remark(findings.rendered_because)) else []
     count = findings.sample_count
     if count is not None and count.table and not count.converged:
         remarks.append(
-            f"The margin still moved with the sample count at {count.spp} samples a pixel, the most that was tried: "
-            "noise may take part in the verdict."
+            f"It is not shown that the margin stands still at {count.spp} samples a pixel, the most that a check "
+            "takes: noise may take part in the verdict."
         )
     if not_finite := problem.renderer.non_finite + recorder.ahead.non_finite:
         remarks.append(f"{not_finite} values of pictures or gradients were not finite and were set to 0.")
