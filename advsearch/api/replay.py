@@ -236,5 +236,5 @@ def _row(way: Way, condition: RetrialCondition, retrials: Retrials, u: torch.Ten
         clean=ControlGroup(
             correct=counted.successes, trials=counted.trials, rate=counted.rate, interval=counted.interval
         ),
-        verified=verified_rate(checked.adversarial, checked.adversarial_trials),
+        verified=verified_rate(checked),
     )

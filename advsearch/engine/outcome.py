@@ -8,15 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import torch
 from torch import Tensor
 
-from advsearch import seeds
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.smallest import Bracket
 from advsearch.engine.failures import described_failures, write_failures
-from advsearch.engine.pictures import write_artifacts, write_object, write_pictures
+from advsearch.engine.pictures import Shown, trial_to_show, write_artifacts, write_object, write_pictures
 from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
@@ -43,6 +41,7 @@ from advsearch.runs.results.attack import (
     LinearTransport,
     NotFinite,
     PathSegments,
+    PicturedAnswer,
     PredictionError,
     Printability,
     PrintCost,
@@ -50,22 +49,16 @@ from advsearch.runs.results.attack import (
     SearchGradients,
     SharedWork,
     SmallestEpsilon,
-    UsualAnswer,
     VerificationSamples,
     VerifiedRate,
 )
 from advsearch.runs.results.base import Formation, MovedValue
-from advsearch.scene.formation import to_8_bit
-from advsearch.tasks.base import typical
 from advsearch.viewer.attack_page import write_report
 
 T = TypeVar("T")
 
 MOST_NUMBERS = 4096
 """Numbers of a distribution that a summary names, at most."""
-
-PICTURE_SPP = 16
-"""Samples a pixel of the pictures that are kept, unless verification needed more: they are what the model saw there."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +86,8 @@ class AttackResult:
         summary: what `summary.json` holds.
         run: the run directory, or None if it was not kept.
         u: (d,) the configuration that was verified; the start where nothing was searched.
-        clean: (H, W, 3) display-referred sRGB in [0, 1], 8-bit values: the clean configuration.
+        clean: (H, W, 3) display-referred sRGB in [0, 1], 8-bit values: the clean configuration, as in the trial that
+            the summary names; its `clean` has what the model says of it.
         adversarial: the same of `u`.
         artifacts: what the controls hand over of `u`, by name: the texture, say; (h, w, 3) sRGB in [0, 1].
         search: the search's own log and claim.
@@ -163,53 +157,43 @@ def summarise(
     search = findings.search
     start = problem.domain.start
     u = start if search is None else problem.domain.project(search.best_u)
-    spp = max(PICTURE_SPP, findings.sample_count.spp if findings.sample_count else 0)
-    noise = seeds.stream(problem.seed, "pictures")
-    stages.progress.stage("making the pictures and the report", hint=f"pictures of {spp} samples a pixel")
-    with torch.no_grad():
-        linear = {
-            "clean": problem.renderer.radiance(problem.whole(start), noise, spp),
-            "adversarial": problem.renderer.radiance(problem.whole(u), noise, spp),
-        }
-    clean, adversarial = (
-        to_8_bit(problem.space.picture(problem.whole(at), problem.renderer.formation.display(radiance)))
-        for at, radiance in zip((start, u), linear.values(), strict=True)
-    )
+    stages.progress.stage("making the pictures and the report")
+    trial = trial_to_show(findings)
+    clean, adversarial = (Shown.of(problem, findings, at, trial) for at in (start, u))
     space = problem.searched_space
     artifacts = space.artifacts(u)
     run = recorder.run
     warnings = [*warnings, *_remarks(findings, problem, recorder)]
     if run is not None:
-        write_pictures(run, problem, findings, linear, {"clean": clean, "adversarial": adversarial}, u)
+        write_pictures(run, problem, findings, {"clean": clean, "adversarial": adversarial})
         write_failures(run, problem, findings)
         write_artifacts(run, artifacts)
         write_object(run, problem, u)
         for name, data in space.files(u).items():
             write_bytes(run.path / "artifacts" / name, data)
         write_answer(run.path, u.numpy())
-    summary = _summary(asked, problem, findings, clean, adversarial, u)
-    where = {"run": None if run is None else str(run.path), "warnings": warnings}
+    summary = _summary(asked, problem, findings, clean, adversarial)
+    kept = {"run": None if run is None else str(run.path), "warnings": warnings}
     shared = SharedWork.of_facts(recorder.ahead.facts, recorder.machines.known)
     summary = summary.model_copy(
-        update={**where, "shared": shared, "seconds": {**stages.seconds, "total": stages.total}}
+        update={**kept, "shared": shared, "seconds": {**stages.seconds, "total": stages.total}}
     )
     if run is not None:
         run.write_summary(summary)
         write_report(run.path)
         if not findings.interrupted:
             run.finish()
-    return AttackResult(summary, None if run is None else run.path, u, clean, adversarial, artifacts, search)
+    return AttackResult(
+        summary, None if run is None else run.path, u, clean.picture, adversarial.picture, artifacts, search
+    )
 
 
 # ---- the summary ----------------------------------------------------------------------------------------------------
 
 
-def _summary(
-    asked: Question, problem: Problem, findings: Findings, clean: Tensor, adversarial: Tensor, u: Tensor
-) -> AttackSummary:
+def _summary(asked: Question, problem: Problem, findings: Findings, clean: Shown, adversarial: Shown) -> AttackSummary:
     """All but where it is kept, how long it took and what there is to say."""
     task, search, baseline = problem.task, findings.search, findings.baseline
-    judgement = typical(findings.clean) if findings.clean else problem.judge(clean, problem.whole(problem.domain.start))
     controls = problem.searched_space.controls
     budgets = {bound.name: bound.budget for bound in controls}
     depth = problem.renderer.scene.max_depth
@@ -234,13 +218,12 @@ def _summary(
         gradient_plan=problem.plan_summary(problem.plan),
         light_path_segments=PathSegments(search=problem.search_depth or depth, verification=depth),
         clean=CleanAnswer(
-            **vars(judgement.answer),
-            payload=judgement.payload,
-            correct=judgement.right,
+            **_answer(clean),
+            correct=clean.judgement.right,
             moved=[MovedValue.of(one) for one in problem.space.moved],
             control=_control(findings),
         ),
-        adversarial=_adversarial(problem, findings, adversarial, u),
+        adversarial=None if search is None else PicturedAnswer(**_answer(adversarial)),
         verified=_verified(findings.verification),
         baseline=None
         if baseline is None
@@ -292,7 +275,7 @@ def _print_cost(problem: Problem, findings: Findings) -> PrintCost | None:
     verified, other, search = findings.verification, findings.unprinted_verification, findings.unprinted
     if verified is None or other is None or search is None:
         return None
-    ours, theirs = (verified_rate(one.adversarial, one.adversarial_trials) for one in (verified, other))
+    ours, theirs = (verified_rate(one) for one in (verified, other))
     return PrintCost(
         steps=len(search.history),
         margin_with=ours.margin,
@@ -308,14 +291,9 @@ def _alone(values: dict[str, T]) -> T | dict[str, T]:
     return next(iter(values.values())) if len(values) == 1 else values
 
 
-def _adversarial(problem: Problem, findings: Findings, picture: Tensor, u: Tensor) -> UsualAnswer | None:
-    """What the model usually answers on the search's answer."""
-    if findings.search is None:
-        return None
-    verification = findings.verification
-    trials = verification.adversarial_trials if verification else (problem.judge(picture, problem.whole(u)),)
-    usual = typical(trials)
-    return UsualAnswer(**vars(usual.answer), payload=usual.payload)
+def _answer(shown: Shown) -> dict[str, Any]:
+    """What the model says of a picture that is kept."""
+    return {**vars(shown.judgement.answer), "payload": shown.judgement.payload, "trial": shown.trial}
 
 
 def _control(findings: Findings) -> ControlGroup | None:
@@ -453,7 +431,7 @@ def _verified(verification: Verification | None) -> VerifiedRate | None:
     """Rates, and what the model answered in the trials that it got wrong."""
     if verification is None:
         return None
-    return verified_rate(verification.adversarial, verification.adversarial_trials)
+    return verified_rate(verification)
 
 
 def _remarks(findings: Findings, problem: Problem, recorder: Recorder) -> list[str]:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from advsearch.attacks import Trials
+from advsearch.attacks import Trials, Verification
 from advsearch.described import Value
 from advsearch.report.wording import count
 from advsearch.runs.results.attack import VerifiedRate
@@ -91,9 +91,14 @@ def judgement_of(row: Row) -> Judgement:
     return Judgement(score, margin, right, Answer(row.label or "", row.label_index, row.probability), row.payload)
 
 
-def verified_rate(rate: Trials, trials: Sequence[Judgement]) -> VerifiedRate:
+def verified_rate(checked: Verification) -> VerifiedRate:
     """Return the rate of a success, with how often each such answer was given and the mean score of the trials."""
-    labels = Counter(trial.answer.label for trial in trials if trial.success)
+    return rate_of(checked.adversarial, checked.counting, checked.successes)
+
+
+def rate_of(rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judgement]) -> VerifiedRate:
+    """Return a rate with the answers of its successes and the mean score of its trials."""
+    labels = Counter(trial.answer.label for trial in successes)
     return VerifiedRate(
         successes=rate.successes,
         trials=rate.trials,

@@ -17,7 +17,7 @@ from advsearch.files import JsonObject
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
 from advsearch.report.notebook import axis_cells
-from advsearch.report.phrases import percent
+from advsearch.report.phrases import answer_text, percent
 from advsearch.report.surface_words import difference_text, surface_sentences, wrong_text
 from advsearch.runs import directory
 from advsearch.runs.files import write_bytes, write_text
@@ -228,7 +228,8 @@ def _worst_text(summary: SweepSummary) -> str:
     if worst is None:
         return ""
     where = ", ".join(f"{name} {wording.number_text(one.value)}" for name, one in worst.values.items())
-    told, rate = f"{where}: the model answers {worst.claimed.label}", worst.verified
+    said = answer_text(summary.task, worst.pictured or worst.claimed)
+    told, rate = f"{where}: the model answers {said}", worst.verified
     return f"{told}; wrong in {rate.successes} of {rate.trials} fresh renders." if rate else f"{told}."
 
 

@@ -125,7 +125,7 @@ class Sweep:
                 tally = self._go_through(left, tally)
                 worst = self._claimed(tally)
                 if worst is not None:
-                    worst = worst.model_copy(update={"verified": self._verified(worst)})
+                    worst = worst.model_copy(update=self._verified(worst))
                 if self.job.surface and self.run is not None:
                     self.stages.begin("surface", "tracing the surface that was seen", self.total)
                     rows = self.run.store.rows(KIND)
@@ -306,22 +306,23 @@ class Sweep:
             values={name: DescribedValue.of(value) for name, value in row.values.items()},
             seed=self._seeds(picks.number),
             label_set=list(task.truth_names(truth)),
-            claimed=WorstClaim(**vars(seen.answer), margin=seen.margin, payload=seen.payload),
+            claimed=_claim_of(seen),
             verified=None,
         )
 
-    def _verified(self, worst: WorstConfiguration) -> WorstVerified | None:
-        """What fresh renders say of it; keeps a picture."""
+    def _verified(self, worst: WorstConfiguration) -> dict[str, object]:
+        """What fresh renders say of it, and what the model says of the picture that is kept."""
         points, picks, model = self._find(worst.configuration)
         view = self._batches.open(picks.number // self.per_scene)
         u = points.configurations(picks)[0]
         checked = check_worst(view, self.job, model, u, self.run, self.stages)
-        if self.run is not None:
-            spp = max(PICTURE_SPP, checked.spp if checked else 0)
-            picture = view.picture(model, u, worst.seed, spp)
-            self.run.save_image("worst", picture)
-            save_marked(self.run, "worst", picture, view.marks(model, u, picture))
-        return checked
+        if self.run is None:
+            return {"verified": checked}
+        spp = max(PICTURE_SPP, checked.spp if checked else 0)
+        picture = view.picture(model, u, worst.seed, spp)
+        self.run.save_image("worst", picture)
+        save_marked(self.run, "worst", picture, view.marks(model, u, picture))
+        return {"verified": checked, "pictured": _claim_of(view.judge(model, u, picture))}
 
     def _find(self, index: int) -> tuple[Points, Picks, int]:
         """A configuration by its number: its scene's points, its picture, its model."""
@@ -392,6 +393,10 @@ class Sweep:
                 "that was tried: noise may take part in it."
             )
         return remarks
+
+
+def _claim_of(seen: Judgement) -> WorstClaim:
+    return WorstClaim(**vars(seen.answer), margin=seen.margin, payload=seen.payload)
 
 
 def carry_out(job: Job, run: RunDirectory | None, progress: Progress, executor: Executor | None = None) -> SweepResult:

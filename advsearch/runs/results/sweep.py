@@ -49,7 +49,7 @@ class SweepMap(Fields):
 
 
 class WorstClaim(Fields):
-    """What the sweep saw at its worst."""
+    """What the model says of one picture of the worst configuration."""
 
     label: str
     index: int | None
@@ -72,8 +72,9 @@ class WorstConfiguration(Fields):
     values: Annotated[dict[str, DescribedValue], having("object", "model")]
     seed: int
     label_set: list[str] = Field(description="the names that count as right there")
-    claimed: WorstClaim
+    claimed: WorstClaim = Field(description="of the sweep's own picture")
     verified: WorstVerified | None = Field(description="null where it was not rendered again")
+    pictured: WorstClaim | None = Field(default=None, description="of the picture that is kept; absent without")
 
 
 class SurfacePart(Fields):
