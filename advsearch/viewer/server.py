@@ -37,7 +37,7 @@ from advsearch.viewer.following import START, following_page, goes_on, progress
 from advsearch.viewer.list_page import list_page
 from advsearch.viewer.photographing import PhotoTaker
 from advsearch.viewer.refused import Refused
-from advsearch.viewer.sweep_page import SweepSource, page, result_of
+from advsearch.viewer.sweep_page import SweepSource, page, result_of, task_of
 from advsearch.viewer.thumbnails import kept_pictures, path_of
 
 LOOPBACK = "127.0.0.1"
@@ -377,7 +377,8 @@ _POSTED: Routes = (("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._take),)
 
 def _source(name: str, run: Path) -> SweepSource:
     base = f"/runs/{quote(name, safe='')}"
-    return SweepSource(name, f"{base}/rows", parts=True, pictures=kept_pictures(run), folder=f"{base}/pictures")
+    kept, rows = kept_pictures(run), f"{base}/rows"
+    return SweepSource(name, rows, task_of(run), parts=True, pictures=kept, folder=f"{base}/pictures")
 
 
 def _is_loopback(host: str) -> bool:

@@ -9,10 +9,12 @@ from __future__ import annotations
 import base64
 import gzip
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from advsearch.errors import AdvsearchError
 from advsearch.files import JsonObject
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
@@ -23,6 +25,7 @@ from advsearch.runs import directory
 from advsearch.runs.files import write_bytes, write_text
 from advsearch.runs.results.sweep import AxisRow, SurfaceTable, SweepSummary
 from advsearch.runs.summary import read_result
+from advsearch.settings import read_yaml
 from advsearch.viewer.columns import Columns, read_columns
 from advsearch.viewer.document import data_script, data_url, document, scrolled
 from advsearch.viewer.study_page import facts_table, table
@@ -46,6 +49,7 @@ class SweepSource:
         name: of the run.
         rows: columns for a page that needs no other file; else the address they are fetched from; None where they are
             too many for such a page, which then has the tables only.
+        task: what judges the answers; empty where that is not known yet.
         parts: whether the address gives them in parts (``?after=ID``), as those of a sweep that goes on.
         pictures: which thumbnails there are; None for none.
         folder: address of the thumbnails; None puts them into the page.
@@ -53,6 +57,7 @@ class SweepSource:
 
     name: str
     rows: Columns | str | None
+    task: str = ""
     parts: bool = False
     pictures: Kept | None = None
     folder: str | None = None
@@ -67,7 +72,8 @@ def write_page(run: Path, summary: SweepSummary) -> Path:
     """
     columns = read_columns(run)
     write_bytes(run / directory.COLUMNS, columns.packed(), durable=False)
-    source = SweepSource(run.name, columns if len(columns.step) <= MOST_ROWS else None, pictures=kept_pictures(run))
+    rows = columns if len(columns.step) <= MOST_ROWS else None
+    source = SweepSource(run.name, rows, summary.task, pictures=kept_pictures(run))
     return write_text(run / directory.REPORT, page([(run, summary)], [source]), durable=False)
 
 
@@ -108,7 +114,7 @@ def page(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[Swe
 
 
 def _described(source: SweepSource, number: int) -> JsonObject:
-    described: JsonObject = {"name": source.name, "parts": source.parts}
+    described: JsonObject = {"name": source.name, "task": source.task, "parts": source.parts}
     described["embedded" if isinstance(source.rows, Columns) else "rows"] = (
         f"rows-{number}" if isinstance(source.rows, Columns) else source.rows
     )
@@ -278,3 +284,15 @@ def result_of(run: Path) -> SweepSummary | None:
         return None
     found = read_result(run)
     return found if isinstance(found, SweepSummary) else None
+
+
+def task_of(run: Path) -> str:
+    """Return what judges the answers of a sweep, by its name; empty where its settings cannot be read."""
+    found = result_of(run)
+    if found is not None:
+        return found.task
+    with suppress(AdvsearchError):
+        given = read_yaml(run / directory.CONFIG).get("task")
+        name = given.get("name", "") if isinstance(given, Mapping) else given
+        return str(name or "").partition("=")[0]
+    return ""

@@ -332,7 +332,9 @@ def test_a_difference_is_claimed_where_intervals_are_apart_and_not_where_they_ov
     shown = figure(
         {"figure": "bars", "by": "environment"}, rows({"noon": (5, 50), "studio": (45, 50), "loft": (30, 50)})
     )
-    assert shown.text[0].startswith("Hardest is noon: right in 5 of 50 (10 %, 95 % interval 3-22 %); easiest is studio")
+    assert shown.text[0].startswith(
+        "Hardest is noon: right in 5 of 50 (10 %, 95 % interval 3.3-22 %); easiest is studio"
+    )
     assert shown.text[1].startswith("The difference is shown")
     assert [one.name for one in shown.bars] == ["studio", "loft", "noon"]
     hidden = figure({"figure": "bars", "by": "environment"}, rows({"noon": (8, 20), "studio": (12, 20)}))

@@ -13,7 +13,7 @@ from advsearch.engine.answers import Looked, check_truth, facts_of
 from advsearch.engine.domains import domain_of
 from advsearch.engine.loading import PictureSettings, Scene, framed
 from advsearch.engine.sweeps.axes import Axis, on_grid
-from advsearch.engine.sweeps.points import BINS, Drawn, Points
+from advsearch.engine.sweeps.points import Drawn, Points
 from advsearch.errors import InputError
 from advsearch.models import Model
 from advsearch.scene.description import ENVIRONMENT
@@ -113,7 +113,8 @@ class Job:
 
     def points(self, space: Space) -> Points:
         """The configurations of a space."""
-        return Points(space, domain_of(space.controls), self.axes, self.samples, self.sampler, self.pictures.seed)
+        domain = domain_of(space.controls)
+        return Points(space, domain, self.axes, self.samples, self.sampler, self.pictures.seed, len(self.places))
 
     def truth(self, place: NamedScene, model: int, values: Mapping[str, Value], look: Looked | None = None) -> Truth:
         """What is true of a configuration, as the task of a model needs it.
@@ -197,7 +198,8 @@ def check_all(job: Job) -> tuple[Points, tuple[Drawn, ...]]:
     drawn = []
     for versions in zip(*(points.drawn for _, points in bound), strict=True):
         same = all(one.parts == versions[0].parts for one in versions)
-        drawn.append(versions[0] if same else replace(versions[0], unit="of its range", parts=_shares()))
+        shares = tuple([k / first.parts, (k + 1) / first.parts] for k in range(first.parts))
+        drawn.append(versions[0] if same else replace(versions[0], unit="of its range", parts=shares, settled=False))
     return first, tuple(drawn)
 
 
@@ -209,7 +211,3 @@ def _check_draws(place: NamedScene, space: Space) -> None:
                 f"`controls` {group.control}: draws {group.parameter} by chance, and `set` {group.setting} fixes it; "
                 "leave it out of one of the two"
             )
-
-
-def _shares() -> tuple[list[float], ...]:
-    return tuple([k / BINS, (k + 1) / BINS] for k in range(BINS))

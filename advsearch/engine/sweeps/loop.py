@@ -8,6 +8,7 @@ number, so that a sweep that was stopped, or whose batches come in another order
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -49,6 +50,7 @@ from advsearch.runs.results.sweep import (
 from advsearch.scene.transport.renderer import SPP as BASIS_SPP
 from advsearch.tasks import Judgement
 from advsearch.viewer import thumbnails
+from advsearch.viewer.columns import EDGES
 from advsearch.viewer.sweep_page import write_page
 
 NOT_FINITE = "pictures not finite"
@@ -83,6 +85,8 @@ class Sweep:
         self.job, self.run, self.stages = job, run, Stages(progress)
         self.stages.begin("setup", "preparing the scenes for rendering")
         self.points, self._shown = check_all(job)
+        if run is not None:
+            run.store.set_note(EDGES, json.dumps({one.name: one.edges for one in self._shown if one.edges}))
         self.per_scene, self.models = self.points.count, len(job.models)
         self.total = len(job.places) * self.per_scene * self.models
         self.samples = job.spp

@@ -156,5 +156,5 @@ class SweepSummary(CountedAnswers, RunResult):
 
     @property
     def brief(self) -> str:
-        """The accuracy."""
-        return "" if self.accuracy is None else f"accuracy {self.accuracy:.1%}"
+        """How many are right."""
+        return f"right in {self.correct} of {self.configurations}" if self.configurations else ""
