@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import itertools
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from samples import sweep
 
 from advsearch.config import SweepConfig
 from advsearch.described import Value
+from advsearch.files import JsonValue
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.store import Row
 from advsearch.viewer import thumbnails
@@ -28,10 +30,19 @@ def described(value: float | str, unit: str = "") -> Value:
     return {"value": value, "unit": unit}
 
 
-def make_sweep(path: Path, *, keep: str = "none", label: str = "mug", ended: bool = True) -> Path:
+def make_sweep(
+    path: Path,
+    *,
+    keep: str = "none",
+    label: str = "mug",
+    ended: bool = True,
+    environments: Sequence[str] = ENVIRONMENTS,
+    payload: JsonValue = None,
+    **summarised: Any,
+) -> Path:
     """Make the run of a sweep of 24 configurations, wrong at noon from 40 degrees, and return its folder."""
     config = SweepConfig(object="mug", run=str(path), grid={"pose.yaw": list(YAWS)}, keep_pictures=keep)
-    points = list(itertools.product(ENVIRONMENTS, YAWS, ELEVATIONS, (0.5, 0.75)))
+    points = list(itertools.product(environments, YAWS, ELEVATIONS, (0.5, 0.75)))
     with RunDirectory.create_for(config) as run:
         rows = []
         for step, (environment, yaw, elevation, power) in enumerate(points):
@@ -45,7 +56,7 @@ def make_sweep(path: Path, *, keep: str = "none", label: str = "mug", ended: boo
             }
             rows.append(
                 Row("sweep", step, correct=not wrong, margin=2.0 + step / 100 if wrong else -3.0, probability=0.9,
-                    label="cup" if wrong else label, values=values)
+                    label="cup" if wrong else label, values=values, payload=payload)
             )  # fmt: skip
             if keep == "all" or (keep == "wrong" and wrong):
                 picture = np.full((16, 16, 3), step / len(points), np.float32)
@@ -60,7 +71,7 @@ def make_sweep(path: Path, *, keep: str = "none", label: str = "mug", ended: boo
                 "interval": (0.5, 0.9),
             }
             axis = {"axis": "pose.yaw", "unit": "degrees", "value": 45.0, **counts}
-            summary = sweep(**counts, planned=len(rows), run=str(path), axes=[axis])
+            summary = sweep(**counts, planned=len(rows), run=str(path), axes=[axis], **summarised)
             run.write_summary(summary)
             write_page(run.path, summary)
     return path

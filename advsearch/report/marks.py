@@ -67,8 +67,9 @@ def marked(picture: Any, shapes: Sequence[Shape]) -> Floats:
     boxes = [(shape, _corners(shape.box, factor, size)) for shape in shapes if shape.box is not None]
     for shape, ends in boxes:
         draw.rectangle(ends, outline=_colour(shape), width=2)
+    written: list[tuple[int, int, int, int]] = []
     for shape, ends in boxes:
-        _write(draw, shape, ends, size, font)
+        written.append(_write(draw, shape, ends, size, font, written))
     found: Floats = np.asarray(image, dtype=np.float32) / np.float32(255.0)
     return found
 
@@ -99,13 +100,26 @@ def _corners(box: Box, factor: int, size: tuple[int, int]) -> tuple[int, int, in
 
 
 def _write(
-    draw: ImageDraw.ImageDraw, shape: Shape, ends: tuple[int, int, int, int], size: tuple[int, int], font: Any
-) -> None:
-    """Write beside a box: above it, or below where it is true, so that the two do not cover each other."""
+    draw: ImageDraw.ImageDraw,
+    shape: Shape,
+    ends: tuple[int, int, int, int],
+    size: tuple[int, int],
+    font: Any,
+    others: Sequence[tuple[int, int, int, int]],
+) -> tuple[int, int, int, int]:
+    """Write beside a box, and return where: above it, or below where it is true, where no other text is."""
     text = f"true: {shape.text}" if shape.true else shape.text
-    left, top, right, bottom = draw.textbbox((0, 0), text, font=font)
+    left, top, right, bottom = map(round, draw.textbbox((0, 0), text, font=font))
     wide, high = right - left + 6, bottom - top + 6
     y = ends[3] if shape.true else ends[1] - high
     x, y = max(0, min(ends[0], size[0] - wide)), max(0, min(y, size[1] - high))
+    rows = sorted(range(0, max(size[1] - high, 0) + 1), key=lambda one: (abs(one - y), one))
+    free = (one for one in rows if not any(_overlap((x, one, x + wide, one + high), other) for other in others))
+    y = next(free, y)
     draw.rectangle((x, y, x + wide, y + high), fill=_colour(shape))
     draw.text((x + 3 - left, y + 3 - top), text, fill=(0, 0, 0), font=font)
+    return x, y, x + wide, y + high
+
+
+def _overlap(one: tuple[int, int, int, int], other: tuple[int, int, int, int]) -> bool:
+    return one[0] <= other[2] and other[0] <= one[2] and one[1] <= other[3] and other[1] <= one[3]

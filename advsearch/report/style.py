@@ -20,7 +20,9 @@ p { margin: 0.5rem 0; max-width: 46rem; }
 .eyebrow { font-size: 0.9rem; margin: 0; }
 .remarks { list-style: none; margin: 1rem 0 0; padding: 0.6rem 0.9rem; border-left: 3px solid var(--warn);
   background: var(--warn-paper); max-width: 46rem; }
-.remarks li + li { margin-top: 0.35rem; }
+.remarks li + li, .notes li + li { margin-top: 0.35rem; }
+.notes { list-style: none; margin: 0.8rem 0 0; padding: 0; max-width: 46rem; color: var(--soft); font-size: 0.92rem; }
+header .remarks li, header .notes li, .eyebrow { overflow-wrap: anywhere; }
 .pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(14rem, 44%), 1fr)); gap: 1.25rem 1rem; }
 .pictures.pair { max-width: 40rem; }
 .pictures.single { max-width: 24rem; }

@@ -16,6 +16,7 @@ from advsearch.report.phrases import (
     wanted,
     with_article,
 )
+from advsearch.settings import split_names
 
 if TYPE_CHECKING:
     from advsearch.runs.results.attack import AttackSummary, SharedWork, VerifiedRate
@@ -117,6 +118,11 @@ def smallest_text(summary: AttackSummary) -> str:
 def short_name(value: Any) -> str:
     """Return the last part of a path, and a name as it is."""
     return PurePath(str(value)).name or str(value)
+
+
+def short_names(text: str) -> str:
+    """Return the last parts of paths, of one or of several separated by commas: ``a.hdr, studio``."""
+    return ", ".join(map(short_name, split_names(text)))
 
 
 def interval_text(interval: Interval | None) -> str:

@@ -29,6 +29,7 @@ class Listed:
         answer: what came out, in a few words.
         kinds: how many rows there are of each kind.
         begun: whether its settings are there, without which it cannot be resumed.
+        when: it was begun, seconds since 1970 (UTC); None where that is not known.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Listed:
     answer: str
     kinds: Mapping[str, int]
     begun: bool
+    when: float | None
 
 
 def listed(folder: Path) -> list[Listed]:
@@ -87,7 +89,15 @@ def described(path: Path, *, counts: bool = True) -> Listed:
         answer=result.brief if result else "",
         kinds=kinds,
         begun=bool(config),
+        when=_when(path),
     )
+
+
+def _when(path: Path) -> float | None:
+    for name in (CONFIG, summary.NAME):
+        with suppress(OSError):
+            return (path / name).stat().st_mtime
+    return None
 
 
 def _state(path: Path, result: Result | None) -> str:

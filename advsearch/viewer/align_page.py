@@ -20,26 +20,23 @@ NO_QR = "pip install segno"
 """What to type where there is nothing to draw a code with."""
 
 
-def align_page(
-    run: str, renderings: Sequence[str], table: PhotoAgreement, path: str, key: str, elsewhere: str | None
-) -> str:
+def align_page(run: str, renderings: Sequence[str], table: PhotoAgreement, key: str, elsewhere: str | None) -> str:
     """Return the page as HTML.
 
     Args:
         run: its name.
         renderings: names of the renderings that it kept; the first one is shown.
         table: of the photographs so far.
-        path: of the page on its server, with a slash at its end.
         key: what the server wants to see with a photograph.
         elsewhere: the address by which another device opens the page; None where none can.
     """
-    facts = {"path": path, "key": key, "names": list(renderings[:1])}
+    facts = {"key": key, "names": list(renderings[:1])}
     align = element("div", _hint(renderings), id="align") if renderings else _without()
     main = element(
         "main",
         align,
         element("h2", "Renderings and reality"),
-        element("div", table_html(table, path), id="agreement"),
+        element("div", table_html(table), id="agreement"),
         _code(elsewhere),
     )
     header = element("header", element("p", "Photographs", class_="eyebrow"), element("h1", f"{run}, photographed"))
@@ -109,13 +106,8 @@ def _made(address: str) -> Any:
 # ---- the table ------------------------------------------------------------------------------------------------------
 
 
-def table_html(table: PhotoAgreement, path: str) -> Html:
-    """Return the counts of right and wrong answers in rendering and photograph, in all and by rendering.
-
-    Args:
-        table: what is counted.
-        path: of the page on its server.
-    """
+def table_html(table: PhotoAgreement) -> Html:
+    """Return the counts of right and wrong answers in rendering and photograph, in all and by rendering."""
     if not table.photos or table.interval is None:
         return element("p", "No photographs yet.", class_="soft")
     heads = ("photographs", "right in the photograph", "wrong in the photograph")
@@ -134,7 +126,7 @@ def table_html(table: PhotoAgreement, path: str) -> Html:
     each = element(
         "table",
         element("thead", element("tr", *(element("th", text, scope="col") for text in names))),
-        element("tbody", *(_rendering(one, path, several) for one in table.renderings)),
+        element("tbody", *(_rendering(one, several) for one in table.renderings)),
     )
     counts = element("table", element("thead", head), element("tbody", *rows), class_="agreement")
     return join(
@@ -148,12 +140,12 @@ def _row(name: str, *cells: str) -> Html:
     return element("tr", element("th", name, scope="row"), *(element("td", one, class_="number") for one in cells))
 
 
-def _rendering(one: PhotographedRendering, path: str, several: bool) -> Html:
+def _rendering(one: PhotographedRendering, several: bool) -> Html:
     photos = [
-        join(element("a", label or "nothing", href=f"{path}photos/{quote(file, safe='')}"), " ")
+        join(element("a", label or "nothing", href=f"photos/{quote(file, safe='')}"), " ")
         for label, file in zip(one.labels, one.files, strict=True)
     ]
-    name = element("a", one.rendering, href=f"{path}renderings/{quote(one.rendering, safe='')}")
+    name = element("a", one.rendering, href=f"renderings/{quote(one.rendering, safe='')}")
     return element(
         "tr",
         element("th", name, scope="row"),

@@ -23,7 +23,7 @@ from advsearch.runs.files import write_text
 from advsearch.runs.results.attack import AttackSummary, DifferentFailure, FoundValue, PicturedAnswer
 from advsearch.runs.summary import attack_of
 from advsearch.viewer.document import data_script, data_url, document, scrolled
-from advsearch.viewer.study_page import facts_table, table
+from advsearch.viewer.study_page import facts_table, heading, named, table
 from advsearch.viewer.turning import object_data, object_section, read_object
 
 LARGE_PICTURE = 1_000_000
@@ -115,15 +115,8 @@ def page(data: RunData) -> str:
 
 
 def _header(summary: AttackSummary) -> Html:
-    remarks = [element("li", text) for text in wording.remarks(summary)]
-    model, environment = (wording.short_name(name) for name in (summary.model, summary.environment))
-    what = f"{wording.budget_text(summary)}; object {wording.noun(summary)}, environment {environment}, model {model}"
-    return element(
-        "header",
-        element("p", what, class_="eyebrow"),
-        element("h1", wording.verdict(summary)),
-        element("ul", *remarks, class_="remarks") if remarks else None,
-    )
+    about = named(("object", summary.object), ("environment", summary.environment), ("model", summary.model))
+    return heading(join(f"{wording.budget_text(summary)}; ", about), wording.verdict(summary), wording.remarks(summary))
 
 
 def _pictures(data: RunData) -> Html:

@@ -13,7 +13,7 @@ from advsearch.runs.results.sweep import SweepSummary
 from advsearch.runs.summary import read_result
 from advsearch.viewer.columns import read_columns
 from advsearch.viewer.pages import write_page
-from advsearch.viewer.sweep_page import SweepSource, page, task_of
+from advsearch.viewer.sweep_page import SweepSource, page
 from advsearch.viewer.thumbnails import kept_pictures, path_of
 
 INDEX = "index.html"
@@ -69,4 +69,4 @@ def _copied(run: Path, folder: Path, number: int) -> SweepSource:
         target = folder / pictures / source.parent.name / source.name
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, target)
-    return SweepSource(run.name, rows, task_of(run), pictures=kept, folder=pictures)
+    return SweepSource(run.name, rows, pictures=kept, folder=pictures)

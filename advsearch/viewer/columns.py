@@ -34,6 +34,11 @@ UNKNOWN = 2
 
 NO_PROBABILITY = 65535
 
+BOX_STEPS = 8
+"""Of a pixel, in which the corners of boxes are counted."""
+
+NO_BOX = 65535
+
 Array = npt.NDArray[Any]
 
 
@@ -69,6 +74,8 @@ class Columns:
         answers: what was answered.
         parameters: in the order in which rows have them.
         last: the id of the last row; 0 where there is none.
+        boxes: (n, 8) uint16, of detection: x0, y0, x1, y1 of the true box and of the one that the answer is about, in
+            `BOX_STEPS` of a pixel of the rendering; `NO_BOX` where there is none. None where no row has any.
         more: whether there are further rows behind these.
         running: whether further rows are still being made.
     """
@@ -81,6 +88,7 @@ class Columns:
     answers: tuple[str, ...]
     parameters: tuple[Column, ...]
     last: int
+    boxes: Array | None = None
     more: bool = False
     running: bool = False
 
@@ -90,7 +98,7 @@ class Columns:
         arrays = self._arrays()
         starts = np.cumsum([0, *(one.nbytes for _, one in arrays)])
         placed = [
-            {"name": name, "type": one.dtype.name, "at": int(start)}
+            {"name": name, "type": one.dtype.name, "at": int(start), "width": one.size // max(len(one), 1)}
             for (name, one), start in zip(arrays, starts[:-1], strict=True)
         ]
         parameters = [
@@ -132,6 +140,7 @@ class Columns:
             ("right", self.right),
         ]
         own += [(f"parameter {number}", one.data) for number, one in enumerate(self.parameters)]
+        own += [] if self.boxes is None else [("boxes", self.boxes)]
         return sorted(own, key=lambda one: -one[1].itemsize)
 
 
@@ -158,7 +167,7 @@ def _edges(noted: object) -> tuple[float, ...] | None:
 def columns_of(rows: Iterable[Row]) -> Columns:
     """Return rows as columns."""
     steps, margins, shares, right = array("L"), array("f"), array("H"), array("B")
-    answers, parameters, last = _Levels(), _Parameters(), 0
+    answers, parameters, last, boxes = _Levels(), _Parameters(), 0, array("H")
     for number, row in enumerate(rows):
         steps.append(row.step)
         margins.append(math.nan if row.margin is None else row.margin)
@@ -168,6 +177,9 @@ def columns_of(rows: Iterable[Row]) -> Columns:
         right.append(UNKNOWN if row.correct is None else int(row.correct))
         parameters.add(number, row.values)
         last = row.id or number + 1
+        if isinstance(row.payload, dict) and "box" in row.payload:
+            boxes.extend([NO_BOX] * (8 * number - len(boxes)))
+            boxes.extend(_boxes(row.payload, row.label or ""))
     return Columns(
         step=np.array(steps, np.uint32),
         margin=np.array(margins, np.float32),
@@ -177,7 +189,20 @@ def columns_of(rows: Iterable[Row]) -> Columns:
         answers=tuple(answers.names),
         parameters=parameters.columns(len(steps)),
         last=last,
+        boxes=_filled(boxes, len(steps)) if boxes else None,
     )
+
+
+def _filled(boxes: array[int], count: int) -> Array:
+    boxes.extend([NO_BOX] * (8 * count - len(boxes)))
+    return np.array(boxes, np.uint16).reshape(count, 8)
+
+
+def _boxes(payload: Mapping[str, Any], label: str) -> list[int]:
+    """The true box of a detector's answer, and the best one with the label that the answer is, or misses."""
+    said = next((one["box"] for one in payload.get("found", ()) if one["label"] == label.removeprefix("no ")), None)
+    corners = (*(payload["box"] or [None] * 4), *(said or [None] * 4))
+    return [NO_BOX if x is None else round(min(max(BOX_STEPS * x, 0), NO_BOX - 1)) for x in corners]
 
 
 class _Levels:

@@ -21,7 +21,7 @@ from advsearch.report.explanations import (
 from advsearch.report.markup import Html, element, join
 from advsearch.runs.results.explain import ExplainResult, FailureCluster, NearestRight
 from advsearch.viewer.document import data_url, document
-from advsearch.viewer.study_page import again, facts_table, heading, table
+from advsearch.viewer.study_page import again, facts_table, heading, named, table
 
 RULE_HEADS = ("rule", "right", "where no rule so far holds", "fresh renders inside")
 
@@ -76,7 +76,9 @@ def explain_page(run: Path, result: ExplainResult) -> str:
         ),
         again(result.command_line),
     )
-    header = heading(f"explain; {result.object}, {result.model}", explain_text(result), result.warnings)
+    header = heading(
+        join("explain; ", named(("", result.object), ("", result.model))), explain_text(result), result.warnings
+    )
     return document(f"{run.name}, explained", header, main, footer=f"run {run.name}. This page needs no other file.")
 
 

@@ -11,7 +11,7 @@ from advsearch.report.phrases import percent
 from advsearch.runs.directory import IMAGES
 from advsearch.runs.results.harden import HardenResult
 from advsearch.viewer.document import data_url, document, scrolled
-from advsearch.viewer.study_page import again, facts_table, heading, table
+from advsearch.viewer.study_page import again, facts_table, heading, named, table
 
 ROUND_HEADS = ("round", "views trained on", "part of the way", "plain pictures right", "worst pictures right", "kept")
 SPLIT_HEADS = ("side", "objects", "environments", "scenes", "views")
@@ -70,6 +70,6 @@ def harden_page(run: Path, result: HardenResult) -> str:
         facts_table(facts),
         again(result.command_line),
     )
-    what = f"harden; {', '.join(result.objects)}; {', '.join(result.controls)}"
+    what = join("harden; ", named(("", ",".join(result.objects)), ("", ", ".join(result.controls))))
     header = heading(what, hardened_text(result), result.warnings)
     return document(f"{run.name}, harden", header, main, footer=f"run {run.name}. This page needs no other file.")

@@ -39,11 +39,10 @@ class PhotoTaker(Protocol):
         """Return the run's table."""
 
 
-def page(taker: PhotoTaker | None, run: Path, name: str, path: str, key: str, elsewhere: str | None) -> Answered:
+def page(taker: PhotoTaker | None, run: Path, name: str, key: str, elsewhere: str | None) -> bytes:
     """Return the page of a run's photographs; arguments as for `align_page`."""
     table = _there(taker).agreement(run)
-    html = align_page(name, rendering_names(run), table, path, key, elsewhere)
-    return "text/html; charset=utf-8", html.encode()
+    return align_page(name, rendering_names(run), table, key, elsewhere).encode()
 
 
 def rendering(run: Path, name: str) -> Answered:
@@ -68,14 +67,13 @@ def check_sender(headers: Message, key: str) -> None:
         raise Refused(HTTPStatus.FORBIDDEN, "a photograph is sent by the page that this server shows; open it anew")
 
 
-def take(taker: PhotoTaker | None, run: Path, name: str, path: str, data: Callable[[], bytes]) -> Answered:
+def take(taker: PhotoTaker | None, run: Path, name: str, data: Callable[[], bytes]) -> Answered:
     """Take a photograph in.
 
     Args:
         taker: what does; None where nothing does.
         run: its folder.
         name: of the rendering.
-        path: of the page.
         data: reads what was sent, once there is something to compare it with.
 
     Raises:
@@ -86,7 +84,7 @@ def take(taker: PhotoTaker | None, run: Path, name: str, path: str, data: Callab
         table = _there(taker).add(run, name, data())
     except InputError as error:
         raise Refused(HTTPStatus.BAD_REQUEST, str(error)) from None
-    return "application/json", json.dumps({"table": str(table_html(table, path))}).encode()
+    return "application/json", json.dumps({"table": str(table_html(table))}).encode()
 
 
 def body(headers: Message, stream: BufferedIOBase) -> bytes:

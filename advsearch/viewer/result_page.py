@@ -10,7 +10,7 @@ from advsearch.report.markup import Html, element, join
 from advsearch.runs.directory import IMAGES
 from advsearch.runs.results.base import Fields, Formation, Result
 from advsearch.viewer.document import data_url, document
-from advsearch.viewer.study_page import again, facts_table, heading, table
+from advsearch.viewer.study_page import again, facts_table, heading, named, table
 
 LONG = 24
 """Rows of a table above which it is folded."""
@@ -28,8 +28,8 @@ _ELSEWHERE = (
 def result_page(run: Path, result: Result) -> str:
     """Return the page of what is in the folder `run`."""
     values = {name: getattr(result, name) for name in type(result).model_fields}
-    named = [values.get("object"), *[", ".join(values.get(one) or ()) for one in ("objects", "controls")]]
-    what = "; ".join(filter(None, [result.command, *map(_text, named)]))
+    about = [values.get("object"), *[", ".join(values.get(one) or ()) for one in ("objects", "controls")]]
+    what = join(result.command, *(join("; ", named(("", _text(one)))) for one in about if one))
     tables = [(name, rows) for name, value in values.items() if (rows := _rows(value))]
     rest = {name: value for name, value in values.items() if name not in _ELSEWHERE and not _rows(value)}
     plain = {_words(name): _text(value) for name, value in rest.items()}

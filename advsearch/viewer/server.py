@@ -28,6 +28,7 @@ from urllib.parse import parse_qs, quote, unquote, urlsplit
 
 from advsearch.errors import AdvsearchError, InputError
 from advsearch.files import open_regular
+from advsearch.report.markup import element
 from advsearch.runs import listing, lock
 from advsearch.runs.directory import COLUMNS, HOME, PARTS, REPORT, is_run
 from advsearch.viewer import photographing
@@ -37,8 +38,8 @@ from advsearch.viewer.following import START, following_page, goes_on, progress
 from advsearch.viewer.list_page import list_page
 from advsearch.viewer.photographing import PhotoTaker
 from advsearch.viewer.refused import Refused
-from advsearch.viewer.sweep_page import SweepSource, page, result_of, task_of
-from advsearch.viewer.thumbnails import kept_pictures, path_of
+from advsearch.viewer.sweep_page import SweepSource, page, result_of
+from advsearch.viewer.thumbnails import cover, kept_pictures, path_of
 
 LOOPBACK = "127.0.0.1"
 
@@ -279,16 +280,20 @@ class _Handler(BaseHTTPRequestHandler):
     def _list(self, _query: Mapping[str, list[str]]) -> tuple[str, bytes]:
         return "text/html; charset=utf-8", list_page(self.server.runs()).encode()
 
+    def _cover(self, _query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
+        """A small picture of a run for the list; an empty one where it has none."""
+        return "image/jpeg", cover(self._run(name))
+
     def _page(self, _query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
         run = self._run(name)
         if listing.described(run, counts=False).command == "sweep":
-            return "text/html; charset=utf-8", page([(run, result_of(run))], [_source(name, run)]).encode()
+            return _html(page([(run, result_of(run))], [_source(name, run, "")]).encode(), "../../")
         report = run / REPORT
         if report.is_symlink():
             raise Refused(HTTPStatus.NOT_FOUND, f"{name} has no page; advsearch show {name} prints what it has")
         if goes_on(run):
-            return "text/html; charset=utf-8", following_page(name, run).encode()
-        return "text/html; charset=utf-8", report.read_bytes()
+            return _html(following_page(name, run).encode(), "../../")
+        return _html(report.read_bytes(), "../../")
 
     def _progress(self, query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
         after = query.get("after", [START])[0]
@@ -302,7 +307,7 @@ class _Handler(BaseHTTPRequestHandler):
         report = None if found is None or found.is_symlink() else found / REPORT
         if report is None or report.is_symlink() or not report.is_file():
             raise Refused(HTTPStatus.NOT_FOUND, "there is no such attack")
-        return "text/html; charset=utf-8", report.read_bytes()
+        return _html(report.read_bytes(), "../../../../", ("../../", name))
 
     def _compare(self, query: Mapping[str, list[str]]) -> tuple[str, bytes]:
         names = list(dict.fromkeys(query.get("run", [])))
@@ -312,8 +317,8 @@ class _Handler(BaseHTTPRequestHandler):
         other = [name for name, run in runs if listing.described(run, counts=False).command != "sweep"]
         if other:
             raise Refused(HTTPStatus.BAD_REQUEST, f"only sweeps can be shown side by side; {', '.join(other)} is none")
-        pages = page([(run, result_of(run)) for _, run in runs], [_source(name, run) for name, run in runs])
-        return "text/html; charset=utf-8", pages.encode()
+        sources = [_source(name, run, f"../runs/{quote(name, safe='')}/") for name, run in runs]
+        return _html(page([(run, result_of(run)) for _, run in runs], sources).encode(), "../")
 
     def _rows(self, query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
         run = self._run(name)
@@ -334,7 +339,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _align(self, _query: Mapping[str, list[str]], name: str) -> tuple[str, bytes]:
         path = f"/runs/{quote(name, safe='')}/align/"
         elsewhere = self.server.address_of(path) if self.server.token else None
-        return photographing.page(self.server.photographs, self._run(name), name, path, self.server.key, elsewhere)
+        made = photographing.page(self.server.photographs, self._run(name), name, self.server.key, elsewhere)
+        return _html(made, "../../../", ("../", name))
 
     def _rendering(self, _query: Mapping[str, list[str]], name: str, rendering: str) -> tuple[str, bytes]:
         return photographing.rendering(self._run(name), rendering)
@@ -344,9 +350,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _take(self, _query: Mapping[str, list[str]], name: str, rendering: str) -> tuple[str, bytes]:
         photographing.check_sender(self.headers, self.server.key)
-        path = f"/runs/{quote(name, safe='')}/align/"
         data = partial(photographing.body, self.headers, self.rfile)
-        return photographing.take(self.server.photographs, self._run(name), rendering, path, data)
+        return photographing.take(self.server.photographs, self._run(name), rendering, data)
 
     def _picture(self, _query: Mapping[str, list[str]], name: str, number: str) -> tuple[str, bytes]:
         file = path_of(self._run(name), int(number))
@@ -362,6 +367,7 @@ _ROUTES: Routes = (
     ("/", _Handler._list),
     ("/compare/", _Handler._compare),
     ("/runs/([^/]+)/", _Handler._page),
+    ("/runs/([^/]+)/cover", _Handler._cover),
     ("/runs/([^/]+)/rows", _Handler._rows),
     ("/runs/([^/]+)/progress", _Handler._progress),
     (f"/runs/([^/]+)/{PARTS}/([^/]+)/{re.escape(REPORT)}", _Handler._part),
@@ -375,10 +381,16 @@ _POSTED: Routes = (("/runs/([^/]+)/align/renderings/([^/]+)", _Handler._take),)
 """What is sent, not asked for."""
 
 
-def _source(name: str, run: Path) -> SweepSource:
-    base = f"/runs/{quote(name, safe='')}"
-    kept, rows = kept_pictures(run), f"{base}/rows"
-    return SweepSource(name, rows, task_of(run), parts=True, pictures=kept, folder=f"{base}/pictures")
+def _source(name: str, run: Path, base: str) -> SweepSource:
+    """Where a page gets a sweep's rows and pictures; `base` leads from the page to the run's own address."""
+    return SweepSource(name, f"{base}rows", parts=True, pictures=kept_pictures(run), folder=f"{base}pictures")
+
+
+def _html(page: bytes, home: str, above: tuple[str, str] | None = None) -> tuple[str, bytes]:
+    """Return a page with the way back: to the list, and to what it is a part of (an address and its name)."""
+    links = [("All runs", home), *([(above[1], above[0])] if above else [])]
+    way = element("nav", *(element("a", text, href=address) for text, address in links), aria_label="back")
+    return "text/html; charset=utf-8", page.replace(b"<body>", b"<body>" + way.encode(), 1)
 
 
 def _is_loopback(host: str) -> bool:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+from advsearch.files import MESHES
 from advsearch.report import gaps, wording
 from advsearch.report.charts import HEIGHT, NARROW, WIDE, study_chart
 from advsearch.report.markup import Html, element, join
@@ -95,7 +97,10 @@ def matrix_page(run: Path, result: MatrixResult) -> str:
 
 def replay_page(run: Path, result: ReplayResult) -> str:
     """Return the page of a replay in the folder `run`."""
-    what = f"answer of {Path(result.answer).name} ({result.answered}); {result.object}, {', '.join(result.controls)}"
+    what = join(
+        f"answer of {Path(result.answer).name} ({result.answered}); ",
+        named(("", result.object), ("", ", ".join(result.controls))),
+    )
     note = (
         "Trials with fresh seeds, the same under every condition, rounded to 8 bits, with 95 % Clopper-Pearson "
         "intervals. A success is what the search sought, where the clean scene is right with the same seed under the "
@@ -124,10 +129,29 @@ def replay_page(run: Path, result: ReplayResult) -> str:
 # ---- parts ----------------------------------------------------------------------------------------------------------
 
 
-def heading(eyebrow: str, text: str, remarks: Sequence[str]) -> Html:
+def heading(eyebrow: Html | str, text: str, remarks: Sequence[str]) -> Html:
     """Return the header of a page: what was asked, the answer, and what has to be known beside it."""
-    listed = element("ul", *(element("li", one) for one in remarks), class_="remarks") if remarks else None
-    return element("header", element("p", eyebrow, class_="eyebrow"), element("h1", text), listed)
+    return element("header", element("p", eyebrow, class_="eyebrow"), element("h1", text), beside(remarks))
+
+
+def beside(remarks: Sequence[str]) -> Html:
+    """Return what has to be known beside an answer, and below it, folded where it is much, how files were read."""
+    notes = [one for one in remarks if _OF_A_FILE.match(one)]
+    listed, noted = (
+        element("ul", *(element("li", one) for one in lines), class_=css) if lines else None
+        for lines, css in (([one for one in remarks if one not in notes], "remarks"), (notes, "notes"))
+    )
+    if len(notes) > MOST_NOTES:
+        noted = element("details", element("summary", f"{len(notes)} notes on how files were read"), noted)
+    return join(listed, noted)
+
+
+def named(*parts: tuple[str, str]) -> Html:
+    """Return what a run is about: kinds with their names, the paths among which are short, and whole on hover."""
+    shown = (
+        join(f"{kind} " if kind else "", element("span", wording.short_names(text), title=text)) for kind, text in parts
+    )
+    return join(*(join(", " if number else "", one) for number, one in enumerate(shown)))
 
 
 def facts_table(facts: Mapping[str, str]) -> Html:
@@ -163,6 +187,14 @@ def table(
     return scrolled(made)
 
 
+MOST_NOTES = 3
+"""Notes on files that are not folded."""
+
+_OF_A_FILE = re.compile(
+    rf"[^:]{{1,200}}\.({'|'.join(one[1:] for one in (*MESHES, '.hdr', '.exr', '.xml'))})[: ]|The clean scene has "
+)
+"""How what is said of the reading of a file begins, and of a value that a control leaves out."""
+
 LONG = 32
 """Letters of a cell above which its text is broken into lines."""
 
@@ -192,7 +224,7 @@ def _study_page(
     run: Path, result: StudyResult, said: str, body: Sequence[Html | None], facts: Mapping[str, str] | None = None
 ) -> str:
     """The page of several attacks: what is said of them, the attacks and how they came about."""
-    what = f"{', '.join(result.objects)}; {', '.join(result.controls)}; environment {result.environment}"
+    what = named(("", ",".join(result.objects)), ("", ", ".join(result.controls)), ("environment", result.environment))
     conditions = {
         "Model": result.model,
         "Environment": result.environment,
@@ -202,8 +234,8 @@ def _study_page(
         "Seed": str(result.seed),
     }
     links = part_links(run, list(result.parts))
-    named = zip(result.parts, links, strict=True)
-    parts = [element("li", element("a", name, href=link) if link else name) for name, link in named]
+    linked = zip(result.parts, links, strict=True)
+    parts = [element("li", element("a", name, href=link) if link else name) for name, link in linked]
     summary = element("summary", f"The attacks ({len(parts)})")
     main = element(
         "main",

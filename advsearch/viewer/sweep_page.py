@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from advsearch.errors import AdvsearchError
-from advsearch.files import JsonObject
+from advsearch.files import JsonObject, JsonValue
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
 from advsearch.report.notebook import axis_cells
@@ -28,7 +28,7 @@ from advsearch.runs.summary import read_result
 from advsearch.settings import read_yaml
 from advsearch.viewer.columns import Columns, read_columns
 from advsearch.viewer.document import data_script, data_url, document, scrolled
-from advsearch.viewer.study_page import facts_table, table
+from advsearch.viewer.study_page import beside, facts_table, named, table
 from advsearch.viewer.thumbnails import Kept, kept_pictures
 
 MOST_EMBEDDED = 3_000_000
@@ -49,7 +49,6 @@ class SweepSource:
         name: of the run.
         rows: columns for a page that needs no other file; else the address they are fetched from; None where they are
             too many for such a page, which then has the tables only.
-        task: what judges the answers; empty where that is not known yet.
         parts: whether the address gives them in parts (``?after=ID``), as those of a sweep that goes on.
         pictures: which thumbnails there are; None for none.
         folder: address of the thumbnails; None puts them into the page.
@@ -57,7 +56,6 @@ class SweepSource:
 
     name: str
     rows: Columns | str | None
-    task: str = ""
     parts: bool = False
     pictures: Kept | None = None
     folder: str | None = None
@@ -73,7 +71,7 @@ def write_page(run: Path, summary: SweepSummary) -> Path:
     columns = read_columns(run)
     write_bytes(run / directory.COLUMNS, columns.packed(), durable=False)
     rows = columns if len(columns.step) <= MOST_ROWS else None
-    source = SweepSource(run.name, rows, summary.task, pictures=kept_pictures(run))
+    source = SweepSource(run.name, rows, pictures=kept_pictures(run))
     return write_text(run / directory.REPORT, page([(run, summary)], [source]), durable=False)
 
 
@@ -88,16 +86,16 @@ def page(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[Swe
     summaries = [(path, summary) for path, summary in runs if summary is not None]
     title = ", ".join(path.name for path, _ in runs)
     described, data, left_out = [], [], []
-    sources = [one for one in sources if one.rows is not None]
-    for number, source in enumerate(sources):
-        described.append(_described(source, number))
+    shown = [(one, *run) for one, run in zip(sources, runs, strict=True) if one.rows is not None]
+    for number, (source, path, summary) in enumerate(shown):
+        described.append(_described(source, number) | (_going_on(path) if summary is None else _judged(summary)))
         if isinstance(source.rows, Columns):
             packed = base64.b64encode(gzip.compress(source.rows.packed(), 6, mtime=0)).decode()
             data.append(element("script", Html(packed), type="application/octet-stream", id=f"rows-{number}"))
             left_out.append(_left_out(described[-1], source))
     main = element(
         "main",
-        element("div", id="explorer", hidden="hidden") if sources else _too_many(runs),
+        element("div", id="explorer", hidden="hidden") if shown else _too_many(runs),
         *left_out,
         *(_still(path, summary) for path, summary in summaries),
         *(_surface(path, summary) for path, summary in summaries),
@@ -114,7 +112,7 @@ def page(runs: Sequence[tuple[Path, SweepSummary | None]], sources: Sequence[Swe
 
 
 def _described(source: SweepSource, number: int) -> JsonObject:
-    described: JsonObject = {"name": source.name, "task": source.task, "parts": source.parts}
+    described: JsonObject = {"name": source.name, "parts": source.parts}
     described["embedded" if isinstance(source.rows, Columns) else "rows"] = (
         f"rows-{number}" if isinstance(source.rows, Columns) else source.rows
     )
@@ -129,17 +127,31 @@ def _described(source: SweepSource, number: int) -> JsonObject:
     return {**described, "pictures": pictures}
 
 
+def _going_on(run: Path) -> JsonObject:
+    """The task of a sweep that has no result yet, as far as its settings can be read."""
+    with suppress(AdvsearchError):
+        given = read_yaml(run / directory.CONFIG).get("task")
+        return {"task": str(given.get("name") if isinstance(given, Mapping) else given).partition("=")[0]}
+    return {}
+
+
+def _judged(summary: SweepSummary) -> JsonObject:
+    """The task, and height and width in pixels of what was judged, where that is one size: boxes are told in them."""
+    formed = summary.image_formation
+    size = None if formed is None or "," in summary.model else list[JsonValue](formed.resolution)
+    return {"task": summary.task, "size": size}
+
+
 def _header(runs: Sequence[tuple[Path, SweepSummary | None]]) -> Html:
     lines: list[Html] = []
     for path, summary in runs:
-        heading = "h1" if len(runs) == 1 else "h2"
+        title = "h1" if len(runs) == 1 else "h2"
         if summary is None:
-            lines += [element(heading, f"{path.name}: this sweep has not ended yet")]
+            lines += [element(title, f"{path.name}: this sweep has not ended yet")]
             continue
-        what = f"sweep {path.name}; object {summary.object}, environment {summary.environment}, model {summary.model}"
-        lines += [element("p", what, class_="eyebrow"), element(heading, verdict(summary))]
-        remarks = [element("li", text) for text in summary.warnings]
-        lines += [element("ul", *remarks, class_="remarks")] if remarks else []
+        what = named(("object", summary.object), ("environment", summary.environment), ("model", summary.model))
+        lines += [element("p", f"sweep {path.name}; ", what, class_="eyebrow"), element(title, verdict(summary))]
+        lines += [beside(summary.warnings)]
     return element("header", element("h1", "Sweeps side by side") if len(runs) > 1 else None, *lines)
 
 
@@ -284,15 +296,3 @@ def result_of(run: Path) -> SweepSummary | None:
         return None
     found = read_result(run)
     return found if isinstance(found, SweepSummary) else None
-
-
-def task_of(run: Path) -> str:
-    """Return what judges the answers of a sweep, by its name; empty where its settings cannot be read."""
-    found = result_of(run)
-    if found is not None:
-        return found.task
-    with suppress(AdvsearchError):
-        given = read_yaml(run / directory.CONFIG).get("task")
-        name = given.get("name", "") if isinstance(given, Mapping) else given
-        return str(name or "").partition("=")[0]
-    return ""

@@ -6,17 +6,22 @@ import base64
 import io
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from advsearch.runs.directory import CONFIG
+from advsearch.runs.directory import CONFIG, IMAGES
 from advsearch.runs.files import write_bytes
 from advsearch.runs.images import Bytes, to_8bit
 from advsearch.settings import read_yaml, split_names
 from advsearch.viewer.columns import Columns
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 FOLDER = "rows"
 """In `images/` of the run."""
@@ -30,6 +35,9 @@ SIDE = 128
 QUALITY = 85
 """Of the JPEG files, from 1 to 95."""
 
+LARGEST_COVER = 50_000_000
+"""Pixels of a picture that a list shows small."""
+
 BYTES = 5000
 """What a thumbnail of `SIDE` takes, about; measured on pictures of the bundled objects."""
 
@@ -39,9 +47,26 @@ def thumbnail(picture: object) -> bytes:
     from PIL import Image
 
     values: Bytes = to_8bit(picture)
-    image = Image.fromarray(values)
-    image.thumbnail((SIDE, SIDE))
+    return _jpeg(Image.fromarray(values))
+
+
+def cover(run: Path) -> bytes:
+    """Return a small picture of a run as a JPEG: its worst answer, or else its first figure; grey where it has none."""
+    from PIL import Image
+
+    first = [run / IMAGES / f"{name}.png" for name in ("adversarial", "clean", "worst")]
+    for file in (*first, *sorted((run / IMAGES).glob("*.png"))):
+        if file.is_symlink() or not file.is_file():
+            continue
+        with suppress(OSError, SyntaxError, Image.DecompressionBombError), Image.open(file) as image:
+            if image.width * image.height <= LARGEST_COVER:
+                return _jpeg(image.convert("RGB"))
+    return _jpeg(Image.new("RGB", (1, 1), (128, 128, 128)))
+
+
+def _jpeg(image: Image.Image) -> bytes:
     buffer = io.BytesIO()
+    image.thumbnail((SIDE, SIDE))
     image.save(buffer, "JPEG", quality=QUALITY)
     return buffer.getvalue()
 

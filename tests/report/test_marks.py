@@ -38,6 +38,16 @@ def test_what_is_true_is_written_below_and_both_can_be_seen() -> None:
     assert blue[450:470, 130:180].mean() > 0.3 and orange[172:192, 128:140].mean() > 0.3
 
 
+def test_texts_of_boxes_in_one_place_do_not_cover_each_other() -> None:
+    box = (16.0, 24.0, 48.0, 56.0)
+    both = [Mark("cup 0.76", False, box=box), Mark("bowl 0.54", False, box=box)]
+    drawn = marked(GREY, both)
+    for alone in (marked(GREY, [one]) for one in both):
+        top = int(np.flatnonzero(where(alone, SAID)[:, 132])[0])
+        text = alone[top:192, 128:180]
+        assert any(np.array_equal(drawn[y : y + len(text), 128:180], text) for y in range(230))
+
+
 @pytest.mark.parametrize("box", [(-20.0, -20.0, 90.0, 90.0), (60.0, 60.0, 64.0, 64.0), (5.0, 5.0, 5.0, 5.0)])
 def test_what_reaches_out_of_the_picture_is_cut(box: tuple[float, float, float, float]) -> None:
     drawn = marked(GREY, [Mark("a very long name of a thing that is there", True, box=box)])

@@ -137,9 +137,11 @@ def explored(page: Page) -> None:
     assert "pose.yaw 90: right in 2 of 4 (50\xa0%, 7\xa0% to 93\xa0%)" in str(worst.get_attribute("aria-label"))
 
     worst.hover()
-    until(page, lambda: page.locator(".card").count() == 4)
+    until(page, lambda: page.locator(".peek img").count() == 4)
+    assert "right in 2 of 4" in page.locator(".peek").inner_text()
+    assert page.locator(".card").count() == 24  # what is below stays as it is
     page.locator("h1").hover()
-    until(page, lambda: page.locator(".card").count() == 24)
+    until(page, lambda: not page.locator(".peek").is_visible())
 
     worst.click()
     assert page.locator('[data-cell="0,1,2"]').get_attribute("aria-pressed") == "true"
@@ -149,7 +151,14 @@ def explored(page: Page) -> None:
     until(page, lambda: mark.inner_text().strip() == "✗")  # a card has no text until a frame has shown it
     page.locator(".card").first.click()
     assert "camera.elevation [degrees]" in page.locator("dialog").inner_text()
-    page.locator("dialog button").click()
+    first = page.locator("dialog").get_attribute("aria-label")
+    page.get_by_role("button", name="Next").click()
+    assert page.locator("dialog").get_attribute("aria-label") != first
+    assert "2 of 2" in page.locator("dialog").inner_text()
+    page.keyboard.press("ArrowLeft")
+    assert page.locator("dialog").get_attribute("aria-label") == first
+    assert page.locator("dialog").evaluate("one => one.scrollTop") == 0  # its picture is seen whole
+    page.get_by_role("button", name="Close").click()
     page.locator("h1").hover()  # away from the cells
 
     page.locator("#parameter-0").select_option("one value")  # environment
@@ -227,9 +236,48 @@ def test_a_cell_that_was_pointed_at_does_not_outlive_its_map(browser: Browser, s
     with opened(browser, (sweep / "report.html").as_uri()) as page:
         page.wait_for_selector("[data-cell]")
         page.locator('[data-cell="0,1,2"]').dispatch_event("pointerover", {"pointerType": "mouse"})
-        until(page, lambda: page.locator(".card").count() == 4)
+        until(page, lambda: page.locator(".peek").is_visible())
         page.get_by_label("Side by side").select_option("environment")
-        assert page.locator(".card").count() == 24
+        assert not page.locator(".peek").is_visible()
+
+
+def test_long_paths_are_short_names_that_tell_everything_apart(browser: Browser, tmp_path: Path) -> None:
+    folder = "/data/of/a/person/with a long path from a studio/downloads-2026-11"
+    names = (f"{folder}/abandoned_factory_canteen_01_1k.hdr", f"{folder}/night/room.hdr", f"{folder}/day/room.hdr")
+    run = make_sweep(tmp_path / "paths", environments=names)
+    with opened(browser, (run / "report.html").as_uri(), 390) as page:
+        page.wait_for_selector("[data-cell]")
+        assert page.evaluate("document.scrollingElement.scrollWidth <= innerWidth")
+        page.locator("#parameter-0").select_option("one value")
+        shown = page.locator("output")
+        assert (shown.inner_text(), shown.get_attribute("title")) == ("abandoned_factory_canteen_01_1k.hdr", names[0])
+        assert page.locator("#parameter-0-value").is_visible()
+        page.locator("#parameter-0").select_option("up")
+        rows = page.locator("table.map th[scope=row]")
+        assert rows.all_inner_texts() == ["day/room.hdr", "night/room.hdr", "abandoned_factory_canteen_01_1k.hdr"]
+        assert rows.nth(0).get_attribute("title") == names[2]
+        assert page.evaluate("document.scrollingElement.scrollWidth <= innerWidth")
+        first = page.locator("svg.along text:not(.name)").all_text_contents()
+        assert any(text.endswith("abandoned_facto…") for text in first) and any("day/room.hdr" in one for one in first)
+
+
+def test_the_boxes_of_a_detector_lie_on_its_pictures(browser: Browser, tmp_path: Path) -> None:
+    found = [{"box": [1.0, 1.0, 5.0, 6.0], "label": "bowl", "score": 0.9}]
+    found += [{"box": [4.0, 4.5, 12.0, 12.0], "label": "mug", "score": 0.4}]
+    payload: Any = {"box": [4, 4, 12, 12], "found": found}
+    run = make_sweep(tmp_path / "boxes", keep="all", payload=payload, label="no mug", task="detection")
+    with opened(browser, (run / "report.html").as_uri()) as page:
+        page.wait_for_selector(".card svg")
+        page.get_by_label("Show", exact=True).select_option("right")
+        rect = page.locator(".card rect.said").first
+        assert [rect.get_attribute(name) for name in ("x", "y", "width", "height")] == ["4", "4.5", "8", "7.5"]
+        assert page.locator(".card rect.true").count() == page.locator(".card").count() == 18
+        image, drawing = page.locator(".card img").first.bounding_box(), page.locator(".card svg").first.bounding_box()
+        assert image == drawing
+        card = page.locator(".card").first
+        until(page, lambda: "no mug found (best score of mug 0.90)" in card.inner_text())
+        page.get_by_label("Show", exact=True).select_option("wrong")  # "cup", which is none of those that were found
+        assert page.locator(".card rect.said").count() == 0 and page.locator(".card rect.true").count() == 6
 
 
 def test_sweeps_stand_side_by_side(browser: Browser, sweep: Path, tmp_path: Path) -> None:
@@ -238,9 +286,17 @@ def test_sweeps_stand_side_by_side(browser: Browser, sweep: Path, tmp_path: Path
         page.get_by_label("compare second").check()
         page.get_by_role("button").click()
         page.wait_for_selector("[data-cell]")
-        page.get_by_label("Side by side").select_option("run")
-        assert page.locator("figure.map figcaption").all_inner_texts()[0].startswith("run first")
+        assert page.get_by_label("Side by side").input_value() == "run"
+        assert page.locator("figure.map").count() == 2
+        titles = [one.partition(":")[0] for one in page.locator("figure.map figcaption").all_inner_texts()]
+        assert sorted(titles) == ["run first", "run second"]
         assert "48 configurations" in page.locator("#explorer .status").inner_text()
+        page.get_by_label("Side by side").select_option("")
+        page.reload()
+        page.wait_for_selector("[data-cell]")
+        assert page.locator("figure.map").count() == 1  # as the address says
+        page.get_by_role("link", name="All runs").click()
+        assert page.locator("table.runs tbody tr").count() == 2
 
 
 def test_a_sweep_that_goes_on_is_followed(browser: Browser, tmp_path: Path) -> None:
@@ -295,9 +351,11 @@ def test_an_attack_that_goes_on_is_followed_step_by_step(browser: Browser, tmp_p
 
 def test_an_attack_is_compared_and_played(browser: Browser, attack: Path) -> None:
     with opened(browser, (attack / "report.html").as_uri()) as page:
-        slider = page.get_by_label("how much of the adversarial")
+        slider = page.get_by_label("where the clean picture ends")
         slider.fill("20")
         assert page.locator(".stage").evaluate("stage => stage.style.getPropertyValue('--shown')") == "20%"
+        shown = page.locator(".stage .over").evaluate("one => getComputedStyle(one).clipPath")
+        assert shown == "inset(0px 0px 0px 20%)"  # clean on the left, as the slider's ends say
         step = page.get_by_label("step of the search")
         step.fill("0")
         first = page.locator("#search img").get_attribute("src")

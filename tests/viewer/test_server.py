@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import re
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from functools import partial
@@ -11,7 +14,9 @@ from http.client import HTTPConnection, HTTPResponse, HTTPSConnection
 from pathlib import Path
 from ssl import _create_unverified_context
 
+import numpy as np
 import pytest
+from PIL import Image
 from stored_sweeps import make_sweep, serving
 
 from advsearch.errors import InputError
@@ -49,16 +54,39 @@ def server(run: Path) -> Iterator[Dashboard]:
 
 def test_it_lists_runs_and_shows_them(server: Dashboard) -> None:
     _, page = ask(server, "/")
-    assert b"/runs/first/" in page
+    assert b'href="runs/first/"' in page
+    assert f"{time.localtime().tm_year}-" in page.decode()  # when it was begun
     assert b"<b>" not in page
     answer, page = ask(server, "/runs/first/")
     assert answer.status == 200
-    assert b"/runs/first/rows" in page
+    assert b'"rows": "rows"' in page
+    assert b'<nav aria-label="back"><a href="../../">All runs</a></nav>' in page
     answer, page = ask(server, "/runs/second%2C%20%3Cb%3E/")
     assert answer.status == 200
     answer, page = ask(server, "/compare/?run=first&run=second%2C%20%3Cb%3E")
     assert answer.status == 200
-    assert page.count(b'"rows": ') == 2
+    assert page.count(b'"rows": "../runs/') == 2
+    assert b'<a href="../">All runs</a>' in page
+
+
+def test_a_list_has_pictures(server: Dashboard, run: Path) -> None:
+    for name, colour in (("worst", (200, 40, 40)), ("adversarial", (40, 40, 200))):
+        Image.new("RGB", (300, 200), colour).save(run / "images" / f"{name}.png")
+        answer, data = ask(server, "/runs/first/cover")
+        assert answer.headers["Content-Type"] == "image/jpeg"
+        with Image.open(io.BytesIO(data)) as shown:
+            assert shown.size == (128, 85)
+            assert np.abs(np.asarray(shown)[40, 60].astype(int) - colour).max() < 12
+        (run / "images" / f"{name}.png").unlink()
+    assert ask(server, "/runs/first/cover")[0].status == 200  # grey
+
+
+def test_pages_work_below_another_address(server: Dashboard) -> None:
+    """As behind a proxy that takes a part of the address away: no link, and nothing that is fetched, begins at /."""
+    for path in ("/", "/runs/first/", "/compare/?run=first", "/runs/first/align/"):
+        _, page = ask(server, path)
+        assert not re.findall(rb'(?:href|src|action)="/', page), path
+        assert not re.findall(rb'"(?:rows|folder|path)": "/', page), path
 
 
 def test_rows_and_pictures(server: Dashboard, run: Path) -> None:

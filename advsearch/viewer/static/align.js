@@ -2,7 +2,7 @@
 "use strict";
 (() => {
   const SIDE = 1024; // longest side of a photograph, pixels
-  const { path, key, names } = JSON.parse(document.getElementById("photographing").textContent);
+  const { key, names } = JSON.parse(document.getElementById("photographing").textContent);
   const place = document.getElementById("align");
   const asked = new URLSearchParams(location.search).get("rendering");
   let chosen = listed(asked || names[0]), at = 0, shape = [1, 1], image = null;
@@ -29,7 +29,7 @@
   function button(text, onclick) { return make("button", { type: "button", onclick }, text); }
   function label(text, input) { return make("label", { for: input.id }, make("span", {}, text), input); }
   function listed(text) { return text.split(/[\s,]+/).filter(Boolean); }
-  function address(name) { return `${path}renderings/${encodeURIComponent(name)}`; }
+  function address(name) { return `renderings/${encodeURIComponent(name)}`; }
   function say(text) { status.textContent = text; }
 
   function choose() {

@@ -13,7 +13,7 @@
     under.removeAttribute("data-picture");
     const stage = make("div", { class: "stage" }, under, over);
     const slide = (value) => stage.style.setProperty("--shown", `${value}%`);
-    const input = make("input", { type: "range", min: 0, max: 100, value: 50, "aria-label": "how much of the adversarial picture is shown", oninput: (event) => slide(event.target.value) });
+    const input = make("input", { type: "range", min: 0, max: 100, value: 50, "aria-label": "where the clean picture ends and the adversarial one begins", oninput: (event) => slide(event.target.value) });
     slide(50);
     place.append(stage, make("label", { class: "ends" }, make("span", {}, "clean"), input, make("span", {}, "adversarial")));
     place.hidden = false;

@@ -8,7 +8,8 @@
   const FOLLOW = 3000; // milliseconds between two looks at a sweep that goes on
   const MAP = [[0, 34, 78], [42, 63, 108], [87, 93, 109], [127, 124, 117], [166, 157, 117], [210, 193, 101], [254, 232, 56]];
   const KINDS = { uint32: Uint32Array, float32: Float32Array, uint16: Uint16Array, uint8: Uint8Array };
-  const UNKNOWN = 2, NO_PROBABILITY = 65535;
+  const UNKNOWN = 2, NO_PROBABILITY = 65535, NO_BOX = 65535, BOX_STEPS = 8;
+  const PEEKED = 4; // pictures beside a cell that is pointed at
   const OVERALL = "all values", ACROSS = "across", UP = "up", ONE = "one value";
 
   // ---- elements ----------------------------------------------------------------------------------------------------
@@ -52,10 +53,19 @@
     if (task === "detection") return label.startsWith("no ") ? `${label} found (best score of ${label.slice(3)} ${share.toFixed(2)})` : `${label} (score ${share.toFixed(2)})`;
     return task === "segmentation" ? `accuracy ${percent(share)}, most often ${label}` : `${label} ${percent(share)}`;
   }
-  function numberName(task, label) {
-    return task === "segmentation" ? "accuracy" : task !== "detection" ? "probability" : label.startsWith("no ") ? `best score of ${label.slice(3)}` : "score";
-  }
   const short = (value) => (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(4))));
+  // The last part of each path, with as much before it as tells it from the others; names stay as they are.
+  function shortened(names) {
+    const parts = names.map((name) => name.split(/[\\/]/).filter(Boolean));
+    return names.map((name, k) => {
+      for (let count = 1; count < parts[k].length; count++) {
+        const end = parts[k].slice(-count).join("/");
+        if (!names.some((other, j) => other !== name && (parts[j].slice(-count).join("/") === end))) return end;
+      }
+      return name;
+    });
+  }
+  const cut = (text, letters) => (text.length > letters ? `${text.slice(0, Math.max(letters - 1, 1))}…` : text);
   const named = (name, unit) => (unit && unit !== "name" && unit !== "1" ? `${name} [${unit}]` : name);
 
   const factorials = [0];
@@ -116,7 +126,7 @@
     const size = new DataView(buffer).getUint32(0, true);
     const head = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, size)));
     const arrays = {};
-    for (const one of head.columns) arrays[one.name] = new KINDS[one.type](buffer, 4 + size + one.at, head.count);
+    for (const one of head.columns) arrays[one.name] = new KINDS[one.type](buffer, 4 + size + one.at, head.count * (one.width || 1));
     return { head, arrays };
   }
 
@@ -127,7 +137,7 @@
       this.parameters = [];
       this.answers = [];
       this.sources = [];
-      this.columns = { step: new Uint32Array(0), margin: new Float32Array(0), answer: new Uint16Array(0), probability: new Uint16Array(0), right: new Uint8Array(0), source: new Uint16Array(0) };
+      this.columns = { step: new Uint32Array(0), margin: new Float32Array(0), answer: new Uint16Array(0), probability: new Uint16Array(0), right: new Uint8Array(0), source: new Uint16Array(0), boxes: null };
     }
 
     add({ head, arrays }, source) {
@@ -144,6 +154,12 @@
       }
       this.columns.source = grown(this.columns.source, Uint16Array);
       this.columns.source.fill(source, before);
+      if (arrays.boxes || this.columns.boxes) {
+        const boxes = new Uint16Array(8 * count).fill(NO_BOX);
+        if (this.columns.boxes) boxes.set(this.columns.boxes);
+        if (arrays.boxes) boxes.set(arrays.boxes, 8 * before);
+        this.columns.boxes = boxes;
+      }
       this.columns.answer = grown(this.columns.answer, Uint16Array);
       this.put(this.columns.answer, arrays.answer, this.places(this.answers, head.answers), before);
       head.parameters.forEach((given, number) => {
@@ -187,7 +203,7 @@
     }
 
     axis({ name, unit, levels, edges, data }) {
-      if (levels) return { name, unit, labels: levels, level: data, names: true };
+      if (levels) return { name, unit, labels: shortened(levels), full: levels, level: data, names: true };
       const seen = new Set();
       for (let k = 0; k < data.length && seen.size <= MOST_LEVELS; k++) if (!Number.isNaN(data[k])) seen.add(data[k]);
       const parts = Boolean(edges) || seen.size > MOST_LEVELS;
@@ -233,10 +249,9 @@
       this.place = place;
       this.table = table;
       this.state = { across: null, up: null, by: null, measure: "accuracy", fixed: {}, cell: null, show: "all", order: "worst" };
-      this.hover = null;
-      this.parts = { controls: make("div", { class: "parameters" }), options: make("div", { class: "options" }), maps: make("div", { class: "maps" }), legend: make("div", { class: "legend" }), status: make("p", { class: "status", role: "status", "aria-live": "polite" }), alongs: make("div", { class: "alongs" }), gallery: make("div", { class: "gallery" }), bar: make("div", { class: "options" }) };
+      this.parts = { peek: make("div", { class: "peek", hidden: true, "aria-hidden": "true" }), controls: make("div", { class: "parameters" }), options: make("div", { class: "options" }), maps: make("div", { class: "maps" }), legend: make("div", { class: "legend" }), status: make("p", { class: "status", role: "status", "aria-live": "polite" }), alongs: make("div", { class: "alongs" }), gallery: make("div", { class: "gallery" }), bar: make("div", { class: "options" }) };
       const heading = (text) => make("h2", {}, text);
-      place.append(heading("Accuracy over two parameters"), this.parts.options, this.parts.controls, this.parts.maps, this.parts.legend, this.parts.status, heading("Pictures"), this.parts.bar, this.parts.gallery, heading("Along each parameter"), make("p", { class: "soft" }, "Accuracy with its 95 % interval (Clopper and Pearson), over what is chosen above."), this.parts.alongs);
+      place.append(heading("Accuracy over two parameters"), this.parts.options, this.parts.controls, this.parts.maps, this.parts.legend, this.parts.status, heading("Pictures"), this.parts.bar, this.parts.gallery, heading("Along each parameter"), make("p", { class: "soft" }, "Accuracy with its 95 % interval (Clopper and Pearson), over what is chosen above."), this.parts.alongs, this.parts.peek);
       window.addEventListener("hashchange", () => this.arrive());
     }
 
@@ -265,7 +280,8 @@
       state.across = pick(given.get("across"), given.get("up"));
       state.up = pick(given.get("up") === state.across ? null : given.get("up"), state.across);
       if (state.up === state.across) state.up = null;
-      state.by = this.byName.has(given.get("by")) ? given.get("by") : null;
+      const by = given.has("by") ? given.get("by") : "run"; // several runs stand side by side unless asked otherwise
+      state.by = this.byName.has(by) && by !== state.across && by !== state.up ? by : null;
       state.measure = ["accuracy", "margin", "count"].includes(given.get("measure")) ? given.get("measure") : "accuracy";
       state.show = ["all", "wrong", "right"].includes(given.get("show")) ? given.get("show") : "all";
       state.order = ["worst", "best", "first"].includes(given.get("order")) ? given.get("order") : "worst";
@@ -280,7 +296,7 @@
 
     written() {
       const state = this.state, out = new URLSearchParams();
-      for (const name of ["across", "up", "by"]) if (state[name]) out.set(name, state[name]);
+      for (const name of ["across", "up", "by"]) if (state[name] || (name === "by" && this.byName.has("run"))) out.set(name, state[name] || "");
       if (state.measure !== "accuracy") out.set("measure", state.measure);
       if (state.show !== "all") out.set("show", state.show);
       if (state.order !== "worst") out.set("order", state.order);
@@ -371,9 +387,10 @@
       for (const one of [ACROSS, UP, ONE, OVERALL]) select.append(make("option", { selected: one === role }, one));
       const parts = [make("label", { for: id }, named(axis.name, axis.unit)), select];
       if (role === ONE) {
-        const text = make("output", {}, axis.labels[fixed]);
+        const full = (level) => (axis.full || axis.labels)[level], text = make("output", { title: full(fixed) }, axis.labels[fixed]);
         const range = make("input", { type: "range", id: `${id}-value`, min: 0, max: axis.labels.length - 1, value: fixed, "aria-label": `${axis.name}: value`, "aria-valuetext": axis.labels[fixed], oninput: (event) => {
           text.textContent = axis.labels[event.target.value];
+          text.title = full(event.target.value);
           this.change({ fixed: { ...this.state.fixed, [axis.name]: Number(event.target.value) } });
         } });
         parts.push(make("span", { class: "value" }, range, text));
@@ -424,16 +441,16 @@
       const area = across.labels.length * up.labels.length, stop = [...(state.cell || [0, 0, 0])];
       this.cells = { across, up, by };
       clearTimeout(this.waits);
-      this.hover = null; // it was a cell of other maps
+      this.peek(null); // it was a cell of other maps
       this.parts.maps.replaceChildren(...by.labels.map((label, part) => {
-        const head = make("tr", {}, make("td", {}), ...across.labels.map((text) => make("th", { scope: "col" }, make("span", {}, text))));
-        const rows = up.labels.map((text, row) => make("tr", {}, make("th", { scope: "row" }, text), ...across.labels.map((_, column) => {
+        const head = make("tr", {}, make("td", {}), ...across.labels.map((text, column) => make("th", { scope: "col", title: across.full && across.full[column] }, text)));
+        const rows = up.labels.map((text, row) => make("tr", {}, make("th", { scope: "row", class: up.names && "names", title: up.full && up.full[row] }, text), ...across.labels.map((_, column) => {
           const place = part * area + row * across.labels.length + column;
           const cell = [part, row, column], value = values[place];
           const pinned = state.cell && state.cell.every((one, k) => one === cell[k]);
           const words = this.words(cell, counts, place, value);
           const written = value === null ? "" : state.measure === "accuracy" ? percentNumber(value) : short(Number(value.toPrecision(2)));
-          return make("td", {}, make("button", { type: "button", class: value === null ? "cell none" : "cell", style: value === null ? {} : colour(shade(value)), "aria-label": words, "aria-pressed": pinned ? "true" : "false", title: words, tabindex: row === stop[1] && column === stop[2] ? 0 : -1, "data-cell": cell.join(",") }, written));
+          return make("td", {}, make("button", { type: "button", class: value === null ? "cell none" : "cell", style: value === null ? {} : colour(shade(value)), "aria-label": words, "aria-pressed": pinned ? "true" : "false", tabindex: row === stop[1] && column === stop[2] ? 0 : -1, "data-cell": cell.join(",") }, written));
         })));
         rows.reverse();
         const table = make("table", { class: "map", style: { "min-width": `${6.2 + 2 * across.labels.length}rem` } }, make("thead", {}, head), make("tbody", {}, ...rows));
@@ -465,15 +482,11 @@
         const same = this.state.cell && this.state.cell.join(",") === button.dataset.cell;
         this.change({ cell: same ? null : cell(button) });
         const again = maps.querySelector(`[data-cell="${button.dataset.cell}"]`);
-        if (again) again.focus();
+        if (again) again.focus({ preventScroll: true });
       };
       const look = (button) => {
         clearTimeout(this.waits);
-        this.waits = setTimeout(() => {
-          this.hover = button ? cell(button) : null;
-          this.say();
-          this.showGallery();
-        }, 60);
+        this.waits = setTimeout(() => this.peek(button), 60);
       };
       maps.onpointerover = (event) => { if (event.pointerType !== "touch" && at(event)) look(at(event)); };
       maps.onpointerleave = () => look(null);
@@ -490,10 +503,23 @@
       };
     }
 
+    // What is in a cell that is pointed at, beside it: its counts and its worst pictures.
+    peek(button) {
+      const place = this.parts.peek;
+      place.hidden = !button;
+      if (!button) return;
+      const found = this.found(button.dataset.cell.split(",").map(Number), PEEKED).rows.filter((k) => this.address(k));
+      place.replaceChildren(make("div", {}, button.getAttribute("aria-label")), make("div", { class: "gallery" }, ...found.map((k) => this.picture(k, ""))));
+      const at = button.getBoundingClientRect(), mine = place.getBoundingClientRect(), gap = 8;
+      const below = at.bottom + gap + mine.height <= innerHeight || at.top < mine.height + gap;
+      place.style.left = `${Math.max(gap, Math.min(at.left + at.width / 2 - mine.width / 2, document.documentElement.clientWidth - mine.width - gap))}px`;
+      place.style.top = `${below ? at.bottom + gap : at.top - gap - mine.height}px`;
+    }
+
     say() {
-      const cell = this.hover || this.state.cell;
+      const cell = this.state.cell;
       const button = cell && this.parts.maps.querySelector(`[data-cell="${cell.join(",")}"]`);
-      this.parts.status.textContent = button ? button.getAttribute("aria-label") : `${this.number()} configurations. Point at a cell, or choose one, to see its pictures.`;
+      this.parts.status.textContent = button ? `${button.getAttribute("aria-label")}. Its pictures are below.` : `${this.number()} configurations. Point at a cell to see what is in it; choose it, and the pictures below are its own.`;
     }
 
     number() {
@@ -525,9 +551,11 @@
       const y = (share) => 8 + (1 - share) * (high - bottom - 8);
       const marks = [], rows = [];
       for (const share of [0, 0.5, 1]) marks.push(drawn("line", { x1: left, x2: wide - 8, y1: y(share), y2: y(share), class: "rule" }), drawn("text", { x: left - 6, y: y(share) + 4, "text-anchor": "end" }, `${100 * share}\u00a0%`));
-      const every = Math.ceil(n / Math.max(1, Math.floor(46 / Math.max(...axis.labels.map((text) => text.length + 1)))));
+      const longest = Math.max(...axis.labels.map((text) => text.length)), room = 52; // letters beside each other
+      const letters = axis.names ? Math.min(Math.max(Math.floor(room / n) - 1, 7), longest) : longest;
+      const every = Math.ceil(n / Math.max(1, Math.floor(room / (letters + 1))));
       axis.labels.forEach((text, level) => {
-        if (level % every === 0) marks.push(drawn("text", { x: x(level, (parts.length - 1) / 2), y: high - 24, "text-anchor": "middle" }, text.length > 16 ? `${text.slice(0, 15)}…` : text));
+        if (level % every === 0) marks.push(drawn("text", { x: x(level, (parts.length - 1) / 2), y: high - 24, "text-anchor": "middle" }, drawn("title", {}, (axis.full || axis.labels)[level]), cut(text, letters)));
       });
       marks.push(drawn("text", { x: (wide + left) / 2, y: high - 6, "text-anchor": "middle", class: "name" }, named(axis.name, axis.unit)));
       parts.forEach((part, series) => axis.labels.forEach((text, level) => {
@@ -546,8 +574,9 @@
 
     // ---- pictures ----------------------------------------------------------------------------------------------------
 
-    showGallery() {
-      const state = this.state, cell = this.hover || state.cell, { across, up, by } = this.cells;
+    // The first rows, of a cell or of all, in the order that is chosen, and how many there are.
+    found(cell, most) {
+      const state = this.state, { across, up, by } = this.cells;
       const { right, margin } = this.table.columns, kept = this.kept, found = [];
       let all = 0;
       const sign = state.order === "worst" ? 1 : -1;
@@ -558,11 +587,11 @@
         if (cell && (by.level[k] !== cell[0] || up.level[k] !== cell[1] || across.level[k] !== cell[2])) continue;
         if (state.show !== "all" && right[k] !== (state.show === "right" ? 1 : 0)) continue;
         all += 1;
-        if (found.length < SHOWN) {
+        if (found.length < most) {
           found.push(k);
-          if (state.order !== "first" && found.length === SHOWN) found.sort((a, b) => better(b, a));
-        } else if (state.order !== "first" && better(k, found[SHOWN - 1]) > 0) {
-          let place = SHOWN - 1;
+          if (state.order !== "first" && found.length === most) found.sort((a, b) => better(b, a));
+        } else if (state.order !== "first" && better(k, found[most - 1]) > 0) {
+          let place = most - 1;
           while (place > 0 && better(k, found[place - 1]) > 0) {
             found[place] = found[place - 1];
             place -= 1;
@@ -571,37 +600,80 @@
         }
       }
       if (state.order !== "first") found.sort((a, b) => better(b, a));
+      return { rows: found, all };
+    }
+
+    showGallery() {
+      const state = this.state, { rows, all } = this.found(state.cell, SHOWN), boxes = rows.some((k) => this.marks(k).length);
       this.parts.bar.replaceChildren(
         choice("Show", [["all", "all"], ["wrong", "wrong answers"], ["right", "right answers"]], state.show, (show) => this.change({ show })),
         choice("First", [["worst", "worst margin"], ["best", "best margin"], ["first", "as they were made"]], state.order, (order) => this.change({ order })),
-        make("span", { class: "soft" }, `${Math.min(all, SHOWN)} of ${all.toLocaleString("en")}${cell ? " in this cell" : ""}`),
+        make("span", { class: "soft" }, `${rows.length} of ${all.toLocaleString("en")}${state.cell ? " in this cell" : ""}`),
+        boxes ? make("span", { class: "soft boxes" }, "Boxes: ", make("span", { class: "true" }, "where the object is"), ", ", make("span", { class: "said" }, "where the model says its answer is")) : "",
         ...(state.cell ? [make("button", { type: "button", onclick: () => this.change({ cell: null }) }, "All cells")] : []),
       );
-      this.parts.gallery.replaceChildren(...found.map((k) => this.card(k)));
+      this.parts.gallery.replaceChildren(...rows.map((k, place) => this.card(k, () => this.details(rows, place))));
     }
 
-    card(k) {
-      const { answer, probability, right, step, source } = this.table.columns;
-      const label = this.table.answers[answer[k]] || "no answer", share = probability[k] === NO_PROBABILITY ? null : probability[k] / 10000;
-      const verdict = right[k] === UNKNOWN ? "not judged" : right[k] ? "right" : "wrong";
-      const address = this.table.sources[source[k]].picture(step[k]);
-      const picture = address ? make("img", { src: address, alt: `${verdict}: ${label}`, loading: "lazy" }) : null;
-      return make("button", { type: "button", class: `card ${verdict.replace(" ", "-")}`, onclick: () => this.details(k) }, ...(picture ? [picture] : []), make("span", {}, make("strong", {}, verdict === "wrong" ? "✗ " : verdict === "right" ? "✓ " : ""), said(this.table.sources[source[k]].task, label, share)));
+    address(k) {
+      const { step, source } = this.table.columns;
+      return this.table.sources[source[k]].picture(step[k]);
     }
 
-    details(k) {
-      const { answer, probability, right, margin, step, source } = this.table.columns, from = this.table.sources[source[k]];
-      const label = this.table.answers[answer[k]], share = probability[k] === NO_PROBABILITY ? null : probability[k] / 10000;
-      const facts = [["run", from.name], ["configuration", String(step[k])], ["answer", label], ["verdict", ["wrong", "right", "not judged"][right[k]]], [numberName(from.task, label), share === null ? "none" : from.task === "detection" ? share.toFixed(2) : percent(share)], ["margin", short(Number(margin[k].toPrecision(4)))]];
-      for (const one of this.table.parameters) {
-        const value = one.levels ? one.levels[one.data[k]] : short(one.data[k]);
-        facts.push([named(one.name, one.unit), value]);
-      }
-      const address = from.picture(step[k]);
-      const dialog = make("dialog", { "aria-label": `Configuration ${step[k]}`, onclose: (event) => event.target.remove(), onclick: (event) => { if (event.target === dialog) dialog.close(); } },
-        address ? make("img", { src: address, alt: "what the model saw" }) : null,
-        make("table", { class: "facts" }, make("tbody", {}, ...facts.map(([name, value]) => make("tr", {}, make("th", { scope: "row" }, name), make("td", {}, value))))),
-        make("button", { type: "button", onclick: () => dialog.close() }, "Close"));
+    // The boxes of a detector's answer: a class and x, y, width, height in pixels of what it saw.
+    marks(k) {
+      const { boxes, source } = this.table.columns;
+      if (!boxes || !this.table.sources[source[k]].size) return [];
+      return ["true", "said"].map((name, number) => {
+        const [x0, y0, x1, y1] = Array.from(boxes.subarray(8 * k + 4 * number, 8 * k + 4 * number + 4), (x) => x / BOX_STEPS);
+        return { name, x: x0, y: y0, width: x1 - x0, height: y1 - y0 };
+      }).filter((one) => one.x < NO_BOX / BOX_STEPS);
+    }
+
+    picture(k, alt) {
+      const marks = this.marks(k), image = make("img", { src: this.address(k), alt, loading: "lazy" });
+      if (!marks.length) return make("span", { class: "picture" }, image);
+      const [high, wide] = this.table.sources[this.table.columns.source[k]].size;
+      return make("span", { class: "picture" }, image, drawn("svg", { viewBox: `0 0 ${wide} ${high}`, "aria-hidden": "true" }, ...marks.map(({ name, ...ends }) => drawn("rect", { class: name, ...ends }))));
+    }
+
+    // What was answered, with its probability or score: of an object that was missed, the best score that did not count.
+    answered(k) {
+      const { answer, probability, source } = this.table.columns, label = this.table.answers[answer[k]] || "no answer";
+      return said(this.table.sources[source[k]].task, label, probability[k] === NO_PROBABILITY ? null : probability[k] / 10000);
+    }
+
+    card(k, open) {
+      const { right } = this.table.columns, verdict = right[k] === UNKNOWN ? "not judged" : right[k] ? "right" : "wrong";
+      const picture = this.address(k) ? [this.picture(k, `${verdict}: ${this.answered(k)}`)] : [];
+      return make("button", { type: "button", class: `card ${verdict.replace(" ", "-")}`, onclick: open }, ...picture, make("span", {}, make("strong", {}, verdict === "wrong" ? "✗ " : verdict === "right" ? "✓ " : ""), this.answered(k)));
+    }
+
+    details(rows, first) {
+      let place = first;
+      const inside = make("div", {}), count = make("span", { class: "soft", role: "status" });
+      const step = (by) => {
+        place = (place + by + rows.length) % rows.length;
+        show();
+      };
+      const button = (text, onclick) => make("button", { type: "button", onclick }, text);
+      const dialog = make("dialog", {
+        onclose: (event) => event.target.remove(),
+        onclick: (event) => { if (event.target === dialog) dialog.close(); },
+        onkeydown: (event) => { if (event.key === "ArrowLeft" || event.key === "ArrowRight") step(event.key === "ArrowLeft" ? -1 : 1); },
+      });
+      const show = () => {
+        const k = rows[place], { right, margin, step: number, source } = this.table.columns;
+        const facts = [["run", this.table.sources[source[k]].name], ["configuration", String(number[k])], ["answer", this.answered(k)], ["verdict", ["wrong", "right", "not judged"][right[k]]], ["margin", short(Number(margin[k].toPrecision(4)))]];
+        for (const one of this.table.parameters) facts.push([named(one.name, one.unit), one.levels ? shortened(one.levels)[one.data[k]] : short(one.data[k]), one.levels && one.levels[one.data[k]]]);
+        dialog.setAttribute("aria-label", `Configuration ${number[k]}`);
+        count.textContent = `${place + 1} of ${rows.length}`;
+        inside.replaceChildren(
+          ...(this.address(k) ? [this.picture(k, "what the model saw")] : []),
+          make("table", { class: "facts" }, make("tbody", {}, ...facts.map(([name, value, full]) => make("tr", {}, make("th", { scope: "row" }, name), make("td", { title: full }, value))))));
+      };
+      dialog.append(make("p", { class: "options" }, button("Previous", () => step(-1)), button("Next", () => step(1)), count, button("Close", () => dialog.close())), inside);
+      show();
       document.body.append(dialog);
       dialog.showModal();
     }
@@ -637,7 +709,7 @@
     const body = make("div", {});
     place.append(body);
     const explorer = new Explorer(body, table);
-    table.sources = runs.map((run) => ({ name: run.name, task: run.task, picture: pictures(run) }));
+    table.sources = runs.map((run) => ({ name: run.name, picture: pictures(run), task: run.task, size: run.size }));
     const renew = () => {
       for (const still of document.querySelectorAll("[data-still]")) still.hidden = true;
       explorer.renew();
