@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from advsearch.errors import FileFormatError
+from advsearch.files import note_opened
 from advsearch.scene.color import srgb_to_linear
 from advsearch.scene.environments import SUFFIXES as RADIANCE
 from advsearch.scene.environments import import_environment
@@ -57,6 +58,7 @@ def trusted(path: Path, scene: Mapping[str, object]) -> Plugin:
         for candidate in (str(name), os.path.basename(str(name))):
             found = Path(os.path.realpath(os.path.join(path.parent, candidate)))
             if found.is_file() and found.is_relative_to(os.path.realpath(path.parent)):
+                note_opened(found)
                 return found
         raise FileFormatError(f"{path}: {kind} needs {shown(str(name))}; write its name as it is in the folder")
 
