@@ -13,6 +13,7 @@ from torch import Tensor
 from advsearch.attacks import Ending, SearchResult, Verification, count_right
 from advsearch.attacks.distribution import Distribution
 from advsearch.attacks.smallest import Bracket
+from advsearch.engine.domains import domain_of
 from advsearch.engine.failures import described_failures, write_failures
 from advsearch.engine.pictures import Shown, trial_to_show, write_artifacts, write_object, write_pictures
 from advsearch.engine.print_terms import print_terms
@@ -24,6 +25,7 @@ from advsearch.errors import InputError
 from advsearch.report.drawing import new_axes
 from advsearch.report.notebook import attack_html, side_by_side
 from advsearch.report.studies import search_axes
+from advsearch.report.wording import number_text
 from advsearch.runs import store
 from advsearch.runs.answer import write_answer
 from advsearch.runs.export import to_pandas
@@ -52,7 +54,7 @@ from advsearch.runs.results.attack import (
     VerificationSamples,
     VerifiedRate,
 )
-from advsearch.runs.results.base import Formation, MovedValue
+from advsearch.runs.results.base import Formation, MovedValue, VariedValue
 from advsearch.viewer.attack_page import write_report
 
 T = TypeVar("T")
@@ -213,6 +215,7 @@ def _summary(asked: Question, problem: Problem, findings: Findings, clean: Shown
         goal=task.goal,
         target=list(task.target_names) or None,
         over=[bound.name for bound in problem.space.controls[len(controls) :]],
+        conditions=_conditions(problem),
         ending=_ending(findings, problem).value,
         image_formation=Formation.of(problem.renderer.formation),
         gradient_plan=problem.plan_summary(problem.plan),
@@ -327,6 +330,30 @@ def _found_values(problem: Problem, u: Tensor) -> dict[str, FoundValue]:
         if name in names and isinstance(low, float) and isinstance(high, float) and low < high:
             given |= {"low": low, "high": high}
         found[name] = FoundValue.of(given)
+    return found
+
+
+def _conditions(problem: Problem) -> dict[str, VariedValue]:
+    """What the conditions are drawn from, of single numbers and names."""
+    found: dict[str, VariedValue] = {}
+    if problem.conditions is None:
+        return found
+    start = problem.whole(problem.domain.start)
+    for group, (block, _) in zip(problem.space.groups, domain_of(problem.space.controls).parts(), strict=True):
+        if group.size != 1 or group.begin < len(problem.domain.start):
+            continue
+        values, options = [], max(block.options, 1)
+        for share in [0.0, 1.0] if not block.options else [(k + 0.5) / options for k in range(options)]:
+            moved = start.clone()
+            moved[group.begin] = share
+            values.append(problem.space.describe(moved).get(group.name))
+        told = [one["value"] for one in values if one is not None]
+        unit = next((str(one["unit"]) for one in values if one is not None), "")
+        numbers = [float(one) for one in told if isinstance(one, (int, float))]
+        if numbers and not block.options:
+            found[group.name] = VariedValue(unit=unit, low=min(numbers), high=max(numbers))
+        elif told:
+            found[group.name] = VariedValue(unit=unit, names=[number_text(one) for one in told])
     return found
 
 

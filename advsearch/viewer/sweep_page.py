@@ -274,11 +274,12 @@ def _table(rows: Sequence[AxisRow]) -> Html:
 
 
 def _cost(path: Path, summary: SweepSummary) -> Html:
+    formed = summary.image_formation
     facts = {
         "Ending": summary.ending,
         "Time": wording.seconds_text(summary.seconds["total"]),
         "Samples a pixel": str(summary.spp),
-        "Image formation": wording.formation_text(summary.image_formation) if summary.image_formation else "",
+        "Image formation": wording.formation_text(formed, summary.gains) if formed else "",
         "Seed": str(summary.seed),
         "Again": shlex.join(["advsearch", "run", f"{summary.run or path}/{directory.CONFIG}"]),
         "Command": summary.command_line,

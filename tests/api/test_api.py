@@ -234,6 +234,9 @@ def test_over_conditions_caption_and_payload_are_of_the_picture_and_labels_of_th
     assert 12 <= summary.clean.control.correct < 24, "some, and not all, trials have to count"
     assert summary.verified.trials == summary.clean.control.correct
     assert sum(summary.verified.labels.values()) == summary.verified.successes <= summary.verified.trials
+    assert list(summary.conditions) == ["camera.exposure"]
+    drawn = summary.conditions["camera.exposure"]
+    assert (drawn.unit, drawn.low, drawn.high) == ("stops", -1.5, pytest.approx(0.2))
     trial = summary.clean.trial
     assert trial is not None and trial == summary.adversarial.trial
     with Store(tmp_path / "run" / "results.sqlite", read_only=True) as store:

@@ -46,6 +46,7 @@ from advsearch.engine.sweeps.loop import Sweep
 from advsearch.engine.sweeps.points import Points, parts_of_ranges
 from advsearch.errors import InputError, RunExistsError, UnknownNameError
 from advsearch.progress import NullProgress
+from advsearch.report.wording import formation_text
 from advsearch.runs.directory import RunDirectory
 from advsearch.runs.results.base import plain
 from advsearch.runs.results.sweep import SweepSummary
@@ -484,6 +485,21 @@ def test_ten_million_draws_start_at_once() -> None:
 def test_a_pair_of_parts_has_several_draws(pictures: int, parts: int) -> None:
     assert parts_of_ranges(pictures) == parts
     assert pictures / parts**2 >= 5 or parts == 2
+
+
+def test_each_room_has_its_own_gain_and_ranges_are_the_declared_ones() -> None:
+    drawn = {"camera": {"azimuth": [0, 90]}}
+    rooms = advsearch.sweep("mug", model(), environment="studio,noon", controls=drawn, samples=3).summary
+    own = {name: advsearch.load_scene("mug", environment=name).description.gain for name in ("studio", "noon")}
+    assert rooms.gains == {f"mug, {name}": pytest.approx(gain) for name, gain in own.items()}
+    assert own["studio"] != pytest.approx(own["noon"], rel=1e-3)
+    assert rooms.image_formation and rooms.image_formation.gain is None
+    said = formation_text(rooms.image_formation, rooms.gains)
+    assert said.endswith(f"a gain for each scene: mug, studio {own['studio']:.4g}; mug, noon {own['noon']:.4g}")
+    one = advsearch.sweep("mug", model(), environment="noon", controls=drawn, samples=3).summary
+    assert one.image_formation and one.image_formation.gain == pytest.approx(own["noon"]) and one.gains is None
+    (azimuth,) = one.drawn.values()
+    assert (azimuth.low, azimuth.high, azimuth.unit) == (0.0, pytest.approx(90.0), "degrees")
 
 
 def test_page_and_table_cut_the_declared_range_at_the_same_places(tmp_path: Path) -> None:

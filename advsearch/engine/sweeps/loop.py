@@ -18,6 +18,7 @@ from advsearch.attacks.draws import Seeds
 from advsearch.attacks.product import batches
 from advsearch.cluster.executor import Done, Executor, InProcess
 from advsearch.described import Value
+from advsearch.engine.loading import framed
 from advsearch.engine.machines import Machines
 from advsearch.engine.pictures import save_marked
 from advsearch.engine.record import Stages
@@ -64,6 +65,9 @@ TELL_SECONDS = 0.1
 
 MOST_WAITING = 10_000
 """Batches that wait for an earlier one to be counted; where there are more, all rows are counted again at the end."""
+
+MOST_METERED = 256
+"""Scenes whose gains a summary lists; of more it has none."""
 
 READ_AT_ONCE = 256
 """Pictures whose places are worked out at once when rows are read back."""
@@ -342,6 +346,10 @@ class Sweep:
         job, seconds = self.job, self.stages.seconds
         view, checked = self._batches.view, worst.verified if worst else None
         swept = seconds.get("sweep", 0.0)
+        formation = Formation.of(next(iter(view.renderers.values())).formation) if view else None
+        gains = self._gains() if formation else {}
+        if formation is not None and len(set(gains.values())) != 1:
+            formation = formation.model_copy(update={"gain": None})
         summary = SweepSummary(
             run=None if self.run is None else str(self.run.path),
             object=job.object,
@@ -350,7 +358,9 @@ class Sweep:
             environment=self.points.environment or job.environment,
             controls=[control.name for control in job.controls],
             ending=ending,
-            image_formation=Formation.of(next(iter(view.renderers.values())).formation) if view else None,
+            image_formation=formation,
+            gains=gains if len(gains) > 1 else None,
+            drawn={one.name: one.varied for one in self._shown},
             planned=self.total,
             **vars(rate(tally.correct, tally.seen)),
             not_finite=tally.not_finite,
@@ -382,6 +392,16 @@ class Sweep:
                 write_bytes(self.run.path / "images" / f"sweep.{suffix}", data)
             write_page(self.run.path, summary)
         return SweepResult(summary, None if self.run is None else self.run.path, tuple(self._kept))
+
+    def _gains(self) -> dict[str, float]:
+        """The gain of each scene, by object and environment, where there are not too many to meter."""
+        if len(self.job.places) > MOST_METERED:
+            return {}
+        size = self.job.sizes[0]
+        return {
+            f"{place.object}, {place.environment}": framed(place.scene.description, size).gain
+            for place in self.job.places
+        }
 
     def _remarks(self, tally: Tally, checked: WorstVerified | None) -> list[str]:
         """What a reader has to know beside the numbers."""

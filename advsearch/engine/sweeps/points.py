@@ -25,6 +25,7 @@ from advsearch.controls.base import BoundControl, Value
 from advsearch.controls.numbers import BoundNumbers
 from advsearch.controls.values import Fixed, OneOf, Range, to_value
 from advsearch.engine.sweeps.axes import Axis
+from advsearch.runs.results.base import VariedValue
 from advsearch.scene.description import ENVIRONMENT
 
 MOST_PARTS, FEWEST_PARTS = 10, 2
@@ -78,6 +79,14 @@ class Drawn:
     column: int
     parts: tuple[Any, ...]
     settled: bool = True
+
+    @property
+    def varied(self) -> VariedValue:
+        """What it was drawn from."""
+        ends = [end for part in self.parts if isinstance(part, list) for end in part]
+        if ends:
+            return VariedValue(unit=self.unit, low=min(ends), high=max(ends))
+        return VariedValue(unit=self.unit, names=[str(one) for one in self.parts])
 
     @property
     def edges(self) -> list[float] | None:

@@ -7,7 +7,16 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
-from advsearch.runs.results.base import CleanScene, Fields, Formation, Interval, Number, Payload, SceneResult
+from advsearch.runs.results.base import (
+    CleanScene,
+    Fields,
+    Formation,
+    Interval,
+    Number,
+    Payload,
+    SceneResult,
+    VariedValue,
+)
 from advsearch.runs.results.plan import PlannedGradient
 
 
@@ -274,6 +283,9 @@ class AttackSummary(SceneResult):
     goal: str = Field(description="`a wrong answer`, `a target answer` or `a right answer`: what counts as success")
     target: list[str] | None = Field(description="the targets' names")
     over: list[str] = Field(description="the controls that varied by chance")
+    conditions: dict[str, VariedValue] = Field(
+        default={}, description="what they were drawn from; absent without, and of parameters of many numbers"
+    )
     image_formation: Formation
     gradient_plan: PlannedGradient
     light_path_segments: PathSegments

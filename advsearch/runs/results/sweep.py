@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field
 
 from advsearch.runs.results.attack import DescribedValue, LinearTransport, SharedWork, VerifiedRate
-from advsearch.runs.results.base import Fields, Formation, Interval, Number, Payload, RunResult, having
+from advsearch.runs.results.base import Fields, Formation, Interval, Number, Payload, RunResult, VariedValue, having
 
 AxisValue = int | float | str | tuple[float, float]
 """A number, a name, or both ends of a part of a range."""
@@ -134,6 +134,12 @@ class SweepSummary(CountedAnswers, RunResult):
     )
     worst: WorstConfiguration | None
     grid: dict[str, int] = Field(description="how many values each axis of the grid has")
+    gains: dict[str, float] | None = Field(
+        default=None, description="the gain of each scene, by object and environment; absent of one scene"
+    )
+    drawn: dict[str, VariedValue] = Field(
+        default={}, description="what each value was drawn from, of parameters of few numbers"
+    )
     samples: int = Field(description="draws at each point of the grid")
     sampler: str | None = Field(description="of the draws; null without any")
     spp: int = Field(description="samples a pixel")
