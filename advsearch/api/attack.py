@@ -23,7 +23,7 @@ from advsearch.controls import Space, make_space
 from advsearch.controls.base import Control
 from advsearch.controls.clean import sentences
 from advsearch.engine.ahead import Ahead, seen_by
-from advsearch.engine.answers import Described, Looked, check_truth, facts_of
+from advsearch.engine.answers import Described, Looked, check_truth, facts_of, shown
 from advsearch.engine.budget import Preparation, RenderBudget, verification_ladder
 from advsearch.engine.loading import (
     Controls,
@@ -325,21 +325,27 @@ def check_from_config(config: AttackConfig) -> None:
         InputError: as for `attack_from_config`.
     """
     job = _job(config)
-    _, _, pictures = _task(job)
+    _, _, pictures = _task(job, shows=False)
     _space(job, framed(job.scene.description, pictures.size(job.loaded[0])))
 
 
-def _task(job: _Job) -> tuple[Task, Callable[[Described, Looked], Facts], PictureSettings]:
-    """The task on the model, what gives it facts, and how pictures are made; refuses what cannot be judged."""
+def _task(job: _Job, *, shows: bool = True) -> tuple[Task, Callable[[Described, Looked], Facts], PictureSettings]:
+    """The task on the model, what gives it facts, and how pictures are made; refuses what cannot be judged.
+
+    With `shows`, the task is shown a clean picture where it asks for one.
+    """
     config, (model, _) = job.config, job.loaded
     asked = job.task.seeking(job.objective) if isinstance(job.objective, str) else job.task
     task = task_for(asked, model).on(model, target=config.target, minimise=config.minimise)
     facts = partial(facts_of, job.scene, config.object, config.label)
     pictures = PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed)
-    alone = zip(task.tasks, task.models, strict=True) if isinstance(task, Together) else [(task, model)]
-    for one, network in alone:
+    together = isinstance(task, Together)
+    tasks = list[Task]()
+    for one, network in zip(task.tasks, task.models, strict=True) if together else [(task, model)]:
         check_truth(one, network, job.scene, facts(dict), pictures)
-    return task, facts, pictures
+        tasks.append(shown(one, network, [job.scene], config.label, pictures) if shows else one)
+        job.loaded[1].extend(remark for remark in tasks[-1].remarks if remark not in job.loaded[1])
+    return replace(task, tasks=tuple(tasks)) if together else tasks[0], facts, pictures
 
 
 def _space(job: _Job, description: SceneDescription) -> Space:

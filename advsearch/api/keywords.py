@@ -289,7 +289,10 @@ def asks(config: type[Config], keywords: type[Any]) -> Callable[[Function], Func
                 signature.bind(*args, **given)
             except TypeError as error:
                 raise TypeError(f"{function.__name__}() {error}") from None
-            return function(*args, **given)
+            from advsearch.models.switches import plainly
+
+            with plainly():
+                return function(*args, **given)
 
         text = inspect.cleandoc(function.__doc__ or "")
         listed = textwrap.indent("\n".join(lines), "    ")

@@ -12,7 +12,7 @@ from advsearch.api.keywords import SweepKeywords, asks
 from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
 from advsearch.config import SweepConfig
-from advsearch.engine.answers import one_label_for_several
+from advsearch.engine.answers import one_label_for_several, shown
 from advsearch.engine.budget import verification_ladder
 from advsearch.engine.loading import Controls, PictureSettings, Scene, load_scene, named_camera, settings_of
 from advsearch.engine.naming import (
@@ -194,7 +194,10 @@ def _job(
     check_scenes(places, drawn, axes)
     made = make_task(task)
     networks, warnings = _models(models, config, made)
-    tasks = tuple(made.on(network) for network in networks)
+    pictures = PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed)
+    scenes = [place.scene for place in places]
+    tasks = tuple(shown(made.on(network), network, scenes, config.label, pictures) for network in networks)
+    warnings += [remark for task in tasks for remark in task.remarks]
     own = {place.object: place.scene.description.object.label for place in places}
     warnings += one_label_for_several(networks, config.label, own)
     for place in places:
@@ -204,7 +207,7 @@ def _job(
         environment=config.lit_by,
         task=config.task_name,
         label=config.label,
-        pictures=PictureSettings(config.resolution, config.denoise, config.pixel_sampler, config.seed),
+        pictures=pictures,
         spp=next_count(config.pixel_sampler, config.search_spp),
         places=tuple(places),
         models=networks,

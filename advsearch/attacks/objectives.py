@@ -228,7 +228,7 @@ def get_objective(
             )
         found = feature_distance(features, clean)
     else:
-        found = kind.form(targeted=targeted)
+        found = _of_answers(kind.form(targeted=targeted), task)
     found = _aimed(found, task.target) if targeted else found
     return negated(found) if task.minimise else found
 
@@ -291,6 +291,15 @@ def _aimed(objective: Objective, target: Any) -> Objective:
         return objective(output, images, target)
 
     return aimed
+
+
+def _of_answers(objective: Objective, task: Task) -> Objective:
+    """Wrap an objective of logits so that it sees only what is an answer."""
+
+    def of_answers(output: Any, images: Tensor, truth: Any) -> Tensor:
+        return objective(task.answerable(output, truth), images, truth)
+
+    return of_answers
 
 
 def negated(objective: Objective) -> Objective:

@@ -10,6 +10,7 @@ from typing import final
 from advsearch.controls import Control, Space, gathered, make_control, make_space, settings_by_name
 from advsearch.errors import InputError
 from advsearch.models import Model
+from advsearch.models.switches import plainly
 from advsearch.scene import settings
 from advsearch.scene.assets import EnvironmentAsset, ObjectAsset
 from advsearch.scene.description import (
@@ -125,6 +126,7 @@ class PictureSettings:
         return self.resolution or (model.input_size[0], model.input_size[1])
 
 
+@plainly()
 def load_scene(
     object: str | Path | ObjectAsset,
     environment: str | Path | EnvironmentAsset | None = None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from advsearch.engine.pictures import Shown, trial_to_show, write_artifacts, wri
 from advsearch.engine.print_terms import print_terms
 from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
-from advsearch.engine.rows import lost_remarks, verified_rate
+from advsearch.engine.rows import control_group, lost_remarks, mean_number, verified_rate
 from advsearch.engine.searches import UNPRINTED
 from advsearch.errors import InputError
 from advsearch.report.drawing import new_axes
@@ -302,9 +303,7 @@ def _answer(shown: Shown) -> dict[str, Any]:
 def _control(findings: Findings) -> ControlGroup | None:
     if not findings.clean:
         return None
-    counted = count_right(findings.clean, findings.spp)
-    rate, interval = counted.rate, counted.interval
-    return ControlGroup(correct=counted.successes, trials=counted.trials, rate=rate, interval=interval)
+    return control_group(findings.clean, findings.spp)
 
 
 def _described(problem: Problem, u: Tensor) -> dict[str, DescribedValue]:
@@ -418,8 +417,8 @@ def _average(findings: Findings) -> AverageCase:
         correct=counted.successes,
         accuracy=counted.rate,
         interval=counted.interval,
-        margin=sum(scores) / len(scores),
-        worst_margin=max(scores),
+        margin=mean_number(scores),
+        worst_margin=max((score for score in scores if score == score), default=math.nan),
     )
 
 

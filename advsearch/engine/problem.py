@@ -343,7 +343,8 @@ class Problem:
     def _usual(each: Sequence[Judgement]) -> Judgement:
         """The most frequent answer, with the means over all."""
         score, margin = (mean(values) for values in ([one.score for one in each], [one.margin for one in each]))
-        return replace(typical(each), score=score, margin=margin, right=margin <= 0.0)
+        usual = typical(each)
+        return Judgement.of(score, margin, usual.answer, usual.payload)
 
     def loss(self, image: Tensor) -> Tensor:
         """The objective of a picture (H, W, 3) sRGB near the start, as a number with a graph."""

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from advsearch.attacks import Trials, Verification
-from advsearch.described import Value
+from advsearch.attacks import Trials, Verification, count_right
+from advsearch.described import NOT_A_NUMBER, Value
 from advsearch.report.wording import count
-from advsearch.runs.results.attack import VerifiedRate
+from advsearch.runs.results.attack import ControlGroup, VerifiedRate
 from advsearch.runs.store import Row
 from advsearch.tasks import Answer, Judgement
+from advsearch.tasks.base import mean
 
 LOST = "(no answer)"
 """The answer to a picture that nobody could make; what the row keeps beside it says why."""
@@ -72,7 +73,7 @@ def _said(judgement: Judgement) -> dict[str, Any]:
     return {
         "correct": judgement.right,
         "margin": _number(judgement.margin),
-        "label": answer.label,
+        "label": None if judgement.not_a_number else answer.label,
         "label_index": answer.index,
         "probability": answer.probability,
         "payload": judgement.payload,
@@ -84,11 +85,16 @@ def _number(value: float) -> float | None:
 
 
 def judgement_of(row: Row) -> Judgement:
-    """Return what was said of a trial from its row; in an old row, only the score says whether it was right."""
+    """Return what was said of a trial from its row: nothing where it has no label, for the answer was not a number.
+
+    In an old row, only the score says whether it was right.
+    """
     score = math.nan if row.objective is None else row.objective
     margin = math.nan if row.margin is None else row.margin
     right = score <= 0.0 if row.correct is None else row.correct
-    return Judgement(score, margin, right, Answer(row.label or "", row.label_index, row.probability), row.payload)
+    return Judgement(
+        score, margin, right, Answer(row.label or NOT_A_NUMBER, row.label_index, row.probability), row.payload
+    )
 
 
 def verified_rate(checked: Verification) -> VerifiedRate:
@@ -97,7 +103,7 @@ def verified_rate(checked: Verification) -> VerifiedRate:
 
 
 def rate_of(rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judgement]) -> VerifiedRate:
-    """Return a rate with the answers of its successes and the mean score of its trials."""
+    """Return a rate with the answers of its successes and the mean score of those that are a number."""
     labels = Counter(trial.answer.label for trial in successes)
     return VerifiedRate(
         successes=rate.successes,
@@ -106,5 +112,21 @@ def rate_of(rate: Trials, trials: Sequence[Judgement], successes: Sequence[Judge
         interval=rate.interval,
         spp=rate.spp,
         labels=dict(labels.most_common()),
-        margin=sum(trial.score for trial in trials) / len(trials),
+        margin=mean_number(trial.score for trial in trials),
+        not_a_number=sum(trial.not_a_number for trial in trials),
     )
+
+
+def control_group(trials: Sequence[Judgement], spp: int) -> ControlGroup:
+    """Return how many trials of the clean scene are right."""
+    counted, nothing = count_right(trials, spp), sum(trial.not_a_number for trial in trials)
+    rate, interval = counted.rate, counted.interval
+    return ControlGroup(
+        correct=counted.successes, trials=counted.trials, rate=rate, interval=interval, not_a_number=nothing
+    )
+
+
+def mean_number(values: Iterable[float]) -> float:
+    """Return the mean of those that are numbers; NaN where none is."""
+    numbers = [value for value in values if not math.isnan(value)]
+    return mean(numbers) if numbers else math.nan

@@ -19,6 +19,7 @@ from advsearch.models.model import Model, Read
 from advsearch.models.preprocessing import Preprocessing
 from advsearch.models.probe import probe
 from advsearch.models.source import Source, source_of
+from advsearch.models.switches import called_under, plainly, turned_by_code
 from advsearch.models.zoo import timm, torchvision, transformers
 from advsearch.registry import Registry
 
@@ -39,6 +40,7 @@ FORMS = (
 )
 
 
+@plainly()
 def load_model(
     spec: str | os.PathLike[str] | nn.Module | Model,
     *,
@@ -95,6 +97,9 @@ def load_model(
     given = {key: value for key, value in options.items() if value is not None}
     names, origin = _given_labels(labels)  # first, because loading a model takes seconds
     found = _find(spec)
+    switches = turned_by_code()
+    if isinstance(found, Source) and isinstance(found.module, nn.Module):
+        called_under(found.module, switches)
     if isinstance(found, Model):
         found = dataclasses.replace(found, read=read or found.read)
         return _relabelled(found, names, origin, name, given)

@@ -121,9 +121,11 @@ class Model:
 
     def ask(self, x: Tensor) -> Any:
         """Return the output for a batch as `batches` yields it."""
+        with torch.set_grad_enabled(torch.is_grad_enabled()):  # a network may switch gradients off as it runs
+            answer = self.module(x)
         if self.read is not None:
-            return read_by(self.read, self.module(x), len(x), self.name)
-        logits = logits_of(self.module(x), len(x), self.classes, self.name)
+            return read_by(self.read, answer, len(x), self.name)
+        logits = logits_of(answer, len(x), self.classes, self.name)
         return logits.clamp_min(SMALLEST_PROBABILITY).log() if self.probabilities else logits
 
 

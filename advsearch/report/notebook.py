@@ -43,7 +43,9 @@ def attack_html(summary: AttackSummary, pictures: Mapping[str, ArrayLike]) -> st
     ]
     rows = [["", "answer", "probability", "rate", "95 % interval"]]
     success, control = wording.success(summary), summary.clean.control
-    rate = _rate("right", control.correct, control.trials, control.interval) if control else ["", ""]
+    rate = (
+        _rate("right", control.correct, control.trials, control.interval, control.not_a_number) if control else ["", ""]
+    )
     rows.append(["clean", *cells(summary.task, summary.clean), *rate])
     if summary.adversarial:
         rows.append(["adversarial", *cells(summary.task, summary.adversarial), *_verified(success, summary.verified)])
@@ -90,11 +92,11 @@ def axis_cells(row: AxisRow) -> list[str]:
 
 
 def _verified(what: str, rated: VerifiedRate | None) -> list[str]:
-    return _rate(what, rated.successes, rated.trials, rated.interval) if rated else ["", ""]
+    return _rate(what, rated.successes, rated.trials, rated.interval, rated.not_a_number) if rated else ["", ""]
 
 
-def _rate(what: str, number: int, trials: int, interval: Interval) -> list[str]:
-    return [f"{what} in {number} of {trials}", wording.interval_text(interval)]
+def _rate(what: str, number: int, trials: int, interval: Interval, not_a_number: int = 0) -> list[str]:
+    return [wording.tally(what, number, trials, not_a_number), wording.interval_text(interval)]
 
 
 def _picture(png: bytes, width: int, alt: str) -> Html:

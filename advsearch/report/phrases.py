@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Protocol
 
+from advsearch.described import NOT_A_NUMBER
+
 CLASSIFICATION, DETECTION, SEGMENTATION = "classification", "detection", "segmentation"
 """Tasks whose answers have words of their own; others are quoted."""
 
@@ -114,6 +116,8 @@ def cells(task: str, answer: Said) -> list[str]:
 def answer_text(task: str, answer: Said) -> str:
     """Return an answer on one line: ``vase, 91 %``, ``no cup found (best score of cup 0.12)``."""
     label, number = cells(task, answer)
+    if task == SEGMENTATION and number and label.startswith(_NONE):
+        return f"{label} found, accuracy over the object's pixels {percent(answer.probability)}"
     if task == SEGMENTATION and number:
         return f"accuracy over the object's pixels {percent(answer.probability)}, most often {label}"
     if task == DETECTION and number:
@@ -139,6 +143,10 @@ def seen_text(task: str, answer: Said) -> str:
 
 def calls(task: str, thing: str, label: str) -> str:
     """Return what a model does to a thing, as a clause: ``calls this mug a vase``, ``finds no cup``."""
+    if label == NOT_A_NUMBER:
+        return f"answers nothing for {thing}, for its answer is not a number"
+    if task == SEGMENTATION and label.startswith(_NONE):
+        return f"finds {label}"
     if task == CLASSIFICATION:
         return f"calls {thing} {with_article(label)}"
     if task == DETECTION:
@@ -148,6 +156,8 @@ def calls(task: str, thing: str, label: str) -> str:
 
 def calling(task: str, label: str) -> str:
     """Return the same of a thing that was named already: ``calling it a vase``, ``finding no cup``."""
+    if task == SEGMENTATION and label.startswith(_NONE):
+        return f"finding {label}"
     if task == CLASSIFICATION:
         return f"calling it {with_article(label)}"
     if task == DETECTION:

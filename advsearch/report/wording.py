@@ -63,7 +63,8 @@ def remarks(summary: AttackSummary) -> list[str]:
     missed = control.trials - control.correct if control else 0
     if control and missed and summary.ending != "already wrong" and not summary.minimises:
         apart = " They do not count." if summary.over else ""
-        said.append(f"The clean scene itself fails {missed} of its {control.trials} trials.{apart}")
+        nothing = f"; in {control.not_a_number} the answer is not a number" if control.not_a_number else ""
+        said.append(f"The clean scene itself fails {missed} of its {control.trials} trials{nothing}.{apart}")
     if summary.answer_from == "random" and own:
         said.append(
             "The random search beside it found a worse configuration than the policy did "
@@ -131,8 +132,25 @@ def interval_text(interval: Interval | None) -> str:
 
 
 def rate_text(rated: VerifiedRate) -> str:
-    """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``."""
-    return f"{rated.successes} of {rated.trials} fresh renders (95 % interval {interval_text(rated.interval)})"
+    """Return ``20 of 20 fresh renders (95 % interval 83-100 %)``; and how many answers are not numbers."""
+    nothing = f"in {rated.not_a_number} its answer is not a number" if rated.not_a_number else ""
+    if nothing and not rated.successes:
+        return f"none of {rated.trials} fresh renders: {nothing}"
+    rate = f"{rated.successes} of {rated.trials} fresh renders (95 % interval {interval_text(rated.interval)})"
+    return f"{rate}, and {nothing}" if nothing else rate
+
+
+def no_numbers(count: int) -> str:
+    """Return what a table adds to a rate where answers are not numbers."""
+    return f", {count} not a number" if count else ""
+
+
+def tally(what: str, number: int, trials: int, not_a_number: int = 0) -> str:
+    """Return ``wrong in 20 of 20``; of answers that are not numbers, how many."""
+    nothing = f"not a number in {not_a_number} of {trials}"
+    if not not_a_number:
+        return f"{what} in {number} of {trials}"
+    return f"{what} in {number}, {nothing}" if number else nothing
 
 
 def seconds_text(seconds: Any) -> str:

@@ -185,24 +185,25 @@ def _rates(summary: AttackSummary) -> Html:
     control, average, baseline = summary.clean.control, summary.average, summary.baseline
     success, rows = wording.success(summary), []
     if control:
-        rows.append(("Clean scene (control group)", "right", control.correct, control.trials, control.interval))
+        clean = control.correct, control.trials, control.interval, control.not_a_number
+        rows.append(("Clean scene (control group)", "right", *clean))
     random = f"{baseline.policy.capitalize()} search" if baseline else ""
     for name, rated in (("Adversarial", summary.verified), (random, baseline.verified if baseline else None)):
         if rated:
-            rows.append((name, success, rated.successes, rated.trials, rated.interval))
+            rows.append((name, success, rated.successes, rated.trials, rated.interval, rated.not_a_number))
     if average:
         average_case = "Average case (random configurations)"
-        rows.append((average_case, "right", average.correct, average.configurations, average.interval))
+        rows.append((average_case, "right", average.correct, average.configurations, average.interval, 0))
     lines = [
         element(
             "tr",
             element("th", name, scope="row"),
             element("td", what),
-            element("td", f"{number} of {trials}", class_="number"),
+            element("td", wording.tally("", number, trials, nothing).removeprefix(" in "), class_="number"),
             element("td", wording.interval_text(interval), class_="number"),
             element("td", _bar(number / trials, interval), class_="hide-small"),
         )
-        for name, what, number, trials, interval in rows
+        for name, what, number, trials, interval, nothing in rows
     ]
     if not lines:
         return Html("")

@@ -248,7 +248,9 @@ def _worst_text(summary: SweepSummary) -> str:
     where = ", ".join(f"{name} {wording.number_text(one.value)}" for name, one in worst.values.items())
     said = answer_text(summary.task, worst.pictured or worst.claimed)
     told, rate = f"{where}: the model answers {said}", worst.verified
-    return f"{told}; wrong in {rate.successes} of {rate.trials} fresh renders." if rate else f"{told}."
+    if rate is None:
+        return f"{told}."
+    return f"{told}; {wording.tally('wrong', rate.successes, rate.trials, rate.not_a_number)} fresh renders."
 
 
 def _figure(file: Path, caption: str, *, wide: bool = False) -> Html | None:

@@ -408,7 +408,7 @@ class Sweep:
         remarks = lost_remarks(self._lost)
         remarks += self._machines.remarks
         if tally.not_finite:
-            remarks.append(f"{tally.not_finite} answers of the model were not finite; they count as not right.")
+            remarks.append(f"{tally.not_finite} answers of the model are not numbers; they count as not right.")
         if self._not_finite:
             remarks.append("Some values of pictures were not finite and were set to 0.")
         if checked and not checked.converged:

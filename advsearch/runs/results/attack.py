@@ -54,6 +54,7 @@ class ControlGroup(Fields):
     trials: int
     rate: float
     interval: Interval
+    not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
 
 
 class CleanAnswer(CleanScene, PicturedAnswer):
@@ -73,6 +74,7 @@ class VerifiedRate(Fields):
     spp: int = Field(description="samples a pixel")
     labels: dict[str, int] = Field(description="answers of the successes, and how often each was given")
     margin: Number = Field(description="mean over these trials, in logits; of a detector in log-odds")
+    not_a_number: int = Field(default=0, description="trials whose answer is NaN or infinity; absent without")
 
 
 class BaselineSearch(Fields):

@@ -6,7 +6,7 @@ and whatever the file has (repeating textures, several materials, vertex colours
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -73,7 +73,7 @@ def textured(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[Soup, Sur
         soup = replace(soup, uvs=np.clip(soup.uvs, 0.0, 1.0)) if kept else unwrapped(soup)
         return soup, SurfaceMaps(_of_one_color(soup, first), None, first.emission), []
     if colored and (first.texture is None or soup.colors.min() == 1.0) and np.isfinite(soup.uvs).all():
-        uvs, pictures = _windowed(_into_unit_square(soup), first.pictures)
+        uvs, pictures = _windowed(_into_unit_square(soup), first.pictures, first.texture)
         twice = _usable(soup, uvs) and _lit_twice(uvs, first, pictures)
         if _usable(soup, uvs) and not twice:
             return *_kept(soup, np.clip(uvs, 0.0, 1.0), first, pictures), []
@@ -133,9 +133,9 @@ def _plain(surface: ImportedSurface) -> Floats:
 
 
 def _tinted(color: npt.NDArray[np.floating], factor: npt.NDArray[np.floating]) -> Floats:
-    """Multiply display-referred colours (..., 3 or 4) by factors (..., 3) in linear light; opacity stays."""
+    """Multiply display-referred colours (..., 3 or 4) by linear factors (..., 3); opacity stays."""
     color = np.asarray(color, np.float32)
-    product = srgb_to_linear(color[..., :3]) * srgb_to_linear(np.asarray(factor, np.float32))
+    product = srgb_to_linear(color[..., :3]) * factor
     return np.concatenate([linear_to_srgb(product.astype(np.float32)), color[..., 3:]], axis=-1)
 
 
@@ -164,7 +164,7 @@ def _into_unit_square(soup: Soup) -> Array:
     return moved
 
 
-def _windowed(uvs: Array, pictures: Sequence[Floats]) -> tuple[Array, Sequence[Floats]]:
+def _windowed(uvs: Array, pictures: Sequence[Floats], colors: Floats | None) -> tuple[Array, Sequence[Floats]]:
     """Cut pictures to the window that UVs span where they overstep the unit square a little or use a corner of it.
 
     The layout of the charts stays. Windows larger than `_WINDOW` textures are left alone: there the textures repeat.
@@ -178,17 +178,17 @@ def _windowed(uvs: Array, pictures: Sequence[Floats]) -> tuple[Array, Sequence[F
     inside = low.min() >= -_SLACK - texel.max() and high.max() <= 1.0 + _SLACK + texel.max()
     if size.max() > _WINDOW or (inside and np.abs(doubled_areas(uvs)).sum() / 2.0 >= _CRAMPED):
         return uvs, pictures
-    return (uvs - low) / size, [_cut(one, low, high) for one in pictures]
+    return (uvs - low) / size, [_cut(one, low, high, filtered if one is colors else sampled) for one in pictures]
 
 
-def _cut(picture: Floats, low: Array, high: Array) -> Floats:
+def _cut(picture: Floats, low: Array, high: Array, look_up: Callable[[Floats, Array], Floats]) -> Floats:
     """Return the window of a repeating picture (H, W, C) between two corners (u, v), with texels of the same size."""
     size = high - low
     width, height = np.clip(np.ceil(size * np.array(picture.shape[1::-1])), 1, TEXTURE_LIMIT).astype(int)
     columns = low[0] + (np.arange(width) + 0.5) / width * size[0]
     rows = high[1] - (np.arange(height) + 0.5) / height * size[1]
     grid = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
-    return sampled(picture, grid).reshape(height, width, -1)
+    return look_up(picture, grid).reshape(height, width, -1)
 
 
 # --- baking ----------------------------------------
@@ -238,7 +238,7 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surfac
 def _looked_up(surface: ImportedSurface, at: Array) -> Floats:
     """Return the base colour (T, 3 or 4) of a surface at UVs (T, 2)."""
     if surface.texture is not None and np.isfinite(at).all():
-        return sampled(surface.texture, at)
+        return filtered(surface.texture, at)
     color = _plain(surface)[None] if surface.texture is None else _mean(surface.texture)
     return np.broadcast_to(color, (len(at), color.shape[1]))
 
@@ -261,12 +261,32 @@ def _baked_size(soup: Soup, surfaces: Sequence[ImportedSurface]) -> int:
 
 def _mean(texture: Floats) -> Floats:
     """Return the mean colour (1, 3 or 4) of a texture, taken in linear light."""
-    mean: Floats = srgb_to_linear(texture[:, :, :3]).mean(axis=(0, 1), dtype=np.float64).astype(np.float32)
-    return np.concatenate([linear_to_srgb(mean), texture[:, :, 3:].mean(axis=(0, 1))])[None]
+    mean = _in_display(_in_linear(texture).mean(axis=(0, 1), dtype=np.float64).astype(np.float32))
+    return mean[None]
+
+
+def filtered(colors: Floats, uvs: Array) -> Floats:
+    """Look a repeating texture of display-referred colours up with bilinear interpolation in linear light; what is
+    transparent does not count. Arguments and result as for `sampled`."""
+    return _in_display(sampled(_in_linear(colors), uvs))
+
+
+def _in_linear(colors: Floats) -> Floats:
+    """Return display-referred colours (..., 3 or 4) as linear ones, times their opacity where there is one."""
+    linear = srgb_to_linear(colors[..., :3])
+    return linear if colors.shape[-1] == 3 else np.concatenate([linear * colors[..., 3:], colors[..., 3:]], axis=-1)
+
+
+def _in_display(colors: Floats) -> Floats:
+    """Undo `_in_linear`; what is transparent all over is black."""
+    linear, opacity = colors[..., :3], colors[..., 3:]
+    if opacity.size:
+        linear = linear / np.maximum(opacity, np.float32(1e-9))
+    return np.concatenate([linear_to_srgb(linear), opacity], axis=-1)
 
 
 def sampled(texture: Floats, uvs: Array) -> Floats:
-    """Look a repeating texture up with bilinear interpolation of its display-referred values.
+    """Look a repeating texture up with bilinear interpolation of its values, as they are.
 
     Args:
         texture: (H, W, C) float32, row 0 on top.

@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from advsearch.errors import InputError
 from advsearch.scene.color import linear_to_srgb
-from advsearch.scene.importing.parts import ImportedPart, read_parts
+from advsearch.scene.importing.imported_part import ImportedPart
+from advsearch.scene.importing.parts import read_parts
 from advsearch.scene.importing.surfaces import ImportedSurface
 from advsearch.scene.mitsuba_backend.variant import Plugin
 from advsearch.scene.parts import BASE_COLOR
