@@ -462,5 +462,5 @@ def _not_told(rule: CountedRule, found: Observations) -> RuleNotTold:
 
 def round_up(rows: float) -> int:
     """Return a number of rows with two digits that mean something: 173.2 becomes 180."""
-    step = 10 ** max(0, math.floor(math.log10(rows)) - 1)
+    step: int = 10 ** max(0, math.floor(math.log10(rows)) - 1)
     return math.ceil(rows / step) * step
