@@ -680,7 +680,7 @@ def test_answers_that_are_not_finite_are_counted_and_not_right() -> None:
     bad = [row for row in result.rows() if row.objective is None]
     assert bad and all((row.correct, row.margin) == (False, None) for row in bad)
     assert result.summary.not_finite == len(bad)
-    assert any("not finite; they count as not right" in text for text in result.summary.warnings)
+    assert any("not numbers; they count as not right" in text for text in result.summary.warnings)
     assert result.summary.worst is not None and math.isfinite(result.summary.worst.claimed.margin)
 
 
