@@ -18,6 +18,7 @@ from advsearch.attacks.objectives import check_objective
 from advsearch.cluster.executor import Call, Executor, Work
 from advsearch.cluster.opening import executor_of
 from advsearch.config import AttackConfig, PrecisionConfig, SceneConfig
+from advsearch.config.attack import OVER_NUMBERS, OVER_PREDICTED, OVER_RENDERED, STEPS
 from advsearch.config.scene import one_only
 from advsearch.controls import Space, make_space
 from advsearch.controls.base import Control
@@ -44,13 +45,14 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Recorder, Stages
 from advsearch.engine.run_settings import RunSettings
 from advsearch.engine.stages import Attack
-from advsearch.engine.transport import CleanMatrix
+from advsearch.engine.transport import CleanMatrix, reason_against
 from advsearch.errors import InputError
 from advsearch.files import JsonObject
 from advsearch.models import Model
 from advsearch.models.ensemble import together
 from advsearch.options import as_setting
 from advsearch.progress import NullProgress, Progress
+from advsearch.report.wording import count
 from advsearch.runs.directory import RunDirectory, check_free, is_run, run_path
 from advsearch.runs.results.gap import CurveResult
 from advsearch.runs.results.matrix import MatrixResult
@@ -378,7 +380,7 @@ def _problem(job: _Job, *, differentiated: bool = True) -> Problem:
     if config.printable:
         searched = make_space(job.controls, description)
         print_terms(searched, searched.start)  # refuses where nothing can be printed
-    return Problem(
+    problem = Problem(
         renderer,
         space,
         model,
@@ -388,16 +390,28 @@ def _problem(job: _Job, *, differentiated: bool = True) -> Problem:
         next_count(config.pixel_sampler, config.search_spp),
         config.seed,
         searched=len(job.controls),
-        draws=config.draws if job.over else 1,
         printable=config.printable,
         aovs=aovs_of(config.aov),
     )
+    problem.draws = search_size(config, problem)[1]
+    return problem
 
 
-def budget_of(config: AttackConfig) -> RenderBudget:
+def search_size(config: AttackConfig, problem: Problem) -> tuple[int, int]:
+    """Return the steps of a search, and how many conditions each looks at: what was asked for, or what is right for
+    one picture, or for many conditions: predicted, rendered, or rendered where only a few numbers are searched."""
+    if problem.conditions is None:
+        return config.steps or STEPS, 1
+    predicted = reason_against(problem, config.steps or OVER_PREDICTED[0], config.specialise) is None
+    balls = any(block.norm != "box" for block in problem.domain.blocks)
+    steps, draws = OVER_PREDICTED if predicted else OVER_RENDERED if balls else OVER_NUMBERS
+    return config.steps or steps, config.draws or draws
+
+
+def budget_of(config: AttackConfig, problem: Problem) -> RenderBudget:
     """Return what an attack may spend."""
     return RenderBudget(
-        steps=config.steps,
+        steps=search_size(config, problem)[0],
         seconds=config.seconds,
         close_looks=config.close_looks,
         baseline=config.baseline,
@@ -429,7 +443,7 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
     stages.begin("setup", PREPARING)
     problem = _problem(job)
     own = job.scene.description
-    warnings = [*own.notes, *job.loaded[1], *sentences(problem.space.moved)]
+    warnings = [*(problem.space.scene or own).notes, *job.loaded[1], *sentences(problem.space.moved)]
     for text in warnings:
         progress.message(text)
     policy = _policy(job, problem)
@@ -437,7 +451,13 @@ def _carry_out(job: _Job, progress: Progress, run: RunDirectory | None = None) -
         memory = Memory(kept)
         with executor_for(job.config, "advsearch.api.attack:announced_of", progress) as executor:
             recorder = Recorder(kept, problem, memory, Ahead(executor))
-            spent = (budget_of(job.config), policy, recorder, memory, stages, preparation_of(job.config))
+            budget = budget_of(job.config, problem)
+            if problem.conditions is not None and None in (job.config.steps, job.config.draws):
+                progress.message(
+                    f"One answer for many conditions: {count(budget.steps, 'step')}, each over "
+                    f"{count(problem.draws, 'condition')}; `steps` and `draws` change that."
+                )
+            spent = (budget, policy, recorder, memory, stages, preparation_of(job.config))
             findings = Attack(problem, *spent, clean=job.clean).carry_out()
         return summarise(_question(job), problem, findings, recorder, stages, warnings)
 

@@ -71,12 +71,12 @@ class SearchKeywords(DerivativeKeywords, total=False):
     """Of every search."""
 
     measure: Literal["no", "quick", "full"]
-    steps: int
+    steps: int | None
     seconds: float | None
     step_size: float | None
     target: int | Names | None
     minimise: bool
-    draws: int
+    draws: int | None
     average: int
     baseline: bool
     verify_spp: int | None
@@ -195,6 +195,7 @@ class RecipeKeywords(RunKeywords, total=False):
     resolution: int | str | tuple[int, int] | None
     model: Path | Names | None
     labels: str | Path | None
+    task: Named | None
     label: str | Mapping[str, str]
     seed: int
     threads: int | None

@@ -18,6 +18,7 @@ from advsearch.api.photos import Photographs, photographs_in
 from advsearch.api.subruns import carry_out_part
 from advsearch.api.sweep import job_of
 from advsearch.config import AttackConfig, RecipeConfig, SweepConfig
+from advsearch.config.named import name_in
 from advsearch.config.scene import DEFAULT_ENVIRONMENT, SceneConfig
 from advsearch.controls import CONTROLS
 from advsearch.engine.sweeps.job import check_all
@@ -28,6 +29,7 @@ from advsearch.recipes.description import Recipe, read_recipe, recipe_of
 from advsearch.recipes.figures import compute, draw, read_options
 from advsearch.recipes.parts import Planned, listed, made_of, planned
 from advsearch.recipes.table import TRIAL, WORKERS, Answered, Table, photographs_of, rows_of
+from advsearch.report.phrases import DETECTION
 from advsearch.runs.directory import IMAGES, PARTS, RunDirectory
 from advsearch.runs.files import write_bytes
 from advsearch.runs.results.attack import AnswerDistribution, AttackSummary, DescribedValue, FoundValue
@@ -44,6 +46,9 @@ if TYPE_CHECKING:
 
 TURN = 360.0
 """Degrees."""
+
+CUES = "cues"
+"""The figure of answers by shape and by texture."""
 
 NOTE = "recipe"
 """Under which a run's store keeps the recipe, so that it goes on as it began."""
@@ -114,6 +119,11 @@ def _check(described: Recipe, config: RecipeConfig) -> None:
         raise InputError(f"photographs: {config.recipe} keeps no pictures to compare them with; recipe realism does")
     for one in described.figures:
         read_options(one, config.recipe)
+        if one.get("figure") == CUES and config.task is not None and name_in(config.task) == DETECTION:
+            raise InputError(
+                f"task: {config.recipe} asks whether answers are classes of the texture or of the shape, and detection "
+                "answers whether the object is found; give it a classifier"
+            )
 
 
 def _check_runs(runs: Sequence[Planned]) -> dict[str, set[str]]:

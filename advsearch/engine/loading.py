@@ -20,6 +20,7 @@ from advsearch.scene.description import (
     SceneDescription,
     check_ground,
     check_meshes,
+    check_one_environment,
     describe,
 )
 from advsearch.scene.formation import ImageFormation
@@ -85,6 +86,8 @@ class Scene:
         own = self.description
         given = own.given | {ENVIRONMENT}
         check_ground(own.given_values, name)
+        if environment is not None:
+            check_one_environment(own.parts, f"`environment={name}`")
         return Scene(replace(own, environment=environment, environment_spec=name, given=given))
 
     def __repr__(self) -> str:

@@ -22,6 +22,7 @@ from advsearch.engine.problem import Problem
 from advsearch.engine.record import Findings, Recorder, Stages
 from advsearch.engine.rows import control_group, lost_remarks, mean_number, verified_rate
 from advsearch.engine.searches import UNPRINTED
+from advsearch.engine.transport import remark
 from advsearch.errors import InputError
 from advsearch.report.drawing import new_axes
 from advsearch.report.notebook import attack_html, side_by_side
@@ -161,7 +162,7 @@ def summarise(
     start = problem.domain.start
     u = start if search is None else problem.domain.project(search.best_u)
     stages.progress.stage("making the pictures and the report")
-    trial = trial_to_show(findings)
+    trial = None if findings.interrupted else trial_to_show(findings)  # whoever presses Ctrl-C is in a hurry
     clean, adversarial = (Shown.of(problem, findings, at, trial) for at in (start, u))
     space = problem.searched_space
     artifacts = space.artifacts(u)
@@ -462,12 +463,12 @@ def _verified(verification: Verification | None) -> VerifiedRate | None:
 
 def _remarks(findings: Findings, problem: Problem, recorder: Recorder) -> list[str]:
     """What a reader has to know beside the numbers."""
-    remarks = []
+    remarks = [told] if (told := remark(findings.rendered_because)) else []
     count = findings.sample_count
     if count is not None and count.table and not count.converged:
         remarks.append(
-            f"The margin still moved with the sample count at {count.spp} samples a pixel, the most that was tried: "
-            "noise may take part in the verdict."
+            f"It is not shown that the margin stands still at {count.spp} samples a pixel, the most that a check "
+            "takes: noise may take part in the verdict."
         )
     if not_finite := problem.renderer.non_finite + recorder.ahead.non_finite:
         remarks.append(f"{not_finite} values of pictures or gradients were not finite and were set to 0.")

@@ -192,7 +192,7 @@ class Attack:
             raise RuntimeError("nothing was searched, so there is nothing to verify")
         answer = problem.domain.project(found.best_u)
         if not self.budget.smallest or findings.sample_count is None:
-            self._verifier.choose_spp({"clean": problem.domain.start, "adversarial": answer})
+            self._verifier.choose_spp({"adversarial": answer, "clean": problem.domain.start})
         groups = 1 + (baseline is not None) + (unprinted is not None) + (not self._verifier.clean_tried)
         self._verifier.begin("checking the answer with fresh renders", groups * self.budget.trials, at_most=True)
         self._verifier.try_clean()

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from advsearch.report import wording
 from advsearch.report.drawing import Figures
 from advsearch.report.markup import Html, element, join
-from advsearch.report.phrases import cells, percent
+from advsearch.report.phrases import beside_text, cells, percent
 from advsearch.report.studies import sweep_figure
 from advsearch.runs.images import png_bytes
 from advsearch.runs.results.attack import AttackSummary, VerifiedRate
@@ -58,6 +58,7 @@ def sweep_html(summary: SweepSummary) -> str:
     """Return a sweep's accuracy, its map, and the accuracy of every value of every axis."""
     if not summary.configurations:
         return element("p", "No configuration was looked at.")
+    compared = [beside_text(summary.beside.answer, one) for one in summary.beside.pairs] if summary.beside else []
     total = f"Right in {summary.correct} of {summary.configurations} configurations"
     rate = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}"
     figure = sweep_figure(summary)
@@ -66,7 +67,9 @@ def sweep_html(summary: SweepSummary) -> str:
         mine = [row for row in summary.axes if row.axis == name]
         rows += [axis_cells(row) for row in mine] if len(mine) <= MOST_ROWS else []
     drawn = _picture(figure["png"], 2 * SHOWN, "the numbers of the table") if figure else None
-    return element("div", element("p", f"{total} ({rate})."), drawn, _table(rows) if len(rows) > 1 else None)
+    return element(
+        "div", element("p", " ".join(compared) or f"{total} ({rate})."), drawn, _table(rows) if len(rows) > 1 else None
+    )
 
 
 def study_html(said: str, figure: Figures, tables: Sequence[Sequence[Sequence[str]]]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import Any, Protocol
 
 from advsearch.described import NOT_A_NUMBER
 
@@ -77,6 +77,24 @@ def percent_number(share: float) -> str:
 def with_article(name: str) -> str:
     """Return ``a mug``, ``an iron``."""
     return f"{'an' if name[:1].lower() in 'aeiou' else 'a'} {name}"
+
+
+def beside_text(answer: str, pair: Any) -> str:
+    """Return what a model does without and with the answer of a run (`PairedRates`), in sentences."""
+    sides = [
+        f"{one.correct} of {one.configurations} ({percent(one.accuracy)}, 95 % interval "
+        f"{percent_number(one.interval[0])}-{percent_number(one.interval[1])} %)"
+        for one in (pair.clean, pair.answer)
+    ]
+    low, high = (100.0 * end for end in pair.interval)
+    ends = f"{-high:.0f} to {-low:.0f}" if pair.difference < 0 else f"{low:.0f} to {high:.0f}"
+    shown = "" if low > 0.0 or high < 0.0 else "; that there is a difference is not shown"
+    return (
+        f"{pair.model} is right in {sides[0]} of the clean scene, and in {sides[1]} with the answer of {answer}: "
+        f"{abs(100.0 * pair.difference):.0f} points {'fewer' if pair.difference < 0 else 'more'} (95 % interval of "
+        f"pairs {ends}){shown}. Right in the clean one alone are {pair.clean_only} pairs, with the answer alone "
+        f"{pair.answer_only}."
+    )
 
 
 def margin_text(task: str) -> str:

@@ -42,6 +42,9 @@ def verdict(summary: AttackSummary) -> str:
     if ending == "already wrong":
         wrong = calls(summary.task, thing, summary.clean.label)
         return f"The model already {wrong}: nothing was changed and nothing counts as found."
+    if verified is None and ending == "interrupted" and summary.adversarial:
+        says = calls(summary.task, thing, summary.adversarial.label)
+        return f"Interrupted after {count(summary.steps, 'step')}. The answer so far is not verified: the model {says}."
     if verified is None:
         return f"{ending[:1].upper()}{ending[1:]} after {count(summary.steps, 'step')}; nothing is verified."
     rate = rate_text(verified) + _each(summary)

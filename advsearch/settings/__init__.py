@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from advsearch.settings.configuration import FILES, Config
 from advsearch.settings.declaration import Clash, Setting, setting, setting_as_in, settings
-from advsearch.settings.values import all_finite, check_once, number_or_text, parse_assignment, split_names
+from advsearch.settings.values import all_finite, check_once, number_or_text, parse_assignment, shown, split_names
 from advsearch.settings.yaml_files import HEADER, read_yaml
 
 __all__ = [
@@ -24,5 +24,6 @@ __all__ = [
     "setting",
     "setting_as_in",
     "settings",
+    "shown",
     "split_names",
 ]

@@ -289,7 +289,11 @@ def _repeat(data: RunData) -> Html:
     recipe = None
     if data.recipe:
         recipe = element("details", element("summary", "All settings"), element("pre", data.recipe, class_="wrap"))
-    return join(element("h2", "Do it again"), *(element("pre", text, class_="wrap") for text in commands), recipe)
+    on: list[Html] = []
+    if data.summary.goes_on:
+        resume = shlex.join(["advsearch", "resume", str(data.summary.run or data.path)])
+        on = [element("h2", "Go on, and verify the answer"), element("pre", resume, class_="wrap")]
+    return join(*on, element("h2", "Do it again"), *(element("pre", text, class_="wrap") for text in commands), recipe)
 
 
 def _section(heading: str, figures: Iterable[Html | None], css: str = "", note: str = "") -> Html:

@@ -19,7 +19,7 @@ from advsearch.files import JsonObject, JsonValue
 from advsearch.report import wording
 from advsearch.report.markup import Html, element, join
 from advsearch.report.notebook import axis_cells
-from advsearch.report.phrases import answer_text, percent
+from advsearch.report.phrases import answer_text, beside_text, percent
 from advsearch.report.surface_words import difference_text, surface_sentences, wrong_text
 from advsearch.runs import directory
 from advsearch.runs.files import write_bytes, write_text
@@ -186,6 +186,8 @@ def verdict(summary: SweepSummary) -> str:
     """Return what a sweep came to, in one sentence."""
     if not summary.configurations:
         return "No configuration was looked at."
+    if summary.beside and summary.beside.pairs:
+        return " ".join(beside_text(summary.beside.answer, one) for one in summary.beside.pairs)
     share = f"{percent(summary.accuracy)}, 95 % interval {wording.interval_text(summary.interval)}"
     ended = "" if summary.configurations == summary.planned else f" so far, of {summary.planned} planned"
     return f"Right in {summary.correct} of {summary.configurations} configurations{ended} ({share})."

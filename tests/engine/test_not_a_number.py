@@ -87,7 +87,8 @@ def test_a_region_has_no_verdict_where_the_model_says_nothing(tmp_path: Path) ->
     labels = tmp_path / "labels.txt"
     labels.write_text("mug\nbowl\nvase\n")
     settings: Any = {
-        "controls": {"pose": {}}, "vary": ["pose.yaw"], "verify_spp": 1, "samples": 2, "resolution": 16, "labels": labels,
+        "controls": {"pose": {}}, "vary": ["pose.yaw"], "verify_spp": 1, "samples": 2, "resolution": 16,
+        "labels": labels,
     }  # fmt: skip
     with pytest.raises(
         InputError, match=r"the model's answer is not a number in [0-9]+ of [0-9]+ trials at the centre"

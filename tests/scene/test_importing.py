@@ -617,7 +617,9 @@ def test_several_materials_are_baked_into_one_texture(tmp_path: Path) -> None:
             text += "f " + " ".join(f"{v}/{k + 1}" if name == "wood" else v for k, v in enumerate(face.split())) + "\n"
     asset = import_object(written(tmp_path, "cube.obj", text))
     check_sound(asset)
-    assert asset.warnings == ("cube.obj: the colours of its 3 parts were baked into one texture",)
+    assert asset.warnings == (
+        "cube.obj: the colours of its 3 materials were baked into one texture (512 x 512 texels)",
+    )
     assert overlap(asset.mesh) == 0
     got = color_at(asset, np.array([[0.0, -0.5, 0.5], [0.0, 0.0, 0.0]]))
     assert got == pytest.approx(np.array([[0.9, 0.1, 0.1], [0.0, 0.0, 1.0]]), abs=1e-5)
@@ -683,7 +685,8 @@ def test_several_roughnesses_are_replaced_by_their_mean(tmp_path: Path) -> None:
         scene.add_geometry(box, transform=trimesh.transformations.translation_matrix([3.0 * k, 0.0, 0.0]))
     asset = import_object(exported(tmp_path, "boxes.glb", scene))
     assert asset.material.roughness == pytest.approx(0.2 * 0.2 + 0.8 * 0.7)
-    assert asset.warnings == ("boxes.glb: the roughness and metallic of its materials are replaced by their means",)
+    told = "the roughness and metallic of its materials are replaced by their means (0.6 and 1)"
+    assert asset.warnings == (f"boxes.glb: {told}",)
     assert asset.base_color == pytest.approx(np.broadcast_to([1.0, 0.0, 0.0], (8, 8, 3)))
 
 
@@ -727,7 +730,7 @@ def test_vertex_colors_are_baked(tmp_path: Path) -> None:
     box.visual.vertex_colors = np.where(box.vertices[:, 2:] > 0.0, [[255, 0, 0, 255]], [[0, 0, 255, 255]])
     asset = import_object(exported(tmp_path, "box.ply", box))
     check_sound(asset)
-    assert asset.warnings == ("box.ply: its vertex or face colours were baked into a texture",)
+    assert asset.warnings == ("box.ply: its vertex or face colours were baked into a texture (512 x 512 texels)",)
     got = color_at(asset, np.array([[0.0, 0.1, 1.0], [0.0, 0.1, 0.0]]))
     assert got == pytest.approx(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), abs=1e-5)
 
@@ -1256,10 +1259,14 @@ def _morphed(header: dict[str, Any]) -> None:
             _painted,
             [
                 ": 1 mesh with an opacity in vertex colours, which is left out",
-                ": its vertex or face colours were baked into a texture",
+                ": its vertex or face colours were baked into a texture (512 x 512 texels)",
             ],
         ),
         (_elsewhere, [": 1 further scene: left out", ": 2 nodes with a mesh outside of its scene: left out"]),
+        (
+            lambda header: header["materials"][0].update(alphaMode="mask"),
+            [": 1 material with an alphaMode that glTF does not have: opaque"],
+        ),
         (_occluded, [": 1 occlusion map: left out"]),
         (_morphed, [": 1 mesh with morph targets, which are left out"]),
         (

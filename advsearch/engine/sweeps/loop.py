@@ -1,9 +1,10 @@
 """The loop of a sweep: have batches carried out (`batch`), store and count what comes of them, sum it up.
 
-Configurations are numbered: scenes (object, environment), then the grid with its last axis fastest, then the draws of a
-point of the grid, then the models. Models are shown the same pictures, so that they can be compared, and one is
-rendered once. A batch begins at a multiple of its size and is stored in one transaction, each row in the place of its
-number, so that a sweep that was stopped, or whose batches come in another order, ends bit for bit as one that was not.
+Configurations are numbered: scenes (object, environment; beside an answer first all without it), then the grid with its
+last axis fastest, then the draws of a point of the grid, then the models. Models are shown the same pictures, so that
+they can be compared, and one is rendered once. A batch begins at a multiple of its size and is stored in one
+transaction, each row in the place of its number, so that a sweep that was stopped, or whose batches come in another
+order, ends bit for bit as one that was not.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ from advsearch.runs.images import write_layers
 from advsearch.runs.results.attack import DescribedValue, LinearTransport, SharedWork
 from advsearch.runs.results.base import Formation
 from advsearch.runs.results.sweep import (
+    BesideAnswer,
     SurfaceMap,
     SweepSummary,
     WorstClaim,
@@ -107,8 +109,18 @@ class Sweep:
         objects, environments = (
             list(dict.fromkeys(getattr(place, name) for place in job.places)) for name in ("object", "environment")
         )
-        self._outer = [("object", objects), ("environment", environments), ("model", [one.name for one in job.models])]
-        self._places = [(objects.index(one.object), environments.index(one.environment)) for one in job.places]
+        answers = list(dict.fromkeys(place.answer for place in job.places))
+        self._outer = [
+            ("object", objects),
+            ("environment", environments),
+            ("answer", answers),
+            ("model", [one.name for one in job.models]),
+        ]
+        self._places = [
+            (objects.index(one.object), environments.index(one.environment), answers.index(one.answer))
+            for one in job.places
+        ]
+        self._pairs = self.total // 2 if len(answers) > 1 else 0
 
     def carry_out(self, first: int | None = None) -> SweepResult:
         """Do what is left and return the answer.
@@ -226,16 +238,20 @@ class Sweep:
         shown: tuple[bool, int] = (False, 1),
         **more: Any,
     ) -> store.Row:
-        """What is stored of a configuration; a predicted picture has no seed of its own."""
+        """What is stored of a configuration: what varies; a predicted picture has no seed of its own."""
         place, (predicted, traced) = self.job.places[number // self.per_scene], shown
         lit_by = self.points.lit_by(values)
         named = place.values
         if lit_by is not None:
             named["environment"] = {"value": lit_by, "unit": ""}
-        named |= {"model": {"value": self.job.models[model].name, "unit": ""}, **values}
+        still = {control.name for control in place.held}
+        varied = {name: value for name, value in values.items() if name.partition(".")[0] not in still}
+        named |= {"model": {"value": self.job.models[model].name, "unit": ""}, **varied}
         step = number * self.models + model
         more |= {"id": step + 1, "renders": traced if self._is_first_of_size(model) else 0}
-        row = trial_row(KIND, step, self._seeds(number), self.samples, trial, named, sought=False, **more)
+        row = trial_row(
+            KIND, step, self._seeds(self.points.draw(number)), self.samples, trial, named, sought=False, **more
+        )
         return replace(row, seed=None, spp=BASIS_SPP) if predicted else row
 
     def _is_first_of_size(self, model: int) -> bool:
@@ -258,7 +274,7 @@ class Sweep:
 
     def _counted(self) -> Tally:
         """Counts of the rows that are stored already, read one after the other."""
-        tally = Tally(self._outer, self.job.axes, self._shown)
+        tally = Tally(self._outer, self.job.axes, self._shown, self._pairs)
         self._traced = self._predicted = self._lost = 0
         key, picks = (-1, -1), self.points.picks(0, 0)
         for row in self._kept if self.run is None else self.run.store.rows(KIND):
@@ -312,7 +328,7 @@ class Sweep:
         return WorstConfiguration(
             configuration=index,
             values={name: DescribedValue.of(value) for name, value in row.values.items()},
-            seed=self._seeds(picks.number),
+            seed=self._seeds(points.draw(picks.number)),
             label_set=list(task.truth_names(truth)),
             claimed=_claim_of(seen),
             verified=None,
@@ -367,6 +383,7 @@ class Sweep:
             answers=tally.frequent(),
             axes=tally.table(),
             cells=tally.map(),
+            beside=self._beside(tally),
             worst=worst,
             grid={axis.name: len(axis.values) for axis in job.axes},
             samples=job.samples,
@@ -403,6 +420,13 @@ class Sweep:
             for place in self.job.places
         }
 
+    def _beside(self, tally: Tally) -> BesideAnswer | None:
+        """The clean scene and the answer of a run, where there is one."""
+        if not self._pairs:
+            return None
+        models = [one.name for one in self.job.models]
+        return BesideAnswer(answer=self.job.places[-1].answer, pairs=tally.beside(models))
+
     def _remarks(self, tally: Tally, checked: WorstVerified | None) -> list[str]:
         """What a reader has to know beside the numbers."""
         remarks = lost_remarks(self._lost)
@@ -413,8 +437,8 @@ class Sweep:
             remarks.append("Some values of pictures were not finite and were set to 0.")
         if checked and not checked.converged:
             remarks.append(
-                f"The worst margin still moved with the sample count at {checked.spp} samples a pixel, the most "
-                "that was tried: noise may take part in it."
+                f"It is not shown that the worst margin stands still at {checked.spp} samples a pixel, the most that a "
+                "check takes: noise may take part in it."
             )
         return remarks
 

@@ -152,7 +152,7 @@ class VerificationSamples(Fields):
     """The sample count of the verification."""
 
     spp: int
-    converged: bool = Field(description="whether the margins stood still there")
+    converged: bool = Field(description="whether the margins are shown to stand still there")
 
 
 class SearchClaim(Fields):
@@ -325,5 +325,7 @@ class AttackSummary(SceneResult):
 
     @property
     def brief(self) -> str:
-        """The verified rate."""
-        return f"{self.verified.successes}/{self.verified.trials}" if self.verified else ""
+        """The verified rate; of a run that was interrupted before, the answer so far."""
+        if self.verified is None:
+            return f"{self.adversarial.label}, unverified" if self.goes_on and self.adversarial else ""
+        return f"{self.verified.successes}/{self.verified.trials}"

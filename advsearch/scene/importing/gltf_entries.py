@@ -180,6 +180,9 @@ class TextureTransform(_Entry):
     texCoord: Map | None = None
 
 
+UNMOVED = TextureTransform()
+
+
 class _TextureUseExtensions(_Extensions):
     transform: TextureTransform | None = Field(default=None, alias="KHR_texture_transform")
 
@@ -193,7 +196,7 @@ class TextureUse(_Entry):
     def transform(self) -> TextureTransform:
         """What is done to the texture coordinates before it is looked up."""
         given = self.extensions.transform if self.extensions else None
-        return given or TextureTransform()
+        return given or UNMOVED
 
     @property
     def attribute(self) -> str:

@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 from advsearch.scene.importing.files import shown
 from advsearch.scene.importing.gltf_checks import READ
-from advsearch.scene.importing.gltf_entries import Header, MeshEntry
+from advsearch.scene.importing.gltf_entries import CUT_OUTS, Header, MeshEntry
 from advsearch.scene.importing.left_out import Inventory
 
 _OPAQUE = " lets light pass through surfaces with {name}; here they are opaque"
@@ -47,6 +47,9 @@ def left_out(header: Header) -> Iterator[str]:
         ),
         "emission texture{s} with other coordinates than the base colour: left out, with the emission": sum(
             any(one.emission) and not one.reads(one.emissiveTexture) for one in header.materials
+        ),
+        "material{s} with an alphaMode that glTF does not have: opaque": sum(
+            one.alphaMode not in ("OPAQUE", *CUT_OUTS) for one in header.materials
         ),
         "skin{s}: what is bound to bones stays as it was drawn": _length(header.skins),
         "animation{s}: left out": _length(header.animations),

@@ -59,15 +59,12 @@ def read_gltf(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         if keys:
             notes.append(f"{path.name}: {gltf_notes.counted(len(set(keys)), words)}")
     surfaces = GltfSurfaces(path.name, header, buffers, references)
+    groups: dict[int | None, dict[tuple[int, int], ImportedPart]] = {}
+    for key, piece in found.items():
+        groups.setdefault(piece.material, {})[key] = piece.part
     finished = {}
-    for number in sorted({-1 if piece.material is None else piece.material for piece in found.values()}):
-        group = {
-            key: piece.part
-            for key, piece in found.items()
-            if (piece.material, number) in ((None, -1), (number, number))
-        }
-        uvs = [part.uvs for part in group.values() if part.uvs is not None]
-        surface, fit = surfaces.surface(None if number < 0 else number, uvs)
+    for material, group in groups.items():
+        surface, fit = surfaces.surface(material, [part.uvs for part in group.values() if part.uvs is not None])
         for key, part in group.items():
             finished[key] = replace(part, surface=surface, uvs=None if part.uvs is None else _upwards(fit(part.uvs)))
     parts = [

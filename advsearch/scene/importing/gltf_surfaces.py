@@ -105,7 +105,8 @@ class GltfSurfaces:
             words = ": the normal map {name} {why}; it is left out"
             normals = self._picture(material.normalTexture, "numbers", words)
             normals = None if normals is None else normal_map(normals, material.normalTexture.scale)
-        found = ImportedSurface(kept, texture, unit(roughness), unit(metallic), normals, self._emission(material))
+        name = "" if number is None else material.name or f"material {number}"
+        found = ImportedSurface(kept, texture, unit(roughness), unit(metallic), normals, self._emission(material), name)
         return self._fitted(found, material, uvs)
 
     def _emission(self, material: MaterialEntry) -> Floats | None:

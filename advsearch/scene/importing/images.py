@@ -56,7 +56,7 @@ def check_pixels(path: Path | str, width: int, height: int, limit: int = LARGEST
         raise files.too_large(path, expected, f"{width} x {height}")
 
 
-def read_picture(path: Path, limit: int | None = TEXTURE_LIMIT) -> Floats:
+def read_picture(path: Path, limit: int | None = TEXTURE_LIMIT, *, raw: bool = False) -> Floats:
     """Read a picture file; arguments and result as for `display_image`.
 
     Raises:
@@ -67,7 +67,7 @@ def read_picture(path: Path, limit: int | None = TEXTURE_LIMIT) -> Floats:
         with warnings.catch_warnings(), without_pillows_limit():
             warnings.simplefilter("ignore")  # of odd metadata
             with Image.open(io.BytesIO(data), formats=FORMATS) as image:
-                return display_image(image, limit, path)
+                return display_image(image, limit, path, raw=raw)
     except (OSError, ValueError, SyntaxError, EOFError) as error:
         reason = getattr(error, "strerror", None) or "one that cannot be read"
         raise FileFormatError(f"{path}: expected a picture file such as PNG, got {reason}; check the path") from error

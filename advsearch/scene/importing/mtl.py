@@ -50,12 +50,18 @@ class MtlMaterial:
         file: name of the material file.
         statements: the rest of each line by its keyword in lower case; of several lines with the same one, the last.
         spelled: the keywords as the file spells them.
+        again: keywords of lines that others with the same one, and something else to say, come after.
     """
 
     name: str
     file: str
     statements: dict[str, str] = field(default_factory=dict)
     spelled: dict[str, str] = field(default_factory=dict)
+    again: list[str] = field(default_factory=list)
+
+    def numbers(self, key: str) -> str:
+        """Return what a statement of numbers says, without a comment; empty where there is none."""
+        return self.statements.get(key, "").partition("#")[0].strip()
 
 
 @dataclass(frozen=True)
@@ -109,6 +115,8 @@ def parsed(text: str, file: str) -> tuple[list[MtlMaterial], list[str]]:
         if key.lower() == "newmtl":
             found.append(MtlMaterial(" ".join(rest.split()), file))
         elif found:
+            if found[-1].statements.get(key.lower(), rest.strip()) != rest.strip():
+                found[-1].again.append(key)
             found[-1].statements[key.lower()] = rest.strip()
             found[-1].spelled[key.lower()] = key
         else:

@@ -98,7 +98,10 @@ class MtlReader:
         for key in stray:
             self.inventory.has(f"before the first material of {shown(file, quoted=False)}, statement", key)
         for material in materials:
-            self._materials.setdefault(material.name, material)
+            first = self._materials.setdefault(material.name, material)
+            if first.statements != material.statements and first.file == material.file:
+                twice = f"{file} has the material {shown(material.name)} more than once"
+                self.note(f"{self.source}: {twice}; the first counts")
         for material in materials:  # a comment, or part of the name: both are tried
             self._materials.setdefault(without_comment(material.name), material)
 
@@ -137,6 +140,7 @@ class MtlReader:
             metallic=self._share(material, "pm", uses.get("map_pm")),
             normal_map=self._bumps(material, uses),
             emission=self._glow(material, uses.get("map_ke")),
+            name=material.name,
         )
         if first is None:
             return Painted(found)
@@ -146,14 +150,18 @@ class MtlReader:
     def _list(self, material: MtlMaterial) -> None:
         """Put what is not read into the inventory; what is there by default, and changes nothing, is not in it."""
         said = {key: without_comment(rest) for key, rest in material.statements.items()}
-        zero = {key for key, rest in said.items() if not any(numbers_of(rest) or [1.0])}
+        zero = {key for key in said if not any(numbers_of(material.numbers(key)) or [1.0])}
+        for key in material.again:
+            self.inventory.has("earlier material statement", key)
+        if len(material.numbers("kd").split()) == 4:
+            self.inventory.has("fourth number of", material.spelled["kd"])
         base = map_of(said.get("map_kd", ""))
         for key, rest in said.items():
             use = map_of(rest)
             quiet = key in READ or key in QUIET or key in zero or (key == "pcr" and "pc" in zero)
             quiet |= key == "tf" and len(set(rest.split())) == 1
             quiet |= key == "map_ka" and use is not None and base is not None and use.name == base.name
-            if key == "illum" and rest not in ("", "0", "1", "2"):
+            if key == "illum" and material.numbers(key) not in ("", "0", "1", "2"):
                 self.inventory.has("illumination model", rest)
             elif not quiet:
                 self.inventory.has(STATEMENT, material.spelled[key])
@@ -186,7 +194,7 @@ class MtlReader:
         return use
 
     def _color(self, material: MtlMaterial) -> Floats | None:
-        rest = without_comment(material.statements.get("kd", ""))
+        rest = material.numbers("kd")
         color = color_of(rest)
         if "kd" in material.statements and color is None:
             self.note(
@@ -237,10 +245,9 @@ class MtlReader:
 
     def _opacity(self, material: MtlMaterial) -> float:
         """Return ``d``, or 1 - ``Tr`` where there is none; some programs write Tr for d."""
-        said = {key: without_comment(material.statements[key]) for key in ("d", "tr") if key in material.statements}
-        if "-halo" in said.get("d", "").lower().split():
+        if "-halo" in material.numbers("d").lower().split():
             self.inventory.has("option", "-halo of d")
-        opacity, clear = share_of(said.get("d", ""), -1.0), share_of(said.get("tr", ""), -1.0)
+        opacity, clear = share_of(material.numbers("d"), -1.0), share_of(material.numbers("tr"), -1.0)
         what = f"{self.source}: the material {shown(material.name)} has Tr {clear:g}"
         if opacity >= 0.0:
             if clear >= 0.0 and min(abs(clear - opacity), abs(1.0 - clear - opacity)) > 0.01:
@@ -261,7 +268,7 @@ class MtlReader:
                 self.note(f"{self.source}: textures of roughness and metallic are replaced by their means")
                 return float(_channel(found, use).mean())
             self.note(f"{self.source}: {material.spelled[f'map_{key}']} {shown(use.name)} {found}; it is left out")
-        rest = without_comment(material.statements.get(key, ""))
+        rest = material.numbers(key)
         value = share_of(rest, -1.0)
         return value if value >= 0.0 else None
 
@@ -281,7 +288,7 @@ class MtlReader:
 
     def _glow(self, material: MtlMaterial, use: MapUse | None) -> Floats | None:
         """Return the radiance that is said by ``Ke`` and ``map_Ke``; where there are both, their product."""
-        rest = without_comment(material.statements.get("ke", ""))
+        rest = material.numbers("ke")
         factor, picture = radiance_of(rest), None
         if factor is None:
             self.note(f"{self.source}: the emission {shown(rest)} is no colour; it is left out")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Literal
@@ -20,7 +21,7 @@ from advsearch.scene.importing.geometry import Soup, assemble, join, repaired
 from advsearch.scene.importing.imported_part import ImportedPart
 from advsearch.scene.importing.parts import GLTF, read_parts
 from advsearch.scene.importing.surfaces import ImportedSurface
-from advsearch.scene.importing.texture import textured
+from advsearch.scene.importing.texture import by_material, textured
 from advsearch.scene.importing.upright import guess_up
 
 Floats = npt.NDArray[np.float32]
@@ -96,7 +97,7 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     material, blends = _material(soup, surfaces)
     return ObjectAsset(
         name=name,
-        mesh=_mesh(soup, file),
+        mesh=_mesh(soup, surfaces, file),
         base_color=np.ascontiguousarray(maps.color[:, :, :3]),
         material=material,
         source=str(file),
@@ -108,9 +109,12 @@ def object_of(parts: list[ImportedPart], notes: list[str], file: Path, name: str
     )
 
 
-def _mesh(soup: Soup, file: Path) -> Mesh:
+def _mesh(soup: Soup, surfaces: list[ImportedSurface], file: Path) -> Mesh:
+    names, number = by_material(soup, surfaces)
+    faces = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number, minlength=len(names)))[:-1])
+    materials = {name: group for name, group in zip(names, faces, strict=True) if name and len(group)}
     try:
-        return normalised(assemble(soup))
+        return replace(normalised(assemble(soup)), materials=materials)
     except InputError as error:  # which knows of no file
         raise InputError(f"{file}: {error}") from None
 
@@ -160,5 +164,6 @@ def _material(soup: Soup, surfaces: list[ImportedSurface]) -> tuple[Material, li
     )
     same = bool((values[area > 0] == values[area > 0][0]).all())
     roughness, metallic = values[area > 0][0] if same else (values * area[:, None]).sum(axis=0) / area.sum()
-    notes = [] if same else ["the roughness and metallic of its materials are replaced by their means"]
+    means = f"{roughness:.2g} and {metallic:.2g}"
+    notes = [] if same else [f"the roughness and metallic of its materials are replaced by their means ({means})"]
     return Material(roughness=float(roughness), metallic=float(metallic)), notes

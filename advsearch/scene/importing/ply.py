@@ -216,6 +216,8 @@ class _Reader:
     def texture_numbers(self, names: Sequence[str], corner: Ints, counts: Ints) -> Ints:
         """Return the number (P,) of each polygon's texture among several; -1 for none."""
         faces, vertices = (self.elements.get(name) for name in ("face", "vertex"))
+        if not names:
+            return np.full(len(counts), -1)
         if faces is not None and "texnumber" in faces.scalars:
             self.inventory.take("face property", "texnumber")
             number = np.full(len(counts), -1)
@@ -228,9 +230,9 @@ class _Reader:
                 self.note(
                     f"of its {len(names)} textures only {shown(names[0])} is used, as its faces have no texnumber"
                 )
-            return np.zeros(len(counts), np.int64) if names else np.full(len(counts), -1)
+            return np.zeros(len(counts), np.int64)
         wrong = int(((number < -1) | (number >= len(names))).sum())
-        if wrong and names:
+        if wrong:
             self.note(f"{wrong:,} faces have a texnumber of a texture that it does not name; they have none")
         return np.where((number >= 0) & (number < len(names)), number, -1)
 
@@ -240,14 +242,18 @@ class _Reader:
         pictures = Pictures(len(names), references.get, references.refused)
         surfaces = []
         instead = "neutral grey is" if plain else "the colours of its vertices or faces are"
-        read = {name: pictures.of_file(name, "colours") for name in dict.fromkeys(names)}
+        read = {name: pictures.of_file(name, "colours and alpha") for name in dict.fromkeys(names)}
         for note in pictures.notes:
             self.note(note)
         for name in names:
             found = read[name]
             if isinstance(found, str):
                 self.note(f" names the texture {shown(name)}, which {found}; {instead} used instead")
-            surfaces.append(ImportedSurface(texture=None if isinstance(found, str) else found))
+                surfaces.append(ImportedSurface(name=name))
+                continue
+            if found[:, :, 3].min() < 1.0:
+                self.note(f"the alpha of {shown(name)} is left out")
+            surfaces.append(ImportedSurface(texture=np.ascontiguousarray(found[:, :, :3]), name=name))
         return surfaces
 
 

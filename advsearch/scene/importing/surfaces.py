@@ -33,6 +33,7 @@ class ImportedSurface:
         normal_map: (H, W, 3) float32 of `advsearch.scene.importing.normal_maps`, row 0 on top; or None.
         emission: (H, W, 3) float32 linear radiance, row 0 on top; (1, 1, 3) where it is the same everywhere, None where
             there is none.
+        name: of the material in the file; empty where it has none.
     """
 
     color: Floats | None = None
@@ -41,6 +42,7 @@ class ImportedSurface:
     metallic: float | None = None
     normal_map: Floats | None = None
     emission: Floats | None = None
+    name: str = ""
 
     @property
     def pictures(self) -> tuple[Floats, ...]:

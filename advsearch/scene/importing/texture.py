@@ -15,7 +15,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array, csgraph
 
 from advsearch.scene.color import linear_to_srgb, srgb_to_linear
-from advsearch.scene.importing.geometry import Array, Soup
+from advsearch.scene.importing.geometry import Array, Ints, Soup
 from advsearch.scene.importing.images import TEXTURE_LIMIT
 from advsearch.scene.importing.normal_maps import FLAT
 from advsearch.scene.importing.surfaces import NEUTRAL, ImportedSurface
@@ -37,7 +37,8 @@ _SQUASHED = 0.05  # share of the surface that may have no area in UV space
 _CRAMPED = 0.02  # share of the unit square that UVs must cover in all
 _WINDOW = 1.5  # how many textures wide and high UVs may be and still keep their layout
 _BORDER = 2.0  # texels outside a chart up to which it emits light: filtering needs them
-_SHARED = 0.005  # share of the texels that emit light which may lie on several faces
+_SHARED = 0.005  # share of the texels which may lie on several faces where each should have its own
+_FINER = 1.5  # how many times more texels a picture may have than a baked texture before that is said
 _FILLED = 0.5  # share of an atlas that its charts fill, about
 
 
@@ -65,21 +66,43 @@ def textured(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[Soup, Sur
         soup: repaired geometry.
         surfaces: the surface of each part.
     """
-    used = [surfaces[number] for number in np.unique(soup.part)]
+    used = list({id(surfaces[number]): surfaces[number] for number in np.unique(soup.part)}.values())
     first, uniform = used[0], all(surface.same_maps(used[0]) for surface in used)
-    colored, twice = uniform and _one_factor(soup), False
+    colored, twice, material = uniform and _one_factor(soup), False, by_material(soup, surfaces)[1]
     if colored and not first.pictures:
-        kept = _usable(soup, soup.uvs)
-        soup = replace(soup, uvs=np.clip(soup.uvs, 0.0, 1.0)) if kept else unwrapped(soup)
+        kept = _usable(soup, soup.uvs) and not _overlap(soup.uvs, material)
+        soup = replace(soup, uvs=np.clip(soup.uvs, 0.0, 1.0)) if kept else unwrapped(soup, material)
         return soup, SurfaceMaps(_of_one_color(soup, first), None, first.emission), []
     if colored and (first.texture is None or soup.colors.min() == 1.0) and np.isfinite(soup.uvs).all():
         uvs, pictures = _windowed(_into_unit_square(soup), first.pictures, first.texture)
         twice = _usable(soup, uvs) and _lit_twice(uvs, first, pictures)
         if _usable(soup, uvs) and not twice:
             return *_kept(soup, np.clip(uvs, 0.0, 1.0), first, pictures), []
-    fresh = unwrapped(soup)
+    fresh = unwrapped(soup, material)
+    maps = baked(fresh.uvs, soup, surfaces)
     shared = "several faces share a texture that emits light; it was unwrapped anew and its texture resampled"
-    return fresh, baked(fresh.uvs, soup, surfaces), [shared if twice else _why(soup, used, uniform)]
+    size, why = len(maps.color), shared if twice else _why(soup, used, uniform)
+    times = _texels(soup, surfaces) / (size * size * _FILLED)
+    fewer = "" if times < _FINER else f", {times:.0f} times fewer than its pictures have there"
+    return fresh, maps, [f"{why} ({size} x {size} texels{fewer})"]
+
+
+def by_material(soup: Soup, surfaces: Sequence[ImportedSurface]) -> tuple[list[str], Ints]:
+    """Return the names of materials, "" for none, and the number (F,) of each face's among them."""
+    numbers = {name: number for number, name in enumerate(dict.fromkeys(surface.name for surface in surfaces))}
+    return list(numbers), np.array([numbers[surface.name] for surface in surfaces])[soup.part]
+
+
+def _overlap(uvs: Array, material: Ints) -> bool:
+    """Whether places of different materials (F,) lie at the same texture coordinates (F, 3, 2)."""
+    if material.min() == material.max():
+        return False
+    side = BAKED_SIZE
+    face, row, column, _ = pixels_in(uvs * side - 0.5, (side, side), tolerance=-1e-6)
+    least, most = np.full(side * side, len(uvs)), np.full(side * side, -1)
+    np.minimum.at(least, row * side + column, material[face])
+    np.maximum.at(most, row * side + column, material[face])
+    return bool((most > least).sum() > _SHARED * (most >= 0).sum())
 
 
 def _of_one_color(soup: Soup, surface: ImportedSurface) -> Floats:
@@ -113,7 +136,8 @@ def _lit_twice(uvs: Array, surface: ImportedSurface, pictures: Sequence[Floats])
 def _why(soup: Soup, used: Sequence[ImportedSurface], uniform: bool) -> str:
     """Return the sentence that says why the object was unwrapped anew."""
     if not uniform:
-        return f"the colours of its {len(used)} parts were baked into one texture"
+        count = len({surface.name or id(surface) for surface in used})
+        return f"the colours of its {count} materials were baked into one texture"
     if not _one_factor(soup) or soup.colors.min() < 1.0:
         return "its vertex or face colours were baked into a texture"
     if not np.isfinite(soup.uvs).all():
@@ -205,7 +229,7 @@ def baked(uvs: Array, soup: Soup, surfaces: Sequence[ImportedSurface]) -> Surfac
     Returns:
         Maps (N, N, ...). Texels outside every chart repeat the nearest one inside, so that filtering finds no seam.
     """
-    size = _baked_size(soup, surfaces)
+    size = _baked_size(_texels(soup, surfaces))
     corners = np.stack([uvs[:, :, 0] * size - 0.5, (1.0 - uvs[:, :, 1]) * size - 0.5], axis=2)
     face, rows, columns, weights = pixels_in(corners, (size, size), tolerance=1e-9)
     through = any(_channels(one) == 4 for one in surfaces)
@@ -248,11 +272,16 @@ def _channels(surface: ImportedSurface) -> int:
     return int((_plain(surface) if surface.texture is None else surface.texture).shape[-1])
 
 
-def _baked_size(soup: Soup, surfaces: Sequence[ImportedSurface]) -> int:
-    """Return a power of two, `BAKED_SIZE` to `TEXTURE_LIMIT`, that has room for the texels that the object shows."""
+def _texels(soup: Soup, surfaces: Sequence[ImportedSurface]) -> float:
+    """Return how many texels of its pictures the object shows."""
     texels, areas = 0.0, np.nan_to_num(np.abs(doubled_areas(soup.uvs)) / 2.0)
     for number, area in enumerate(np.bincount(soup.part, areas)):
         texels += float(area) * max((one.shape[0] * one.shape[1] for one in surfaces[number].pictures), default=0)
+    return texels
+
+
+def _baked_size(texels: float) -> int:
+    """Return a power of two, `BAKED_SIZE` to `TEXTURE_LIMIT`, that has room for the texels that the object shows."""
     size = BAKED_SIZE
     while size < TEXTURE_LIMIT and size * size * _FILLED < texels:
         size *= 2

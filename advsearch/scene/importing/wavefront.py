@@ -81,7 +81,7 @@ def read_obj(path: Path, data: bytes) -> tuple[list[ImportedPart], list[str]]:
         painted = reader.painted(names[first[0]]) if first[0] >= 0 and names[first[0]] else Painted(ImportedSurface())
         tint = None if colors is None else colors[position[chosen]]
         if painted is None:
-            painted = Painted(ImportedSurface())
+            painted = Painted(ImportedSurface(name=without_comment(names[first[0]])))
             instead = "neutral grey" if tint is None else "the colour of its vertices"
             _note_unknown(reader, said, names[first[0]], instead)
         surface, tint = _tinted(reader, painted.surface, tint)

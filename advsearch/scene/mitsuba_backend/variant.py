@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
 
@@ -34,6 +36,18 @@ def mitsuba() -> ModuleType:
         _settle(mi)
     module: ModuleType = mi
     return module
+
+
+@contextmanager
+def fewer_warnings() -> Iterator[None]:
+    """Keep Mitsuba from warning: of a film that samples beyond its border, at every call, or of what is told here."""
+    mi = mitsuba()
+    before = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        mi.set_log_level(before)
 
 
 def _settle(mi: ModuleType) -> None:
