@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,9 @@ LARGEST = 16 << 20
 
 LONGEST = 1000
 """Most characters of a label name; those of ImageNet have up to 130."""
+
+LONGEST_NAMES = 1 << 20
+"""Most characters of all names that a network's metadata say."""
 
 MOST_SUGGESTIONS = 4
 """Labels that a message suggests for an unknown one."""
@@ -190,6 +194,34 @@ def read_labels(source: str | Path | Sequence[str]) -> tuple[str, ...]:
     if problem:
         raise InputError(f"labels: {problem}")
     return tuple(name.strip() for name in source)
+
+
+def names_in(said: Any) -> tuple[str, ...] | None:
+    """Return the names that a network says its classes have: as YOLO's do in `names`, and their files in metadata.
+
+    Args:
+        said: a mapping from 0, 1, ... to names, a list of names, or the text of one of these; from a stranger.
+
+    Returns:
+        The names in order; None of anything else.
+    """
+    if isinstance(said, str):
+        if len(said) > LONGEST_NAMES or not _FLAT.fullmatch(said):
+            return None
+        try:
+            said = ast.literal_eval(said)
+        except (ValueError, SyntaxError, MemoryError):
+            return None
+    if isinstance(said, Mapping):
+        if list(said) != list(range(len(said))):
+            return None
+        said = list(said.values())
+    return read_labels(said) if isinstance(said, (list, tuple)) and not _problem(said) else None
+
+
+_TEXT = r"""(?:'(?:[^'\\\n]|\\.)*'|"(?:[^"\\\n]|\\.)*")"""
+_FLAT = re.compile(rf"\{{(?:\d{{1,6}}: {_TEXT}(?:, |(?=\}})))*\}}|\[(?:{_TEXT}(?:, |(?=\])))*\]")
+"""A mapping or a list as Python writes it: nothing in it is deep or runs."""
 
 
 def sets_of(classes: int) -> list[str]:

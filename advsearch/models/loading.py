@@ -14,7 +14,7 @@ from torch import nn
 from advsearch.errors import InputError, UnknownNameError, resembling
 from advsearch.models import files, imported, reference
 from advsearch.models import preprocessing as pre
-from advsearch.models.labels import SETS, fitting_labels, read_labels
+from advsearch.models.labels import SETS, fitting_labels, names_in, read_labels
 from advsearch.models.model import Model, Read
 from advsearch.models.preprocessing import Preprocessing
 from advsearch.models.probe import probe
@@ -117,6 +117,8 @@ def _loaded(
         found = dataclasses.replace(found, read=read or found.read)
         found = found if names is None and name is None else dataclasses.replace(found, asked=None)
         return _relabelled(found, names, origin, name, given)
+    if read is not None and isinstance(found.module, nn.Module):
+        found = _with_what_it_says(found)
     low, high = found.batch_limits
     bare = Model(
         module=found.module,
@@ -129,6 +131,21 @@ def _loaded(
         read=read,
     )
     return probe(bare, found.labels if names is None else names, origin)
+
+
+def _with_what_it_says(found: Source) -> Source:
+    """Return a source with the names and the size that its module has as attributes, as those of YOLO's do.
+
+    These are `names`, and `args` from training with `imgsz`.
+    """
+    args = getattr(found.module, "args", None)
+    size = args.get("imgsz") if isinstance(args, Mapping) else None
+    sized = isinstance(size, int) and not isinstance(size, bool) and 0 < size
+    return dataclasses.replace(
+        found,
+        labels=found.labels or names_in(getattr(found.module, "names", None)),
+        input_size=found.input_size or ((size, size) if sized else None),
+    )
 
 
 def named_code(spec: str) -> str | None:

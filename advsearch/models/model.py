@@ -248,7 +248,7 @@ def _advice(got: tuple[int, ...]) -> str:
     if len(got) == 4:
         return f"{_other_task('segmentation')}. If these are a classifier's feature maps, wrap the network to pool them"
     if len(got) > 2:
-        return "pass a classifier, or wrap the network to pool its output"
+        return "pass a classifier, or wrap the network to pool its output; if it is a detector, use `task=detection`"
     if len(got) == 2 and got[1] == 1:
         return "one score is not enough: wrap the network to return a score for each of the two classes"
     if len(got) == 1:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from advsearch.errors import FileFormatError, ModelError
+from advsearch.models.labels import names_in
 from advsearch.models.probe import first_line
 from advsearch.models.source import Source
 from advsearch.models.zoo.library import library
@@ -83,14 +84,24 @@ def load(path: Path) -> Source:
         )
     layout = "NHWC" if shape[3] == 3 and shape[1] != 3 else "NCHW"
     sides = shape[1:3] if layout == "NHWC" else shape[2:4]
+    said = session.get_modelmeta().custom_metadata_map
+    if not all(isinstance(side, int) for side in sides):
+        sides = sizes_in(said.get("imgsz", ""))
     return Source(
         OnnxNetwork(session, runtime.RunOptions),
         path.stem,
-        input_size=(sides[0], sides[1]) if all(isinstance(side, int) for side in sides) else None,
+        input_size=(sides[0], sides[1]) if sides else None,
         layout=layout,
+        labels=names_in(said.get("names", "")),
         batch_limits=(shape[0], shape[0]) if isinstance(shape[0], int) else (1, LARGEST_BATCH),
         dtype=FLOATS[inputs[0].type],
     )
+
+
+def sizes_in(text: str) -> tuple[int, int] | None:
+    """Return (height, width) of what YOLO's exporters write as `imgsz`, such as "[640, 640]"; None of anything else."""
+    found = re.fullmatch(r"\[(\d{1,5}), ?(\d{1,5})\]", text)
+    return (int(found[1]), int(found[2])) if found and min(int(found[1]), int(found[2])) > 0 else None
 
 
 def _check_version(path: Path, version: str) -> None:

@@ -11,6 +11,9 @@ from torch import Tensor
 FORMS = ("xyxy", "xywh", "cxcywh", "yxyx")
 """How a box may be given: corners; a corner or the middle with width and height; corners with y first."""
 
+MOST = 2000
+"""Most boxes of a class that are looked at in suppression, the best ones: a network that has learnt has fewer."""
+
 
 def overlap(boxes: Tensor, box: Tensor) -> Tensor:
     """Return intersection over union of boxes (D, 4) with one box (4,), (D,) in [0, 1]; differentiable."""
@@ -64,3 +67,22 @@ def strongest(boxes: Tensor, scores: Tensor, count: int, iou: float) -> list[int
         kept.append(int(first))
         left = left[overlap(boxes[left], boxes[first]) < iou]
     return kept
+
+
+def left_over(boxes: Tensor, scores: Tensor, iou: float) -> Tensor:
+    """Return which boxes are left as by `strongest`, (D,) bool; of those beyond the best `MOST`, none is.
+
+    Each round keeps the boxes that no better one overlaps which may still be left, and removes those that they overlap.
+    """
+    order = scores.argsort(descending=True)[:MOST]
+    best = boxes[order]
+    parts = [overlap(best, some[:, None]) >= iou for some in best.split(256)]
+    over = torch.cat(parts).tril(-1)  # whether box j, which is better, overlaps box i
+    undecided = torch.ones(len(best), dtype=torch.bool, device=boxes.device)
+    kept = ~undecided
+    while bool(undecided.any()):
+        kept = kept | (undecided & ~(over & undecided).any(dim=1))
+        undecided = undecided & ~kept & ~(over & kept).any(dim=1)
+    left = torch.zeros(len(boxes), dtype=torch.bool, device=boxes.device)
+    left[order] = kept
+    return left

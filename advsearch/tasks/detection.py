@@ -24,7 +24,7 @@ from advsearch.models import Model
 from advsearch.options import FROM_RUN
 from advsearch.tasks.base import Answer, Facts, Judgement, Mark
 from advsearch.tasks.box_readings import UNITS, Reading, strongest_boxes, unit_in
-from advsearch.tasks.boxes import FORMS, overlap, share_inside, strongest
+from advsearch.tasks.boxes import FORMS, left_over, overlap, share_inside, strongest
 from advsearch.tasks.classes import NO, ClassTask, Labels
 from advsearch.tasks.detector_answers import (
     ORDERS,
@@ -37,6 +37,7 @@ from advsearch.tasks.detector_answers import (
     order_in,
     settled,
 )
+from advsearch.tasks.yolo_heads import HEADS, LAYOUTS, names_head
 
 GOALS = {
     "vanish": "no right box is found where the object is",
@@ -87,17 +88,20 @@ class Detection(ClassTask):
     Args:
         iou: least intersection over union with the true box.
         confidence: least score of a box that counts.
-        boxes: how the model gives a box, one of `FORMS`; "" for xyxy.
+        boxes: how the model gives a box, one of `FORMS`; "" for xyxy, of YOLO's heads cxcywh.
         suppression: intersection over union from which two boxes of a class are one thing, of which the better one is
             left; 1 where a model's own boxes should all count.
         unit: of these numbers: "fractions" of the picture's sides, or "pixels" of the model's input; "" for what the
             boxes in a picture of noise look like, or in a clean picture of the scene where it finds none in noise.
         order: of outputs without names, or of the columns of rows: "boxes labels scores", say, with "batch" for the
-            number of the picture; "" for what types and numbers show.
+            number of the picture; of YOLO's heads "boxes scores" or "boxes objectness scores", with "channels first" or
+            "channels last" after it; "" for what types and numbers show.
         seek: what an attack is after, one of `GOALS`.
         input_size: (height, width) of the model's input in pixels.
         seen_unit, seen_order: what the model's own answers show; "" where they have not yet.
         undecided: whether only numbers tell scores from classes in its answers.
+        shape: (A, B) of an answer that is read as a YOLO's head; None of others.
+        masks: whether mask coefficients stand in its answers, which are left out.
         fills_with_nan: whether rows of NaN stand where nothing is found, and not for an answer that is not a number.
         doubts: what is odd about these.
 
@@ -119,6 +123,8 @@ class Detection(ClassTask):
     seen_unit: str = field(default="", metadata=FROM_RUN)
     seen_order: str = field(default="", metadata=FROM_RUN)
     undecided: bool = field(default=False, metadata=FROM_RUN)
+    shape: tuple[int, ...] | None = field(default=None, metadata=FROM_RUN)
+    masks: bool = field(default=False, metadata=FROM_RUN)
     fills_with_nan: bool = field(default=False, metadata=FROM_RUN)
     doubts: str = field(default="", metadata=FROM_RUN)
 
@@ -162,6 +168,7 @@ class Detection(ClassTask):
     def seeing(self, output: Sequence[Detections], truth: Place | None) -> Detection:
         """See `Task.seeing`."""
         found = self._having_seen(output)
+        output = found._boxed(output)
         reading, right = found._reading, strongest_boxes(output)[:0]
         if truth is not None and truth.shares is not None:
             each = [(one["boxes"], found._of(one, truth.labels)) for one in found._settled(output)]
@@ -176,17 +183,37 @@ class Detection(ClassTask):
 
     def _having_seen(self, output: Sequence[Detections]) -> Detection:
         """The task with what an answer of its model shows of orders and units."""
+        grids = [one["raw"] for one in output if "raw" in one]
         try:
-            order = order_in(output, len(self.labels) if self.named else None)
+            order = order_in(output, len(self.labels) if self.named else None, self._head)
         except ValueError as error:
-            raise InputError(f"task detection: {error}; {ask_order()}") from None
-        return replace(
+            what = f"the model's answer is {tuple(grids[0].shape)}: " if grids else ""
+            asked = "" if grids else f"; {ask_order()}"
+            raise InputError(f"task detection: {what}{error}{asked}") from None
+        found = replace(
             self,
-            seen_unit=unit_in(strongest_boxes(output)) or self.seen_unit,
             seen_order=order or self.seen_order,
             undecided=self.undecided or any("either" in one for one in output),
-            fills_with_nan=self.fills_with_nan or any("blank" in one and len(one["boxes"]) for one in output),
+            shape=tuple(grids[0].shape) if grids else self.shape,
+            masks=self.masks or any(self._has_masks(one, order) for one in output),
         )
+        boxed = found._boxed(output)
+        return replace(
+            found,
+            seen_unit=unit_in(strongest_boxes(boxed)) or self.seen_unit,
+            fills_with_nan=self.fills_with_nan or any("blank" in one and len(one["boxes"]) for one in boxed),
+        )
+
+    def _has_masks(self, one: Detections, order: str) -> bool:
+        """Whether what stands beside the scores of a picture's boxes are mask coefficients."""
+        if "raw" not in one:
+            return "beside" in one
+        length = one["raw"].shape[0 if order.endswith(LAYOUTS[0]) else 1]
+        return length > len(self.labels) + next(start for head, start in HEADS.items() if order.startswith(head))
+
+    def _boxed(self, output: Sequence[Detections]) -> Sequence[Detections]:
+        """What the model answered, with the boxes of YOLO's heads found."""
+        return self._settled(output) if any("raw" in one for one in output) else output
 
     @property
     def unsaid(self) -> str:
@@ -205,6 +232,12 @@ class Detection(ClassTask):
     def remarks(self) -> tuple[str, ...]:
         """See `Task.remarks`."""
         said = []
+        if self.shape and not self.order:
+            said.append(
+                f"The detector's answer of {self.shape} is read as a YOLO's: {as_option(f'order: {self.seen_order}')}."
+            )
+        if self.masks:
+            said.append("The detector's masks are left out: its boxes and scores are read.")
         if self.undecided and self.seen_order and not self.order:
             said.append(
                 "Scores and classes of the detector's boxes are told apart by their values: they are read as "
@@ -216,7 +249,16 @@ class Detection(ClassTask):
 
     @property
     def _reading(self) -> Reading:
-        return Reading(self.boxes or FORMS[0], self.unit or self.seen_unit or UNITS[1], self.input_size)
+        middle = names_head(self._head or self.seen_order)
+        return Reading(
+            self.boxes or ("cxcywh" if middle else FORMS[0]), self.unit or self.seen_unit or UNITS[1], self.input_size
+        )
+
+    @property
+    def _head(self) -> str:
+        """The head of `yolo_heads.HEADS` that `order` says; "" where it says none."""
+        order = " ".join(checked_order(self.order)) if self.order else ""
+        return order if names_head(order) else ""
 
     def seeking(self, objective: str) -> Detection:
         """See `Task.seeking`: the objectives of detection say what counts as success."""
@@ -308,7 +350,7 @@ class Detection(ClassTask):
     def _settled(self, output: Sequence[Detections]) -> list[Detections]:
         """What the model answered, with scores and classes told apart, boxes as they came."""
         try:
-            return [settled(one, self.seen_order) for one in output]
+            return [settled(one, self.seen_order, len(self.labels) or None) for one in output]
         except ValueError as error:
             raise InputError(f"task detection: {error}") from None
 
@@ -353,8 +395,7 @@ class Detection(ClassTask):
         for label in classes.unique().tolist():
             mine = rows[classes == label]
             if len(mine) > 1:
-                removed[mine, label] = True
-                removed[mine[strongest(boxes[mine], scores[mine, label], len(mine), self.suppression)], label] = False
+                removed[mine, label] = ~left_over(boxes[mine], scores[mine, label], self.suppression)
         return {**one, "scores": torch.where(removed, 0.0, one["scores"])}
 
     def _overlap(self, one: Detections, truth: Place) -> Tensor | None:

@@ -2,8 +2,9 @@
 
 Detections of one picture are a mapping with `boxes` (D, 4) as they came and `scores`: (D, C) of every class, or (D,)
 with `labels` (D,), the class of each box. Where types, names and shapes leave open which of two numbers of a box is its
-score and which its class, these stand as `either` (D, 2) in place of both. Rows that only fill up are
-gone; how many of them were NaN throughout is said as `blank` (1,), if any were.
+score and which its class, these stand as `either` (D, 2) in place of both. One tensor that only the number of classes
+explains stands as `raw` (A, B) in place of all, with the channels of maps that came with it as `beside` (K,), see
+`yolo_heads`. Rows that only fill up are gone; how many of them were NaN throughout is said as `blank` (1,), if any.
 """
 
 from __future__ import annotations
@@ -15,12 +16,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from advsearch.models.model import each_tensor
+from advsearch.tasks.yolo_heads import HEADS, LAYOUTS, TOLERANCE, head_in, names_head, split
+
 Detections = Mapping[str, Tensor]
 
 EXPECTED = (
     "expected boxes (N, D, 4) and scores (N, D, classes); boxes (N, D, 4), labels (N, D) and scores (N, D); rows "
-    "(N, D, 6) of a box, a score and a class; or for each picture a mapping with boxes (D, 4), labels (D,) and scores "
-    "(D,)"
+    "(N, D, 6) of a box, a score and a class; one tensor (N, 4 + classes, D) or (N, D, 5 + classes) as YOLO's; or for "
+    "each picture a mapping with boxes (D, 4), labels (D,) and scores (D,)"
 )
 
 ORDERS = ("boxes scores labels", "boxes labels scores")
@@ -38,19 +42,23 @@ WORDS = {"boxes": ("box",), "scores": ("score", "conf", "prob", "logit"), "label
 
 NOTHING: Detections = {"boxes": torch.zeros(0, 4), "either": torch.zeros(0, 2)}
 
-TOLERANCE = 1e-3
-"""How far outside [0, 1] a score may lie."""
-
 
 def checked_order(text: str) -> tuple[str, ...]:
     """Return the parts that an order names: boxes, scores and labels, and "batch" for the number of the picture.
+
+    Of one of YOLO's heads these are the words of `yolo_heads.HEADS`, and of a layout.
 
     Raises:
         ValueError: it names others.
     """
     parts = tuple(text.replace(",", " ").split())
+    if names_head(" ".join(parts)):
+        return parts
     if sorted(parts) not in (sorted(NAMES), sorted([*NAMES, "batch"])):
-        raise ValueError(f"expected boxes, scores and labels in their order, such as '{ORDERS[0]}', got {text!r}")
+        raise ValueError(
+            f"expected boxes, scores and labels in their order, such as '{ORDERS[0]}', or of a YOLO's head "
+            f"{' or '.join(map(repr, HEADS))} with '{LAYOUTS[0]}' or '{LAYOUTS[1]}' after it, got {text!r}"
+        )
     return parts
 
 
@@ -66,6 +74,16 @@ def detections_in(answer: Any, count: int, order: str = "") -> list[Detections]:
         ValueError: it is something else, or scores are not in [0, 1].
     """
     parts = checked_order(order) if order else ()
+    answer, channels = _first(answer)
+    beside = torch.tensor(sorted(channels), dtype=torch.long)
+    grid = isinstance(answer, Tensor) and answer.ndim == 3 and answer.shape[0] == count and answer.shape[2] != 4
+    masked = grid and answer.shape[2] - 6 in channels and bool((answer[..., 5] == answer[..., 5].round()).all())
+    if grid and (names_head(" ".join(parts)) or not (parts or masked or answer.shape[2] == 6)):
+        return [{"raw": one.float(), "beside": beside} for one in answer]
+    if masked:  # rows of a box, a score, a class and mask coefficients
+        return [{**one, "beside": beside} for one in detections_in(answer[..., :6], count, order)]
+    if "objectness" in parts or "channels" in parts:
+        raise ValueError(EXPECTED)
     if isinstance(answer, (list, tuple)) and len(answer) == count and all(map(_is_one, answer)):
         found = [dict(NOTHING) if one is None else _parts(one, parts) for one in answer]
     elif isinstance(answer, Tensor) and answer.ndim == 2 and answer.shape[1] == 7:
@@ -78,6 +96,23 @@ def detections_in(answer: Any, count: int, order: str = "") -> list[Detections]:
             raise ValueError(EXPECTED)
         found = [{name: part[k] for name, part in together.items()} for k in range(count)]
     return [_one(one) for one in found]
+
+
+def _first(answer: Any) -> tuple[Any, set[int]]:
+    """The predictions of a YOLO's answer, and how many channels the maps (N, K, h, w) have that came with them.
+
+    In training form they are the first of a tuple, feature maps and prototypes of masks stand beside them, in lists and
+    mappings too. Any other answer is returned as it is.
+    """
+    if not isinstance(answer, (list, tuple)) or not answer or not isinstance(answer[0], Tensor):
+        return answer, set()
+    first, others = answer[0], answer[1:]
+    beside = any(isinstance(one, Tensor) and one.ndim < 4 for one in others)
+    if first.ndim != 3 or first.shape[2] == 4 or beside:
+        return answer, set()
+    maps = list[Tensor]()
+    each_tensor(list(others), lambda one: maps.append(one) or one)
+    return first, {one.shape[1] for one in maps if one.ndim == 4}
 
 
 def _is_one(part: Any) -> bool:
@@ -234,25 +269,36 @@ def numbers_of(one: Detections) -> Tensor:
     return beside if beside.ndim == 2 else beside[:, None]
 
 
-def settled(one: Detections, order: str = "") -> Detections:
-    """Return the detections of a picture with scores and labels told apart.
+def settled(one: Detections, order: str = "", classes: int | None = None) -> Detections:
+    """Return the detections of a picture with boxes, scores and labels told apart.
 
     Args:
         one: of `detections_in`.
-        order: one of `ORDERS`; "" for what its rows show.
+        order: one of `ORDERS`, or of `yolo_heads.HEADS` with a layout; "" for what its rows show.
+        classes: that there are; None where nobody says.
 
     Raises:
         ValueError: they do not show it, or something else than the order says.
     """
+    if "raw" in one:
+        if classes is None:
+            raise ValueError(EXPECTED)
+        order = order or order_in([one], classes)
+        boxes, scores = split(one["raw"], classes, order)
+        return _one({"boxes": boxes, "scores": scores})
     if "either" not in one:
-        return one
+        return {name: part for name, part in one.items() if name != "beside"}
     rows = counted(one) | one["either"].isnan().any(dim=1)
-    order = order or order_in([one]) or ("" if bool(rows.any()) else ORDERS[0])
+    order = order or order_in([one], classes) or ("" if bool(rows.any()) else ORDERS[0])
     if not order:
         raise ValueError(f"which of a box's two numbers is its score does not show; {ask_order()}")
+    if names_head(order):
+        scores = one["either"].prod(dim=1, keepdim=True) if "objectness" in order else one["either"]
+        return _one({"boxes": one["boxes"], "scores": scores})
     first, second = one["either"].unbind(dim=1)
     scores, labels = (first, second) if order == ORDERS[0] else (second, first)
-    return _one({**{k: v for k, v in one.items() if k != "either"}, "scores": scores, "labels": labels})
+    said = {name: part for name, part in one.items() if name not in ("either", "beside")}
+    return _one({**said, "scores": scores, "labels": labels})
 
 
 def ask_order() -> str:
@@ -265,18 +311,29 @@ def as_option(options: str) -> str:
     return f"`task='detection={{{options}}}'`"
 
 
-def order_in(found: Sequence[Detections], classes: int | None = None) -> str:
-    """Return which of `ORDERS` the rows of detections show; "" where they leave it open.
+def order_in(found: Sequence[Detections], classes: int | None = None, head: str = "") -> str:
+    """Return which of `ORDERS`, or of `yolo_heads.HEADS` with its layout, detections show; "" where they leave it open.
 
-    A class is a whole number, a score lies in [0, 1]; and what suppression leaves comes by falling scores.
+    A class is a whole number, a score lies in [0, 1]; and what suppression leaves comes by falling scores. Two numbers
+    of which none is a class are the scores of two classes, or objectness and the score of the only one.
 
     Args:
         found: of any pictures.
         classes: that there are; None where nobody says.
+        head: of `yolo_heads.HEADS`, what is said of answers in one tensor; "" for nothing.
 
     Raises:
-        ValueError: no number can be a score, or none a class.
+        ValueError: no number can be a score, or none a class; or a grid of boxes has none or several of its orders.
     """
+    grids = [one for one in found if "raw" in one]
+    if grids and classes is not None:
+        heads = set.intersection(*(set(head_in(one["raw"], one["beside"].tolist(), classes, head)) for one in grids))
+        if not heads:
+            raise ValueError("pictures do not agree about how its numbers are to be read")
+        if len(heads) > 1:
+            said = " or ".join(as_option(f"order: {head}") for head in sorted(heads))
+            raise ValueError(f"how its numbers are to be read does not show; say {said}")
+        return heads.pop()
     each = [one["either"][counted(one)] for one in found if "either" in one]
     rows = [one[one.isfinite().all(dim=1)].detach() for one in each]
     if not any(map(len, rows)):
@@ -285,6 +342,8 @@ def order_in(found: Sequence[Detections], classes: int | None = None) -> str:
     whole = [bool(((c == c.round()) & (c >= -1.0) & (c < most)).all()) for c in numbers]
     share = [bool(((c >= -TOLERANCE) & (c <= 1.0 + TOLERANCE)).all()) for c in numbers]
     fits = [share[0] and whole[1], share[1] and whole[0]]
+    if not any(fits) and all(share) and classes in (1, 2):
+        return f"{list(HEADS)[2 - classes]} {LAYOUTS[1]}"
     if not any(fits) and classes is not None:
         return order_in(found)
     if not any(fits):

@@ -299,6 +299,9 @@ class Session:
     def get_inputs(self) -> Any:
         return [types.SimpleNamespace(name="x", type="tensor(float)", shape=list(self.shape))]
 
+    def get_modelmeta(self) -> Any:
+        return types.SimpleNamespace(custom_metadata_map={})
+
     def run(self, _: None, given: dict[str, Any], options: object) -> list[Any]:
         with torch.no_grad():
             return [Net()(torch.from_numpy(given["x"])).numpy()]

@@ -162,7 +162,7 @@ def three() -> Rows:
         (lambda b, s, c: None, "expected boxes"),
         (lambda b, s, c: (b, c.long(), c.long()), "expected boxes"),
         (lambda b, s, c: {"boxes": b, "labels": c + 0.5, "scores": s}, "classes that are whole numbers"),
-        (lambda b, s, c: torch.cat([b, s[..., None]], dim=-1), "expected boxes"),
+        (lambda b, s, c: torch.cat([b, s[..., None]], dim=-1)[0], "expected boxes"),
         (lambda b, s, c: torch.cat([s[..., None] + 0.5, rows(b, s, c)], dim=-1)[0], "expected boxes"),
     ],
 )

@@ -1,0 +1,345 @@
+"""What YOLO's networks answer, in each form that they have: one cup at a known place, and noise everywhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+import advsearch
+from advsearch.errors import InputError
+from advsearch.models import ModelWarning, load_model
+from advsearch.models.labels import names_in, read_labels
+from advsearch.tasks import Answer, Detection
+from advsearch.tasks.boxes import left_over, strongest
+from advsearch.tasks.detection import Place
+
+CUP = (20.0, 40.0, 60.0, 90.0)
+PICTURE = torch.full((100, 100, 3), 0.25)
+TRUTH = Place((1,), (20, 40, 60, 90), (100, 100))
+NAMES = ("bowl", "cup", "dog")
+PLACES = 21
+
+
+def grid(x: Tensor, classes: int, objectness: float | None) -> Tensor:
+    """Numbers of each place (N, PLACES, 4 + classes), or 5 with objectness, in pixels of a picture of 100 x 100.
+
+    The cup, of the class before the last, is in place 5 with a probability of 0.8; a worse box of it beside that.
+    """
+    noise = noisy(len(x), PLACES, 4 + classes).abs() / 3.0
+    boxes = torch.cat([noise[..., :2] * 100.0, noise[..., 2:4] * 20.0 + 5.0], dim=2)
+    scores = 0.05 * noise[..., 4:]
+    boxes[:, 5], boxes[:, 6] = torch.tensor([40.0, 65.0, 40.0, 50.0]), torch.tensor([42.0, 65.0, 40.0, 50.0])
+    scores[:, 5, cup(classes)], scores[:, 6, cup(classes)] = 0.8, 0.7
+    scores = (scores + 1e-3 * x.mean(dim=(1, 2, 3))[:, None, None] - 0.25e-3).clamp(0.0, 1.0)
+    if objectness is None:
+        return torch.cat([boxes, scores], dim=2)
+    there = torch.full((len(x), PLACES, 1), 0.3)
+    there[:, 5:7] = objectness
+    return torch.cat([boxes, there, scores], dim=2)
+
+
+def cup(classes: int) -> int:
+    return max(classes - 2, 0)
+
+
+def noisy(count: int, *shape: int) -> Tensor:
+    """The same numbers for each picture, (count, *shape), in [-3, 3]."""
+    return torch.randn(shape, generator=torch.Generator().manual_seed(0)).clamp(-3.0, 3.0).expand(count, *shape).clone()
+
+
+class Head(nn.Module):
+    """Answers with a grid as `form` says."""
+
+    def __init__(self, form: Callable[[Tensor], Any], classes: int = 3, objectness: float | None = None) -> None:
+        super().__init__()
+        self.form, self.classes, self.objectness = form, classes, objectness
+
+    def forward(self, x: Tensor) -> Any:
+        return self.form(grid(x, self.classes, self.objectness))
+
+
+def feature_maps(numbers: Tensor) -> list[Tensor]:
+    return [noisy(len(numbers), 64 + 3, side, side) for side in (8, 4, 2)]
+
+
+def with_masks(numbers: Tensor) -> Tensor:
+    return torch.cat([numbers, noisy(len(numbers), PLACES, 32)], dim=2)
+
+
+def prototypes(numbers: Tensor) -> Tensor:
+    return noisy(len(numbers), 32, 16, 16)
+
+
+def free_of_suppression(numbers: Tensor) -> Tensor:
+    """Rows of two corners, a score and a class by falling scores."""
+    middle, size = numbers[..., :2], numbers[..., 2:4]
+    best, label = numbers[..., 4:].max(dim=2)
+    rows = torch.cat([middle - size / 2, middle + size / 2, best[..., None], label[..., None].float()], dim=2)
+    return torch.stack([one[one[:, 4].argsort(descending=True)] for one in rows])
+
+
+def first(numbers: Tensor) -> Tensor:
+    return numbers.transpose(1, 2)
+
+
+V8, V8_LAST, V5 = "boxes scores channels first", "boxes scores channels last", "boxes objectness scores channels last"
+
+FORMS: dict[str, tuple[Callable[[Tensor], Any], float | None, str]] = {
+    "v8": (first, None, V8),
+    "v8 in training form": (lambda n: (first(n), feature_maps(n)), None, V8),
+    "v8 with a mapping": (lambda n: (first(n), {"boxes": n[..., :4], "feats": feature_maps(n)}), None, V8),
+    "RT-DETR": (lambda n: torch.cat([n[..., :4] / 100.0, n[..., 4:]], dim=2), None, V8_LAST),
+    "v5": (lambda n: n, 0.9, V5),
+    "v5 in training form": (lambda n: (n, [noisy(len(n), 3, 8, 8, 8)]), 0.9, V5),
+    "v5 of a file": (lambda n: (n, noisy(len(n), 3, 8, 8, 8), noisy(len(n), 3, 4, 4, 8)), 0.9, V5),
+    "v8 with masks": (lambda n: (first(with_masks(n)), prototypes(n)), None, V8),
+    "v8 with masks in training form": (
+        lambda n: (first(with_masks(n)), (feature_maps(n), noisy(len(n), 32, PLACES), prototypes(n))), None, V8,
+    ),
+    "v5 with masks": (lambda n: (with_masks(n), prototypes(n)), 0.9, V5),
+    "v10": (free_of_suppression, None, "boxes scores labels"),
+    "v10 in training form": (
+        lambda n: (free_of_suppression(n), {"one2many": feature_maps(n), "one2one": feature_maps(n)}),
+        None,
+        "boxes scores labels",
+    ),
+    "without suppression, with masks": (
+        lambda n: (with_masks(free_of_suppression(n)), prototypes(n)), None, "boxes scores labels",
+    ),
+}  # fmt: skip
+
+
+def on(network: nn.Module, labels: Any = NAMES, **options: Any) -> tuple[Detection, Any]:
+    """The task after it has seen the picture, and the answer to it."""
+    task = Detection(**options)
+    model = load_model(network, input_size=100, read=task.reader, labels=labels)
+    output = model(PICTURE)
+    names = tuple(labels)
+    return task.on(model).seeing(output, Place((cup(len(names)),), TRUTH.box, TRUTH.size)), output
+
+
+@pytest.mark.filterwarnings("ignore:no gradient")
+@pytest.mark.parametrize("classes", [1, 2, 3, 80])
+@pytest.mark.parametrize("form", FORMS)
+def test_each_form_is_read_right(form: str, classes: int) -> None:
+    made, objectness, order = FORMS[form]
+    names = read_labels("coco") if classes == 80 else tuple(f"thing {k}" for k in range(classes))
+    task, output = on(Head(made, classes, objectness), names)
+    truth = Place((cup(classes),), TRUTH.box, TRUTH.size)
+    (found,) = task.judge(output, truth)
+    score = 0.8 * (objectness or 1.0)
+    assert found.right and found.answer == Answer(names[cup(classes)], cup(classes), pytest.approx(score, abs=1e-4))
+    best: Any = found.payload
+    assert best["found"][0]["box"] == pytest.approx(CUP, abs=0.1)
+    assert task.seen_order == order and task.seen_unit == ("fractions" if form == "RT-DETR" else "pixels")
+    assert not task.unsaid and not task.doubts
+    said = " ".join(task.remarks)
+    assert f"order: {order}" in said and ("masks are left out" in said) is ("masks" in form)
+
+
+# ---- what is refused ------------------------------------------------------------------------------------------------
+
+
+def more(columns: int, span: float = 0.9) -> Callable[[Tensor], Tensor]:
+    """A grid with so many numbers more after those of each place, in [-span, span]."""
+    return lambda n: first(torch.cat([n, noisy(len(n), PLACES, columns) / 3.0 * span], dim=2))
+
+
+@pytest.mark.parametrize(
+    ("form", "labels", "text"),
+    [
+        (more(1, span=3.0), NAMES, r"answer is \(8, 21\): it has an angle after the scores, as OBB heads have it"),
+        (lambda n: more(1)(n).abs(), NAMES, "may be those of an OBB head"),
+        (more(6), NAMES, "as pose heads .with keypoints. have it, which are not read; or give the `labels`"),
+        (lambda n: torch.cat([free_of_suppression(n), noisy(len(n), PLACES, 1)], dim=2), ["a"], "OBB heads"),
+        (lambda n: first(torch.cat([n[..., :4], 9.0 * n[..., 4:] - 4.0], dim=2)), NAMES, "apply a sigmoid to them"),
+        (
+            first,
+            ["a"],
+            "expected 4 . 1 or 5 . 1 numbers of a box for 1 classes, got 7; give the `labels` of the model's",
+        ),
+        (lambda n: n[..., :6].mT, NAMES, "expected 4 . 3 or 5 . 3 numbers of a box for 3 classes, got 6"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:no gradient")
+def test_other_heads_are_refused_in_a_sentence(form: Callable[[Tensor], Any], labels: Any, text: str) -> None:
+    with pytest.raises(InputError, match=text) as caught:
+        on(Head(form), labels)
+    assert "\n" not in str(caught.value)
+
+
+def test_labels_of_another_set_are_named() -> None:
+    with pytest.raises(InputError, match=r"for 21 classes, got 84; `labels=coco` would fit"):
+        on(Head(lambda n: first(n).repeat(1, 1, 5), 80), read_labels("voc"))
+
+
+def square(numbers: Tensor) -> Tensor:
+    """As many places as numbers, and boxes in shares: nothing tells one from the other."""
+    return first(torch.cat([numbers[..., :4] / 100.0, numbers[..., 4:]], dim=2))
+
+
+def test_what_fits_twice_is_asked_for() -> None:
+    names = [f"thing {k}" for k in range(PLACES - 4)]
+    with pytest.raises(InputError, match=f"{V8}.*or .*{V8_LAST}"):
+        on(Head(square, len(names)), names)
+    task, output = on(Head(square, len(names)), names, order=V8)
+    truth = Place((cup(len(names)),), TRUTH.box, TRUTH.size)
+    assert task.judge(output, truth)[0].answer.probability == pytest.approx(0.8, abs=1e-4) and not task.remarks
+
+
+@pytest.mark.parametrize("order", ["boxes objectness scores", "boxes, objectness, scores, channels, first"])
+def test_an_order_says_what_a_head_is(order: str) -> None:
+    task, output = on(Head(first, objectness=0.9), order=order)
+    assert task.judge(output, TRUTH)[0].answer == Answer("cup", 1, pytest.approx(0.72, abs=1e-4))
+    assert not task.remarks
+    with pytest.raises(InputError, match="order: expected boxes, scores and labels in their order"):
+        Detection(order="boxes objectness")
+
+
+def test_boxes_of_a_head_in_another_form_are_noted() -> None:
+    def corners(numbers: Tensor) -> Tensor:
+        middle, size = numbers[..., :2], numbers[..., 2:4]
+        return first(torch.cat([middle - size / 2, middle + size / 2, numbers[..., 4:]], dim=2))
+
+    task, _ = on(Head(corners))
+    assert any("nearer to the object with `task='detection={boxes: xyxy}'`" in one for one in task.remarks)
+    assert not on(Head(corners), boxes="xyxy")[0].doubts
+
+
+# ---- names, suppression, derivatives --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("names", [dict(enumerate(NAMES)), list(NAMES)])
+def test_names_and_size_come_from_the_network(names: Any) -> None:
+    network: Any = Head(first)
+    network.names, network.args = names, {"imgsz": 96}
+    model = load_model(network, read=Detection().reader)
+    assert model.labels == NAMES and model.input_size == (96, 96)
+    assert load_model(network, read=Detection().reader, labels=["x", "y", "z"], input_size=64).labels == ("x", "y", "z")
+
+
+@pytest.mark.parametrize("iou", [0.3, 0.7])
+def test_suppression_in_rounds_leaves_what_the_greedy_one_does(iou: float) -> None:
+    numbers = torch.rand(300, 5, generator=torch.Generator().manual_seed(1))
+    boxes = torch.cat([numbers[:, :2], numbers[:, :2] + 0.4 * numbers[:, 2:4]], dim=1)
+    left = left_over(boxes, numbers[:, 4], iou).nonzero().flatten().tolist()
+    assert left == sorted(strongest(boxes, numbers[:, 4], 300, iou)) and 10 < len(left) < 295
+
+
+def test_many_boxes_that_overlap_are_suppressed_at_once() -> None:
+    """8400 boxes of 80 classes: the memory of the overlaps of all pairs would be a gigabyte, one by one a minute."""
+    raw = torch.rand(1, 84, 8400, generator=torch.Generator().manual_seed(0))
+    raw[:, :2], raw[:, 2:4] = raw[:, :2] * 6.0 + 52.0, raw[:, 2:4] * 10.0 + 30.0
+    raw[:, 4:] *= 0.09
+    raw[:, 4 + 41] = raw[:, 4 + 41] * 10.0
+    task = Detection(labels=read_labels("coco"), unit="pixels", order=V8, input_size=(640, 640), confidence=0.25)
+    truth = Place((41,), (35, 35, 75, 75), (640, 640))
+    (found,) = task.judge(task.read(raw, 1), truth)
+    assert found.answer.label == "cup" and found.right
+
+
+class Suppressed(nn.Module):
+    """Finds something of which it is sure enough, of the class that it is surer of: what it finds jumps."""
+
+    def forward(self, x: Tensor) -> Any:
+        scores = x.flatten(2).mean(dim=1).softmax(dim=1)
+        scores = scores * len(scores[0]) * 0.5
+        found = []
+        for one in scores:
+            kept = (one > 0.5).nonzero().flatten()
+            boxes = torch.stack([kept, kept, kept + 9, kept + 9], dim=1).float() + one[kept, None]
+            found.append({"boxes": boxes, "scores": one[kept].clamp(max=1.0), "labels": kept % 3})
+        return found
+
+
+def test_what_suppression_leaves_is_no_masked_gradient(recwarn: pytest.WarningsRecorder) -> None:
+    assert load_model(Suppressed(), input_size=16, labels=NAMES, read=Detection().reader).differentiable
+    assert not list(recwarn)
+
+
+class Bright(nn.Module):
+    """A little YOLO: nine places in the middle of a picture, mugs where that is bright and bowls where it is dark.
+
+    Boxes move a little with the picture. As v8 answers, in training form.
+    """
+
+    def __init__(self, threshold: float = 0.46) -> None:
+        super().__init__()
+        self.threshold, self.names = threshold, {0: "bowl", 1: "coffee mug"}
+
+    def forward(self, x: Tensor) -> Any:
+        side = float(x.shape[-1])
+        brightness = x[..., 8:24, 8:24].mean(dim=(1, 2, 3))[:, None].expand(-1, 9)
+        shift = torch.linspace(-0.02, 0.02, 9).expand(len(x), 9)
+        middle, size = (0.5 + shift) * side, (0.75 + 0.02 * brightness) * side
+        logit = 30.0 * (brightness - self.threshold) + 10.0 * shift
+        numbers = torch.stack([middle, middle, size, size, torch.sigmoid(-logit), torch.sigmoid(logit)], dim=1)
+        return numbers, [x, x]
+
+
+def test_a_search_goes_through_a_head_to_its_verified_end(tmp_path: Path) -> None:
+    model = load_model(Bright(), input_size=32, read=Detection().reader)
+    result = advsearch.attack(
+        "mug", model, task="detection", label="coffee mug", objective="vanish", policy="auto", steps=6,
+        controls={"texture": {"epsilon": 0.4}}, trials=6, spp=2, verify_spp=4, denoise="none", measure="no",
+        specialise=False, baseline=False, run=tmp_path / "run",
+    )  # fmt: skip
+    summary = result.summary
+    assert summary.ending == "found" and summary.clean.control and summary.clean.control.correct == 6
+    assert summary.clean.label == "coffee mug" and summary.verified
+    assert set(summary.verified.labels) <= {"bowl", "no coffee mug"}
+    assert any(f"read as a YOLO's: `task='detection={{order: {V8}}}'`" in one for one in summary.warnings)
+    assert (tmp_path / "run" / "images" / "adversarial-answer.png").is_file()
+
+
+def test_a_file_of_onnx_says_names_and_size(tmp_path: Path) -> None:
+    """As ultralytics' exporter writes it, of free sides: a constant grid, to which a little of the picture is added."""
+    onnx, _ = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
+    make = onnx.helper
+    numbers = first(grid(torch.full((1, 3, 100, 100), 0.25), 3, None))
+    nodes = [
+        make.make_node("ReduceMean", ["images"], ["mean"], axes=[1, 2, 3], keepdims=0),
+        make.make_node("Mul", ["mean", "little"], ["add"]),
+        make.make_node("Unsqueeze", ["add", "ends"], ["wide"]),
+        make.make_node("Add", ["grid", "wide"], ["sum"]),
+        make.make_node("Clip", ["sum", "zero"], ["output0"]),
+    ]
+    constants = [
+        onnx.numpy_helper.from_array(numbers.numpy(), "grid"),
+        onnx.numpy_helper.from_array(torch.tensor([1e-5]).numpy(), "little"),
+        onnx.numpy_helper.from_array(torch.tensor(0.0).numpy(), "zero"),
+        onnx.numpy_helper.from_array(torch.tensor([1, 2]).numpy(), "ends"),
+    ]
+    inputs = [make.make_tensor_value_info("images", 1, ["batch", 3, "height", "width"])]
+    outputs = [make.make_tensor_value_info("output0", 1, ["batch", 7, PLACES])]
+    graph = make.make_graph(nodes, "head", inputs, outputs, constants)
+    model = make.make_model(graph, opset_imports=[make.make_opsetid("", 13)], ir_version=8)
+    make.set_model_props(model, {"names": str(dict(enumerate(NAMES))), "imgsz": "[100, 100]", "stride": "32"})
+    onnx.save(model, str(tmp_path / "head.onnx"))
+    with pytest.warns(ModelWarning, match="no gradient"):
+        loaded = load_model(tmp_path / "head.onnx", read=Detection().reader)
+    assert loaded.labels == NAMES and loaded.input_size == (100, 100)
+    output = loaded(PICTURE)
+    task = Detection().on(loaded).seeing(output, TRUTH)
+    assert task.judge(output, TRUTH)[0].answer == Answer("cup", 1, pytest.approx(0.8, abs=1e-3)) and not task.doubts
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("{0: 'cup', 1: \"it's\", 2: 'a\\'b'}", ("cup", "it's", "a'b")),
+        ("['cup', 'bowl']", ("cup", "bowl")),
+        ("{1: 'cup'}", None),
+        ("{0: __import__('os')}", None),
+        ("[" * 5000, None),
+        ("{0: ''}", None),
+        ("", None),
+    ],
+)
+def test_names_in_metadata_are_plain_texts_or_nothing(text: str, names: tuple[str, ...] | None) -> None:
+    assert names_in(text) == names
